@@ -1,0 +1,35 @@
+"""Every error that the program raises on purpose.
+
+CompanionError            one clear line for the user: what, where, what to do
+├── InputError            what the user gave cannot be used; exit status 2
+│   ├── ConfigError       an unknown key, a wrong type or value
+│   ├── FlightError       a flight folder, video, calibration or log that cannot be read
+│   └── DeviceError       no OpenCL device, or not the one asked for
+└── StageError            a stage failed on input that it should have handled; exit status 1
+"""
+
+from __future__ import annotations
+
+
+class CompanionError(Exception):
+    """Root of the tree; its text is one line fit for the user."""
+
+
+class InputError(CompanionError):
+    """What the user gave cannot be used."""
+
+
+class ConfigError(InputError):
+    """A configuration key or value is not valid."""
+
+
+class FlightError(InputError):
+    """A flight folder, its video, calibration or telemetry cannot be read."""
+
+
+class DeviceError(InputError):
+    """The OpenCL device asked for is not there or does not compute correctly."""
+
+
+class StageError(CompanionError):
+    """A stage failed on input that it should have handled."""

@@ -1,0 +1,196 @@
+"""Rotations, rigid poses and similarities: numpy only, pure.
+
+Frames (all right-handed):
+
+| name   | axes                                   | unit      |
+|--------|----------------------------------------|-----------|
+| world  | north, east, down (local NED)          | metres    |
+| map    | like world once levelled; first camera at the origin | map units |
+| body   | forward, right, down (FRD)             | metres    |
+| camera | right, down, forward                   | map units |
+| image  | u right, v down; pixel centres at integers | pixels |
+
+A transform is named `a_from_b`: it takes coordinates in b to coordinates in a, so that names
+meet in a product. Quaternions are Hamilton, ordered w x y z, with w >= 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """A rigid transform `a_from_b`: rotation (3, 3), translation (3,)."""
+
+    rotation: Array
+    translation: Array
+
+    @staticmethod
+    def identity() -> Pose:
+        """The transform of a frame to itself."""
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: NDArray[Any]) -> Pose:
+        """Build from a (3, 4) or (4, 4) matrix."""
+        m = np.asarray(matrix, np.float64)
+        return Pose(m[:3, :3].copy(), m[:3, 3].copy())
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(
+            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
+        )
+
+    def inverse(self) -> Pose:
+        """Return `b_from_a`."""
+        return Pose(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def apply(self, points: Array) -> Array:
+        """Transform points (..., 3)."""
+        moved: Array = points @ self.rotation.T + self.translation
+        return moved
+
+    def matrix(self) -> Array:
+        """The (4, 4) matrix."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.rotation, self.translation
+        return m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """A transform with scale: a = scale * rotation @ b + translation."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def apply(self, points: Array) -> Array:
+        """Transform points (..., 3)."""
+        moved: Array = self.scale * (points @ self.rotation.T) + self.translation
+        return moved
+
+    def apply_to_pose(self, pose: Pose) -> Pose:
+        """Return the rigid pose of a frame whose pose is given in b: its position scaled, its axes turned."""
+        return Pose(self.rotation @ pose.rotation, self.apply(pose.translation))
+
+    def inverse(self) -> Similarity:
+        """Return `b_from_a`."""
+        r = self.rotation.T
+        return Similarity(1.0 / self.scale, r, -(r @ self.translation) / self.scale)
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    v = np.asarray(v, np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def rotation_from_vector(rotvec: Array) -> Array:
+    """Rotation (3, 3) of a rotation vector (3,) in radians (Rodrigues).
+
+    >>> np.round(rotation_from_vector(np.array([0, 0, np.pi / 2])) @ [1, 0, 0], 6)
+    array([0., 1., 0.])
+    """
+    v = np.asarray(rotvec, np.float64)
+    theta = float(np.linalg.norm(v))
+    k = skew(v)
+    if theta < 1e-8:
+        r: Array = np.eye(3) + k + 0.5 * k @ k
+        return r
+    r = np.eye(3) + np.sin(theta) / theta * k + (1 - np.cos(theta)) / theta**2 * (k @ k)
+    return r
+
+
+def vector_from_rotation(rotation: Array) -> Array:
+    """Rotation vector (3,) in radians of a rotation (3, 3); the inverse of the above."""
+    w, x, y, z = quaternion_from_rotation(rotation)
+    v = np.array([x, y, z])
+    s = float(np.linalg.norm(v))
+    if s < 1e-12:
+        return 2.0 * v
+    out: Array = v / s * 2.0 * np.arctan2(s, w)
+    return out
+
+
+def rotation_from_quaternion(quaternion_wxyz: NDArray[Any]) -> Array:
+    """Rotation (3, 3) of a quaternion w x y z; it is normalised first."""
+    q = np.asarray(quaternion_wxyz, np.float64)
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """Unit quaternion w x y z, w >= 0, of a rotation (3, 3) (Shepperd's method)."""
+    m = np.asarray(rotation, np.float64)
+    t = m[0, 0] + m[1, 1] + m[2, 2]
+    k = int(np.argmax([t, m[0, 0], m[1, 1], m[2, 2]]))
+    if k == 0:
+        q = np.array([1 + t, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    elif k == 1:
+        q = np.array(
+            [m[2, 1] - m[1, 2], 1 + 2 * m[0, 0] - t, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]
+        )
+    elif k == 2:
+        q = np.array(
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 + 2 * m[1, 1] - t, m[1, 2] + m[2, 1]]
+        )
+    else:
+        q = np.array(
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 + 2 * m[2, 2] - t]
+        )
+    q = q / np.linalg.norm(q)
+    out: Array = -q if q[0] < 0 else q
+    return out
+
+
+def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
+    """Quaternion w x y z `ned_from_body` of aerospace roll, pitch, yaw (z-y-x, intrinsic)."""
+    cr, sr = np.cos(roll_rad / 2), np.sin(roll_rad / 2)
+    cp, sp = np.cos(pitch_rad / 2), np.sin(pitch_rad / 2)
+    cy, sy = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
+    q = np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+    return -q if q[0] < 0 else q
+
+
+def interpolate_rotation(rotation_a: Array, rotation_b: Array, fraction: float) -> Array:
+    """Rotation on the shortest arc from a (fraction 0) to b (fraction 1); outside it extrapolates."""
+    out: Array = rotation_a @ rotation_from_vector(
+        fraction * vector_from_rotation(rotation_a.T @ rotation_b)
+    )
+    return out
+
+
+def yaw_rotation(yaw_rad: float) -> Array:
+    """Rotation (3, 3) about the down axis."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def angle_between(rotation_a: Array, rotation_b: Array) -> float:
+    """Angle in radians that turns a into b."""
+    return float(np.linalg.norm(vector_from_rotation(rotation_a.T @ rotation_b)))

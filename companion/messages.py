@@ -1,0 +1,251 @@
+"""Every noun that passes between rooms: frozen, with its time, its unit and its frame in its name.
+
+`t_ns` is nanoseconds on the flight's own clock: that of the computer which stamped the frames (Unix
+time in recorded flights). Arrays are not to be written to after construction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry import Array, Pose, Similarity
+
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image. `t_ns` is mid-exposure; `grey` (H, W) u8; `rgb` (H, W, 3) u8."""
+
+    seq: int
+    t_ns: int
+    grey: Bytes
+    rgb: Bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeSample:
+    """Attitude of the autopilot: quaternion w x y z, body rates (3,) or None."""
+
+    t_ns: int
+    ned_from_body: Array
+    rates_body_rad_s: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSample:
+    """Angular rate and specific force in the body frame, (3,) each."""
+
+    t_ns: int
+    gyro_rad_s: Array
+    accel_m_s2: Array
+
+
+class PositionSource(Enum):
+    """Where a position comes from; earlier ones are preferred."""
+
+    LOCAL = "local position"
+    GLOBAL = "global position"
+    GPS = "GPS"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionSample:
+    """Position (3,) of the body in local NED, velocity (3,) where the autopilot gives it.
+
+    All samples of a source share one origin, the reader's `GeoOrigin` where that is known.
+    """
+
+    t_ns: int
+    source: PositionSource
+    position_ned_m: Array
+    velocity_ned_m_s: Array | None = None
+    sigma_horizontal_m: float | None = None
+    sigma_vertical_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeSample:
+    """Distance along the body's down axis to the ground, by rangefinder."""
+
+    t_ns: int
+    distance_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightSample:
+    """Barometric height above an arbitrary, constant level; up is positive."""
+
+    t_ns: int
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmedSample:
+    """Whether the motors are armed."""
+
+    t_ns: int
+    armed: bool
+
+
+Telemetry = AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
+
+
+@dataclass(frozen=True, slots=True)
+class GeoOrigin:
+    """Where local NED has its zero (WGS84; altitude above mean sea level)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+
+class TrackState(Enum):
+    """What the tracker knows."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Where one frame was taken, or that it is not known.
+
+    Its pose is `map_from_camera` as believed at that time, and `keyframe_from_camera` relative to
+    keyframe `keyframe_id`, which stays true when the map is corrected. All are None unless tracking.
+    `keypoints_px` (N, 2) are distorted pixels of the map points found. `backfilled` marks frames
+    that were placed after the fact (the ones between the two initial keyframes, for instance).
+    """
+
+    seq: int
+    t_ns: int
+    state: TrackState
+    map_from_camera: Pose | None = None
+    keyframe_id: int | None = None
+    keyframe_from_camera: Pose | None = None
+    n_inliers: int = 0
+    n_matches: int = 0
+    keypoints_px: Floats | None = None
+    backfilled: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeAdded:
+    """A new keyframe: which frame it is, and how deep the map points that it sees lie.
+
+    `points_camera` (N, 3) are these points in its camera frame, map units.
+    """
+
+    keyframe_id: int
+    seq: int
+    t_ns: int
+    map_from_camera: Pose
+    points_camera: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Georeference:
+    """How the map lies in the world: local NED in metres.
+
+    `metres_per_unit` is `world_from_map.scale`; the sigmas are one standard deviation. `method`
+    says in words what the scale came from.
+    """
+
+    world_from_map: Similarity
+    sigma_scale: float
+    """relative: 0.01 is one percent"""
+    sigma_yaw_rad: float
+    method: str
+    n_positions: int
+    residual_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapUpdate:
+    """The map as it now stands: every keyframe's pose, and the sparse points (N, 3) in map units."""
+
+    revision: int
+    t_ns: int
+    map_from_camera: Mapping[int, Pose]
+    points_map: Array
+    georeference: Georeference | None
+
+
+class PixelState(Enum):
+    """State of a pixel's depth filter."""
+
+    UPDATING = 0
+    CONVERGED = 1
+    DIVERGED = 2
+    BORDER = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """Dense depth of a keyframe, in its undistorted pinhole image.
+
+    `depth` (H, W) f32 along z in map units, 0 where there is none; `sigma` (H, W) f32 likewise;
+    `state` (H, W) u8 of `PixelState`; `inlier_ratio` (H, W) f32 0..1; `rgb` (H, W, 3) the
+    undistorted image; `intrinsics` fx, fy, cx, cy.
+    """
+
+    keyframe_id: int
+    t_ns: int
+    intrinsics: tuple[float, float, float, float]
+    depth: Floats
+    sigma: Floats
+    state: Bytes
+    inlier_ratio: Floats
+    rgb: Bytes
+    n_updates: int
+    kernel_ms: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointChunk:
+    """Fused points of one keyframe, in its camera frame and map units.
+
+    `points_camera` (N, 3) f32, `rgb` (N, 3) u8, `confidence` (N,) f32 in 0..1. A moved keyframe moves
+    its chunk: nothing here changes.
+    """
+
+    keyframe_id: int
+    t_ns: int
+    points_camera: Floats
+    rgb: Bytes
+    confidence: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Warned:
+    """Something the user should know of; `what` is a short constant, by which warnings are counted."""
+
+    t_ns: int
+    what: str
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClockReport:
+    """How autopilot boot time was put on the flight's clock."""
+
+    method: str
+    offset_s: float
+    drift_ppm: float
+    sigma_ms: float
+    n_reboots: int
+
+
+Message = (
+    Frame | Telemetry | Track | KeyframeAdded | MapUpdate | DepthMap | PointChunk | Warned
+)  # fmt: skip
+
+Details = Mapping[str, Any]

@@ -1,0 +1,1 @@
+"""The edge towards cameras, autopilots and recorded flights: everything becomes stamped messages."""
