@@ -1,0 +1,159 @@
+"""What is believed of the camera's motion between images: attitude history and motion filter.
+
+The only file that knows filterpy.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections import deque
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from companion.geometry import (
+    Array,
+    Pose,
+    interpolate_rotation,
+    rotation_from_quaternion,
+    rotation_from_vector,
+    vector_from_rotation,
+)
+from companion.messages import AttitudeSample
+
+MAX_GAP_NS = 500_000_000
+MAX_EXTRAPOLATION_NS = 250_000_000
+
+
+class AttitudeHistory:
+    """The recent past of the autopilot's attitude, read at any time within it."""
+
+    def __init__(self, keep: int = 4000) -> None:
+        self._keep = keep
+        self._samples: list[AttitudeSample] = []
+        self._times: list[int] = []
+
+    def add(self, sample: AttitudeSample) -> None:
+        """Take a sample; late ones are put in their place, doubles ignored."""
+        if not self._times or sample.t_ns > self._times[-1]:
+            self._times.append(sample.t_ns)
+            self._samples.append(sample)
+        else:
+            at = bisect_left(self._times, sample.t_ns)
+            if self._times[at] == sample.t_ns:
+                return
+            insort(self._times, sample.t_ns)
+            self._samples.insert(at, sample)
+        if len(self._times) > 2 * self._keep:
+            del self._times[: -self._keep], self._samples[: -self._keep]
+
+    def at(self, t_ns: int) -> Array | None:
+        """Rotation `ned_from_body` (3, 3) at a time; None where no sample is near enough."""
+        if not self._times:
+            return None
+        i = bisect_left(self._times, t_ns)
+        if 0 < i < len(self._times):
+            before, after = self._samples[i - 1], self._samples[i]
+            span = after.t_ns - before.t_ns
+            if span > MAX_GAP_NS:
+                return None
+            return interpolate_rotation(
+                rotation_from_quaternion(before.ned_from_body),
+                rotation_from_quaternion(after.ned_from_body),
+                (t_ns - before.t_ns) / span,
+            )
+        nearest = self._samples[0] if i == 0 else self._samples[-1]
+        gap_ns = t_ns - nearest.t_ns
+        if abs(gap_ns) > MAX_EXTRAPOLATION_NS:
+            return None
+        rotation = rotation_from_quaternion(nearest.ned_from_body)
+        if nearest.rates_body_rad_s is None:
+            return rotation
+        turned: Array = rotation @ rotation_from_vector(nearest.rates_body_rad_s * (gap_ns * 1e-9))
+        return turned
+
+
+class MotionFilter:
+    """Kalman filter over position and velocity (map units) and the autopilot's attitude error (rad).
+
+    State x = [position (3), velocity (3), attitude error (3)]: constant velocity, and an attitude
+    error that wanders slowly, so that the autopilot's attitude predicts the camera's rotation even
+    where its yaw has drifted. Without attitude the last turn rate is held.
+    """
+
+    def __init__(self) -> None:
+        self._t_ns: int | None = None
+        self._poses: deque[tuple[int, Pose]] = deque(maxlen=2)
+        self._filter: KalmanFilter | None = None
+        self._disagreement_rad: deque[float] = deque(maxlen=60)
+        self.unit = 1.0
+
+    def reset(self) -> None:
+        """Forget everything but what is known of the autopilot's attitude."""
+        self._t_ns, self._filter = None, None
+        self._poses.clear()
+
+    @property
+    def attitude_disagreement_rad(self) -> float | None:
+        """Median change between frames that the autopilot's attitude did not see; None until known."""
+        if len(self._disagreement_rad) < 20:
+            return None
+        return float(np.median(self._disagreement_rad))
+
+    def predict(self, t_ns: int, ned_from_camera: Array | None) -> Pose | None:
+        """Predicted `map_from_camera`; None when nothing is known."""
+        if self._filter is None or self._t_ns is None:
+            return None
+        dt = (t_ns - self._t_ns) * 1e-9
+        x = self._filter.x.ravel()
+        position = x[:3] + np.clip(dt, 0.0, 1.0) * x[3:6]
+        if ned_from_camera is not None:
+            return Pose(rotation_from_vector(x[6:9]) @ ned_from_camera, position)
+        (t0, a), (t1, b) = self._poses[0], self._poses[-1]
+        if t1 == t0 or dt > 1.0:
+            return Pose(b.rotation, position)
+        return Pose(
+            interpolate_rotation(a.rotation, b.rotation, (t_ns - t0) / (t1 - t0)), position
+        )
+
+    def correct(self, t_ns: int, map_from_camera: Pose, ned_from_camera: Array | None) -> None:
+        """Take the pose that the image gave."""
+        error = np.zeros(3)
+        if ned_from_camera is not None:
+            error = vector_from_rotation(map_from_camera.rotation @ ned_from_camera.T)
+        if self._filter is None or self._t_ns is None or t_ns - self._t_ns > 2_000_000_000:
+            self._filter = self._fresh(map_from_camera.translation, error)
+        else:
+            dt = max((t_ns - self._t_ns) * 1e-9, 1e-3)
+            f = self._filter
+            f.F = np.eye(9)
+            f.F[:3, 3:6] = dt * np.eye(3)
+            q = np.zeros((9, 9))
+            accel = 0.3 * self.unit
+            q[:3, :3] = np.eye(3) * accel**2 * dt**4 / 4
+            q[:3, 3:6] = q[3:6, :3] = np.eye(3) * accel**2 * dt**3 / 2
+            q[3:6, 3:6] = np.eye(3) * accel**2 * dt**2
+            q[6:, 6:] = np.eye(3) * np.radians(1.0) ** 2 * dt
+            f.Q = q
+            f.predict()
+            rows = 6 if ned_from_camera is not None else 3
+            h = np.zeros((rows, 9))
+            h[:3, :3] = np.eye(3)
+            r = np.eye(rows) * (0.003 * self.unit) ** 2
+            z = map_from_camera.translation
+            if ned_from_camera is not None:
+                h[3:, 6:] = np.eye(3)
+                r[3:, 3:] = np.eye(3) * np.radians(0.3) ** 2
+                previous = rotation_from_vector(f.x.ravel()[6:9])
+                turn = vector_from_rotation(map_from_camera.rotation @ ned_from_camera.T @ previous.T)
+                self._disagreement_rad.append(float(np.linalg.norm(turn)))
+                z = np.r_[z, f.x.ravel()[6:9] + turn]
+            f.update(z.reshape(-1, 1), R=r, H=h)
+        self._t_ns = t_ns
+        self._poses.append((t_ns, map_from_camera))
+
+    def _fresh(self, position: Array, error: Array) -> KalmanFilter:
+        f = KalmanFilter(dim_x=9, dim_z=6)
+        f.x = np.r_[position, np.zeros(3), error].reshape(-1, 1)
+        f.P = np.diag(np.r_[np.full(3, 1e-4), np.full(3, 1.0), np.full(3, 1e-4)] * self.unit**2)
+        return f

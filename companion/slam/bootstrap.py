@@ -1,0 +1,77 @@
+"""Waiting for two frames that start a map, and keeping those that came meanwhile."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.camera import Camera
+from companion.config import TrackingConfig
+from companion.geometry import Array, Pose
+from companion.slam.features import Features, Ints
+from companion.slam.initializer import MIN_POINTS, initialise
+from companion.slam.matching import match_descriptors
+from companion.slam.view import View
+
+MAX_PENDING = 150
+FORWARD_IS_NORTH = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+"""Attitude of a camera that is taken as level and looking north, where nobody tells."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Two views with poses in a new map, and the points (N, 3) that both see."""
+
+    first: View
+    second: View
+    points_map: Array
+    features_first: Ints
+    features_second: Ints
+
+
+class Bootstrap:
+    """Tries each new frame against a reference frame until both start a map."""
+
+    def __init__(self, config: TrackingConfig, camera: Camera) -> None:
+        self._config = config
+        self._camera = camera
+        self.pending: deque[View] = deque(maxlen=MAX_PENDING)
+        self._reference: View | None = None
+
+    def step(self, seq: int, t_ns: int, features: Features, ned_from_camera: Array | None) -> Start | None:
+        """Take a frame; a Start when a map can begin with it."""
+        view = View(seq, t_ns, features, ned_from_camera, Pose.identity(), np.full(len(features), -1))
+        self.pending.append(view)
+        reference = self._reference
+        if reference is None:
+            if len(features) >= 2 * MIN_POINTS:
+                self._reference = view
+            return None
+        ia, ib = match_descriptors(reference.features, features)
+        if len(ia) < MIN_POINTS:
+            # the view has moved on: begin again from a frame in between, else from this one
+            between = [v for v in self.pending if reference.seq < v.seq < seq and len(v.features) >= 2 * MIN_POINTS]
+            self._reference = between[len(between) // 2] if between else None
+            return None
+        shift = np.linalg.norm(reference.features.pixels[ia] - features.pixels[ib], axis=1)
+        if np.median(shift) < 3.0:
+            return None
+        rotation_prior = None
+        if ned_from_camera is not None and reference.ned_from_camera is not None:
+            rotation_prior = ned_from_camera.T @ reference.ned_from_camera
+        result = initialise(
+            reference.features, features, ia, ib, self._camera.focal_px, seq + 1, rotation_prior,
+            float(np.radians(self._config.min_init_parallax_deg)),
+        )  # fmt: skip
+        if result is None:
+            return None
+        # the map: axes by the first view's attitude, unit length its median depth
+        unit = 1.0 / float(np.median(result.points_a[:, 2]))
+        map_rotation = reference.ned_from_camera if reference.ned_from_camera is not None else FORWARD_IS_NORTH
+        reference.camera_from_map = Pose(map_rotation.T, np.zeros(3))
+        b_from_a = Pose(result.b_from_a.rotation, result.b_from_a.translation * unit)
+        view.camera_from_map = b_from_a @ reference.camera_from_map
+        points_map = result.points_a * unit @ map_rotation.T
+        return Start(reference, view, points_map, result.features_a, result.features_b)

@@ -1,0 +1,144 @@
+"""Bundle adjustment: camera poses and points together, by the Schur complement (Triggs et al., 1999).
+
+Levenberg-Marquardt with Huber's loss. The camera-point blocks are kept dense, cameras by points, so
+that elimination is one matrix product: right for windows of some tens of cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from companion.geometry import Array, Pose, rotation_from_vector
+from companion.slam.features import Bools, Ints
+from companion.slam.pose_refinement import CHI2_2D, HUBER
+
+
+@dataclass(slots=True, eq=False)
+class Bundle:
+    """Cameras (C), points (P, 3) and observations (O): which camera sees which point where.
+
+    The first `n_variable` cameras move, the others hold the gauge. `normalised` (O, 2) and
+    `whitening` (O, 2, 2) are as in Features. No camera sees a point twice.
+    """
+
+    poses: list[Pose]
+    n_variable: int
+    points: Array
+    camera: Ints
+    point: Ints
+    normalised: Array
+    whitening: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """The adjusted poses and points, which observations agree (O,), and the cost before and after."""
+
+    poses: list[Pose]
+    points: Array
+    inlier: Bools
+    cost_before: float
+    cost_after: float
+
+
+def _project(rotation: Array, translation: Array, points: Array, b: Bundle) -> tuple[Array, Array]:
+    p = np.matmul(rotation[b.camera], points[b.point][..., None])[..., 0] + translation[b.camera]
+    z = np.where(np.abs(p[:, 2]) < 1e-9, 1e-9, p[:, 2])
+    error = p[:, :2] / z[:, None] - b.normalised
+    return p, np.matmul(b.whitening, error[..., None])[..., 0]
+
+
+def _cost(residual: Array, depth: Array) -> float:
+    size = np.sqrt((residual * residual).sum(1))
+    robust = np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER))
+    return float(np.where(depth > 0, robust, HUBER * 100.0).sum())
+
+
+def adjust(bundle: Bundle, iterations: int = 6) -> Adjusted:
+    """Adjust; the input is left as it is."""
+    b = bundle
+    n_var, n_points = b.n_variable, len(b.points)
+    rotation = np.stack([p.rotation for p in b.poses])
+    translation = np.stack([p.translation for p in b.poses])
+    points = b.points.copy()
+    p, residual = _project(rotation, translation, points, b)
+    cost = first_cost = _cost(residual, p[:, 2])
+    damping = 1e-4
+    moving = b.camera < n_var
+    cam, pt = b.camera[moving], b.point[moving]
+    accepted = True
+    for _ in range(iterations):
+        if accepted:
+            jc, jp = _jacobians(rotation, p, b)
+            size = np.sqrt((residual * residual).sum(1))
+            weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-9)) * (p[:, 2] > 0)
+            root = np.sqrt(weight)[:, None, None]
+            jc, jp = jc[moving] * root[moving], jp * root
+            r = residual * root[:, :, 0]
+            hpp = np.zeros((n_points, 3, 3))
+            np.add.at(hpp, b.point, np.matmul(jp.transpose(0, 2, 1), jp))
+            gp = np.zeros((n_points, 3))
+            np.add.at(gp, b.point, np.matmul(jp.transpose(0, 2, 1), r[..., None])[..., 0])
+            hcc = np.zeros((n_var, 6, 6))
+            np.add.at(hcc, cam, np.matmul(jc.transpose(0, 2, 1), jc))
+            gc = np.zeros((n_var, 6))
+            np.add.at(gc, cam, np.matmul(jc.transpose(0, 2, 1), r[moving][..., None])[..., 0])
+            hcp = np.zeros((n_var, 6, n_points, 3))
+            hcp[cam, :, pt, :] = np.matmul(jc.transpose(0, 2, 1), jp[moving])
+            cross = hcp.reshape(6 * n_var, 3 * n_points)
+        damped = hpp + (damping * np.einsum("nii->ni", hpp) + 1e-9)[..., None] * np.eye(3)
+        inverse = np.linalg.inv(damped)
+        eliminated = np.matmul(hcp.transpose(2, 0, 1, 3).reshape(n_points, 6 * n_var, 3), inverse)
+        eliminated = eliminated.transpose(1, 0, 2).reshape(6 * n_var, 3 * n_points)
+        schur = -eliminated @ cross.T
+        for k in range(n_var):
+            block = schur[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+            block += hcc[k] + np.diag(damping * np.diag(hcc[k]) + 1e-9)
+        rhs = -gc.ravel() + eliminated @ gp.ravel()
+        try:
+            dc = cho_solve(cho_factor(schur, check_finite=False), rhs, check_finite=False)
+        except np.linalg.LinAlgError:
+            damping *= 10
+            accepted = False
+            continue
+        back = -gp - (cross.T @ dc).reshape(n_points, 3)
+        dp = np.matmul(inverse, back[..., None])[..., 0]
+        turns = np.stack([rotation_from_vector(d[:3]) for d in dc.reshape(-1, 6)])
+        new_rotation, new_translation = rotation.copy(), translation.copy()
+        new_rotation[:n_var] = turns @ rotation[:n_var]
+        new_translation[:n_var] = (
+            np.matmul(turns, translation[:n_var, :, None])[..., 0] + dc.reshape(-1, 6)[:, 3:]
+        )
+        new_points = points + dp
+        new_p, new_residual = _project(new_rotation, new_translation, new_points, b)
+        new_cost = _cost(new_residual, new_p[:, 2])
+        accepted = new_cost < cost
+        if accepted:
+            gain = (cost - new_cost) / max(cost, 1e-12)
+            rotation, translation, points = new_rotation, new_translation, new_points
+            p, residual, cost = new_p, new_residual, new_cost
+            damping = max(damping * 0.2, 1e-8)
+            if gain < 1e-4:
+                break
+        else:
+            damping *= 10
+    inlier = ((residual * residual).sum(1) < CHI2_2D) & (p[:, 2] > 0)
+    poses = [Pose(rotation[i], translation[i]) for i in range(len(b.poses))]
+    return Adjusted(poses, points, inlier, first_cost, cost)
+
+
+def _jacobians(rotation: Array, p: Array, b: Bundle) -> tuple[Array, Array]:
+    """Derivatives of whitened residuals for camera (O, 2, 6) and point (O, 2, 3)."""
+    inv = 1.0 / np.where(np.abs(p[:, 2]) < 1e-9, 1e-9, p[:, 2])
+    x, y = p[:, 0] * inv, p[:, 1] * inv
+    jc = np.zeros((len(p), 2, 6))
+    jc[:, 0, 0], jc[:, 0, 1], jc[:, 0, 2] = -x * y, 1 + x * x, -y
+    jc[:, 1, 0], jc[:, 1, 1], jc[:, 1, 2] = -1 - y * y, x * y, x
+    jc[:, 0, 3], jc[:, 0, 5] = inv, -x * inv
+    jc[:, 1, 4], jc[:, 1, 5] = inv, -y * inv
+    jc = np.matmul(b.whitening, jc)
+    jp = np.matmul(jc[:, :, 3:], rotation[b.camera])
+    return jc, jp

@@ -1,0 +1,95 @@
+"""ORB features spread over the image (Rublee et al., ICCV 2011)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from companion.camera import Camera
+from companion.config import FeaturesConfig
+from companion.geometry import Array
+from companion.messages import Bytes, Floats
+
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """The N features of one image.
+
+    `pixels` (N, 2) distorted; `normalised` (N, 2) ideal coordinates x/z, y/z; `octaves` (N,) pyramid
+    level; `angles_deg` (N,); `descriptors` (N, 32); `sigma_px` (N,) the expected error of a position;
+    `whitening` (N, 2, 2) turns an error in normalised coordinates into one in units of sigma;
+    `tree` finds features near a pixel.
+    """
+
+    pixels: Floats
+    normalised: Array
+    octaves: Ints
+    angles_deg: Floats
+    descriptors: Bytes
+    sigma_px: Array
+    whitening: Array
+    tree: cKDTree
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+class FeatureExtractor:
+    """Finds the features of images of one camera."""
+
+    def __init__(self, config: FeaturesConfig, camera: Camera) -> None:
+        self._camera = camera
+        self._config = config
+        self._orb = cv2.ORB_create(
+            nfeatures=4 * config.n_features,
+            scaleFactor=config.scale_factor,
+            nlevels=config.n_levels,
+            fastThreshold=config.fast_threshold,
+        )
+
+    def extract(self, grey: Bytes) -> Features:
+        """Features of an image (H, W); as few as none where it shows nothing."""
+        keypoints = self._orb.detect(grey, None)
+        if keypoints:
+            keypoints = [keypoints[i] for i in self._spread(keypoints)]
+            keypoints, descriptors = self._orb.compute(grey, keypoints)
+        if not keypoints:
+            descriptors = np.zeros((0, 32), np.uint8)
+        pixels = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
+        octaves = np.array([k.octave for k in keypoints], np.int64)
+        angles = np.array([k.angle for k in keypoints], np.float32)
+        normalised = self._camera.normalise(pixels)
+        seen = np.isfinite(normalised).all(1)
+        pixels, octaves, angles = pixels[seen], octaves[seen], angles[seen]
+        normalised = normalised[seen]
+        sigma = self._config.scale_factor**octaves.astype(np.float64)
+        whitening = self._camera.pixel_from_normalised_jacobian(normalised) / sigma[:, None, None]
+        return Features(
+            pixels, normalised, octaves, angles, descriptors[seen], sigma, whitening,
+            cKDTree(pixels) if len(pixels) else cKDTree(np.zeros((0, 2))),
+        )  # fmt: skip
+
+    def _spread(self, keypoints: list[cv2.KeyPoint]) -> list[int]:
+        """Take the strongest of every cell in turn, until there are enough."""
+        n = self._config.n_features
+        if len(keypoints) <= n:
+            return list(range(len(keypoints)))
+        cell_px = self._config.cell_px
+        points = cv2.KeyPoint.convert(keypoints)
+        response = np.array([k.response for k in keypoints])
+        cells = (points // cell_px).astype(np.int64)
+        cell = cells[:, 1] * 100_000 + cells[:, 0]
+        order = np.lexsort((np.arange(len(cell)), -response, cell))
+        starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0])
+        sizes = np.diff(np.r_[starts, len(order)])
+        rank = np.empty(len(order), np.int64)
+        rank[order] = np.arange(len(order)) - np.repeat(starts, sizes)
+        chosen = np.lexsort((np.arange(len(cell)), -response, rank))[:n]
+        return [int(i) for i in np.sort(chosen)]

@@ -1,0 +1,203 @@
+"""The first two keyframes: motion and points from two images alone.
+
+An essential matrix explains a scene with depth, a homography a plane (a survey seen from straight
+above); the one that explains more is taken (after Mur-Artal et al., 2015). Their several solutions
+are told apart by cheirality, and by the autopilot's rotation where there is one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from companion.geometry import Array, Pose, angle_between
+from companion.slam.bundle import Bundle, adjust
+from companion.slam.features import Features, Ints
+from companion.slam.triangulation import consistent, triangulate
+
+MAX_PRIOR_DISAGREEMENT_RAD = np.radians(8.0)
+MIN_POINTS = 60
+GAMMA = 5.991
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoView:
+    """Two views put together: `b_from_a` with a unit baseline, points (N, 3) in a."""
+
+    b_from_a: Pose
+    points_a: Array
+    features_a: Ints
+    features_b: Ints
+    parallax_rad: float
+    planar: bool
+
+
+def initialise(
+    a: Features,
+    b: Features,
+    index_a: Ints,
+    index_b: Ints,
+    focal_px: float,
+    seed: int,
+    rotation_prior: Array | None,
+    min_parallax_rad: float,
+) -> TwoView | None:
+    """Motion and points from matches `index_a`, `index_b`; None when it would not be certain."""
+    if len(index_a) < MIN_POINTS:
+        return None
+    xa, xb = a.normalised[index_a], b.normalised[index_b]
+    candidates: list[tuple[Pose, bool]] = []
+    essential, homography = _models(xa * focal_px, xb * focal_px, focal_px, seed)
+    planar = False
+    if homography is not None and essential is not None:
+        score_e = _score_essential(essential, xa, xb, focal_px)
+        score_h = _score_homography(homography, xa, xb, focal_px)
+        planar = score_h > 0.45 * (score_h + score_e)
+    if essential is not None:
+        r1, r2, t = cv2.decomposeEssentialMat(essential)
+        candidates += [(Pose(r, s * t.ravel()), False) for r in (r1, r2) for s in (1.0, -1.0)]
+    if homography is not None and (planar or essential is None):
+        _, rotations, translations, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
+        for r, t in zip(rotations, translations, strict=True):
+            norm = float(np.linalg.norm(t))
+            if norm > 1e-6 and np.linalg.det(r) > 0:
+                candidates.append((Pose(np.asarray(r), t.ravel() / norm), True))
+    if rotation_prior is not None:
+        candidates += [(c, False) for c in _with_known_rotation(rotation_prior, xa, xb)]
+        candidates = [
+            c for c in candidates
+            if angle_between(c[0].rotation, rotation_prior) < MAX_PRIOR_DISAGREEMENT_RAD
+        ]  # fmt: skip
+    best = _best(candidates, a, b, index_a, index_b, rotation_prior is not None)
+    if best is None:
+        return None
+    return _refined(best, a, b, index_a, index_b, min_parallax_rad, planar)
+
+
+def _models(pa: Array, pb: Array, focal_px: float, seed: int) -> tuple[Array | None, Array | None]:
+    params = cv2.UsacParams()
+    params.randomGeneratorState = seed
+    params.confidence = 0.999
+    params.maxIterations = 500
+    params.threshold = 1.5
+    params.score = cv2.SCORE_METHOD_MAGSAC
+    params.sampler = cv2.SAMPLING_UNIFORM
+    k = np.diag([focal_px, focal_px, 1.0])
+    zero = np.zeros(5)
+    essential, _ = cv2.findEssentialMat(pa, pb, k, k, zero, zero, params)
+    homography, _ = cv2.findHomography(pa, pb, params)
+    if essential is not None and essential.shape != (3, 3):
+        essential = None
+    if homography is not None:
+        inverse = np.diag([1 / focal_px, 1 / focal_px, 1.0])
+        homography = inverse @ homography @ k
+    return essential, homography
+
+
+def _score_essential(e: Array, xa: Array, xb: Array, focal_px: float) -> float:
+    ha, hb = np.c_[xa, np.ones(len(xa))], np.c_[xb, np.ones(len(xb))]
+    score = 0.0
+    for m, p, q in ((e, ha, hb), (e.T, hb, ha)):
+        line = p @ m.T
+        error = (line * q).sum(1) / np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12)
+        chi2 = (error * focal_px / 1.2) ** 2
+        score += float(np.where(chi2 < 3.841, GAMMA - chi2, 0.0).sum())
+    return score
+
+
+def _score_homography(h: Array, xa: Array, xb: Array, focal_px: float) -> float:
+    score = 0.0
+    try:
+        inverse = np.linalg.inv(h)
+    except np.linalg.LinAlgError:
+        return 0.0
+    for m, p, q in ((h, xa, xb), (inverse, xb, xa)):
+        moved = np.c_[p, np.ones(len(p))] @ m.T
+        z = np.where(np.abs(moved[:, 2]) < 1e-9, 1e-9, moved[:, 2])
+        error = (moved[:, :2] / z[:, None] - q) * focal_px / 1.2
+        chi2 = (error * error).sum(1)
+        score += float(np.where(chi2 < GAMMA, GAMMA - chi2, 0.0).sum())
+    return score
+
+
+def _with_known_rotation(rotation: Array, xa: Array, xb: Array) -> list[Pose]:
+    """Both signs of the translation that, with this rotation, fits most rays (a plane hides nothing here)."""
+    rays_a = np.c_[xa, np.ones(len(xa))] @ rotation.T
+    normals = np.cross(rays_a, np.c_[xb, np.ones(len(xb))])
+    length = np.linalg.norm(normals, axis=1)
+    weight = np.ones(len(normals))
+    t = np.array([0.0, 0.0, 1.0])
+    for _ in range(10):  # iteratively reweighted: robust to wrong matches
+        scatter = (normals * weight[:, None]).T @ normals
+        t = np.linalg.eigh(scatter)[1][:, 0]
+        error = np.abs(normals @ t)
+        scale = max(float(np.median(error)), 1e-6)
+        weight = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2) ** 2
+    if float(np.median(length)) < 1e-5:
+        return []
+    return [Pose(rotation, t), Pose(rotation, -t)]
+
+
+def _best(
+    candidates: list[tuple[Pose, bool]],
+    a: Features, b: Features, index_a: Ints, index_b: Ints, with_prior: bool,
+) -> Pose | None:  # fmt: skip
+    scored = []
+    for pose, _ in candidates:
+        points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
+        ok = consistent(
+            points, pose, a.normalised[index_a], b.normalised[index_b],
+            a.whitening[index_a], b.whitening[index_b], 9.0,
+        )  # fmt: skip
+        scored.append((int(ok.sum()), pose))
+    if not scored:
+        return None
+    scored.sort(key=lambda s: -s[0])
+    top, pose = scored[0]
+    # two clearly different motions that explain as much: only the prior could tell
+    for other, rival in scored[1:]:
+        different = (
+            angle_between(rival.rotation, pose.rotation) > np.radians(3)
+            or float(rival.translation @ pose.translation) < 0.9
+        )
+        if different and other > 0.8 * top and not with_prior:
+            return None
+    return pose if top >= MIN_POINTS // 2 else None
+
+
+def _refined(
+    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints,
+    min_parallax_rad: float, planar: bool,
+) -> TwoView | None:  # fmt: skip
+    for limit in (16.0, 5.991):
+        points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
+        ok = consistent(
+            points, pose, a.normalised[index_a], b.normalised[index_b],
+            a.whitening[index_a], b.whitening[index_b], limit,
+        )  # fmt: skip
+        ia, ib, pts = index_a[ok], index_b[ok], points[ok]
+        n = len(ia)
+        if n < MIN_POINTS // 2:
+            return None
+        bundle = Bundle(
+            [pose, Pose.identity()], 1, pts,
+            np.repeat(np.array([0, 1]), n), np.tile(np.arange(n), 2),
+            np.r_[b.normalised[ib], a.normalised[ia]], np.r_[b.whitening[ib], a.whitening[ia]],
+        )  # fmt: skip
+        adjusted = adjust(bundle, 12)
+        scale = 1.0 / max(float(np.linalg.norm(adjusted.poses[0].translation)), 1e-12)
+        pose = Pose(adjusted.poses[0].rotation, adjusted.poses[0].translation * scale)
+    points, cosine = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
+    ok = consistent(
+        points, pose, a.normalised[index_a], b.normalised[index_b],
+        a.whitening[index_a], b.whitening[index_b],
+    )  # fmt: skip
+    if ok.sum() < MIN_POINTS or ok.sum() < 0.5 * len(index_a):
+        return None
+    parallax = float(np.arccos(np.clip(np.quantile(cosine[ok], 0.3), -1, 1)))
+    if parallax < min_parallax_rad:
+        return None
+    ok &= cosine < np.cos(min(0.3 * min_parallax_rad, np.radians(0.3)))
+    return TwoView(pose, points[ok], index_a[ok], index_b[ok], parallax, planar)

@@ -1,0 +1,158 @@
+"""The sparse map: keyframes, points, and who sees what. One owner, no locks.
+
+Points live in growing arrays so that a frame's work is a few vector operations; a point's index is
+its identity for as long as it lives and is not used again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from companion.geometry import Array, Pose
+from companion.messages import Bytes
+from companion.slam.features import Bools, Features, Ints
+
+
+@dataclass(slots=True, eq=False)
+class Keyframe:
+    """A frame that stays: `point_ids` (N,) names the map point of each feature, -1 where none."""
+
+    keyframe_id: int
+    seq: int
+    t_ns: int
+    camera_from_map: Pose
+    features: Features
+    point_ids: Ints
+    body_attitude: Array | None = None
+    """rotation ned_from_body (3, 3) by the autopilot at that time"""
+    n_tracked_at_creation: int = 0
+    parent_id: int | None = None
+
+    @property
+    def centre(self) -> Array:
+        """Position of the camera in the map."""
+        out: Array = -self.camera_from_map.rotation.T @ self.camera_from_map.translation
+        return out
+
+
+@dataclass(slots=True, eq=False)
+class SlamMap:
+    """All keyframes and points. Arrays are over-allocated; `n_points` of each are in use."""
+
+    scale_factor: float
+    n_levels: int
+    keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    n_points: int = 0
+    positions: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    alive: Bools = field(default_factory=lambda: np.zeros(0, bool))
+    descriptors: Bytes = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
+    normals: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """mean viewing direction, from point to camera"""
+    base_distance: Array = field(default_factory=lambda: np.zeros(0))
+    """distance at which the point would be seen at pyramid level 0"""
+    n_visible: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    n_found: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    n_observers: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    born: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """keyframe id at which the point was made"""
+
+    def _reserve(self, n: int) -> None:
+        size = len(self.alive)
+        if n <= size:
+            return
+        new = max(4096, 2 * size, n)
+        for name in (
+            "positions", "alive", "descriptors", "normals", "base_distance",
+            "n_visible", "n_found", "n_observers", "born",
+        ):  # fmt: skip
+            old = getattr(self, name)
+            grown = np.zeros((new, *old.shape[1:]), old.dtype)
+            grown[:size] = old
+            setattr(self, name, grown)
+
+    def add_points(self, positions: Array, descriptors: Bytes, keyframe_id: int) -> Ints:
+        """Add points (M, 3) and return their ids; observations are added apart."""
+        ids = np.arange(self.n_points, self.n_points + len(positions))
+        self._reserve(self.n_points + len(positions))
+        self.positions[ids] = positions
+        self.descriptors[ids] = descriptors
+        self.alive[ids] = True
+        self.n_visible[ids] = 1
+        self.n_found[ids] = 1
+        self.born[ids] = keyframe_id
+        self.n_points += len(positions)
+        return ids
+
+    def observe(self, keyframe: Keyframe, features: Ints, points: Ints) -> None:
+        """Let `keyframe` see `points` with `features`; a feature's earlier point is let go."""
+        old = keyframe.point_ids[features]
+        np.subtract.at(self.n_observers, old[old >= 0], 1)
+        keyframe.point_ids[features] = points
+        np.add.at(self.n_observers, points, 1)
+
+    def forget(self, keyframe: Keyframe, features: Ints) -> None:
+        """Remove observations of a keyframe; points left with fewer than two are removed."""
+        old = keyframe.point_ids[features]
+        old = old[old >= 0]
+        keyframe.point_ids[features] = -1
+        np.subtract.at(self.n_observers, old, 1)
+        self.alive[old[self.n_observers[old] < 2]] = False
+
+    def sweep(self, keyframes: list[Keyframe]) -> None:
+        """Clear observations of removed points from `keyframes`."""
+        for keyframe in keyframes:
+            ids = keyframe.point_ids
+            dead = (ids >= 0) & ~self.alive[np.maximum(ids, 0)]
+            ids[dead] = -1
+
+    def seen_by(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
+        """Features and points (same length) of living points that a keyframe sees."""
+        ids = keyframe.point_ids
+        features = np.flatnonzero((ids >= 0) & self.alive[np.maximum(ids, 0)])
+        return features, ids[features]
+
+    def refresh(self, points: Ints, keyframes: list[Keyframe]) -> None:
+        """Recompute viewing direction and base distance of `points` from the keyframes that see them.
+
+        Only `keyframes` are looked at; a point's base distance comes from the last of them.
+        """
+        if len(points) == 0:
+            return
+        mask = np.zeros(self.n_points, bool)
+        mask[points] = True
+        total = np.zeros((self.n_points, 3))
+        for keyframe in keyframes:
+            features, ids = self.seen_by(keyframe)
+            chosen = mask[ids]
+            features, ids = features[chosen], ids[chosen]
+            towards = keyframe.centre - self.positions[ids]
+            distance = np.linalg.norm(towards, axis=1)
+            total[ids] += towards / np.maximum(distance, 1e-12)[:, None]
+            self.base_distance[ids] = distance * self.scale_factor ** keyframe.features.octaves[features]
+            self.descriptors[ids] = keyframe.features.descriptors[features]
+        norm = np.linalg.norm(total, axis=1)
+        ok = points[norm[points] > 0]
+        self.normals[ok] = total[ok] / norm[ok][:, None]
+
+    def covisible(self, points: Ints, minimum: int = 15) -> list[tuple[int, int]]:
+        """Keyframes that share living `points`: (count, keyframe id), most first, older first on a tie."""
+        mask = np.zeros(self.n_points + 1, bool)
+        mask[points] = True
+        mask[:-1] &= self.alive[: self.n_points]
+        counts = [
+            (int(np.count_nonzero(mask[k.point_ids])), k.keyframe_id)
+            for k in self.keyframes.values()
+        ]
+        return sorted((c for c in counts if c[0] >= minimum), key=lambda c: (-c[0], c[1]))
+
+    def expected_octaves(self, distance: Array, points: Ints) -> Ints:
+        """Pyramid level at which each of `points` is seen from `distance`."""
+        ratio = self.base_distance[points] / np.maximum(distance, 1e-9)
+        level = np.round(np.log(np.maximum(ratio, 1e-9)) / np.log(self.scale_factor))
+        return np.clip(level, 0, self.n_levels - 1).astype(np.int64)
+
+    def living_positions(self) -> Array:
+        """Positions (M, 3) of all living points."""
+        return self.positions[: self.n_points][self.alive[: self.n_points]].copy()

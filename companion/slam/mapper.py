@@ -1,0 +1,219 @@
+"""From a new keyframe to a better map: new points, longer tracks, bundle adjustment, culling."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.camera import Camera
+from companion.config import MappingConfig
+from companion.slam.bundle import Bundle, adjust
+from companion.slam.features import Ints
+from companion.slam.local_map import Projector
+from companion.slam.map import Keyframe, SlamMap
+from companion.slam.matching import match_epipolar
+from companion.slam.triangulation import consistent, triangulate
+
+MIN_PARALLAX_RAD = np.radians(0.8)
+N_NEIGHBOURS = 8
+
+
+class Mapper:
+    """Owns the work done once for each keyframe."""
+
+    def __init__(self, config: MappingConfig, camera: Camera, slam_map: SlamMap) -> None:
+        self._config = config
+        self._map = slam_map
+        self._projector = Projector(camera)
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Take a keyframe, whose tracked points are set, into the map."""
+        slam_map = self._map
+        slam_map.keyframes[keyframe.keyframe_id] = keyframe
+        _, points = slam_map.seen_by(keyframe)
+        neighbours = [
+            slam_map.keyframes[k]
+            for _, k in slam_map.covisible(points, 10)
+            if k != keyframe.keyframe_id
+        ][:N_NEIGHBOURS]
+        slam_map.refresh(points, [*reversed(neighbours), keyframe])
+        created = self._triangulate(keyframe, neighbours)
+        self._extend(keyframe, neighbours, created)
+        self.adjust_locally(keyframe)
+        self._cull(keyframe)
+
+    def _triangulate(self, keyframe: Keyframe, neighbours: list[Keyframe]) -> Ints:
+        created = []
+        slam_map = self._map
+        for other in neighbours:
+            free_a = np.flatnonzero(keyframe.point_ids < 0)
+            free_b = np.flatnonzero(other.point_ids < 0)
+            other_from_here = other.camera_from_map @ keyframe.camera_from_map.inverse()
+            depth = np.median(
+                keyframe.camera_from_map.apply(slam_map.positions[slam_map.seen_by(keyframe)[1]])[:, 2]
+            )
+            if np.linalg.norm(other_from_here.translation) < 0.01 * depth:
+                continue
+            ia, ib = match_epipolar(
+                keyframe.features, other.features, free_a, free_b, other_from_here
+            )
+            if len(ia) == 0:
+                continue
+            fa, fb = keyframe.features, other.features
+            points, cosine = triangulate(fa.normalised[ia], fb.normalised[ib], other_from_here)
+            ok = consistent(
+                points, other_from_here, fa.normalised[ia], fb.normalised[ib],
+                fa.whitening[ia], fb.whitening[ib],
+            )  # fmt: skip
+            ok &= cosine < np.cos(MIN_PARALLAX_RAD)
+            # the same corner is seen at levels that fit its two distances
+            da = np.linalg.norm(points, axis=1)
+            db = np.linalg.norm(other_from_here.apply(points), axis=1)
+            with np.errstate(invalid="ignore"):
+                gap = fa.octaves[ia] - fb.octaves[ib] + np.log(da / db) / np.log(slam_map.scale_factor)
+                ok &= np.abs(gap) < 2.0
+            ia, ib, points = ia[ok], ib[ok], points[ok]
+            if len(ia) == 0:
+                continue
+            ids = slam_map.add_points(
+                keyframe.camera_from_map.inverse().apply(points),
+                fa.descriptors[ia], keyframe.keyframe_id,
+            )  # fmt: skip
+            slam_map.observe(keyframe, ia, ids)
+            slam_map.observe(other, ib, ids)
+            slam_map.refresh(ids, [other, keyframe])
+            created.append(ids)
+        return np.concatenate(created) if created else np.zeros(0, np.int64)
+
+    def _extend(self, keyframe: Keyframe, neighbours: list[Keyframe], created: Ints) -> None:
+        """Look for this keyframe's points in its neighbours, and for theirs in it; merge doubles."""
+        slam_map = self._map
+        for other in neighbours:
+            _, mine = slam_map.seen_by(keyframe)
+            self._search_in(other, mine)
+        theirs = np.unique(np.concatenate([slam_map.seen_by(o)[1] for o in neighbours])) if neighbours else created
+        self._search_in(keyframe, theirs)
+        _, mine = slam_map.seen_by(keyframe)
+        slam_map.refresh(mine, [*reversed(neighbours), keyframe])
+
+    def _search_in(self, keyframe: Keyframe, points: Ints) -> None:
+        slam_map = self._map
+        known = np.zeros(slam_map.n_points, bool)
+        known[slam_map.seen_by(keyframe)[1]] = True
+        points = points[~known[points] & slam_map.alive[points]]
+        visible = self._projector.visible(slam_map, keyframe.camera_from_map, points)
+        ids, features = self._projector.search(
+            slam_map, visible, keyframe.features, 3.0, max_distance=50
+        )
+        if len(ids) == 0:
+            return
+        old = keyframe.point_ids[features]
+        old = np.where((old >= 0) & slam_map.alive[np.maximum(old, 0)], old, -1)
+        free = old < 0
+        slam_map.observe(keyframe, features[free], ids[free])
+        for point, rival in zip(ids[~free].tolist(), old[~free].tolist(), strict=True):
+            self._merge(point, rival)
+
+    def _merge(self, a: int, b: int) -> None:
+        """One point of two: the one seen more often takes over the other's observations."""
+        slam_map = self._map
+        if a == b or not (slam_map.alive[a] and slam_map.alive[b]):
+            return
+        keep, drop = (a, b) if slam_map.n_observers[a] >= slam_map.n_observers[b] else (b, a)
+        for keyframe in self._observers(drop):
+            feature = np.flatnonzero(keyframe.point_ids == drop)
+            if np.any(keyframe.point_ids == keep):
+                keyframe.point_ids[feature] = -1
+            else:
+                keyframe.point_ids[feature] = keep
+                slam_map.n_observers[keep] += len(feature)
+        slam_map.alive[drop] = False
+        slam_map.n_observers[drop] = 0
+        slam_map.n_visible[keep] += slam_map.n_visible[drop]
+        slam_map.n_found[keep] += slam_map.n_found[drop]
+
+    def _observers(self, point: int) -> list[Keyframe]:
+        return [k for k in self._map.keyframes.values() if np.any(k.point_ids == point)]
+
+    def adjust_locally(self, keyframe: Keyframe) -> None:
+        """Adjust the newest keyframes and those that share most with them, with all points they see."""
+        slam_map, config = self._map, self._config
+        _, points = slam_map.seen_by(keyframe)
+        ranked = [slam_map.keyframes[k] for _, k in slam_map.covisible(points, 15)]
+        variable = [k for k in ranked if k is not keyframe][: config.window - 1] + [keyframe]
+        first = min(slam_map.keyframes)
+        variable = [k for k in variable if k.keyframe_id != first]
+        if not variable:
+            return
+        mask = np.zeros(slam_map.n_points, bool)
+        for k in variable:
+            mask[slam_map.seen_by(k)[1]] = True
+        chosen = {k.keyframe_id for k in variable}
+        fixed = [
+            slam_map.keyframes[k]
+            for _, k in slam_map.covisible(np.flatnonzero(mask), 3)
+            if k not in chosen
+        ][: config.n_fixed]
+        if not fixed:  # hold the gauge: position, attitude and scale
+            variable.sort(key=lambda k: k.keyframe_id)
+            fixed, variable = variable[:2], variable[2:]
+            if not variable:
+                return
+        elif len(fixed) == 1 and len(variable) > 1:
+            variable.sort(key=lambda k: k.keyframe_id)
+            fixed, variable = [*fixed, variable[0]], variable[1:]
+        self._adjust(variable, fixed, mask)
+
+    def adjust_all(self, iterations: int) -> None:
+        """Adjust every keyframe and point; the first two keyframes hold the gauge."""
+        ordered = sorted(self._map.keyframes.values(), key=lambda k: k.keyframe_id)
+        if len(ordered) < 3:
+            return
+        mask = self._map.alive[: self._map.n_points].copy()
+        self._adjust(ordered[2:], ordered[:2], mask, iterations)
+
+    def _adjust(
+        self, variable: list[Keyframe], fixed: list[Keyframe], mask: np.ndarray, iterations: int | None = None
+    ) -> None:  # type: ignore[type-arg]
+        slam_map = self._map
+        cameras, obs_cam, obs_feat, obs_id = [*variable, *fixed], [], [], []
+        for i, k in enumerate(cameras):
+            features, ids = slam_map.seen_by(k)
+            wanted = mask[ids]
+            obs_feat.append(features[wanted])
+            obs_id.append(ids[wanted])
+            obs_cam.append(np.full(int(wanted.sum()), i))
+        ids = np.concatenate(obs_id)
+        counts = np.bincount(ids, minlength=slam_map.n_points)
+        keep = counts[ids] >= 2
+        cam, feat, ids = np.concatenate(obs_cam)[keep], np.concatenate(obs_feat)[keep], ids[keep]
+        if len(ids) < 30:
+            return
+        points, index = np.unique(ids, return_inverse=True)
+        bundle = Bundle(
+            [k.camera_from_map for k in cameras], len(variable), slam_map.positions[points],
+            cam, index,
+            np.concatenate([k.features.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
+            np.concatenate([k.features.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
+        )  # fmt: skip
+        result = adjust(bundle, iterations or self._config.iterations)
+        for i, k in enumerate(variable):
+            k.camera_from_map = result.poses[i]
+        slam_map.positions[points] = result.points
+        wrong = ~result.inlier
+        for i, k in enumerate(cameras):
+            bad = feat[wrong & (cam == i)]
+            if len(bad):
+                slam_map.forget(k, bad)
+        slam_map.sweep(cameras)
+
+    def _cull(self, keyframe: Keyframe) -> None:
+        """Remove recent points that are seldom found where they should be, or seen by too few."""
+        slam_map = self._map
+        n = slam_map.n_points
+        age = keyframe.keyframe_id - slam_map.born[:n]
+        recent = slam_map.alive[:n] & (age <= 4)
+        seldom = slam_map.n_found[:n] < 0.25 * slam_map.n_visible[:n]
+        few = (age >= 2) & (slam_map.n_observers[:n] <= 2)
+        doomed = recent & (seldom | few)
+        slam_map.alive[:n][doomed] = False
+        slam_map.sweep(list(slam_map.keyframes.values())[-30:])

@@ -1,0 +1,124 @@
+"""Which feature is which: by descriptor alone, along epipolar lines, and by projection.
+
+Descriptors are 256 bits; distances are Hamming. A match passes a threshold, the ratio test against
+the second best, and is the best in both directions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.geometry import Array, Pose, skew
+from companion.messages import Bytes
+from companion.slam.features import Bools, Features, Ints
+
+MAX_DISTANCE = 64
+"""Bits that the same corner may differ by between views."""
+MAX_DISTANCE_STRICT = 50
+FAR = np.float32(1000.0)
+
+
+def hamming_matrix(descriptors_a: Bytes, descriptors_b: Bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    """Distances (Na, Nb) in bits, as float32; by one matrix product of signs."""
+    signs_a = np.unpackbits(descriptors_a, axis=1).astype(np.float32) * 2 - 1
+    signs_b = np.unpackbits(descriptors_b, axis=1).astype(np.float32) * 2 - 1
+    return np.float32(128.0) - np.float32(0.5) * (signs_a @ signs_b.T)  # type: ignore[no-any-return]
+
+
+def mutual_matches(distances: np.ndarray, max_distance: float, ratio: float) -> tuple[Ints, Ints]:  # type: ignore[type-arg]
+    """Index pairs that are each other's best; ties go to the first."""
+    none = np.zeros(0, np.int64)
+    if distances.shape[0] == 0 or distances.shape[1] < 2:
+        return none, none
+    rows = np.arange(distances.shape[0])
+    best = distances.argmin(1)
+    value = distances[rows, best]
+    second = np.partition(distances, 1, axis=1)[:, 1]
+    good = (value <= max_distance) & (value < ratio * second)
+    good &= distances.argmin(0)[best] == rows
+    return rows[good], best[good]
+
+
+def match_descriptors(
+    a: Features, b: Features, max_distance: float = MAX_DISTANCE_STRICT, ratio: float = 0.8
+) -> tuple[Ints, Ints]:
+    """Match two images without knowing anything of their poses."""
+    if len(a) == 0 or len(b) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    return mutual_matches(hamming_matrix(a.descriptors, b.descriptors), max_distance, ratio)
+
+
+def match_epipolar(
+    a: Features, b: Features, index_a: Ints, index_b: Ints, b_from_a: Pose, max_error: float = 2.0
+) -> tuple[Ints, Ints]:
+    """Match features `index_a` of a with `index_b` of b near their epipolar lines.
+
+    `max_error` is in units of a feature's sigma. Returns indices into a and b.
+    """
+    none = np.zeros(0, np.int64)
+    if len(index_a) < 2 or len(index_b) < 2:
+        return none, none
+    essential = skew(b_from_a.translation) @ b_from_a.rotation
+    rays_a = np.c_[a.normalised[index_a], np.ones(len(index_a))]
+    rays_b = np.c_[b.normalised[index_b], np.ones(len(index_b))]
+    lines = (rays_a @ essential.T).astype(np.float32)
+    norm = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    lines /= np.maximum(norm, 1e-12)
+    error = np.abs(lines @ rays_b.T.astype(np.float32))
+    sigma = 1.0 / np.sqrt(np.abs(np.linalg.det(b.whitening[index_b])))
+    distances = hamming_matrix(a.descriptors[index_a], b.descriptors[index_b])
+    distances[error > (max_error * sigma)[None, :].astype(np.float32)] = FAR
+    octave_gap = np.abs(a.octaves[index_a][:, None] - b.octaves[index_b][None, :])
+    distances[octave_gap > 4] = FAR
+    ia, ib = mutual_matches(distances, MAX_DISTANCE_STRICT, 0.9)
+    return index_a[ia], index_b[ib]
+
+
+def match_projected(
+    projected_px: Array,
+    descriptors: Bytes,
+    octaves: Ints,
+    features: Features,
+    radius_px: Array,
+    usable: Bools | None = None,
+    max_distance: float = MAX_DISTANCE,
+    ratio: float = 0.85,
+    max_octave_gap: int = 2,
+) -> tuple[Ints, Ints]:
+    """Match M points, seen to lie at `projected_px` (M, 2), with the features around there.
+
+    `octaves` (M,) is the pyramid level at which each is expected; `radius_px` (M,) how far to look;
+    `usable` (N,) features that may be taken. Returns indices into points and features, each at most once.
+    """
+    none = np.zeros(0, np.int64)
+    if len(projected_px) == 0 or len(features) < 2:
+        return none, none
+    k = min(12, len(features))
+    near_px, candidates = features.tree.query(
+        projected_px, k=k, distance_upper_bound=float(radius_px.max())
+    )
+    n = len(features)
+    valid = (candidates < n) & (near_px <= radius_px[:, None])
+    candidates = np.where(valid, candidates, 0)
+    valid &= np.abs(features.octaves[candidates] - octaves[:, None]) <= max_octave_gap
+    if usable is not None:
+        valid &= usable[candidates]
+    words = descriptors.view(np.uint64).reshape(-1, 1, 4)
+    others = features.descriptors.view(np.uint64).reshape(-1, 4)[candidates]
+    distance = np.bitwise_count(words ^ others).sum(-1).astype(np.float32)
+    distance[~valid] = FAR
+    rows = np.arange(len(projected_px))
+    best = distance.argmin(1)
+    value = distance[rows, best]
+    # a rival counts against a match only at the same level: the next level shows the same corner
+    rival = distance.copy()
+    rival[rows, best] = FAR
+    chosen_octave = features.octaves[candidates[rows, best]]
+    rival[features.octaves[candidates] != chosen_octave[:, None]] = FAR
+    good = (value <= max_distance) & (value < ratio * rival.min(1))
+    points = rows[good]
+    taken = candidates[points, best[good]]
+    order = np.lexsort((points, value[good]))
+    _, first = np.unique(taken[order], return_index=True)
+    keep = order[first]
+    return points[keep], taken[keep]

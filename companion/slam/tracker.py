@@ -1,0 +1,285 @@
+"""The tracking state machine: every frame gets a pose, or an honest LOST.
+
+Initialising (two views) -> tracking (project the local map, refine) -> lost (match keyframes) and
+back. Knows no clock: times come with the frames, durations are measured by whoever hands in `times`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.camera import Camera
+from companion.config import Config
+from companion.geometry import Array, Pose
+from companion.messages import Frame, KeyframeAdded, Track, TrackState
+from companion.slam.bootstrap import Bootstrap
+from companion.slam.features import FeatureExtractor, Features, Ints
+from companion.slam.local_map import Projector, local_points
+from companion.slam.map import Keyframe, SlamMap
+from companion.slam.mapper import Mapper
+from companion.slam.pose_refinement import refine_pose
+from companion.slam.relocalizer import Relocalizer
+from companion.slam.view import View
+
+Timer = Callable[[str], AbstractContextManager[None]]
+MAX_YOUNG_KEYFRAMES = 5
+"""A map that is lost again with so few keyframes was not worth keeping."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """What is believed of a frame before its image is looked at.
+
+    `map_from_camera` predicted pose or None; `ned_from_camera` rotation by the autopilot or None.
+    """
+
+    map_from_camera: Pose | None
+    ned_from_camera: Array | None
+
+
+class Tracker:
+    """Frames and priors in; Tracks and KeyframeAdded out."""
+
+    def __init__(self, config: Config, camera: Camera, times: Timer) -> None:
+        self._config = config.tracking
+        self._camera = camera
+        self._times = times
+        self._extractor = FeatureExtractor(config.features, camera)
+        self._projector = Projector(camera)
+        self._mapping = config.mapping
+        self._features = config.features
+        self._next_keyframe_id = 0
+        self.n_resets = 0
+        self._reset()
+
+    def _reset(self) -> None:
+        self.map = SlamMap(self._features.scale_factor, self._features.n_levels)
+        self.mapper = Mapper(self._mapping, self._camera, self.map)
+        self._relocalizer = Relocalizer(self.map, self._camera.focal_px)
+        self._bootstrap = Bootstrap(self._config, self._camera)
+        self.state = TrackState.INITIALISING
+        self._last: View | None = None
+        self._reference: Keyframe | None = None
+        self._local: Ints = np.zeros(0, np.int64)
+        self._lost_since_ns: int | None = None
+        self._recent: deque[View] = deque(maxlen=2)
+
+    def step(self, frame: Frame, prior: Prior) -> list[Track | KeyframeAdded]:
+        """Take one frame; frames come in order of time."""
+        with self._times("features"):
+            features = self._extractor.extract(frame.grey)
+        if self.state is TrackState.INITIALISING:
+            return self._initialise(frame, features, prior)
+        view = View(
+            frame.seq, frame.t_ns, features, prior.ned_from_camera,
+            Pose.identity(), np.full(len(features), -1),
+        )  # fmt: skip
+        with self._times("tracking"):
+            found = self._track(view, prior)
+        if not found:
+            return self._lost(frame)
+        self.state = TrackState.TRACKING
+        self._lost_since_ns = None
+        out: list[Track | KeyframeAdded] = []
+        self._last = view
+        if self._wants_keyframe(view):
+            with self._times("mapping"):
+                out.append(self._insert(view))
+        out.insert(0, self._report(view))
+        return out
+
+    # -- initialising ---------------------------------------------------------------------------
+
+    def _initialise(self, frame: Frame, features: Features, prior: Prior) -> list[Track | KeyframeAdded]:
+        with self._times("initialising"):
+            start = self._bootstrap.step(frame.seq, frame.t_ns, features, prior.ned_from_camera)
+        if start is None:
+            return [Track(frame.seq, frame.t_ns, TrackState.INITIALISING)]
+        with self._times("mapping"):
+            first = self._keyframe(start.first)
+            second = self._keyframe(start.second)
+            ids = self.map.add_points(
+                start.points_map, start.second.features.descriptors[start.features_second],
+                second.keyframe_id,
+            )  # fmt: skip
+            self.map.keyframes[first.keyframe_id] = first
+            self.map.observe(first, start.features_first, ids)
+            self.map.observe(second, start.features_second, ids)
+            self.map.refresh(ids, [first, second])
+            self._reference = second
+            self.mapper.add(second)
+            self.mapper.adjust_all(10)
+        start.second.camera_from_map = second.camera_from_map
+        start.second.point_ids = second.point_ids.copy()
+        self._last = start.second
+        self._refresh_local(start.second)
+        self.state = TrackState.TRACKING
+        out: list[Track | KeyframeAdded] = [self._backfilled(v, first) for v in self._backfill(first, second)]
+        out += [self._report(start.second), self._added(first), self._added(second)]
+        return out
+
+    def _backfill(self, first: Keyframe, second: Keyframe) -> list[View]:
+        """Place the frames that came before the map: from the first keyframe outwards."""
+        views = [v for v in self._bootstrap.pending if v.seq != second.seq]
+        placed: list[View] = []
+        before = [v for v in views if v.seq <= first.seq][::-1]
+        after = [v for v in views if v.seq > first.seq]
+        for run, start, end in ((before, first, None), (after, first, second)):
+            pose, misses, last = start.camera_from_map, 0, start.t_ns
+            for v in run:
+                guess = pose
+                if end is not None:
+                    share = (v.t_ns - start.t_ns) / max(end.t_ns - start.t_ns, 1)
+                    centre = (1 - share) * start.centre + share * end.centre
+                    guess = Pose(pose.rotation, -pose.rotation @ centre)
+                if self._place(v, guess):
+                    pose, misses, last = v.camera_from_map, 0, v.t_ns
+                    placed.append(v)
+                else:
+                    misses += 1
+                    if misses > 5 or abs(v.t_ns - last) > 1e9:
+                        break
+        return sorted(placed, key=lambda v: v.seq)
+
+    def _place(self, view: View, guess: Pose) -> bool:
+        if len(view.features) < self._config.min_inliers:
+            return False
+        view.point_ids = np.full(len(view.features), -1)
+        return self._match(view, guess, self._local, 25.0) or self._match(view, guess, self._local, 60.0)
+
+    # -- tracking -------------------------------------------------------------------------------
+
+    def _track(self, view: View, prior: Prior) -> bool:
+        if len(view.features) < self._config.min_inliers:
+            return False
+        last, found = self._last, False
+        if prior.map_from_camera is not None and last is not None:
+            guess = prior.map_from_camera.inverse()
+            recent = last.point_ids[last.point_ids >= 0]
+            recent = recent[self.map.alive[recent]]
+            found = self._match(view, guess, recent, 15.0) or self._match(view, guess, recent, 40.0)
+            if not found:
+                found = self._match(view, guess, self._local, 25.0)
+            if not found and self.state is TrackState.TRACKING and self._reference is not None:
+                found = self._relocalise(view, [self._reference])
+        if not found:
+            found = self._relocalise(view, self._relocalizer.candidates())
+        if not found:
+            return False
+        self._refresh_local(view)
+        return self._match(view, view.camera_from_map, self._local, 5.0, count=True)
+
+    def _match(self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False) -> bool:
+        visible = self._projector.visible(self.map, guess, ids)
+        points, found = self._projector.search(self.map, visible, view.features, radius_px)
+        if len(points) < self._config.min_inliers:
+            return False
+        features = view.features
+        pose, inlier, _ = refine_pose(
+            guess, self.map.positions[points], features.normalised[found], features.whitening[found]
+        )
+        n = int(inlier.sum())
+        if n < self._config.min_inliers or n < 0.3 * len(points):
+            return False
+        view.camera_from_map = pose
+        view.point_ids[:] = -1
+        view.point_ids[found[inlier]] = points[inlier]
+        view.n_matches = len(points)
+        if count:
+            self.map.n_visible[visible.ids] += 1
+            self.map.n_found[points[inlier]] += 1
+        return True
+
+    def _relocalise(self, view: View, keyframes: list[Keyframe]) -> bool:
+        located = self._relocalizer.locate(view.features, view.seq, keyframes)
+        if located is None:
+            return False
+        pose, points, found = located
+        view.camera_from_map = pose
+        view.point_ids[:] = -1
+        view.point_ids[found] = points
+        self._refresh_local(view)
+        return self._match(view, pose, self._local, 12.0)
+
+    def _refresh_local(self, view: View) -> None:
+        seen = view.point_ids[view.point_ids >= 0]
+        pose = view.camera_from_map
+        self._local = local_points(self.map, seen, -pose.rotation.T @ pose.translation)
+
+    def _lost(self, frame: Frame) -> list[Track | KeyframeAdded]:
+        self.state = TrackState.LOST
+        if self._lost_since_ns is None:
+            self._lost_since_ns = frame.t_ns
+        if len(self.map.keyframes) <= MAX_YOUNG_KEYFRAMES:
+            self.n_resets += 1
+            self._reset()
+        return [Track(frame.seq, frame.t_ns, TrackState.LOST)]
+
+    # -- keyframes ------------------------------------------------------------------------------
+
+    def _wants_keyframe(self, view: View) -> bool:
+        reference = self._reference
+        if reference is None:
+            return True
+        config = self._config
+        features, ids = self.map.seen_by(reference)
+        firm = ids[self.map.n_observers[ids] >= min(3, len(self.map.keyframes))]
+        share = view.n_inliers / max(len(firm), 1)
+        tracked = view.point_ids[view.point_ids >= 0]
+        position = self.map.positions[tracked]
+        pose = view.camera_from_map
+        here = (-pose.rotation.T @ pose.translation) - position
+        there = reference.centre - position
+        cosine = (here * there).sum(1) / np.maximum(
+            np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1), 1e-12
+        )
+        parallax = float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
+        late = view.t_ns - reference.t_ns > config.keyframe_max_s * 1e9 and parallax > 0.5
+        weak = share < config.keyframe_min_share and (parallax > 0.4 or share < 0.5)
+        return weak or parallax > config.keyframe_parallax_deg or late
+
+    def _insert(self, view: View) -> KeyframeAdded:
+        keyframe = self._keyframe(view)
+        features = np.flatnonzero(view.point_ids >= 0)
+        self.map.observe(keyframe, features, view.point_ids[features])
+        keyframe.n_tracked_at_creation = len(features)
+        self._reference = keyframe
+        self.mapper.add(keyframe)
+        view.camera_from_map = keyframe.camera_from_map
+        view.point_ids = keyframe.point_ids.copy()
+        return self._added(keyframe)
+
+    def _keyframe(self, view: View) -> Keyframe:
+        keyframe = Keyframe(
+            self._next_keyframe_id, view.seq, view.t_ns, view.camera_from_map, view.features,
+            np.full(len(view.features), -1), view.ned_from_camera,
+        )  # fmt: skip
+        self._next_keyframe_id += 1
+        return keyframe
+
+    def _added(self, keyframe: Keyframe) -> KeyframeAdded:
+        _, ids = self.map.seen_by(keyframe)
+        return KeyframeAdded(
+            keyframe.keyframe_id, keyframe.seq, keyframe.t_ns, keyframe.camera_from_map.inverse(),
+            keyframe.camera_from_map.apply(self.map.positions[ids]),
+        )  # fmt: skip
+
+    # -- reporting ------------------------------------------------------------------------------
+
+    def _report(self, view: View, keyframe: Keyframe | None = None, backfilled: bool = False) -> Track:
+        reference = keyframe or self._reference
+        assert reference is not None
+        map_from_camera = view.camera_from_map.inverse()
+        return Track(
+            view.seq, view.t_ns, TrackState.TRACKING, map_from_camera, reference.keyframe_id,
+            reference.camera_from_map @ map_from_camera, view.n_inliers, view.n_matches,
+            view.features.pixels[view.point_ids >= 0], backfilled,
+        )  # fmt: skip
+
+    def _backfilled(self, view: View, first: Keyframe) -> Track:
+        return self._report(view, first, backfilled=True)

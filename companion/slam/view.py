@@ -1,0 +1,27 @@
+"""The frame in hand, between its image and its place in the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.geometry import Array, Pose
+from companion.slam.features import Features, Ints
+
+
+@dataclass(slots=True, eq=False)
+class View:
+    """The frame in hand: its features, its pose, and the map point of each feature (-1: none)."""
+
+    seq: int
+    t_ns: int
+    features: Features
+    ned_from_camera: Array | None
+    camera_from_map: Pose
+    point_ids: Ints
+    n_matches: int = 0
+
+    @property
+    def n_inliers(self) -> int:
+        return int(np.count_nonzero(self.point_ids >= 0))
