@@ -2,18 +2,54 @@
 
 Each section is a frozen dataclass; a stage takes its own section only. `config/companion.toml`
 describes every key. An unknown key or a wrong type is a ConfigError that names the nearest key.
+
+A key is a bool, int, float or str; `Annotated` with a `Range` or `OneOf` says what values it takes,
+which is checked where a configuration is read (`companion.config_file`).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Annotated
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Values from `least` to `most`, both included."""
+
+    least: float
+    most: float = math.inf
+
+    def allows(self, value: float) -> bool:
+        """Whether a key may have this value."""
+        return self.least <= value <= self.most
+
+    def __str__(self) -> str:
+        if math.isinf(self.most):
+            return f"{self.least:g} or more"
+        return f"{self.least:g} to {self.most:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class OneOf:
+    """One of a few words."""
+
+    words: tuple[str, ...]
+
+    def allows(self, value: str) -> bool:
+        """Whether a key may have this value."""
+        return value in self.words
+
+    def __str__(self) -> str:
+        return "one of " + ", ".join(self.words)
 
 
 @dataclass(frozen=True, slots=True)
 class CameraConfig:
     """What to do about a camera without calibration."""
 
-    assumed_hfov_deg: float = 75.0
+    assumed_hfov_deg: Annotated[float, Range(0, 150)] = 75.0
     """Horizontal field of view taken when a flight has no camera.json; 0 refuses such flights."""
 
 
@@ -21,11 +57,14 @@ class CameraConfig:
 class FeaturesConfig:
     """The ORB front end."""
 
-    n_features: int = 1200
-    n_levels: int = 8
-    scale_factor: float = 1.2
-    fast_threshold: int = 12
-    cell_px: int = 32
+    n_features: Annotated[int, Range(100, 20000)] = 1200
+    n_levels: Annotated[int, Range(1, 16)] = 8
+    scale_factor: Annotated[float, Range(1.05, 2)] = 1.2
+    fast_threshold: Annotated[int, Range(1, 255)] = 12
+    """Contrast that a corner has at least, in grey levels, where the scene is rich."""
+    min_fast_threshold: Annotated[int, Range(1, 255)] = 4
+    """The same where the scene is dull."""
+    cell_px: Annotated[int, Range(8, 512)] = 32
     """Features are spread over cells of this size."""
 
 
@@ -33,35 +72,35 @@ class FeaturesConfig:
 class TrackingConfig:
     """Tracking and keyframes."""
 
-    min_inliers: int = 20
+    min_inliers: Annotated[int, Range(6, 1000)] = 20
     """Fewer map points found than this and the frame is lost."""
-    min_init_parallax_deg: float = 1.0
+    min_init_parallax_deg: Annotated[float, Range(0.1, 30)] = 1.0
     """The two initial keyframes are at least this far apart, seen from the points."""
-    keyframe_min_share: float = 0.75
+    keyframe_min_share: Annotated[float, Range(0.05, 1)] = 0.75
     """A new keyframe comes when fewer than this share of the reference's points are seen."""
-    keyframe_parallax_deg: float = 3.0
+    keyframe_parallax_deg: Annotated[float, Range(0.1, 45)] = 3.0
     """A new keyframe comes when the view of the points has turned by this much."""
-    keyframe_max_s: float = 3.0
+    keyframe_max_s: Annotated[float, Range(0.05, 3600)] = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
     """Triangulation and bundle adjustment."""
 
-    window: int = 10
+    window: Annotated[int, Range(2, 100)] = 10
     """Keyframes adjusted together."""
-    n_fixed: int = 10
+    n_fixed: Annotated[int, Range(1, 200)] = 10
     """Older keyframes that see the same points and hold them."""
-    iterations: int = 6
+    iterations: Annotated[int, Range(1, 100)] = 6
 
 
 @dataclass(frozen=True, slots=True)
 class GeoreferenceConfig:
     """Scale, heading and origin from the autopilot."""
 
-    min_travel_m: float = 3.0
+    min_travel_m: Annotated[float, Range(0.1, 10000)] = 3.0
     """No scale before the autopilot has moved this far."""
-    max_sigma_scale: float = 0.1
+    max_sigma_scale: Annotated[float, Range(0.001, 1)] = 0.1
     """No scale while its standard deviation is larger than this share."""
 
 
@@ -84,7 +123,7 @@ class DepthConfig:
 class CloudConfig:
     """The fused cloud."""
 
-    voxel_m: float = 0.10
+    voxel_m: Annotated[float, Range(0.001, 100)] = 0.10
     """One point is kept in each cube of this size; in map units times the median depth / 100 while
     there is no metric scale."""
 
@@ -93,8 +132,8 @@ class CloudConfig:
 class ViewerConfig:
     """The recording and the live viewer."""
 
-    jpeg_quality: int = 60
-    image_width: int = 640
+    jpeg_quality: Annotated[int, Range(1, 100)] = 60
+    image_width: Annotated[int, Range(32, 8192)] = 640
 
 
 @dataclass(frozen=True, slots=True)
