@@ -1,0 +1,180 @@
+"""From a TOML file and `section.key=value` overrides to a checked `Config`, and back to text.
+
+What is wrong is a ConfigError of one line: where, which key, what was wanted, and the nearest key
+known. Nothing is guessed and nothing unknown is passed over.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from companion.config import Config, OneOf, Range
+from companion.errors import ConfigError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a string"}
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Key:
+    kind: type
+    limits: tuple[Range | OneOf, ...]
+
+
+def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
+    """The defaults, changed by a TOML file if any, then by overrides `section.key=value` in order.
+
+    An override's value is TOML; text that is not is taken as a string, so that quotes may be left
+    out.
+    """
+    changed: dict[str, dict[str, Any]] = {section: {} for section in _sections()}
+    if path is not None:
+        for name, value in _read(path).items():
+            _take(changed, name, value, str(path))
+    for override in overrides:
+        section, key, text = _split(override)
+        where = f"--set {override}"
+        wanted = _key(section, key, where)
+        changed[section][key] = _checked(section, key, _parse(text, wanted.kind), where)
+    config = Config()
+    return dataclasses.replace(
+        config,
+        **{
+            section: dataclasses.replace(getattr(config, section), **values)
+            for section, values in changed.items()
+        },
+    )
+
+
+def dump(config: Config) -> dict[str, dict[str, Any]]:
+    """Every section and key with its value, for a report."""
+    return dataclasses.asdict(config)
+
+
+def to_toml(config: Config) -> str:
+    """The whole configuration as a TOML file that `load_config` reads back."""
+    blocks = []
+    for section, values in dump(config).items():
+        lines = [f"{key} = {toml_value(value)}" for key, value in values.items()]
+        blocks.append("\n".join([f"[{section}]", *lines]) + "\n")
+    return "\n".join(blocks)
+
+
+def toml_value(value: Any) -> str:
+    """One value as TOML writes it."""
+    if isinstance(value, float):
+        return repr(value)
+    return json.dumps(value, ensure_ascii=False)
+
+
+@cache
+def _sections() -> Mapping[str, Mapping[str, _Key]]:
+    sections: dict[str, dict[str, _Key]] = {}
+    for name, section in get_type_hints(Config).items():
+        sections[name] = {}
+        for key, hint in get_type_hints(section, include_extras=True).items():
+            kind, *limits = get_args(hint) or (hint,)
+            sections[name][key] = _Key(kind, tuple(limits))
+    return sections
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ConfigError(f"{path}: cannot read the configuration: {reason}") from error
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+
+
+def _take(changed: dict[str, dict[str, Any]], section: str, values: Any, where: str) -> None:
+    if section not in _sections():
+        raise ConfigError(f"{where}: unknown section [{section}]{_nearest_section(section)}")
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: {section} is a section: write [{section}] and its keys below")
+    for key, value in values.items():
+        changed[section][key] = _checked(section, key, value, where)
+
+
+def _split(override: str) -> tuple[str, str, str]:
+    name, equals, text = override.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not (equals and dot and section and key):
+        raise ConfigError(f"--set {override}: wanted section.key=value")
+    return section, key, text.strip()
+
+
+def _parse(text: str, kind: type) -> Any:
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    if set(table) != {"value"}:
+        return text
+    value = table["value"]
+    # A device may be called 3090: what is wanted as text and was not quoted is text.
+    return text if kind is str and not isinstance(value, str) else value
+
+
+def _key(section: str, key: str, where: str) -> _Key:
+    if section not in _sections():
+        raise ConfigError(f"{where}: unknown section [{section}]{_nearest_section(section)}")
+    if key not in _sections()[section]:
+        raise ConfigError(f"{where}: unknown key {section}.{key}{_nearest_key(section, key)}")
+    return _sections()[section][key]
+
+
+def _checked(section: str, key: str, value: Any, where: str) -> Any:
+    wanted = _key(section, key, where)
+    if wanted.kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not wanted.kind:
+        given = _KINDS.get(type(value), f"a {type(value).__name__}")
+        raise ConfigError(
+            f"{where}: {section}.{key} wants {_KINDS[wanted.kind]}, given is {given}: {value!r}"
+        )
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where}: {section}.{key} wants a finite number, given is {value}")
+    allowed: Any = value
+    for limit in wanted.limits:
+        if not limit.allows(allowed):
+            raise ConfigError(f"{where}: {section}.{key} wants {limit}, given is {value!r}")
+    return allowed
+
+
+def _nearest_section(section: str) -> str:
+    return _nearest(section, [f"[{name}]" for name in _sections()])
+
+
+def _nearest_key(section: str, key: str) -> str:
+    here = difflib.get_close_matches(key, _sections()[section], n=1)
+    if here:
+        return f"; did you mean {section}.{here[0]}?"
+    elsewhere = [
+        f"{other}.{known}" for other, keys in _sections().items() for known in keys if known == key
+    ]
+    return _nearest(f"{section}.{key}", elsewhere or _all_keys())
+
+
+def _all_keys() -> list[str]:
+    return [f"{section}.{key}" for section, keys in _sections().items() for key in keys]
+
+
+def _nearest(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"

@@ -1,0 +1,77 @@
+"""How far a replay has come, for whoever watches it."""
+
+from __future__ import annotations
+
+from typing import Protocol, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn
+from rich.progress import Progress as RichProgress
+from rich.progress import TimeRemainingColumn as RemainingColumn
+from rich.text import Text
+
+
+class Progress(Protocol):
+    """Told of every frame, between frames, when nothing is half done."""
+
+    def start(self, total_frames: int) -> None:
+        """Frames are about to come."""
+
+    def update(self, done: int, state: str, n_points: int) -> None:
+        """So many frames are done, the tracker is in this state, the cloud has so many points."""
+
+    def finish(self) -> None:
+        """No more frames come."""
+
+
+class NoProgress:
+    """Shows nothing."""
+
+    def start(self, total_frames: int) -> None:
+        """Show nothing."""
+
+    def update(self, done: int, state: str, n_points: int) -> None:
+        """Show nothing."""
+
+    def finish(self) -> None:
+        """Show nothing."""
+
+
+class TerminalProgress:
+    """A line in a terminal: bar, frames done, frames/s, state, points, time to go."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._bar = RichProgress(
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames"),
+            _FramesPerSecond(),
+            TextColumn("{task.fields[state]}  {task.fields[points]:,} points"),
+            RemainingColumn(),
+            console=Console(file=stream),
+        )
+        self._task = self._bar.add_task("", start=False, visible=False, state="", points=0)
+
+    def start(self, total_frames: int) -> None:
+        """Show the bar."""
+        self._bar.reset(self._task, total=total_frames, visible=True, state="", points=0)
+        self._bar.start()
+
+    def update(self, done: int, state: str, n_points: int) -> None:
+        """Move the bar."""
+        self._bar.update(self._task, completed=done, state=state, points=n_points)
+
+    def finish(self) -> None:
+        """Leave the bar as it stands."""
+        self._bar.stop()
+
+
+class _FramesPerSecond(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.1f} frames/s")
+
+
+def progress_on(stream: TextIO) -> Progress:
+    """A bar where there is a terminal to show it, nothing elsewhere."""
+    return TerminalProgress(stream) if stream.isatty() else NoProgress()
