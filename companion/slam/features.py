@@ -53,10 +53,11 @@ class FeatureExtractor:
             nlevels=config.n_levels,
             fastThreshold=config.fast_threshold,
         )
+        self._threshold = config.fast_threshold
 
     def extract(self, grey: Bytes) -> Features:
         """Features of an image (H, W); as few as none where it shows nothing."""
-        keypoints = self._orb.detect(grey, None)
+        keypoints = self._detect(grey)
         if keypoints:
             keypoints = [keypoints[i] for i in self._spread(keypoints)]
             keypoints, descriptors = self._orb.compute(grey, keypoints)
@@ -75,6 +76,19 @@ class FeatureExtractor:
             pixels, normalised, octaves, angles, descriptors[seen], sigma, whitening,
             cKDTree(pixels) if len(pixels) else cKDTree(np.zeros((0, 2))),
         )  # fmt: skip
+
+    def _detect(self, grey: Bytes) -> list[cv2.KeyPoint]:
+        """Corners by a contrast threshold that follows the scene, so that dull ground has some too."""
+        config = self._config
+        while True:
+            self._orb.setFastThreshold(self._threshold)
+            keypoints = list(self._orb.detect(grey, None))
+            if len(keypoints) >= 1.25 * config.n_features or self._threshold <= config.min_fast_threshold:
+                break
+            self._threshold = max(config.min_fast_threshold, int(self._threshold * 0.7))
+        if len(keypoints) > 3 * config.n_features:
+            self._threshold = min(config.fast_threshold, self._threshold + 1)
+        return keypoints
 
     def _spread(self, keypoints: list[cv2.KeyPoint]) -> list[int]:
         """Take the strongest of every cell in turn, until there are enough."""

@@ -33,9 +33,10 @@ def mutual_matches(distances: np.ndarray, max_distance: float, ratio: float) -> 
     rows = np.arange(distances.shape[0])
     best = distances.argmin(1)
     value = distances[rows, best]
-    second = np.partition(distances, 1, axis=1)[:, 1]
-    good = (value <= max_distance) & (value < ratio * second)
-    good &= distances.argmin(0)[best] == rows
+    good = distances.argmin(0)[best] == rows
+    rivals = distances.copy()
+    rivals[rows, best] = FAR
+    good &= (value <= max_distance) & (value < ratio * rivals.min(1))
     return rows[good], best[good]
 
 

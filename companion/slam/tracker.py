@@ -6,7 +6,6 @@ back. Knows no clock: times come with the frames, durations are measured by whoe
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -54,20 +53,28 @@ class Tracker:
         self._mapping = config.mapping
         self._features = config.features
         self._next_keyframe_id = 0
-        self.n_resets = 0
-        self._reset()
+        self.segments: list[SlamMap] = []
+        """Maps that stand for themselves: one more each time a lost camera had to begin anew."""
+        self.state = TrackState.INITIALISING
+        self._bootstrap = Bootstrap(self._config, camera)
+        self._lost_since_ns: int | None = None
+        self._begin_segment()
 
-    def _reset(self) -> None:
-        self.map = SlamMap(self._features.scale_factor, self._features.n_levels)
+    @property
+    def map(self) -> SlamMap:
+        """The map in use."""
+        return self.segments[-1]
+
+    def _begin_segment(self) -> None:
+        """A fresh map; one that was hardly begun is given up for it."""
+        if self.segments and len(self.map.keyframes) <= MAX_YOUNG_KEYFRAMES:
+            self.segments.pop()
+        self.segments.append(SlamMap(self._features.scale_factor, self._features.n_levels))
         self.mapper = Mapper(self._mapping, self._camera, self.map)
         self._relocalizer = Relocalizer(self.map, self._camera.focal_px)
-        self._bootstrap = Bootstrap(self._config, self._camera)
-        self.state = TrackState.INITIALISING
         self._last: View | None = None
         self._reference: Keyframe | None = None
         self._local: Ints = np.zeros(0, np.int64)
-        self._lost_since_ns: int | None = None
-        self._recent: deque[View] = deque(maxlen=2)
 
     def step(self, frame: Frame, prior: Prior) -> list[Track | KeyframeAdded]:
         """Take one frame; frames come in order of time."""
@@ -82,7 +89,7 @@ class Tracker:
         with self._times("tracking"):
             found = self._track(view, prior)
         if not found:
-            return self._lost(frame)
+            return self._lost(frame, features, prior)
         self.state = TrackState.TRACKING
         self._lost_since_ns = None
         out: list[Track | KeyframeAdded] = []
@@ -98,8 +105,9 @@ class Tracker:
     def _initialise(self, frame: Frame, features: Features, prior: Prior) -> list[Track | KeyframeAdded]:
         with self._times("initialising"):
             start = self._bootstrap.step(frame.seq, frame.t_ns, features, prior.ned_from_camera)
-        if start is None:
-            return [Track(frame.seq, frame.t_ns, TrackState.INITIALISING)]
+        if start is None or not self._given_up(frame.t_ns):
+            return [Track(frame.seq, frame.t_ns, self.state)]
+        self._begin_segment()
         with self._times("mapping"):
             first = self._keyframe(start.first)
             second = self._keyframe(start.second)
@@ -118,7 +126,7 @@ class Tracker:
         start.second.point_ids = second.point_ids.copy()
         self._last = start.second
         self._refresh_local(start.second)
-        self.state = TrackState.TRACKING
+        self.state, self._lost_since_ns = TrackState.TRACKING, None
         out: list[Track | KeyframeAdded] = [self._backfilled(v, first) for v in self._backfill(first, second)]
         out += [self._report(start.second), self._added(first), self._added(second)]
         return out
@@ -211,14 +219,20 @@ class Tracker:
         pose = view.camera_from_map
         self._local = local_points(self.map, seen, -pose.rotation.T @ pose.translation)
 
-    def _lost(self, frame: Frame) -> list[Track | KeyframeAdded]:
-        self.state = TrackState.LOST
-        if self._lost_since_ns is None:
+    def _given_up(self, t_ns: int) -> bool:
+        """Whether the map in use has been out of sight for so long that another may begin."""
+        since = self._lost_since_ns
+        if since is None or len(self.map.keyframes) <= MAX_YOUNG_KEYFRAMES:
+            return True
+        return t_ns - since > self._config.restart_after_s * 1e9
+
+    def _lost(self, frame: Frame, features: Features, prior: Prior) -> list[Track | KeyframeAdded]:
+        """Note the loss, and see whether this frame could begin a new map."""
+        if self.state is TrackState.TRACKING:
             self._lost_since_ns = frame.t_ns
-        if len(self.map.keyframes) <= MAX_YOUNG_KEYFRAMES:
-            self.n_resets += 1
-            self._reset()
-        return [Track(frame.seq, frame.t_ns, TrackState.LOST)]
+            self._bootstrap = Bootstrap(self._config, self._camera)
+        self.state = TrackState.LOST
+        return self._initialise(frame, features, prior)
 
     # -- keyframes ------------------------------------------------------------------------------
 

@@ -1,0 +1,309 @@
+"""How a map lies in the world: scale, heading, tilt and origin from the autopilot's positions.
+
+A monocular map has neither unit nor north. Both come from comparing where the camera was in the map
+with where the autopilot says it was. Position errors of a GPS wander slowly: they are modelled as an
+Ornstein-Uhlenbeck process, so that a metre of drift over a minute does not pass for scale; velocity,
+whose errors do not add up, is used beside it. Attitude gives the tilt, and heading until the path does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from companion.config import GeoreferenceConfig
+from companion.geometry import Array, Pose, Similarity, rotation_from_vector, skew, vector_from_rotation
+from companion.messages import (
+    Georeference,
+    HeightSample,
+    PositionSample,
+    PositionSource,
+    RangeSample,
+    Telemetry,
+)
+
+MAX_GAP_NS = 1_500_000_000
+MIN_SPACING_NS = 45_000_000
+DRIFT_TAU_S = 40.0
+SIGMA_WHITE_M = 0.15
+SIGMA_VELOCITY_M_S = 0.15
+VELOCITY_TAU_S = 1.0
+SIGMA_TILT_RAD = np.radians(0.5)
+SIGMA_YAW_RAD = np.radians(6.0)
+MAX_PLACES = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """A keyframe to be placed: its pose in the map, and its attitude by the autopilot.
+
+    `ground_units` is the distance from the body straight down its own axis to the map's ground, in
+    map units, where the map shows it.
+    """
+
+    t_ns: int
+    map_from_camera: Pose
+    ned_from_camera: Array | None
+    ground_units: float | None = None
+
+
+@dataclass(slots=True)
+class _Series:
+    """Samples over time, not closer together than needed."""
+
+    times: list[int] = field(default_factory=list)
+    values: list[Array] = field(default_factory=list)
+
+    def add(self, t_ns: int, value: Array) -> None:
+        if np.isfinite(value).all() and (not self.times or t_ns - self.times[-1] >= MIN_SPACING_NS):
+            self.times.append(t_ns)
+            self.values.append(value)
+
+    def at(self, t_ns: Array) -> tuple[Array, np.ndarray]:  # type: ignore[type-arg]
+        """Interpolated values, and where samples on both sides are near enough."""
+        times = np.array(self.times)
+        values = np.stack(self.values)
+        i = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)
+        span = times[i] - times[i - 1]
+        f = ((t_ns - times[i - 1]) / np.maximum(span, 1)).reshape(-1, *([1] * (values.ndim - 1)))
+        inside = (t_ns >= times[0]) & (t_ns <= times[-1]) & (span < MAX_GAP_NS)
+        return values[i - 1] * (1 - f) + values[i] * f, inside
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+
+class Georeferencer:
+    """Collects what the autopilot says of its place; puts a map there when asked."""
+
+    def __init__(self, config: GeoreferenceConfig, body_from_camera: Pose | None) -> None:
+        self._config = config
+        self._body_from_camera = body_from_camera
+        self._positions = {source: _Series() for source in PositionSource}
+        self._travel = {source: _Series() for source in PositionSource}
+        self._height = _Series()
+        self._range = _Series()
+
+    def take(self, sample: Telemetry) -> None:
+        """Take a sample; those that say nothing of the place are ignored."""
+        if isinstance(sample, PositionSample):
+            self._positions[sample.source].add(sample.t_ns, sample.position_ned_m)
+            if sample.velocity_ned_m_s is not None:
+                self._integrate(self._travel[sample.source], sample.t_ns, sample.velocity_ned_m_s)
+        elif isinstance(sample, HeightSample):
+            self._height.add(sample.t_ns, np.array([-sample.height_m]))
+        elif isinstance(sample, RangeSample):
+            self._range.add(sample.t_ns, np.array([sample.distance_m]))
+
+    def _integrate(self, series: _Series, t_ns: int, velocity: Array) -> None:
+        # rows: velocity, and the way travelled so far by it
+        if not series.times:
+            series.add(t_ns, np.stack([velocity, np.zeros(3)]))
+            return
+        previous, way = series.values[-1]
+        dt = (t_ns - series.times[-1]) * 1e-9
+        series.add(t_ns, np.stack([velocity, way + 0.5 * (previous + velocity) * dt]))
+
+    def solve(self, places: list[Place]) -> Georeference | None:
+        """Where the map lies; None until it is known well enough."""
+        if len(places) > MAX_PLACES:
+            chosen = np.unique(np.linspace(0, len(places) - 1, MAX_PLACES).astype(int))
+            places = [places[int(i)] for i in chosen]
+        level = _mean_rotation(places)
+        for source in PositionSource:
+            if len(self._positions[source]) >= 4:
+                found = self._from_positions(places, level, source)
+                if found is not None:
+                    return found
+        if level is None:
+            return None
+        return self._from_range(places, level) or self._from_height(places, level)
+
+    def _from_positions(
+        self, places: list[Place], level: Array | None, source: PositionSource
+    ) -> Georeference | None:
+        t_ns = np.array([p.t_ns for p in places])
+        measured, ok = self._positions[source].at(t_ns)
+        way = np.full((len(places), 3), np.nan)
+        if len(self._travel[source]) >= 4:
+            travelled, near = self._travel[source].at(t_ns)
+            way[near] = travelled[near, 1]
+        if ok.sum() < 4:
+            return None
+        kept = [p for p, good in zip(places, ok, strict=True) if good]
+        mapped = np.stack([p.map_from_camera.translation for p in kept])
+        target = measured[ok] + self._lever_ned(kept)
+        extent = target - target.mean(0)
+        if float(np.linalg.norm(extent, axis=1).max()) < 0.5 * self._config.min_travel_m:
+            return None
+        solution = _fit(t_ns[ok] * 1e-9, mapped, target, way[ok], level)
+        if solution is None:
+            return None
+        similarity, covariance, residual = solution
+        sigma_scale, sigma_yaw = float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[3, 3]))
+        if sigma_scale > self._config.max_sigma_scale:
+            return None
+        with_velocity = np.isfinite(way[ok]).all(1).sum() > 4
+        method = source.value + (" and velocity" if with_velocity else "")
+        return Georeference(similarity, sigma_scale, sigma_yaw, method, int(ok.sum()), residual)
+
+    def _lever_ned(self, places: list[Place]) -> Array:
+        """From body to camera, in NED."""
+        if self._body_from_camera is None:
+            return np.zeros((len(places), 3))
+        lever_camera = self._body_from_camera.rotation.T @ self._body_from_camera.translation
+        return np.stack([
+            p.ned_from_camera @ lever_camera if p.ned_from_camera is not None else np.zeros(3)
+            for p in places
+        ])  # fmt: skip
+
+    def _from_range(self, places: list[Place], level: Array) -> Georeference | None:
+        """Scale from the rangefinder against the map's ground; no positions, so no origin."""
+        if len(self._range) < 4:
+            return None
+        distance, ok = self._range.at(np.array([p.t_ns for p in places]))
+        ratios = np.array([
+            d[0] / p.ground_units
+            for p, d, good in zip(places, distance, ok, strict=True)
+            if good and p.ground_units is not None
+        ])  # fmt: skip
+        if len(ratios) < 4:
+            return None
+        scale = float(np.median(ratios))
+        spread = 1.4826 * float(np.median(np.abs(ratios - scale))) / scale
+        sigma = max(spread / np.sqrt(len(ratios)), 0.01)
+        if sigma > self._config.max_sigma_scale:
+            return None
+        return self._without_origin(places, level, scale, sigma, "rangefinder", len(ratios))
+
+    def _from_height(self, places: list[Place], level: Array) -> Georeference | None:
+        """Scale from changes of barometric height; no positions, so no origin."""
+        if len(self._height) < 4:
+            return None
+        t_ns = np.array([p.t_ns for p in places])
+        down, ok = self._height.at(t_ns)
+        if ok.sum() < 4:
+            return None
+        mapped = np.stack([level @ p.map_from_camera.translation for p in places])[ok, 2]
+        a, b = mapped - mapped.mean(), down[ok, 0] - down[ok, 0].mean()
+        if float(np.ptp(b)) < self._config.min_travel_m:
+            return None
+        scale = float((a * b).sum() / max(float((a * a).sum()), 1e-12))
+        if scale <= 0:
+            return None
+        sigma = 0.5 / np.sqrt(max(float((b * b).sum()), 1e-9)) + float(
+            np.std(b - scale * a) / np.sqrt(max(float((b * b).sum()), 1e-9))
+        )
+        if sigma > self._config.max_sigma_scale:
+            return None
+        return self._without_origin(places, level, scale, sigma, "barometric height", int(ok.sum()))
+
+    def _without_origin(
+        self, places: list[Place], level: Array, scale: float, sigma: float, method: str, n: int
+    ) -> Georeference:
+        start = places[0].map_from_camera.translation
+        similarity = Similarity(scale, level, -scale * (level @ start))
+        return Georeference(similarity, sigma, float(SIGMA_YAW_RAD), method, n, 0.0)
+
+
+def _mean_rotation(places: list[Place]) -> Array | None:
+    """Rotation world_from_map by attitude alone: the chordal mean over keyframes; None without."""
+    turns = [
+        p.ned_from_camera @ p.map_from_camera.rotation.T
+        for p in places
+        if p.ned_from_camera is not None
+    ]
+    if not turns:
+        return None
+    u, _, vt = np.linalg.svd(np.sum(turns, axis=0))
+    out: Array = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    return out
+
+
+def _start(mapped: Array, target: Array, level: Array | None) -> Similarity:
+    """Closed form (Umeyama 1991); about the vertical only where the level is known."""
+    ma, mb = mapped.mean(0), target.mean(0)
+    a, b = mapped - ma, target - mb
+    if level is None:
+        u, d, vt = np.linalg.svd(b.T @ a)
+        sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+        rotation = u @ sign @ vt
+        scale = float((d * np.diag(sign)).sum() / (a * a).sum())
+    else:
+        rotation = level
+        a = a @ level.T
+        scale = float(np.sqrt((b * b).sum() / max(float((a * a).sum()), 1e-18)))
+    return Similarity(scale, rotation, mb - scale * rotation @ ma)
+
+
+def _fit(
+    t_s: Array, mapped: Array, target: Array, way: Array, level: Array | None
+) -> tuple[Similarity, Array, float] | None:
+    """Generalised least squares over (log scale, turn (3), origin (3)); covariance (7, 7)."""
+    guess = _start(mapped, target, level)
+    if not np.isfinite(guess.scale) or guess.scale <= 0:
+        return None
+    prior = np.array([1 / SIGMA_TILT_RAD, 1 / SIGMA_TILT_RAD, 1 / SIGMA_YAW_RAD]) if level is not None else np.full(3, 1e-3)
+    keep = np.ones(len(t_s), bool)
+    steps = np.isfinite(way[1:] - way[:-1]).all(1)
+    dt = np.diff(t_s)
+    information, chi2, n_rows = np.eye(7), 0.0, 1
+    for iteration in range(12):
+        turned = guess.scale * mapped @ guess.rotation.T
+        residual = target - turned - guess.translation
+        if iteration == 6:  # positions that no drift explains
+            size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
+            keep = size < max(5.0 * float(np.median(size)), 3.0)
+        # derivative of the prediction: scale, turn, origin
+        jac = np.zeros((len(t_s), 3, 7))
+        jac[:, :, 0] = turned
+        jac[:, :, 1:4] = -skew(turned)
+        jac[:, :, 4:] = np.eye(3)
+        information = np.zeros((7, 7))
+        gradient = np.zeros(7)
+        chi2, n_rows = 0.0, 0
+        gap = np.abs(t_s[keep][:, None] - t_s[keep][None, :])
+        for axis, sigma in ((0, 1.0), (1, 1.0), (2, 1.0)):
+            covariance = sigma**2 * np.exp(-gap / DRIFT_TAU_S) + SIGMA_WHITE_M**2 * np.eye(len(gap))
+            root = np.linalg.cholesky(covariance)
+            j = solve_triangular(root, jac[keep, axis], lower=True)
+            r = solve_triangular(root, residual[keep, axis], lower=True)
+            information += j.T @ j
+            gradient += j.T @ r
+            chi2 += float(r @ r)
+            n_rows += len(r)
+        use = steps & (dt < 5.0) & keep[1:] & keep[:-1]
+        if use.any():
+            j = (jac[1:] - jac[:-1])[use]
+            r = ((way[1:] - way[:-1]) - (turned[1:] - turned[:-1]))[use]
+            sigma_m = SIGMA_VELOCITY_M_S * np.sqrt(dt[use] * np.maximum(dt[use], VELOCITY_TAU_S))
+            weight = 1.0 / sigma_m
+            length = np.linalg.norm(r, axis=1) * weight
+            weight = weight * np.sqrt(np.minimum(1.0, 3.0 / np.maximum(length, 1e-9)))
+            j, r = j * weight[:, None, None], r * weight[:, None]
+            information += np.einsum("nij,nik->jk", j, j)
+            gradient += np.einsum("nij,ni->j", j, r)
+            chi2 += float((r * r).sum())
+            n_rows += r.size
+        if level is not None:
+            turn = vector_from_rotation(guess.rotation @ level.T)
+            information[1:4, 1:4] += np.diag(prior**2)
+            gradient[1:4] -= prior**2 * turn
+        else:
+            information[1:4, 1:4] += np.diag(prior**2)
+        try:
+            delta = np.linalg.solve(information, gradient)
+        except np.linalg.LinAlgError:
+            return None
+        delta[:4] = np.clip(delta[:4], -0.5, 0.5)
+        guess = Similarity(
+            guess.scale * float(np.exp(delta[0])),
+            rotation_from_vector(delta[1:4]) @ guess.rotation,
+            guess.translation + delta[4:],
+        )
+    covariance = np.linalg.inv(information) * max(chi2 / max(n_rows - 7, 1), 1.0)
+    error = target - guess.apply(mapped)
+    return guess, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))
+
