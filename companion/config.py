@@ -81,6 +81,8 @@ class TrackingConfig:
     keyframe_parallax_deg: Annotated[float, Range(0.1, 45)] = 3.0
     """A new keyframe comes when the view of the points has turned by this much."""
     keyframe_max_s: Annotated[float, Range(0.05, 3600)] = 3.0
+    restart_after_s: Annotated[float, Range(0, 3600)] = 1.0
+    """A camera that has been lost for so long may begin a new segment of the map."""
 
 
 @dataclass(frozen=True, slots=True)
