@@ -39,6 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _replay(arguments: argparse.Namespace, signals: StopSignals) -> None:
     config = load_config(arguments.config, arguments.set)
+    if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
+        raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
     if arguments.out.exists() and not arguments.out.is_dir():
         raise InputError(f"{arguments.out}: is a file; --out wants a folder")
     # Late, since the libraries behind it take a second to load, and --help needs none of them.

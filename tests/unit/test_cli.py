@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from companion import __version__
+from companion.config import Config
+from companion.config_file import load_config
+
+
+def companion(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "companion", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def refused(result: subprocess.CompletedProcess[str]) -> str:
+    """The line that says why, after making sure that it is the only one."""
+    assert result.returncode == 2
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("companion: error: ")
+    return line
+
+
+def test_version() -> None:
+    result = companion("--version")
+    assert (result.returncode, result.stdout) == (0, f"companion {__version__}\n")
+
+
+def test_check_config_prints_what_it_read(tmp_path: Path) -> None:
+    given = tmp_path / "given.toml"
+    given.write_text("[mapping]\nwindow = 7\n")
+    result = companion("check-config", "--config", given, "--set", "opencl.device=gpu")
+    assert (result.returncode, result.stderr) == (0, "")
+    printed = tmp_path / "printed.toml"
+    printed.write_text(result.stdout)
+    assert load_config(printed) == load_config(given, ["opencl.device=gpu"]) != Config()
+
+
+def test_unknown_key_is_one_line() -> None:
+    line = refused(companion("check-config", "--set", "features.nfeatures=3"))
+    assert "features.n_features" in line
+
+
+def test_configuration_that_is_not_there() -> None:
+    assert "none.toml" in refused(companion("check-config", "--config", "none.toml"))
+
+
+def test_flight_that_is_not_there(tmp_path: Path) -> None:
+    line = refused(companion("replay", tmp_path / "no-flight", "--out", tmp_path / "out"))
+    assert "no-flight" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_out_that_is_a_file(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.write_text("")
+    assert str(out) in refused(companion("replay", tmp_path, "--out", out))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "COMMAND"),
+        (["fly"], "fly"),
+        (["replay", "flight"], "--out"),
+        (["replay", "flight", "--out", "out", "--start", "-1"], "--start"),
+        (["replay", "flight", "--out", "out", "--stop", "nan"], "--stop"),
+        (["replay", "flight", "--out", "out", "--start", "soon"], "--start"),
+        (["replay", "flight", "--out", "out", "--viewer", "http://x"], "--viewer"),
+        (["replay", "flight", "--out", "out", "--start", "5", "--stop", "5"], "--stop"),
+    ],
+)
+def test_usage(arguments: list[str], named: str) -> None:
+    result = companion(*arguments)
+    assert result.returncode == 2
+    assert named in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr
