@@ -77,6 +77,11 @@ class Similarity:
         moved: Array = self.scale * (points @ self.rotation.T) + self.translation
         return moved
 
+    def __matmul__(self, other: Similarity) -> Similarity:
+        return Similarity(
+            self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation)
+        )
+
     def apply_to_pose(self, pose: Pose) -> Pose:
         """Return the rigid pose of a frame whose pose is given in b: its position scaled, its axes turned."""
         return Pose(self.rotation @ pose.rotation, self.apply(pose.translation))

@@ -27,6 +27,7 @@ from companion.messages import (
 MAX_GAP_NS = 1_500_000_000
 MIN_SPACING_NS = 45_000_000
 DRIFT_TAU_S = 40.0
+SIGMA_DRIFT_M = 1.0
 SIGMA_WHITE_M = 0.15
 SIGMA_VELOCITY_M_S = 0.15
 VELOCITY_TAU_S = 1.0
@@ -238,6 +239,13 @@ def _start(mapped: Array, target: Array, level: Array | None) -> Similarity:
     return Similarity(scale, rotation, mb - scale * rotation @ ma)
 
 
+def _drift_root(t_s: Array) -> Array:
+    """Cholesky factor of the covariance of slowly wandering positions, for one axis."""
+    gap = np.abs(t_s[:, None] - t_s[None, :])
+    covariance = SIGMA_DRIFT_M**2 * np.exp(-gap / DRIFT_TAU_S) + SIGMA_WHITE_M**2 * np.eye(len(gap))
+    return np.linalg.cholesky(covariance)
+
+
 def _fit(
     t_s: Array, mapped: Array, target: Array, way: Array, level: Array | None
 ) -> tuple[Similarity, Array, float] | None:
@@ -249,7 +257,7 @@ def _fit(
     keep = np.ones(len(t_s), bool)
     steps = np.isfinite(way[1:] - way[:-1]).all(1)
     dt = np.diff(t_s)
-    information, chi2, n_rows = np.eye(7), 0.0, 1
+    information, chi2, n_rows, root = np.eye(7), 0.0, 1, np.eye(len(t_s))
     for iteration in range(12):
         turned = guess.scale * mapped @ guess.rotation.T
         residual = target - turned - guess.translation
@@ -264,10 +272,9 @@ def _fit(
         information = np.zeros((7, 7))
         gradient = np.zeros(7)
         chi2, n_rows = 0.0, 0
-        gap = np.abs(t_s[keep][:, None] - t_s[keep][None, :])
-        for axis, sigma in ((0, 1.0), (1, 1.0), (2, 1.0)):
-            covariance = sigma**2 * np.exp(-gap / DRIFT_TAU_S) + SIGMA_WHITE_M**2 * np.eye(len(gap))
-            root = np.linalg.cholesky(covariance)
+        if iteration in (0, 6):
+            root = _drift_root(t_s[keep])
+        for axis in range(3):
             j = solve_triangular(root, jac[keep, axis], lower=True)
             r = solve_triangular(root, residual[keep, axis], lower=True)
             information += j.T @ j

@@ -7,7 +7,7 @@ time in recorded flights). Arrays are not to be written to after construction.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -170,13 +170,26 @@ class Georeference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
-    """The map as it now stands: every keyframe's pose, and the sparse points (N, 3) in map units."""
+    """The map as it now stands: every keyframe's pose, and the sparse points (N, 3) in map units.
+
+    `unit_of` holds, for keyframes of segments with a scale of their own, how many map units one unit
+    of the keyframe's camera frame is; all others are 1. A keyframe that is missing here has no known
+    place, and what hangs on it has none either.
+    """
 
     revision: int
     t_ns: int
     map_from_camera: Mapping[int, Pose]
     points_map: Array
     georeference: Georeference | None
+    unit_of: Mapping[int, float] = field(default_factory=dict)
+
+    def place_of(self, keyframe_id: int) -> Similarity | None:
+        """The transform `map_from_camera` of a keyframe, unit included; None where it is not known."""
+        pose = self.map_from_camera.get(keyframe_id)
+        if pose is None:
+            return None
+        return Similarity(self.unit_of.get(keyframe_id, 1.0), pose.rotation, pose.translation)
 
 
 class PixelState(Enum):

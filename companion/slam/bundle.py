@@ -1,7 +1,7 @@
 """Bundle adjustment: camera poses and points together, by the Schur complement (Triggs et al., 1999).
 
-Levenberg-Marquardt with Huber's loss. The camera-point blocks are kept dense, cameras by points, so
-that elimination is one matrix product: right for windows of some tens of cameras.
+Levenberg-Marquardt with Huber's loss. The camera-point blocks are a block-sparse matrix, so that a
+window of ten cameras and a whole flight of hundreds are the same code and little memory.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import bsr_matrix
 
 from companion.geometry import Array, Pose, rotation_from_vector
 from companion.slam.features import Bools, Ints
@@ -67,8 +68,12 @@ def adjust(bundle: Bundle, iterations: int = 6) -> Adjusted:
     p, residual = _project(rotation, translation, points, b)
     cost = first_cost = _cost(residual, p[:, 2])
     damping = 1e-4
-    moving = b.camera < n_var
+    moving = np.flatnonzero(b.camera < n_var)
+    # observations of moving cameras ordered by camera: the rows of the block-sparse matrix
+    moving = moving[np.lexsort((b.point[moving], b.camera[moving]))]
     cam, pt = b.camera[moving], b.point[moving]
+    rows = np.concatenate([[0], np.cumsum(np.bincount(cam, minlength=n_var))])
+    shape = (6 * n_var, 3 * n_points)
     accepted = True
     for _ in range(iterations):
         if accepted:
@@ -77,23 +82,20 @@ def adjust(bundle: Bundle, iterations: int = 6) -> Adjusted:
             weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-9)) * (p[:, 2] > 0)
             root = np.sqrt(weight)[:, None, None]
             jc, jp = jc[moving] * root[moving], jp * root
-            r = residual * root[:, :, 0]
-            hpp = np.zeros((n_points, 3, 3))
-            np.add.at(hpp, b.point, np.matmul(jp.transpose(0, 2, 1), jp))
-            gp = np.zeros((n_points, 3))
-            np.add.at(gp, b.point, np.matmul(jp.transpose(0, 2, 1), r[..., None])[..., 0])
-            hcc = np.zeros((n_var, 6, 6))
-            np.add.at(hcc, cam, np.matmul(jc.transpose(0, 2, 1), jc))
-            gc = np.zeros((n_var, 6))
-            np.add.at(gc, cam, np.matmul(jc.transpose(0, 2, 1), r[moving][..., None])[..., 0])
-            hcp = np.zeros((n_var, 6, n_points, 3))
-            hcp[cam, :, pt, :] = np.matmul(jc.transpose(0, 2, 1), jp[moving])
-            cross = hcp.reshape(6 * n_var, 3 * n_points)
+            r = (residual * root[:, :, 0])[..., None]
+            jpt, jct = jp.transpose(0, 2, 1), jc.transpose(0, 2, 1)
+            hpp = _sum_by(b.point, np.matmul(jpt, jp), n_points)
+            gp = _sum_by(b.point, np.matmul(jpt, r)[..., 0], n_points)
+            hcc = _sum_by(cam, np.matmul(jct, jc), n_var)
+            gc = _sum_by(cam, np.matmul(jct, r[moving])[..., 0], n_var)
+            hcp = np.matmul(jct, jp[moving])
+            cross = bsr_matrix((hcp, pt, rows), shape=shape, blocksize=(6, 3))
         damped = hpp + (damping * np.einsum("nii->ni", hpp) + 1e-9)[..., None] * np.eye(3)
         inverse = np.linalg.inv(damped)
-        eliminated = np.matmul(hcp.transpose(2, 0, 1, 3).reshape(n_points, 6 * n_var, 3), inverse)
-        eliminated = eliminated.transpose(1, 0, 2).reshape(6 * n_var, 3 * n_points)
-        schur = -eliminated @ cross.T
+        eliminated = bsr_matrix(
+            (np.matmul(hcp, inverse[pt]), pt, rows), shape=shape, blocksize=(6, 3)
+        )
+        schur = -(eliminated @ cross.T).toarray()
         for k in range(n_var):
             block = schur[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
             block += hcc[k] + np.diag(damping * np.diag(hcc[k]) + 1e-9)
@@ -128,6 +130,13 @@ def adjust(bundle: Bundle, iterations: int = 6) -> Adjusted:
     inlier = ((residual * residual).sum(1) < CHI2_2D) & (p[:, 2] > 0)
     poses = [Pose(rotation[i], translation[i]) for i in range(len(b.poses))]
     return Adjusted(poses, points, inlier, first_cost, cost)
+
+
+def _sum_by(index: Ints, values: Array, n: int) -> Array:
+    """Sums of `values` (O, ...) over equal `index`, in order."""
+    flat = values.reshape(len(values), -1)
+    out = np.stack([np.bincount(index, flat[:, k], n) for k in range(flat.shape[1])], 1)
+    return out.reshape(n, *values.shape[1:])
 
 
 def _jacobians(rotation: Array, p: Array, b: Bundle) -> tuple[Array, Array]:

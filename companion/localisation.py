@@ -1,0 +1,186 @@
+"""The localisation stage: frames and telemetry in; tracks, keyframes and the map out.
+
+It joins what must know each other in flight: the autopilot's attitude predicts the tracker's next
+pose, the tracker's keyframes tell where the map lies in the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+
+from companion.camera import Camera
+from companion.config import Config
+from companion.geometry import Array, Pose, Similarity
+from companion.georeference import Georeferencer, Place
+from companion.messages import (
+    AttitudeSample,
+    Frame,
+    Georeference,
+    KeyframeAdded,
+    MapUpdate,
+    Message,
+    Track,
+    TrackState,
+    Warned,
+)
+from companion.motion import AttitudeHistory, MotionFilter
+from companion.slam.map import Keyframe, SlamMap
+from companion.slam.mapper import Mapper
+from companion.slam.tracker import Prior, Timer, Tracker
+
+MAX_DISAGREEMENT_RAD = np.radians(4.0)
+"""An attitude that misses this much of the camera's turning between frames is not the camera's."""
+MIN_DOWN_COSINE = np.cos(np.radians(8.0))
+
+
+class LocalisationStage:
+    """Knows where the camera is."""
+
+    def __init__(self, config: Config, camera: Camera, times: Timer) -> None:
+        self._config = config
+        self._camera = camera
+        self._times = times
+        self._tracker = Tracker(config, camera, times)
+        self._mapper_config = config.mapping
+        self._attitude = AttitudeHistory()
+        self._motion = MotionFilter()
+        self._georeferencer = Georeferencer(config.georeference, camera.body_from_camera)
+        self._georeferences: dict[int, Georeference] = {}
+        self._use_attitude = camera.body_from_camera is not None
+        self._revision = 0
+        self._t_ns = 0
+
+    @property
+    def state(self) -> TrackState:
+        """What the tracker knows."""
+        return self._tracker.state
+
+    def step(self, message: Message) -> list[Message]:
+        """Take one message; messages come in order of time."""
+        if isinstance(message, Frame):
+            return self._frame(message)
+        if isinstance(message, AttitudeSample):
+            self._attitude.add(message)
+        elif not isinstance(message, (Track, KeyframeAdded, MapUpdate, Warned)):
+            self._georeferencer.take(message)  # type: ignore[arg-type]
+        return []
+
+    def finish(self) -> list[Message]:
+        """Adjust the whole map at the end of a flight."""
+        with self._times("final adjustment"):
+            for segment in self._segments():
+                Mapper(self._mapper_config, self._camera, segment).adjust_all(
+                    self._config.mapping.final_iterations
+                )
+        return [self._map_update(final=True)] if self._segments() else []
+
+    def _segments(self) -> list[SlamMap]:
+        return [s for s in self._tracker.segments if s.keyframes]
+
+    def _ned_from_camera(self, t_ns: int) -> Array | None:
+        mount = self._camera.body_from_camera
+        if not self._use_attitude or mount is None:
+            return None
+        attitude = self._attitude.at(t_ns)
+        return None if attitude is None else attitude @ mount.rotation
+
+    def _frame(self, frame: Frame) -> list[Message]:
+        self._t_ns = frame.t_ns
+        attitude = self._ned_from_camera(frame.t_ns)
+        predicted = self._motion.predict(frame.t_ns, attitude)
+        n_segments = len(self._tracker.segments)
+        tracked = self._tracker.step(frame, Prior(predicted, attitude))
+        if len(self._tracker.segments) != n_segments or self.state is TrackState.INITIALISING:
+            self._motion.reset()
+        out: list[Message] = list(tracked)
+        for message in tracked:
+            if isinstance(message, Track) and message.seq == frame.seq:
+                if message.map_from_camera is not None:
+                    self._motion.correct(frame.t_ns, message.map_from_camera, attitude)
+        if any(isinstance(m, KeyframeAdded) for m in tracked):
+            with self._times("georeference"):
+                out.append(self._map_update(final=False))
+        out += self._judge_attitude(frame.t_ns)
+        return out
+
+    def _judge_attitude(self, t_ns: int) -> list[Message]:
+        """Stop using an attitude that is not the camera's (a gimbal), and say so once."""
+        disagreement = self._motion.attitude_disagreement_rad
+        if not self._use_attitude or disagreement is None or disagreement < MAX_DISAGREEMENT_RAD:
+            return []
+        self._use_attitude = False
+        detail = f"turns between frames differ by {np.degrees(disagreement):.1f} degrees; is the camera on a gimbal?"
+        return [Warned(t_ns, "the autopilot's attitude is not the camera's and is not used", detail)]
+
+    def _map_update(self, final: bool) -> MapUpdate:
+        """The map, all segments in the frame of the main one (the one with most keyframes)."""
+        self._revision += 1
+        segments = self._segments()
+        for index, segment in enumerate(segments):
+            newest = segment is segments[-1]
+            if final or (newest and self._due(segment)):
+                found = self._georeferencer.solve([self._place(k) for k in _spread(segment, final)])
+                key = next(iter(segment.keyframes))
+                if found is not None:
+                    self._georeferences[key] = found
+        main = max(segments, key=lambda s: len(s.keyframes))
+        main_key = next(iter(main.keyframes))
+        anchor = self._georeferences.get(main_key)
+        poses: dict[int, Pose] = {}
+        scales: dict[int, float] = {}
+        points: list[Array] = []
+        for segment in segments:
+            own = self._georeferences.get(next(iter(segment.keyframes)))
+            if segment is main:
+                main_from_own = Similarity(1.0, np.eye(3), np.zeros(3))
+            elif anchor is not None and own is not None:
+                main_from_own = anchor.world_from_map.inverse() @ own.world_from_map
+            else:
+                continue  # nothing says how this segment lies to the main one
+            for key, keyframe in segment.keyframes.items():
+                poses[key] = main_from_own.apply_to_pose(keyframe.camera_from_map.inverse())
+                if main_from_own.scale != 1.0:
+                    scales[key] = main_from_own.scale
+            points.append(main_from_own.apply(segment.living_positions()))
+        return MapUpdate(
+            self._revision, self._t_ns, MappingProxyType(poses), np.concatenate(points), anchor,
+            _read_only(scales),
+        )  # fmt: skip
+
+    def _due(self, segment: SlamMap) -> bool:
+        n = len(segment.keyframes)
+        return n < 40 or n % 5 == 0
+
+    def _place(self, keyframe: Keyframe) -> Place:
+        return Place(
+            keyframe.t_ns, keyframe.camera_from_map.inverse(),
+            self._ned_from_camera(keyframe.t_ns) if keyframe.body_attitude is not None else None,
+            self._ground_below(keyframe),
+        )  # fmt: skip
+
+    def _ground_below(self, keyframe: Keyframe) -> float | None:
+        """Distance from the camera down the body's axis to the map, in map units."""
+        mount = self._camera.body_from_camera
+        if mount is None:
+            return None
+        segment = next(s for s in self._segments() if keyframe.keyframe_id in s.keyframes)
+        _, ids = segment.seen_by(keyframe)
+        p = keyframe.camera_from_map.apply(segment.positions[ids]) @ mount.rotation.T
+        distance = np.linalg.norm(p, axis=1)
+        below = p[p[:, 2] > MIN_DOWN_COSINE * distance]
+        return float(np.median(below[:, 2])) if len(below) >= 5 else None
+
+
+def _spread(segment: SlamMap, final: bool) -> list[Keyframe]:
+    keyframes = list(segment.keyframes.values())
+    most = 400 if final else 120
+    if len(keyframes) <= most:
+        return keyframes
+    return [keyframes[int(i)] for i in np.linspace(0, len(keyframes) - 1, most).astype(int)]
+
+
+def _read_only(scales: dict[int, float]) -> Mapping[int, float]:
+    return MappingProxyType(scales)
