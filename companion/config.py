@@ -94,6 +94,8 @@ class MappingConfig:
     n_fixed: Annotated[int, Range(1, 200)] = 10
     """Older keyframes that see the same points and hold them."""
     iterations: Annotated[int, Range(1, 100)] = 6
+    final_iterations: Annotated[int, Range(1, 100)] = 8
+    """Of the adjustment of the whole map when the flight is over."""
 
 
 @dataclass(frozen=True, slots=True)
