@@ -1,0 +1,120 @@
+"""How well a replay's results agree with a flight's truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """`t_s` (N,); `centres` (N, 3); `rotations` (N, 3, 3), world from camera."""
+
+    t_s: Array
+    centres: Array
+    rotations: Array
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The similarity that takes `a` to `b` with the least squared error (Umeyama 1991)."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def __call__(self, points: Array) -> Array:
+        moved: Array = self.scale * points @ self.rotation.T + self.translation
+        return moved
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of the frames that both trajectories have."""
+
+    n_common: int
+    tracked_share: float
+    ate_sim3_m: float
+    scale_error: float
+    alignment: Alignment
+
+
+def read_tum(path: Path) -> Trajectory:
+    rows = np.loadtxt(path, comments="#", ndmin=2)
+    rotations = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    return Trajectory(rows[:, 0], rows[:, 1:4], rotations)
+
+
+def align(a: Array, b: Array) -> Alignment:
+    """`b` of `a`, both (N, 3)."""
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    u, singular, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
+    flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * flip) @ vt
+    scale = float((singular * flip).sum() / ((a - mean_a) ** 2).sum(1).mean())
+    return Alignment(scale, rotation, mean_b - scale * rotation @ mean_a)
+
+
+def score(run: Trajectory, truth: Trajectory) -> Score:
+    """Frames are the same where their times are within a millisecond."""
+    nearest = np.abs(run.t_s[:, None] - truth.t_s[None]).argmin(1)
+    same = np.abs(run.t_s - truth.t_s[nearest]) < 1e-3
+    found, wanted = run.centres[same], truth.centres[nearest[same]]
+    alignment = align(found, wanted)
+    error = np.linalg.norm(alignment(found) - wanted, axis=1)
+    return Score(
+        n_common=int(same.sum()),
+        tracked_share=len(np.unique(nearest[same])) / len(truth.t_s),
+        ate_sim3_m=float(np.sqrt((error**2).mean())),
+        scale_error=abs(1 / alignment.scale - 1),
+        alignment=alignment,
+    )
+
+
+def read_ply(path: Path) -> NDArray[np.void]:
+    """Vertices of a binary little-endian PLY file without lists, as a structured array."""
+    kinds = {"float": "<f4", "double": "<f8", "uchar": "u1", "ushort": "<u2", "int": "<i4"}
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = head.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    (n,) = (int(line.split()[2]) for line in lines if line.startswith("element vertex "))
+    properties = [line.split()[1:] for line in lines if line.startswith("property ")]
+    kind = np.dtype([(name, kinds[of]) for of, name in properties])
+    assert len(body) == n * kind.itemsize
+    return np.frombuffer(body, kind)
+
+
+def depth_errors(points: Array, flight: Path, truth: Trajectory) -> Array:
+    """How far points (N, 3) in the true world lie off the truth depth images, as share of depth.
+
+    A point counts in every image that has it and that has a truth depth there.
+    """
+    camera = json.loads((flight / "camera.json").read_text())
+    matrix = np.array(
+        [[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1.0]]
+    )
+    lens = np.array([camera[name] for name in ("k1", "k2", "p1", "p2", "k3")])
+    errors = []
+    for path in sorted((flight / "truth" / "depth").glob("*.png")):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert image is not None
+        true_z = np.asarray(image, np.float64) * 0.005
+        index = int(path.stem)
+        p = (points - truth.centres[index]) @ truth.rotations[index]
+        p = p[(p[:, 2] > 0.1) & (np.abs(p[:, :2]) < p[:, 2:]).all(1)]
+        if not len(p):
+            continue
+        pixels, _ = cv2.projectPoints(p, np.zeros(3), np.zeros(3), matrix, lens)
+        u, v = np.rint(np.asarray(pixels)[:, 0]).astype(int).T
+        inside = (u >= 0) & (u < true_z.shape[1]) & (v >= 0) & (v < true_z.shape[0])
+        wanted = true_z[v[inside], u[inside]]
+        errors.append(np.abs(p[inside, 2] / np.maximum(wanted, 1e-9) - 1)[wanted > 0])
+    return np.concatenate(errors)
