@@ -1,0 +1,42 @@
+"""The program as its users run it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a finished command left."""
+
+    status: int
+    stdout: str
+    stderr: str
+    out: Path
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """Its report.json."""
+        report: dict[str, Any] = json.loads((self.out / "report.json").read_text("utf-8"))
+        return report
+
+
+def replay(flight: Path, out: Path, *options: str, timeout_s: float = 280) -> Run:
+    command = [sys.executable, "-m", "companion", "replay", str(flight), "--out", str(out)]
+    done = subprocess.run(
+        [*command, *options], capture_output=True, text=True, timeout=timeout_s, check=False
+    )
+    return Run(done.returncode, done.stdout, done.stderr, out)
+
+
+def refused(run: Run) -> str:
+    """The line that says what is wrong with the input, after making sure that it is all."""
+    assert run.status == 2, run.stderr
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("companion: error: ")
+    return line
