@@ -121,6 +121,29 @@ class DepthConfig:
     """The dense depth filter."""
 
     enabled: bool = True
+    stride: Annotated[int, Range(1, 8)] = 2
+    """Depth is estimated for every so many pixels; images are matched at full size."""
+    n_updates: Annotated[int, Range(3, 100)] = 12
+    """Frames that a keyframe's depth is made of, chosen by their baselines."""
+    max_baseline: Annotated[float, Range(0.01, 1)] = 0.20
+    """Longest baseline used, as a share of the median depth."""
+    lag_keyframes: Annotated[int, Range(1, 20)] = 2
+    """A keyframe waits for so many later ones, whose frames and adjusted poses it uses."""
+    min_zncc: Annotated[float, Range(0, 1)] = 0.65
+    """Least correlation of a match."""
+    peak_margin: Annotated[float, Range(0, 1)] = 0.05
+    """A second peak this near to the best makes a match ambiguous."""
+    noise_grey: Annotated[float, Range(0, 50)] = 1.5
+    """Patches whose grey levels vary less than this are blank."""
+    pose_error_px: Annotated[float, Range(0.01, 2)] = 0.15
+    """Error of a match that comes from the poses, whatever the texture."""
+    converged_sigma: Annotated[float, Range(0.0001, 0.1)] = 0.006
+    """Relative standard deviation at which a pixel has converged."""
+    min_inlier_ratio: Annotated[float, Range(0, 1)] = 0.6
+    """Share of good measurements that a converged pixel has at least."""
+    regularise_iterations: Annotated[int, Range(0, 1000)] = 60
+    regularise_weight: Annotated[float, Range(0.001, 1000)] = 20.0
+    """Weight of the measurements against smoothness."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +151,12 @@ class CloudConfig:
     """The fused cloud."""
 
     voxel_m: Annotated[float, Range(0.001, 100)] = 0.10
-    """One point is kept in each cube of this size; in map units times the median depth / 100 while
-    there is no metric scale."""
+    """One point is kept in each cube of this size; a hundredth of the median depth while there is
+    no metric scale."""
+    min_agreeing: Annotated[int, Range(0, 4)] = 1
+    """Other keyframes whose depth must agree with a point's."""
+    agreement: Annotated[float, Range(0.001, 0.2)] = 0.015
+    """Relative difference of depth up to which two keyframes agree."""
 
 
 @dataclass(frozen=True, slots=True)
