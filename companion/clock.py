@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -49,3 +50,9 @@ class StageTimes:
 def monotonic_s() -> float:
     """Seconds on a clock that never jumps."""
     return time.monotonic()
+
+
+def wait_s(stop: threading.Event, seconds: float) -> None:
+    """Wait for a while, or until `stop` is set."""
+    if seconds > 0:
+        stop.wait(seconds)

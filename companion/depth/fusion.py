@@ -1,0 +1,110 @@
+"""Depth maps that agree become points."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+
+from companion.config import CloudConfig
+from companion.geometry import Array, Similarity
+from companion.messages import DepthMap, MapUpdate, PointChunk
+from companion.voxel import thin_by_voxel
+
+N_HELD = 7
+MAX_STEP = 0.04
+"""Relative step of depth to a neighbour pixel at which a surface ends."""
+
+
+class Fusion:
+    """Holds the last depth maps; turns each into points once its neighbours are there."""
+
+    def __init__(self, config: CloudConfig, wait_for: int = 2) -> None:
+        self._config = config
+        self._wait_for = wait_for
+        self._held: OrderedDict[int, DepthMap] = OrderedDict()
+        self._open: list[int] = []
+
+    def add(self, depth_map: DepthMap, update: MapUpdate) -> list[PointChunk]:
+        """Take a depth map; chunks of those that have waited long enough."""
+        self._held[depth_map.keyframe_id] = depth_map
+        self._open.append(depth_map.keyframe_id)
+        out = []
+        while len(self._open) > self._wait_for:
+            out.append(self._fuse(self._open.pop(0), update))
+        while len(self._held) > N_HELD:
+            self._held.popitem(last=False)
+        return [chunk for chunk in out if chunk is not None]
+
+    def flush(self, update: MapUpdate) -> list[PointChunk]:
+        """Chunks of all that still wait."""
+        out = [self._fuse(k, update) for k in self._open]
+        self._open.clear()
+        return [chunk for chunk in out if chunk is not None]
+
+    def _fuse(self, keyframe_id: int, update: MapUpdate) -> PointChunk | None:
+        depth_map = self._held[keyframe_id]
+        place = update.place_of(keyframe_id)
+        if place is None:
+            return None
+        rows, columns = np.nonzero(depth_map.depth > 0)
+        if len(rows) == 0:
+            return None
+        ahead = _smooth(depth_map.depth)[rows, columns]
+        rows, columns = rows[ahead], columns[ahead]
+        z = depth_map.depth[rows, columns].astype(np.float64)
+        fx, fy, cx, cy = depth_map.intrinsics
+        points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
+        agreeing = np.zeros(len(points), np.int64)
+        for other_id, other in self._held.items():
+            other_place = update.place_of(other_id)
+            if other_id == keyframe_id or other_place is None:
+                continue
+            agreeing += self._agrees(points, other_place.inverse() @ place, other)
+        sigma = depth_map.sigma[rows, columns] / np.maximum(z, 1e-9)
+        ratio = depth_map.inlier_ratio[rows, columns]
+        keep = agreeing >= self._config.min_agreeing
+        points, agreeing, sigma, ratio = points[keep], agreeing[keep], sigma[keep], ratio[keep]
+        rows, columns = rows[keep], columns[keep]
+        if len(points) == 0:
+            return None
+        confidence = ratio * (1.0 - 0.5 ** (agreeing + 1)) / (1.0 + (sigma / 0.01) ** 2)
+        kept = thin_by_voxel(points, confidence, self._voxel(points, place, update))
+        return PointChunk(
+            keyframe_id, depth_map.t_ns, points[kept].astype(np.float32),
+            np.ascontiguousarray(depth_map.rgb[rows[kept], columns[kept]]),
+            confidence[kept].astype(np.float32),
+        )  # fmt: skip
+
+    def _voxel(self, points: Array, place: Similarity, update: MapUpdate) -> float:
+        """Size of a voxel in the chunk's units."""
+        if update.georeference is None:
+            return 0.01 * float(np.median(points[:, 2]))
+        return self._config.voxel_m / (update.georeference.world_from_map.scale * place.scale)
+
+    def _agrees(self, points: Array, other_from_here: Similarity, other: DepthMap) -> Array:
+        p = other_from_here.apply(points)
+        fx, fy, cx, cy = other.intrinsics
+        height, width = other.depth.shape
+        front = p[:, 2] > 1e-6
+        z = np.where(front, p[:, 2], 1.0)
+        u = np.rint(fx * p[:, 0] / z + cx)
+        v = np.rint(fy * p[:, 1] / z + cy)
+        inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        seen = np.zeros(len(points))
+        seen[inside] = other.depth[v[inside].astype(int), u[inside].astype(int)]
+        return (seen > 0) & (np.abs(seen - z) < self._config.agreement * z)
+
+
+def _smooth(depth: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    """Pixels that have a neighbour on the same surface, and none where a nearer surface ends."""
+    ok = np.zeros(depth.shape, bool)
+    edge = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        for shift in (1, -1):
+            other = np.roll(depth, shift, axis)
+            both = (depth > 0) & (other > 0)
+            step = np.abs(depth - other) > MAX_STEP * depth
+            ok |= both & ~step
+            edge |= both & step
+    return ok & ~edge

@@ -1,0 +1,193 @@
+"""The depth stage: keyframes and the frames around them become depth maps and points.
+
+A keyframe waits until some later ones have come, so that its frames' poses are adjusted and both sides
+are at hand. Images wait undistorted, and no more of them than a bound.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from companion.camera import Camera
+from companion.config import CloudConfig, DepthConfig
+from companion.depth.engine import DepthEngine, Intrinsics
+from companion.depth.fusion import Fusion
+from companion.depth.opencl import ComputeDevice
+from companion.geometry import Array, Similarity
+from companion.messages import (
+    Bytes,
+    DepthMap,
+    Frame,
+    KeyframeAdded,
+    MapUpdate,
+    Message,
+    PointChunk,
+    Track,
+)
+
+MAX_HELD = 100
+MAX_HFOV_RAD = np.radians(110.0)
+FIRST_BASELINE = 0.01
+"""Share of the median depth: the first frame has a short search, which is hardly ambiguous."""
+
+
+@dataclass(slots=True, eq=False)
+class _Held:
+    grey: Bytes
+    rgb: Bytes | None
+    track: Track | None = None
+
+
+class DepthStage:
+    """Frames, tracks, keyframes and map updates in; DepthMaps and PointChunks out."""
+
+    def __init__(
+        self, config: DepthConfig, cloud: CloudConfig, camera: Camera, device: ComputeDevice
+    ) -> None:
+        self._config = config
+        self._fusion = Fusion(cloud)
+        self._maps = _undistortion(camera)
+        fx, fy, cx, cy = self._maps[2]
+        self._engine = DepthEngine(
+            device, camera.width, camera.height, Intrinsics(fx, fy, cx, cy), config
+        )
+        self._held: OrderedDict[int, _Held] = OrderedDict()
+        self._waiting: list[KeyframeAdded] = []
+        self._update: MapUpdate | None = None
+
+    def step(self, message: Message) -> list[Message]:
+        """Take one message, in order of time."""
+        if isinstance(message, Frame):
+            self._hold(message)
+        elif isinstance(message, Track):
+            held = self._held.get(message.seq)
+            if held is not None:
+                held.track = message
+        elif isinstance(message, KeyframeAdded):
+            self._waiting.append(message)
+        elif isinstance(message, MapUpdate):
+            self._update = message
+            out: list[Message] = []
+            while len(self._waiting) > self._config.lag_keyframes:
+                out += self._process(self._waiting.pop(0))
+            return out
+        return []
+
+    def flush(self) -> list[Message]:
+        """Process the keyframes that still wait."""
+        out: list[Message] = []
+        for keyframe in self._waiting:
+            out += self._process(keyframe)
+        self._waiting.clear()
+        if self._update is not None:
+            out += self._fusion.flush(self._update)
+        return out
+
+    def _hold(self, frame: Frame) -> None:
+        map_u, map_v, _ = self._maps
+        grey = cv2.remap(frame.grey, map_u, map_v, cv2.INTER_LINEAR)
+        self._held[frame.seq] = _Held(np.asarray(grey, np.uint8), frame.rgb)
+        if len(self._held) > MAX_HELD:
+            # thin out the older half; what a waiting keyframe needs stays
+            needed = {k.seq for k in self._waiting}
+            old = list(self._held)[: MAX_HELD // 2]
+            for seq in old[::2]:
+                if seq not in needed:
+                    del self._held[seq]
+
+    def _process(self, keyframe: KeyframeAdded) -> list[Message]:
+        update, held = self._update, self._held.get(keyframe.seq)
+        place = None if update is None else update.place_of(keyframe.keyframe_id)
+        if update is None or held is None or place is None or len(keyframe.points_camera) < 20:
+            return []
+        z = keyframe.points_camera[:, 2]
+        z = z[z > 0]
+        near, far = 0.5 * float(np.quantile(z, 0.02)), 2.5 * float(np.quantile(z, 0.98))
+        chosen = self._choose(keyframe, update, place, float(np.median(z)))
+        if len(chosen) < 3:
+            return []
+        self._engine.begin(held.grey, near, far)
+        for seq, current_from_reference in chosen:
+            self._engine.update(self._held[seq].grey, current_from_reference)
+        assert held.rgb is not None
+        map_u, map_v, _ = self._maps
+        rgb = np.asarray(cv2.remap(held.rgb, map_u, map_v, cv2.INTER_LINEAR), np.uint8)
+        depth_map = self._engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb)
+        self._forget(keyframe)
+        chunks: list[PointChunk] = self._fusion.add(depth_map, update)
+        return [depth_map, *chunks]
+
+    def _choose(
+        self, keyframe: KeyframeAdded, update: MapUpdate, place: Similarity, median_depth: float
+    ) -> list:  # type: ignore[type-arg]
+        """Frames in order of use: baselines from short to long, both sides in turn."""
+        candidates = []
+        for seq, held in self._held.items():
+            track = held.track
+            if seq == keyframe.seq or track is None or track.keyframe_id is None:
+                continue
+            theirs = update.place_of(track.keyframe_id)
+            if theirs is None or track.keyframe_from_camera is None:
+                continue
+            relative = place.inverse() @ theirs
+            if abs(relative.scale - 1.0) > 1e-9:
+                continue  # another segment
+            reference_from_current = relative.apply_to_pose(track.keyframe_from_camera)
+            baseline = float(np.linalg.norm(reference_from_current.translation)) / median_depth
+            turn = np.arccos(np.clip(reference_from_current.rotation[2, 2], -1, 1))
+            if baseline <= self._config.max_baseline and turn < np.radians(35):
+                candidates.append((baseline, seq, reference_from_current.inverse()))
+        candidates.sort(key=lambda c: (c[0], c[1]))
+        if not candidates:
+            return []
+        longest = min(self._config.max_baseline, candidates[-1][0])
+        targets = np.geomspace(min(FIRST_BASELINE, longest), longest, self._config.n_updates)
+        chosen, used = [], set()
+        for index, target in enumerate(targets):
+            side = index % 2
+            rank = [
+                (abs(np.log(max(b, 1e-6) / target)) + (0.15 if (seq > keyframe.seq) != bool(side) else 0), seq, pose)
+                for b, seq, pose in candidates
+                if seq not in used
+            ]
+            if not rank:
+                break
+            _, seq, pose = min(rank, key=lambda r: (r[0], r[1]))
+            used.add(seq)
+            chosen.append((seq, pose))
+        baselines = {seq: b for b, seq, _ in candidates}
+        return sorted(chosen, key=lambda c: (baselines[c[0]], c[0]))
+
+    def _forget(self, keyframe: KeyframeAdded) -> None:
+        """Let go of images from before the keyframes that can still use them."""
+        first_needed = keyframe.seq
+        for k in self._waiting[:1]:
+            first_needed = min(first_needed, k.seq)
+        # one keyframe interval back stays: the next references look back too
+        span = (self._waiting[0].seq - keyframe.seq) if self._waiting else 0
+        oldest = first_needed - max(2 * span, 10)
+        for seq in [s for s in self._held if s < oldest]:
+            del self._held[seq]
+
+
+def _undistortion(camera: Camera) -> tuple[Array, Array, tuple[float, float, float, float]]:
+    """Remap tables to an ideal pinhole image of the same size, and its fx, fy, cx, cy.
+
+    The focal length is kept, unless the field of view would be too wide for a plane.
+    """
+    fx, fy = camera.fx, camera.fy
+    widest = 0.5 * camera.width / np.tan(0.5 * MAX_HFOV_RAD)
+    if camera.distortion.value == "equidistant" and fx < widest:
+        fx, fy = widest, widest * camera.fy / camera.fx
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    n = np.stack([(u - camera.cx) / fx, (v - camera.cy) / fy], -1).reshape(-1, 2)
+    d = camera.distort(n)
+    shape = (camera.height, camera.width)
+    map_u = (d[:, 0] * camera.fx + camera.cx).reshape(shape).astype(np.float32)
+    map_v = (d[:, 1] * camera.fy + camera.cy).reshape(shape).astype(np.float32)
+    a, b = cv2.convertMaps(map_u, map_v, cv2.CV_16SC2)
+    return a, b, (fx, fy, camera.cx, camera.cy)
