@@ -1,0 +1,223 @@
+"""What is known of a flight once it is over, gathered message by message."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from companion.camera import Camera
+from companion.geometry import Array, Pose
+from companion.messages import (
+    Bytes,
+    ClockReport,
+    DepthMap,
+    Floats,
+    Frame,
+    GeoOrigin,
+    Georeference,
+    MapUpdate,
+    Message,
+    PointChunk,
+    PositionSample,
+    PositionSource,
+    Track,
+    TrackState,
+    Warned,
+)
+from companion.output.depth_pictures import DepthPicture, DepthPictures
+from companion.voxel import thin_by_voxel
+
+POSITION_STEP_NS = 100_000_000
+VOXEL_PER_DEPTH = 0.01
+"""Side of a voxel over the median depth, while there is no metre."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunFacts:
+    """What the messages do not tell of a run; `stage_times` is `StageTimes.summary()`.
+
+    `origin` is where local NED has its zero on earth. `completed` is False when the run was stopped.
+    """
+
+    stage_times: Mapping[str, Mapping[str, float]]
+    wall_s: float
+    clock: ClockReport | None
+    origin: GeoOrigin | None
+    device: str
+    config: Mapping[str, Any]
+    versions: Mapping[str, str]
+    command: str
+    peak_memory_mb: float
+    camera: Camera
+    n_frames_total: int
+    completed: bool
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
+
+
+class WorldPose(NamedTuple):
+    """Where a frame was taken: `world_from_camera` in metres, or in map units without a scale."""
+
+    seq: int
+    t_ns: int
+    world_from_camera: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points (N, 3) f32 in the world, their colours (N, 3) u8 and confidences (N,) f32, 0..1."""
+
+    points: Floats
+    rgb: Bytes
+    confidence: Floats
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(slots=True)
+class WarningCount:
+    """How often one thing was warned of, and what the first said."""
+
+    count: int
+    first_t_ns: int
+    first_detail: str
+
+
+class FlightResult:
+    """A sink that keeps what the results are made of.
+
+    It holds one track for each frame, one chunk of points for each keyframe, a dozen small pictures
+    and the autopilot's path at 10 Hz at most.
+    """
+
+    def __init__(self) -> None:
+        self.n_frames = 0
+        self.first_t_ns: int | None = None
+        self.last_t_ns: int | None = None
+        self.warnings: dict[str, WarningCount] = {}
+        self.update: MapUpdate | None = None
+        self._tracks: dict[int, Track] = {}
+        self._chunks: dict[int, PointChunk] = {}
+        self._positions: dict[PositionSource, list[tuple[int, Array]]] = {}
+        self._pictures = DepthPictures()
+
+    def take(self, message: Message) -> None:
+        """Take one message."""
+        if isinstance(message, Frame):
+            self.n_frames += 1
+            if self.first_t_ns is None:
+                self.first_t_ns = message.t_ns
+            self.last_t_ns = message.t_ns
+        elif isinstance(message, Track):
+            held = self._tracks.get(message.seq)
+            if held is None or message.state is TrackState.TRACKING or not _tracking(held):
+                self._tracks[message.seq] = replace(message, keypoints_px=None)
+        elif isinstance(message, MapUpdate):
+            self.update = message
+        elif isinstance(message, PointChunk):
+            self._chunks[message.keyframe_id] = message
+        elif isinstance(message, DepthMap):
+            self._pictures.take(message)
+        elif isinstance(message, PositionSample):
+            path = self._positions.setdefault(message.source, [])
+            if not path or message.t_ns - path[-1][0] >= POSITION_STEP_NS:
+                path.append((message.t_ns, message.position_ned_m))
+        elif isinstance(message, Warned):
+            warnings = self.warnings.get(message.what)
+            if warnings is None:
+                self.warnings[message.what] = WarningCount(1, message.t_ns, message.detail)
+            else:
+                warnings.count += 1
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """How the map lies in the world; None without a scale."""
+        return self.update.georeference if self.update is not None else None
+
+    @property
+    def unit(self) -> str:
+        """What lengths are in: m, or map units without a scale."""
+        return "m" if self.georeference is not None else "map units"
+
+    @property
+    def n_keyframes(self) -> int:
+        """Keyframes of the map as it ended."""
+        return len(self.update.map_from_camera) if self.update is not None else 0
+
+    @property
+    def n_depth_maps(self) -> int:
+        """Depth maps that were made."""
+        return self._pictures.n_seen
+
+    @property
+    def tracks(self) -> list[Track]:
+        """One track for each frame, without key points, in order of frames."""
+        return [self._tracks[seq] for seq in sorted(self._tracks)]
+
+    def poses(self) -> list[WorldPose]:
+        """All frames whose place is known, in order, by the map as it ended."""
+        out = []
+        for track in self.tracks:
+            if track.keyframe_id is None or track.keyframe_from_camera is None:
+                continue
+            place = self.update.place_of(track.keyframe_id) if self.update is not None else None
+            if place is None:
+                continue
+            pose = place.apply_to_pose(track.keyframe_from_camera)
+            if self.georeference is not None:
+                pose = self.georeference.world_from_map.apply_to_pose(pose)
+            out.append(WorldPose(track.seq, track.t_ns, pose))
+        return out
+
+    def cloud(self, voxel_m: float) -> Cloud:
+        """All chunks in the world, one point in each cube of side `voxel_m`.
+
+        Without a scale the cube is a hundredth of the median depth. The result does not depend on
+        the order in which chunks came.
+        """
+        points, rgb, confidence, depths = [], [], [], []
+        for keyframe_id in sorted(self._chunks):
+            place = self.update.place_of(keyframe_id) if self.update is not None else None
+            chunk = self._chunks[keyframe_id]
+            if place is None or len(chunk.points_camera) == 0:
+                continue
+            if self.georeference is not None:
+                place = self.georeference.world_from_map @ place
+            points.append(place.apply(chunk.points_camera.astype(np.float64)))
+            rgb.append(chunk.rgb)
+            confidence.append(chunk.confidence)
+            depths.append(place.scale * float(np.median(chunk.points_camera[:, 2])))
+        if not points:
+            nowhere = np.zeros((0, 3))
+            return Cloud(
+                nowhere.astype(np.float32), nowhere.astype(np.uint8), np.zeros(0, np.float32)
+            )
+        everywhere, sure = np.concatenate(points), np.concatenate(confidence)
+        metric = self.georeference is not None
+        voxel = voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths))
+        kept = thin_by_voxel(everywhere, sure, voxel)
+        return Cloud(
+            everywhere[kept].astype(np.float32),
+            np.concatenate(rgb)[kept],
+            sure[kept].astype(np.float32),
+        )
+
+    def autopilot_path(self) -> tuple[PositionSource, Array, Array] | None:
+        """The autopilot's own path from its best source: t_ns (N,), NED metres (N, 3)."""
+        for source in PositionSource:
+            path = self._positions.get(source, [])
+            if len(path) >= 2:
+                return source, np.array([t for t, _ in path]), np.stack([p for _, p in path])
+        return None
+
+    def depth_pictures(self, n: int) -> list[DepthPicture]:
+        """At most `n` pictures of depth maps, spread over the flight."""
+        return self._pictures.spread(n)
+
+
+def _tracking(track: Track) -> bool:
+    return track.state is TrackState.TRACKING

@@ -1,0 +1,28 @@
+"""The results of a run, as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from companion.output.atomic_file import write_atomically
+from companion.output.cloud_ply import cloud_ply
+from companion.output.flight_result import FlightResult, RunFacts
+from companion.output.report_json import report, report_json
+from companion.output.report_page import report_page
+from companion.output.trajectory import trajectory_tum
+
+
+def write_results(out: Path, result: FlightResult, facts: RunFacts, voxel_m: float) -> None:
+    """Write trajectory.tum, cloud.ply, report.json and report.html into folder `out`.
+
+    Each is replaced in one step, the page last; raises OSError where the folder cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    poses, cloud = result.poses(), result.cloud(voxel_m)
+    origin, unit = facts.origin, result.unit
+    numbers = report(result, facts, poses, cloud)
+    write_atomically(out / "trajectory.tum", trajectory_tum(poses, unit, origin))
+    write_atomically(out / "cloud.ply", cloud_ply(cloud, unit, origin))
+    write_atomically(out / "report.json", report_json(numbers))
+    page = report_page(result, facts, poses, cloud, numbers)
+    write_atomically(out / "report.html", page)
