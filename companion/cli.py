@@ -28,6 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 _check_config(arguments)
             else:
                 _replay(arguments, signals)
+                signals.take()
         except KeyboardInterrupt:
             print("companion: stopped", file=sys.stderr)
             return signals.exit_status

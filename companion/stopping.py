@@ -9,9 +9,10 @@ from companion.progress import Progress
 
 
 class StopSignals:
-    """A context in which SIGINT and SIGTERM raise KeyboardInterrupt, while frames run at their end.
+    """A context in which SIGINT and SIGTERM raise KeyboardInterrupt.
 
-    A second signal does not wait for the frame. `received` is the first one, None before.
+    Once frames run, the first one waits for the end of the frame; after the last frame, while
+    results are written, it is only kept in `received`. A second one never waits.
     """
 
     def __init__(self) -> None:
@@ -42,9 +43,9 @@ class StopSignals:
         """The same progress, at whose updates a stop is taken."""
         return _StoppableProgress(progress, self)
 
-    def defer(self, deferred: bool) -> None:
-        """From here on a signal waits for `take`, or no longer."""
-        self._deferred = deferred
+    def defer(self) -> None:
+        """From here on the first signal waits for `take`."""
+        self._deferred = True
 
     def take(self) -> None:
         """Raise KeyboardInterrupt when a signal has come."""
@@ -66,13 +67,11 @@ class _StoppableProgress:
 
     def start(self, total_frames: int) -> None:
         self._inner.start(total_frames)
-        self._signals.defer(True)
+        self._signals.defer()
 
     def update(self, done: int, state: str, n_points: int) -> None:
         self._inner.update(done, state, n_points)
         self._signals.take()
 
     def finish(self) -> None:
-        self._signals.defer(False)
         self._inner.finish()
-        self._signals.take()

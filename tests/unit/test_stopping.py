@@ -39,13 +39,26 @@ def test_signal_outside_the_frames_stops_at_once() -> None:
         assert signals.exit_status == 130
 
 
-def test_signal_in_the_last_frame_is_taken_at_the_end() -> None:
+def test_signal_after_the_last_frame_lets_the_results_be_written() -> None:
     with StopSignals() as signals:
         progress = signals.between_frames(NoProgress())
         progress.start(1)
+        progress.update(1, "tracking", 0)
+        progress.finish()
         os.kill(os.getpid(), signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
-            progress.finish()
+            signals.take()
+        assert signals.exit_status == 143
+
+
+def test_progress_can_be_finished_after_a_stop() -> None:
+    with StopSignals() as signals:
+        progress = signals.between_frames(NoProgress())
+        progress.start(3)
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            progress.update(1, "tracking", 0)
+        progress.finish()
 
 
 def test_handlers_are_put_back() -> None:
