@@ -13,7 +13,7 @@ from companion.depth.opencl import ComputeDevice, event_ms
 from companion.geometry import Array, Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
 
-RADIUS = 2
+RADIUS = 3
 MAX_STEPS = 128
 GROUP = 64
 BORDER_PX = RADIUS + 1

@@ -3,7 +3,7 @@
  * Inverse depth rho is along z of the reference camera, in 1 / map unit. A pixel's state is
  * (mu, sigma^2, a, b): Gaussian over rho times Beta over the share of good measurements
  * (Vogiatzis & Hernandez 2011; Pizzoli et al. 2014). Labels: 0 updating, 1 converged, 2 diverged,
- * 3 border. Images are float, row-major, 0..255.
+ * 3 border or blank. Images are float, row-major, 0..255.
  */
 
 #if !defined(RADIUS) || !defined(MAX_STEPS)
@@ -11,6 +11,22 @@
 #endif
 #define SIDE (2 * RADIUS + 1)
 #define AREA (SIDE * SIDE)
+
+#if RADIUS == 2
+#define MASK (float8)(1, 1, 1, 1, 1, 0, 0, 0)
+#elif RADIUS == 3
+#define MASK (float8)(1, 1, 1, 1, 1, 1, 1, 0)
+#else
+#error "RADIUS must be 2 or 3"
+#endif
+
+/* Sum of the lanes that a patch uses. */
+static float lanes(float8 value)
+{
+    const float8 used = value * MASK;
+    const float4 half_ = used.lo + used.hi;
+    return half_.x + half_.y + half_.z + half_.w;
+}
 
 static float bilinear(__global const float *image, int width, float x, float y)
 {
@@ -22,25 +38,34 @@ static float bilinear(__global const float *image, int width, float x, float y)
     return top + fy * (bottom - top);
 }
 
-/* Zero-mean normalised cross-correlation of the template with the patch around (x, y), its offsets
- * mapped by the affine (ax, ay: image of one reference pixel right and down); -1 outside the image. */
-static float correlate(__global const float *image, int width, int height, const float *template_,
-                       float x, float y, float2 ax, float2 ay)
+/* Zero-mean normalised cross-correlation of a template (rows of SIDE values, zero mean, unit energy,
+ * other lanes 0) with the patch around (x, y); -1 outside the image. A row is one vector: its lanes
+ * share the fraction of a pixel, so that interpolation is two multiplications for all of them. */
+static float correlate(__global const float *image, int width, int height, const float8 *template_,
+                       float x, float y)
 {
-    const float reach_x = RADIUS * (fabs(ax.x) + fabs(ay.x)) + 1.0f;
-    const float reach_y = RADIUS * (fabs(ax.y) + fabs(ay.y)) + 1.0f;
-    if (!(x >= reach_x && y >= reach_y && x < width - 1 - reach_x && y < height - 1 - reach_y))
+    const int ix = (int)x - RADIUS, iy = (int)y - RADIUS;
+    /* a row is read 9 wide, and the last may not leave the buffer */
+    if (!(x >= RADIUS && y >= RADIUS && ix + SIDE + 1 < width && iy + SIDE + 2 < height))
         return -1.0f;
-    float sum = 0.0f, square = 0.0f, cross = 0.0f;
-    for (int j = -RADIUS; j <= RADIUS; ++j)
-        for (int i = -RADIUS; i <= RADIUS; ++i) {
-            const float value = bilinear(image, width, x + i * ax.x + j * ay.x, y + i * ax.y + j * ay.y);
-            sum += value;
-            square += value * value;
-            cross += value * template_[(j + RADIUS) * SIDE + i + RADIUS];
-        }
-    const float energy = square - sum * sum / AREA;
-    return energy > 1.0f ? cross * rsqrt(energy) : -1.0f;
+    const float fx = x - (int)x, fy = y - (int)y;
+    __global const float *p = image + iy * width + ix;
+    float8 sum = 0.0f, square = 0.0f, cross = 0.0f;
+    float8 left = vload8(0, p);
+    float8 above = left + fx * (vload8(0, p + 1) - left);
+#pragma unroll
+    for (int j = 0; j < SIDE; ++j) {
+        p += width;
+        left = vload8(0, p);
+        const float8 below = left + fx * (vload8(0, p + 1) - left);
+        const float8 value = above + fy * (below - above);
+        sum += value;
+        square += value * value;
+        cross += value * template_[j];
+        above = below;
+    }
+    const float total = lanes(sum), energy = lanes(square) - total * total / AREA;
+    return energy > 1.0f ? lanes(cross) * rsqrt(energy) : -1.0f;
 }
 
 /* One update of the pixels in `active`. Grid: one work-item for each of them, rounded up.
@@ -67,26 +92,6 @@ __kernel void update(__global const float *reference, __global const float *curr
     const int cell = active[item];
     const int u = (cell % grid_width) * stride, v = (cell / grid_width) * stride;
 
-    float template_[AREA];
-    float mean = 0.0f;
-    for (int j = -RADIUS; j <= RADIUS; ++j)
-        for (int i = -RADIUS; i <= RADIUS; ++i) {
-            const float value = reference[(v + j) * width + u + i];
-            template_[(j + RADIUS) * SIDE + i + RADIUS] = value;
-            mean += value;
-        }
-    mean /= AREA;
-    float energy = 0.0f;
-    for (int k = 0; k < AREA; ++k) {
-        template_[k] -= mean;
-        energy += template_[k] * template_[k];
-    }
-    if (energy < limits.z)
-        return;
-    const float scale = rsqrt(energy);
-    for (int k = 0; k < AREA; ++k)
-        template_[k] *= scale;
-
     float4 s = state[cell];
     const float reach = 2.5f * sqrt(s.y);
     const float rho_low = fmax(s.x - reach, rho.x), rho_high = fmin(s.x + reach, rho.y);
@@ -103,12 +108,43 @@ __kernel void update(__global const float *reference, __global const float *curr
         return;
     const float2 direction = (to - from) / length_px;
 
-    /* the patch around this pixel, as a plane facing the reference at depth 1 / mu, seen from there */
+    /* the patch around this pixel as a plane that faces the reference at depth 1 / mu: how it lies in
+     * the current image, and from there back, so that the template is warped once and not each patch */
     const float inverse_z = 1.0f / middle.z;
     const float2 at = middle.xy * inverse_z;
     const float3 dx = (float3)(m0.x, m1.x, m2.x) / camera.x, dy = (float3)(m0.y, m1.y, m2.y) / camera.y;
     const float2 ax = (float2)(camera.x * (dx.x - at.x * dx.z), camera.y * (dx.y - at.y * dx.z)) * inverse_z;
     const float2 ay = (float2)(camera.x * (dy.x - at.x * dy.z), camera.y * (dy.y - at.y * dy.z)) * inverse_z;
+    const float determinant = ax.x * ay.y - ax.y * ay.x;
+    if (!(determinant > 0.2f && determinant < 5.0f))
+        return;
+    const float2 bx = (float2)(ay.y, -ax.y) / determinant, by = (float2)(-ay.x, ax.x) / determinant;
+    float8 template_[SIDE];
+    float8 total = 0.0f;
+    for (int j = 0; j < SIDE; ++j) {
+        float row[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+        for (int i = 0; i < SIDE; ++i) {
+            const float x = u + (i - RADIUS) * bx.x + (j - RADIUS) * by.x;
+            const float y = v + (i - RADIUS) * bx.y + (j - RADIUS) * by.y;
+            row[i] = bilinear(reference, width, clamp(x, 0.0f, width - 1.01f), clamp(y, 0.0f, height - 1.01f));
+        }
+        template_[j] = vload8(0, row);
+        total += template_[j];
+    }
+    const float mean = lanes(total) / AREA;
+    float8 squares = 0.0f;
+    for (int j = 0; j < SIDE; ++j) {
+        template_[j] = (template_[j] - mean) * MASK;
+        squares += template_[j] * template_[j];
+    }
+    const float energy = lanes(squares);
+    if (energy < limits.z) {
+        label[cell] = 3; /* blank: no image will tell its depth */
+        return;
+    }
+    const float scale = rsqrt(energy);
+    for (int j = 0; j < SIDE; ++j)
+        template_[j] *= scale;
 
     /* one pixel beyond both ends, so that a peak at an end has two sides */
     const int steps = max((int)ceil((length_px + 2.0f) / 0.8f), 4);
@@ -121,7 +157,7 @@ __kernel void update(__global const float *reference, __global const float *curr
     int seen = 0;
     for (int k = 0; k <= steps; ++k) {
         const float2 p = origin + direction * (k * step);
-        const float value = correlate(current, width, height, template_, p.x, p.y, ax, ay);
+        const float value = correlate(current, width, height, template_, p.x, p.y);
         seen += value > -1.0f;
         if (k == best_at + 1)
             after = value;
