@@ -39,7 +39,7 @@ VOXEL_PER_DEPTH = 0.01
 class RunFacts:
     """What the messages do not tell of a run; `stage_times` is `StageTimes.summary()`.
 
-    `origin` is where local NED has its zero on earth. `completed` is False when the run was stopped.
+    `origin` is where local NED has its zero. `completed` is False when the run was stopped.
     """
 
     stage_times: Mapping[str, Mapping[str, float]]

@@ -92,7 +92,7 @@ def _scale(result: FlightResult) -> dict[str, Any]:
     if georeference is None:
         return {"metres_per_unit": None, "scale": None}
     return {
-        "metres_per_unit": georeference.world_from_map.scale,
+        "metres_per_unit": float(georeference.world_from_map.scale),
         "scale": {
             "method": georeference.method,
             "sigma_relative": _finite(georeference.sigma_scale),

@@ -33,7 +33,7 @@ def frame_lines(unit: str, origin: GeoOrigin | None) -> list[str]:
     if origin is not None and unit == "m":
         lines.append(
             f"origin: latitude {origin.latitude_deg:.8f} deg, longitude "
-            f"{origin.longitude_deg:.8f} deg, altitude {origin.altitude_m:.3f} m above mean sea level"
+            f"{origin.longitude_deg:.8f} deg, altitude {origin.altitude_m:.3f} m above sea level"
         )
     return lines
 
