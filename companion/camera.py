@@ -128,7 +128,9 @@ class Camera:
             df = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
             theta = theta - f / np.where(np.abs(df) > 1e-6, df, 1e-6)
         good = (theta < MAX_OFF_AXIS_RAD) & (theta >= 0)
-        scale = np.where(theta_d > 1e-9, np.tan(np.where(good, theta, 0)) / np.maximum(theta_d, 1e-9), 1.0)
+        scale = np.where(
+            theta_d > 1e-9, np.tan(np.where(good, theta, 0)) / np.maximum(theta_d, 1e-9), 1.0
+        )
         return np.where(good[..., None], distorted * scale[..., None], np.nan)
 
     def _distortion_jacobian(self, n: Array) -> Array:

@@ -14,7 +14,14 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from companion.config import GeoreferenceConfig
-from companion.geometry import Array, Pose, Similarity, rotation_from_vector, skew, vector_from_rotation
+from companion.geometry import (
+    Array,
+    Pose,
+    Similarity,
+    rotation_from_vector,
+    skew,
+    vector_from_rotation,
+)
 from companion.messages import (
     Georeference,
     HeightSample,
@@ -253,7 +260,11 @@ def _fit(
     guess = _start(mapped, target, level)
     if not np.isfinite(guess.scale) or guess.scale <= 0:
         return None
-    prior = np.array([1 / SIGMA_TILT_RAD, 1 / SIGMA_TILT_RAD, 1 / SIGMA_YAW_RAD]) if level is not None else np.full(3, 1e-3)
+    prior = (
+        np.array([1 / SIGMA_TILT_RAD, 1 / SIGMA_TILT_RAD, 1 / SIGMA_YAW_RAD])
+        if level is not None
+        else np.full(3, 1e-3)
+    )
     keep = np.ones(len(t_s), bool)
     steps = np.isfinite(way[1:] - way[:-1]).all(1)
     dt = np.diff(t_s)
@@ -313,4 +324,3 @@ def _fit(
     covariance = np.linalg.inv(information) * max(chi2 / max(n_rows - 7, 1), 1.0)
     error = target - guess.apply(mapped)
     return guess, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))
-

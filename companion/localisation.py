@@ -113,7 +113,9 @@ class LocalisationStage:
             return []
         self._use_attitude = False
         detail = f"turns between frames differ by {np.degrees(disagreement):.1f} degrees; is the camera on a gimbal?"
-        return [Warned(t_ns, "the autopilot's attitude is not the camera's and is not used", detail)]
+        return [
+            Warned(t_ns, "the autopilot's attitude is not the camera's and is not used", detail)
+        ]
 
     def _map_update(self, final: bool) -> MapUpdate:
         """The map, all segments in the frame of the main one (the one with most keyframes)."""

@@ -112,9 +112,7 @@ class MotionFilter:
         (t0, a), (t1, b) = self._poses[0], self._poses[-1]
         if t1 == t0 or dt > 1.0:
             return Pose(b.rotation, position)
-        return Pose(
-            interpolate_rotation(a.rotation, b.rotation, (t_ns - t0) / (t1 - t0)), position
-        )
+        return Pose(interpolate_rotation(a.rotation, b.rotation, (t_ns - t0) / (t1 - t0)), position)
 
     def correct(self, t_ns: int, map_from_camera: Pose, ned_from_camera: Array | None) -> None:
         """Take the pose that the image gave."""
@@ -145,7 +143,9 @@ class MotionFilter:
                 h[3:, 6:] = np.eye(3)
                 r[3:, 3:] = np.eye(3) * np.radians(0.3) ** 2
                 previous = rotation_from_vector(f.x.ravel()[6:9])
-                turn = vector_from_rotation(map_from_camera.rotation @ ned_from_camera.T @ previous.T)
+                turn = vector_from_rotation(
+                    map_from_camera.rotation @ ned_from_camera.T @ previous.T
+                )
                 self._disagreement_rad.append(float(np.linalg.norm(turn)))
                 z = np.r_[z, f.x.ravel()[6:9] + turn]
             f.update(z.reshape(-1, 1), R=r, H=h)

@@ -105,7 +105,11 @@ class Pipeline:
     """The stages joined; feed it messages in order of time."""
 
     def __init__(
-        self, localisation: LocalisationStage, depth: Stage | None, sinks: Iterable[Sink], lossless: bool
+        self,
+        localisation: LocalisationStage,
+        depth: Stage | None,
+        sinks: Iterable[Sink],
+        lossless: bool,
     ) -> None:
         self._localisation = localisation
         self._depth = StageThread(depth, lossless) if depth is not None else None
@@ -154,9 +158,7 @@ class Pipeline:
             sink.take(message)
 
 
-def in_order_of_time(
-    telemetry: Iterable[Message], frames: Iterable[Message]
-) -> Iterator[Message]:
+def in_order_of_time(telemetry: Iterable[Message], frames: Iterable[Message]) -> Iterator[Message]:
     """Merge telemetry (sorted) and frames; a frame comes after all telemetry up to its time.
 
     Both are sorted; Warned among the frames passes through at once.

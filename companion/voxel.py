@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from companion.geometry import Array
 
 
-def thin_by_voxel(points: Array, confidence: NDArray[np.floating], voxel: float) -> NDArray[np.int64]:
+def thin_by_voxel(
+    points: Array, confidence: NDArray[np.floating], voxel: float
+) -> NDArray[np.int64]:
     """Indices, ascending, of the most confident point (N, 3) of each cube of side `voxel`.
 
     Equal confidence goes to the earlier point, so that the result depends on nothing else.

@@ -37,7 +37,12 @@ class DepthEngine:
     """A depth filter for images of one size and camera. `begin`, some `update`s, `finish`."""
 
     def __init__(
-        self, device: ComputeDevice, width: int, height: int, intrinsics: Intrinsics, config: DepthConfig
+        self,
+        device: ComputeDevice,
+        width: int,
+        height: int,
+        intrinsics: Intrinsics,
+        config: DepthConfig,
     ) -> None:
         self._device = device
         self._size = (height, width)

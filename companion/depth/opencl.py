@@ -80,7 +80,11 @@ def open_device(config: OpenclConfig) -> ComputeDevice:
         return ComputeDevice(found[0][1])
     wanted = config.device.lower()
     for number, device in found:
-        if wanted == number or wanted in device.name.lower() or wanted in device.platform.name.lower():
+        if (
+            wanted == number
+            or wanted in device.name.lower()
+            or wanted in device.platform.name.lower()
+        ):
             return ComputeDevice(device)
     names = "; ".join(f"{n} {d.name.strip()} ({d.platform.name.strip()})" for n, d in found)
     raise DeviceError(f"opencl.device = {config.device!r} is none of: {names}")

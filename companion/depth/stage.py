@@ -20,7 +20,6 @@ from companion.depth.opencl import ComputeDevice
 from companion.geometry import Array, Similarity
 from companion.messages import (
     Bytes,
-    DepthMap,
     Frame,
     KeyframeAdded,
     MapUpdate,
@@ -150,7 +149,12 @@ class DepthStage:
         for index, target in enumerate(targets):
             side = index % 2
             rank = [
-                (abs(np.log(max(b, 1e-6) / target)) + (0.15 if (seq > keyframe.seq) != bool(side) else 0), seq, pose)
+                (
+                    abs(np.log(max(b, 1e-6) / target))
+                    + (0.15 if (seq > keyframe.seq) != bool(side) else 0),
+                    seq,
+                    pose,
+                )
                 for b, seq, pose in candidates
                 if seq not in used
             ]

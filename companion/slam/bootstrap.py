@@ -40,9 +40,13 @@ class Bootstrap:
         self.pending: deque[View] = deque(maxlen=MAX_PENDING)
         self._reference: View | None = None
 
-    def step(self, seq: int, t_ns: int, features: Features, ned_from_camera: Array | None) -> Start | None:
+    def step(
+        self, seq: int, t_ns: int, features: Features, ned_from_camera: Array | None
+    ) -> Start | None:
         """Take a frame; a Start when a map can begin with it."""
-        view = View(seq, t_ns, features, ned_from_camera, Pose.identity(), np.full(len(features), -1))
+        view = View(
+            seq, t_ns, features, ned_from_camera, Pose.identity(), np.full(len(features), -1)
+        )
         self.pending.append(view)
         reference = self._reference
         if reference is None:
@@ -52,7 +56,11 @@ class Bootstrap:
         ia, ib = match_descriptors(reference.features, features)
         if len(ia) < MIN_POINTS:
             # the view has moved on: begin again from a frame in between, else from this one
-            between = [v for v in self.pending if reference.seq < v.seq < seq and len(v.features) >= 2 * MIN_POINTS]
+            between = [
+                v
+                for v in self.pending
+                if reference.seq < v.seq < seq and len(v.features) >= 2 * MIN_POINTS
+            ]
             self._reference = between[len(between) // 2] if between else None
             return None
         shift = np.linalg.norm(reference.features.pixels[ia] - features.pixels[ib], axis=1)
@@ -69,7 +77,9 @@ class Bootstrap:
             return None
         # the map: axes by the first view's attitude, unit length its median depth
         unit = 1.0 / float(np.median(result.points_a[:, 2]))
-        map_rotation = reference.ned_from_camera if reference.ned_from_camera is not None else FORWARD_IS_NORTH
+        map_rotation = (
+            reference.ned_from_camera if reference.ned_from_camera is not None else FORWARD_IS_NORTH
+        )
         reference.camera_from_map = Pose(map_rotation.T, np.zeros(3))
         b_from_a = Pose(result.b_from_a.rotation, result.b_from_a.translation * unit)
         view.camera_from_map = b_from_a @ reference.camera_from_map

@@ -70,7 +70,7 @@ class FeatureExtractor:
         seen = np.isfinite(normalised).all(1)
         pixels, octaves, angles = pixels[seen], octaves[seen], angles[seen]
         normalised = normalised[seen]
-        sigma = self._config.scale_factor**octaves.astype(np.float64)
+        sigma = self._config.scale_factor ** octaves.astype(np.float64)
         whitening = self._camera.pixel_from_normalised_jacobian(normalised) / sigma[:, None, None]
         return Features(
             pixels, normalised, octaves, angles, descriptors[seen], sigma, whitening,
@@ -83,7 +83,10 @@ class FeatureExtractor:
         while True:
             self._orb.setFastThreshold(self._threshold)
             keypoints = list(self._orb.detect(grey, None))
-            if len(keypoints) >= 1.25 * config.n_features or self._threshold <= config.min_fast_threshold:
+            if (
+                len(keypoints) >= 1.25 * config.n_features
+                or self._threshold <= config.min_fast_threshold
+            ):
                 break
             self._threshold = max(config.min_fast_threshold, int(self._threshold * 0.7))
         if len(keypoints) > 3 * config.n_features:

@@ -31,7 +31,9 @@ class Projector:
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
         w, h = camera.width - 1.0, camera.height - 1.0
-        edge = np.array([[0, 0], [w / 2, 0], [w, 0], [0, h / 2], [w, h / 2], [0, h], [w / 2, h], [w, h]])
+        edge = np.array(
+            [[0, 0], [w / 2, 0], [w, 0], [0, h / 2], [w, h / 2], [0, h], [w / 2, h], [w, h]]
+        )
         rim = camera.normalise(edge)
         # a distortion model folds back far outside the image: points there must not come in again
         self._max_radius = float(np.nanmax(np.linalg.norm(rim, axis=1), initial=0.5)) * 1.05

@@ -130,7 +130,9 @@ class SlamMap:
             towards = keyframe.centre - self.positions[ids]
             distance = np.linalg.norm(towards, axis=1)
             total[ids] += towards / np.maximum(distance, 1e-12)[:, None]
-            self.base_distance[ids] = distance * self.scale_factor ** keyframe.features.octaves[features]
+            self.base_distance[ids] = (
+                distance * self.scale_factor ** keyframe.features.octaves[features]
+            )
             self.descriptors[ids] = keyframe.features.descriptors[features]
         norm = np.linalg.norm(total, axis=1)
         ok = points[norm[points] > 0]

@@ -49,7 +49,9 @@ class Mapper:
             free_b = np.flatnonzero(other.point_ids < 0)
             other_from_here = other.camera_from_map @ keyframe.camera_from_map.inverse()
             depth = np.median(
-                keyframe.camera_from_map.apply(slam_map.positions[slam_map.seen_by(keyframe)[1]])[:, 2]
+                keyframe.camera_from_map.apply(slam_map.positions[slam_map.seen_by(keyframe)[1]])[
+                    :, 2
+                ]
             )
             if np.linalg.norm(other_from_here.translation) < 0.01 * depth:
                 continue
@@ -69,7 +71,11 @@ class Mapper:
             da = np.linalg.norm(points, axis=1)
             db = np.linalg.norm(other_from_here.apply(points), axis=1)
             with np.errstate(invalid="ignore"):
-                gap = fa.octaves[ia] - fb.octaves[ib] + np.log(da / db) / np.log(slam_map.scale_factor)
+                gap = (
+                    fa.octaves[ia]
+                    - fb.octaves[ib]
+                    + np.log(da / db) / np.log(slam_map.scale_factor)
+                )
                 ok &= np.abs(gap) < 2.0
             ia, ib, points = ia[ok], ib[ok], points[ok]
             if len(ia) == 0:
@@ -90,7 +96,11 @@ class Mapper:
         for other in neighbours:
             _, mine = slam_map.seen_by(keyframe)
             self._search_in(other, mine)
-        theirs = np.unique(np.concatenate([slam_map.seen_by(o)[1] for o in neighbours])) if neighbours else created
+        theirs = (
+            np.unique(np.concatenate([slam_map.seen_by(o)[1] for o in neighbours]))
+            if neighbours
+            else created
+        )
         self._search_in(keyframe, theirs)
         _, mine = slam_map.seen_by(keyframe)
         slam_map.refresh(mine, [*reversed(neighbours), keyframe])
@@ -172,7 +182,11 @@ class Mapper:
         self._adjust(ordered[2:], ordered[:2], mask, iterations)
 
     def _adjust(
-        self, variable: list[Keyframe], fixed: list[Keyframe], mask: np.ndarray, iterations: int | None = None
+        self,
+        variable: list[Keyframe],
+        fixed: list[Keyframe],
+        mask: np.ndarray,
+        iterations: int | None = None,
     ) -> None:  # type: ignore[type-arg]
         slam_map = self._map
         cameras, obs_cam, obs_feat, obs_id = [*variable, *fixed], [], [], []

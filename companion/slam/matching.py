@@ -18,7 +18,9 @@ MAX_DISTANCE_STRICT = 50
 FAR = np.float32(1000.0)
 
 
-def hamming_matrix(descriptors_a: Bytes, descriptors_b: Bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+def hamming_matrix(
+    descriptors_a: Bytes, descriptors_b: Bytes
+) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
     """Distances (Na, Nb) in bits, as float32; by one matrix product of signs."""
     signs_a = np.unpackbits(descriptors_a, axis=1).astype(np.float32) * 2 - 1
     signs_b = np.unpackbits(descriptors_b, axis=1).astype(np.float32) * 2 - 1

@@ -102,7 +102,9 @@ class Tracker:
 
     # -- initialising ---------------------------------------------------------------------------
 
-    def _initialise(self, frame: Frame, features: Features, prior: Prior) -> list[Track | KeyframeAdded]:
+    def _initialise(
+        self, frame: Frame, features: Features, prior: Prior
+    ) -> list[Track | KeyframeAdded]:
         with self._times("initialising"):
             start = self._bootstrap.step(frame.seq, frame.t_ns, features, prior.ned_from_camera)
         if start is None or not self._given_up(frame.t_ns):
@@ -127,7 +129,9 @@ class Tracker:
         self._last = start.second
         self._refresh_local(start.second)
         self.state, self._lost_since_ns = TrackState.TRACKING, None
-        out: list[Track | KeyframeAdded] = [self._backfilled(v, first) for v in self._backfill(first, second)]
+        out: list[Track | KeyframeAdded] = [
+            self._backfilled(v, first) for v in self._backfill(first, second)
+        ]
         out += [self._report(start.second), self._added(first), self._added(second)]
         return out
 
@@ -158,7 +162,9 @@ class Tracker:
         if len(view.features) < self._config.min_inliers:
             return False
         view.point_ids = np.full(len(view.features), -1)
-        return self._match(view, guess, self._local, 25.0) or self._match(view, guess, self._local, 60.0)
+        return self._match(view, guess, self._local, 25.0) or self._match(
+            view, guess, self._local, 60.0
+        )
 
     # -- tracking -------------------------------------------------------------------------------
 
@@ -182,7 +188,9 @@ class Tracker:
         self._refresh_local(view)
         return self._match(view, view.camera_from_map, self._local, 5.0, count=True)
 
-    def _match(self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False) -> bool:
+    def _match(
+        self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False
+    ) -> bool:
         visible = self._projector.visible(self.map, guess, ids)
         points, found = self._projector.search(self.map, visible, view.features, radius_px)
         if len(points) < self._config.min_inliers:
@@ -285,7 +293,9 @@ class Tracker:
 
     # -- reporting ------------------------------------------------------------------------------
 
-    def _report(self, view: View, keyframe: Keyframe | None = None, backfilled: bool = False) -> Track:
+    def _report(
+        self, view: View, keyframe: Keyframe | None = None, backfilled: bool = False
+    ) -> Track:
         reference = keyframe or self._reference
         assert reference is not None
         map_from_camera = view.camera_from_map.inverse()

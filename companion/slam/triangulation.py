@@ -48,7 +48,10 @@ def consistent(
     in_b = b_from_a.apply(points_a)
     with np.errstate(invalid="ignore", divide="ignore"):
         ok = (points_a[:, 2] > 0) & (in_b[:, 2] > 0) & np.isfinite(points_a).all(1)
-        for p, seen, white in ((points_a, normalised_a, whitening_a), (in_b, normalised_b, whitening_b)):
+        for p, seen, white in (
+            (points_a, normalised_a, whitening_a),
+            (in_b, normalised_b, whitening_b),
+        ):
             error = np.matmul(white, (p[:, :2] / p[:, 2:] - seen)[..., None])[..., 0]
             ok &= (error * error).sum(1) < max_chi2
     return ok

@@ -1,14 +1,14 @@
 """Messages to entities: what is logged where. Called from one thread.
 
-    world                       local NED in metres (z down)
-      autopilot/<n>             the autopilot's own path, in pieces
-      map                       the map, placed by the georeference
-        camera                  the camera now, with its image and the points found in it
-        path/<n>                the camera's path, in pieces
-        keyframes/<id>          a keyframe; its points lie in its own frame and move with it
-        sparse                  the tracker's points (hidden at first)
-    depth                       depth of the newest keyframe, near is red
-    plots/…, log
+world                       local NED in metres (z down)
+  autopilot/<n>             the autopilot's own path, in pieces
+  map                       the map, placed by the georeference
+    camera                  the camera now, with its image and the points found in it
+    path/<n>                the camera's path, in pieces
+    keyframes/<id>          a keyframe; its points lie in its own frame and move with it
+    sparse                  the tracker's points (hidden at first)
+depth                       depth of the newest keyframe, near is red
+plots/…, log
 """
 
 from __future__ import annotations
@@ -86,7 +86,9 @@ class Scene:
         elif isinstance(message, PointChunk):
             self._rec.log(
                 f"world/map/keyframes/{message.keyframe_id}/points",
-                rr.Points3D(message.points_camera, colors=message.rgb, radii=rr.Radius.ui_points(1.5)),
+                rr.Points3D(
+                    message.points_camera, colors=message.rgb, radii=rr.Radius.ui_points(1.5)
+                ),
             )
         elif isinstance(message, DepthMap):
             self._depth(message)
@@ -102,7 +104,9 @@ class Scene:
         small = rgb
         if self._shrink < 1.0:
             small = np.asarray(
-                cv2.resize(rgb, None, fx=self._shrink, fy=self._shrink, interpolation=cv2.INTER_AREA),
+                cv2.resize(
+                    rgb, None, fx=self._shrink, fy=self._shrink, interpolation=cv2.INTER_AREA
+                ),
                 np.uint8,
             )
         quality = [cv2.IMWRITE_JPEG_QUALITY, self._config.jpeg_quality]
@@ -112,7 +116,9 @@ class Scene:
     def _track(self, track: Track) -> None:
         if track.state is not self._state and not track.backfilled:
             self._state = track.state
-            self._rec.log("log", rr.TextLog(f"Tracker is {track.state.value}", level=rr.TextLogLevel.INFO))
+            self._rec.log(
+                "log", rr.TextLog(f"Tracker is {track.state.value}", level=rr.TextLogLevel.INFO)
+            )
         if not track.backfilled:
             self._rec.log("plots/points", rr.Scalars(float(track.n_inliers)))
         pose = track.map_from_camera
@@ -126,7 +132,11 @@ class Scene:
                     rr.Points2D(track.keypoints_px * self._shrink, colors=COLOUR_FOUND, radii=1.5),
                 )
         self._extend("world/map/path", pose.translation, COLOUR_PATH)
-        if self._update is not None and self._update.georeference is not None and not track.backfilled:
+        if (
+            self._update is not None
+            and self._update.georeference is not None
+            and not track.backfilled
+        ):
             world = self._update.georeference.world_from_map.apply(pose.translation)
             self._rec.log("plots/height", rr.Scalars(float(-world[2])))
             self._speed(track.t_ns, world)

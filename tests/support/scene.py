@@ -46,7 +46,14 @@ class PlaneWorld:
             with np.errstate(divide="ignore", invalid="ignore"):
                 z = (height - centre[2]) / rays[:, 2]
                 hit = centre + z[:, None] * rays
-            ok = (z > 0.1) & (z < depth) & (hit[:, 0] > n0) & (hit[:, 0] < n1) & (hit[:, 1] > e0) & (hit[:, 1] < e1)
+            ok = (
+                (z > 0.1)
+                & (z < depth)
+                & (hit[:, 0] > n0)
+                & (hit[:, 0] < n1)
+                & (hit[:, 1] > e0)
+                & (hit[:, 1] < e1)
+            )
             texel = np.mod(hit[ok, :2] / self._metres_per_texel, len(pattern) - 2)
             image[ok] = _sample(pattern, texel)
             depth[ok] = z[ok]

@@ -52,7 +52,13 @@ def test_bundle_recovers_disturbed_cameras_and_points(rng: np.random.Generator) 
     ]  # fmt: skip
     place = np.argsort(order)
     bundle = Bundle(
-        disturbed, 3, points + rng.normal(scale=0.1, size=points.shape), place[camera], point, seen, whitening(len(seen))
+        disturbed,
+        3,
+        points + rng.normal(scale=0.1, size=points.shape),
+        place[camera],
+        point,
+        seen,
+        whitening(len(seen)),
     )
     result = adjust(bundle, 30)
     assert result.cost_after < 1e-6 * result.cost_before
@@ -70,7 +76,9 @@ def test_bundle_sets_wrong_matches_aside(rng: np.random.Generator) -> None:
     wrong = rng.permutation(len(seen))[:30]
     seen[wrong] += rng.uniform(0.05, 0.2, (30, 2))
     moved = [poses[0], poses[1], *poses[2:]]
-    result = adjust(Bundle(moved[::-1], 2, points.copy(), 3 - camera, point, seen, whitening(len(seen))), 20)
+    result = adjust(
+        Bundle(moved[::-1], 2, points.copy(), 3 - camera, point, seen, whitening(len(seen))), 20
+    )
     assert not result.inlier[wrong].any()
     assert np.count_nonzero(~result.inlier) <= 45
 
@@ -79,7 +87,9 @@ def test_pose_is_refined_past_a_third_of_wrong_points(rng: np.random.Generator) 
     points, pose = scene(rng), cameras(3)[2]
     seen = project(pose, points) + rng.normal(scale=0.5 / FOCAL, size=(len(points), 2))
     seen[:50] += rng.uniform(-0.3, 0.3, (50, 2))
-    start = Pose(rotation_from_vector(np.array([0.01, 0.02, -0.01])) @ pose.rotation, pose.translation + 0.1)
+    start = Pose(
+        rotation_from_vector(np.array([0.01, 0.02, -0.01])) @ pose.rotation, pose.translation + 0.1
+    )
     refined, inlier, information = refine_pose(start, points, seen, whitening(len(seen)))
     assert angle_between(refined.rotation, pose.rotation) < np.radians(0.1)
     np.testing.assert_allclose(refined.translation, pose.translation, atol=0.02)
@@ -122,7 +132,9 @@ def test_two_views_start_a_map(rng: np.random.Generator, flat: bool, prior: bool
     index = np.arange(400)
     result = initialise(features(xa), features(xb), index, index, FOCAL, 5, turn, np.radians(1.0))
     if flat and not prior:  # a plane allows two motions: none may be taken for certain
-        assert result is None or angle_between(result.b_from_a.rotation, b_from_a.rotation) < np.radians(1)
+        assert result is None or angle_between(
+            result.b_from_a.rotation, b_from_a.rotation
+        ) < np.radians(1)
         return
     assert result is not None
     assert angle_between(result.b_from_a.rotation, b_from_a.rotation) < np.radians(1.0)
@@ -139,4 +151,7 @@ def test_pure_rotation_and_tiny_parallax_start_nothing(rng: np.random.Generator)
     xb = project(b, points) + rng.normal(scale=0.3 / FOCAL, size=(300, 2))
     index = np.arange(300)
     for prior in (None, b.rotation):
-        assert initialise(features(xa), features(xb), index, index, FOCAL, 5, prior, np.radians(1.0)) is None
+        assert (
+            initialise(features(xa), features(xb), index, index, FOCAL, 5, prior, np.radians(1.0))
+            is None
+        )

@@ -10,7 +10,9 @@ from companion.geometry import Pose, Similarity, rotation_from_vector, yaw_rotat
 from companion.georeference import Georeferencer, Place
 from companion.messages import HeightSample, PositionSample, PositionSource, RangeSample
 
-TRUTH = Similarity(3.7, rotation_from_vector(np.array([0.02, -0.01, 0.8])), np.array([12.0, -5.0, -30.0]))
+TRUTH = Similarity(
+    3.7, rotation_from_vector(np.array([0.02, -0.01, 0.8])), np.array([12.0, -5.0, -30.0])
+)
 T0 = 1_700_000_000_000_000_000
 
 
@@ -20,7 +22,9 @@ def places(n: int = 80, attitude_error_rad: float = 0.0) -> tuple[list[Place], n
     ned = np.stack([20 * np.sin(k / 9), 0.8 * k, -30 - 2 * np.sin(k / 15)], 1)
     out = []
     for i in range(n):
-        rotation = yaw_rotation(0.3 * np.sin(i / 9)) @ rotation_from_vector(np.array([0.1, 0.2, 0.0]))
+        rotation = yaw_rotation(0.3 * np.sin(i / 9)) @ rotation_from_vector(
+            np.array([0.1, 0.2, 0.0])
+        )
         in_map = TRUTH.inverse()
         pose = Pose(TRUTH.rotation.T @ rotation, in_map.apply(ned[i]))
         ned_from_camera = yaw_rotation(attitude_error_rad) @ rotation
@@ -28,14 +32,23 @@ def places(n: int = 80, attitude_error_rad: float = 0.0) -> tuple[list[Place], n
     return out, ned
 
 
-def reference(ned: np.ndarray, noise: np.ndarray, velocity_noise: np.ndarray | None) -> Georeferencer:
+def reference(
+    ned: np.ndarray, noise: np.ndarray, velocity_noise: np.ndarray | None
+) -> Georeferencer:
     georeferencer = Georeferencer(GeoreferenceConfig(), None)
     t = np.arange(0, len(ned) * 0.5, 0.1)
     for i, s in enumerate(t):
-        p = np.array([np.interp(s, np.arange(len(ned)) * 0.5, ned[:, a] + noise[:, a]) for a in range(3)])
+        p = np.array(
+            [np.interp(s, np.arange(len(ned)) * 0.5, ned[:, a] + noise[:, a]) for a in range(3)]
+        )
         v = None
         if velocity_noise is not None:
-            v = np.array([np.interp(s, np.arange(len(ned)) * 0.5, np.gradient(ned[:, a], 0.5)) for a in range(3)])
+            v = np.array(
+                [
+                    np.interp(s, np.arange(len(ned)) * 0.5, np.gradient(ned[:, a], 0.5))
+                    for a in range(3)
+                ]
+            )
             v = v + velocity_noise[i % len(velocity_noise)]
         georeferencer.take(PositionSample(T0 + int(s * 1e9), PositionSource.LOCAL, p, v))
     return georeferencer
@@ -47,7 +60,9 @@ def test_exact_positions_give_the_exact_similarity() -> None:
     assert found is not None
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=1e-3)
     np.testing.assert_allclose(found.world_from_map.rotation, TRUTH.rotation, atol=2e-3)
-    np.testing.assert_allclose(found.world_from_map.apply(kept[3].map_from_camera.translation), ned[3], atol=0.05)
+    np.testing.assert_allclose(
+        found.world_from_map.apply(kept[3].map_from_camera.translation), ned[3], atol=0.05
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -56,7 +71,9 @@ def test_slow_drift_of_a_metre_is_within_the_stated_sigma(seed: int) -> None:
     kept, ned = places(attitude_error_rad=0.05)
     drift = np.zeros_like(ned)
     for i in range(1, len(ned)):
-        drift[i] = drift[i - 1] * np.exp(-0.5 / 40) + rng.normal(size=3) * np.sqrt(1 - np.exp(-1.0 / 40))
+        drift[i] = drift[i - 1] * np.exp(-0.5 / 40) + rng.normal(size=3) * np.sqrt(
+            1 - np.exp(-1.0 / 40)
+        )
     found = reference(ned, drift, rng.normal(scale=0.1, size=(200, 3))).solve(kept)
     assert found is not None
     error = abs(np.log(found.world_from_map.scale / TRUTH.scale))

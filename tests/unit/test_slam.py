@@ -14,7 +14,9 @@ from companion.messages import Frame, KeyframeAdded, Track, TrackState
 from companion.slam.tracker import Prior, Tracker
 from tests.support.scene import DOWN_LOOKING, PlaneWorld, aligned_error
 
-CAMERA = Camera(320, 240, 260.0, 258.0, 161.0, 118.0, Distortion.RADTAN, (-0.1, 0.02, 1e-3, -5e-4, 0.0))
+CAMERA = Camera(
+    320, 240, 260.0, 258.0, 161.0, 118.0, Distortion.RADTAN, (-0.1, 0.02, 1e-3, -5e-4, 0.0)
+)
 
 
 def nothing(_: str) -> nullcontext[None]:
@@ -24,7 +26,9 @@ def nothing(_: str) -> nullcontext[None]:
 def path(k: int) -> Pose:
     """Eastward at 12 m with some roll, pitch and yaw."""
     wobble = rotation_from_vector(np.array([0.03 * np.sin(k / 5), 0.04 * np.cos(k / 7), 0.01 * k]))
-    return Pose(wobble @ DOWN_LOOKING, np.array([0.1 * k - 3, 0.25 * k - 5, -12.0 - 0.3 * np.sin(k / 6)]))
+    return Pose(
+        wobble @ DOWN_LOOKING, np.array([0.1 * k - 3, 0.25 * k - 5, -12.0 - 0.3 * np.sin(k / 6)])
+    )
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +37,9 @@ def images() -> list[np.ndarray]:
     return [world.render(CAMERA, path(k))[0] for k in range(40)]
 
 
-def run(images: list[np.ndarray], attitude: bool, blind: range = range(0)) -> tuple[Tracker, dict[int, Track], list[Track]]:
+def run(
+    images: list[np.ndarray], attitude: bool, blind: range = range(0)
+) -> tuple[Tracker, dict[int, Track], list[Track]]:
     tracker = Tracker(Config(), CAMERA, nothing)
     tracks: dict[int, Track] = {}
     every: list[Track] = []
@@ -62,13 +68,17 @@ def positions(tracker: Tracker, tracks: dict[int, Track]) -> tuple[Array, Array]
     for seq, track in sorted(tracks.items()):
         keyframe = tracker.map.keyframes[track.keyframe_id]
         assert track.keyframe_from_camera is not None
-        estimated.append((keyframe.camera_from_map.inverse() @ track.keyframe_from_camera).translation)
+        estimated.append(
+            (keyframe.camera_from_map.inverse() @ track.keyframe_from_camera).translation
+        )
         truth.append(path(seq).translation)
     return np.array(estimated), np.array(truth)
 
 
 @pytest.mark.parametrize("attitude", [False, True], ids=["vision alone", "with attitude"])
-def test_every_frame_of_an_easy_flight_is_tracked_to_centimetres(images: list[np.ndarray], attitude: bool) -> None:
+def test_every_frame_of_an_easy_flight_is_tracked_to_centimetres(
+    images: list[np.ndarray], attitude: bool
+) -> None:
     tracker, tracks, _ = run(images, attitude)
     assert sorted(tracks) == list(range(len(images))), "frames before the map are filled in"
     error, _ = aligned_error(*positions(tracker, tracks))
@@ -94,7 +104,9 @@ def test_two_runs_give_the_same_poses_to_the_last_bit(images: list[np.ndarray]) 
         assert np.array_equal(track.map_from_camera.matrix(), other.map_from_camera.matrix())
 
 
-def test_a_blinded_camera_is_lost_honestly_and_found_again_in_the_same_map(images: list[np.ndarray]) -> None:
+def test_a_blinded_camera_is_lost_honestly_and_found_again_in_the_same_map(
+    images: list[np.ndarray],
+) -> None:
     blind = range(22, 26)
     tracker, tracks, every = run(images, attitude=True, blind=blind)
     assert {t.seq for t in every if t.state is TrackState.LOST} >= set(blind)
@@ -109,7 +121,9 @@ def test_a_camera_that_only_turns_starts_no_map() -> None:
     world = PlaneWorld(np.random.default_rng(3))
     tracker = Tracker(Config(), CAMERA, nothing)
     for k in range(12):
-        pose = Pose(rotation_from_vector(np.array([0, 0, 0.03 * k])) @ DOWN_LOOKING, np.array([0, 0, -12.0]))
+        pose = Pose(
+            rotation_from_vector(np.array([0, 0, 0.03 * k])) @ DOWN_LOOKING, np.array([0, 0, -12.0])
+        )
         image, _ = world.render(CAMERA, pose)
         frame = Frame(k, k * 100_000_000, image, np.repeat(image[..., None], 3, 2))
         for message in tracker.step(frame, Prior(None, pose.rotation)):
@@ -123,6 +137,8 @@ def test_an_image_of_nothing_yields_no_pose(level: int) -> None:
     tracker = Tracker(Config(), CAMERA, nothing)
     grey = np.full((240, 320), level, np.uint8)
     for k in range(4):
-        (track,) = tracker.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)), Prior(None, None))
+        (track,) = tracker.step(
+            Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)), Prior(None, None)
+        )
         assert isinstance(track, Track)
         assert track.map_from_camera is None

@@ -1,0 +1,137 @@
+"""A logged flight through the very stages that fly: from folder to map, recording and report."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import shlex
+import sys
+from collections.abc import Iterable
+from contextlib import ExitStack
+from importlib import metadata
+from pathlib import Path
+
+from companion import __version__
+from companion.clock import StageTimes, monotonic_s
+from companion.config import Config
+from companion.config_file import dump
+from companion.depth.opencl import ComputeDevice, open_device
+from companion.depth.stage import DepthStage
+from companion.errors import FlightError
+from companion.localisation import LocalisationStage
+from companion.messages import Frame, Message
+from companion.output.flight_result import FlightResult, RunFacts
+from companion.output.write import write_results
+from companion.paced import PacedFeed
+from companion.pipeline import Pipeline, Sink, in_order_of_time
+from companion.progress import Progress
+from companion.viewer import FileViewer, LiveViewer
+from drivers.flight_folder import Flight, TelemetryLog, open_flight
+
+LIBRARIES = ("numpy", "opencv-python-headless", "pyopencl", "pymavlink", "filterpy", "rerun-sdk")
+LEAD_NS = 10_000_000_000
+"""Telemetry from so long before the first frame is used."""
+
+
+def replay(
+    flight_path: Path,
+    out: Path,
+    config: Config,
+    *,
+    start_s: float | None,
+    stop_s: float | None,
+    viewer: str,
+    paced: bool,
+    progress: Progress,
+) -> FlightResult:
+    """Replay a flight into the folder `out`; InputError when it cannot begin.
+
+    What was done so far is written also when it is interrupted or fails on the way.
+    """
+    flight = open_flight(flight_path, config.camera)
+    start_ns, stop_ns = _span(flight, start_s, stop_s)
+    log = flight.telemetry()
+    device = open_device(config.opencl) if config.depth.enabled else None
+    out.mkdir(parents=True, exist_ok=True)
+    times = StageTimes()
+    result = FlightResult()
+    began_s = monotonic_s()
+    completed = False
+    dropped: dict[str, int] = {}
+    with ExitStack() as stack:
+        sinks: list[Sink] = [result]
+        recording = stack.enter_context(
+            FileViewer(config.viewer, flight.camera, out / "flight.rrd")
+        )
+        sinks.append(recording)
+        if viewer != "none":
+            live = stack.enter_context(LiveViewer(config.viewer, flight.camera, viewer))
+            sinks.append(live)
+        depth = _depth_stage(config, flight, device)
+        pipeline = Pipeline(
+            LocalisationStage(config, flight.camera, times), depth, sinks, lossless=not paced
+        )
+        try:
+            dropped = _run(pipeline, result, flight, log, start_ns, stop_ns, paced, progress)
+            completed = True
+        finally:
+            progress.finish()
+            pipeline.finish()
+            dropped["depth frames"] = pipeline.n_depth_frames_dropped
+            facts = RunFacts(
+                stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
+                origin=log.origin, device=device.name if device else "none (depth.enabled = false)",
+                config=dump(config), versions=_versions(), command=shlex.join(sys.argv),
+                peak_memory_mb=_peak_memory_mb(), camera=flight.camera, n_frames_total=flight.n_frames,
+                completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
+            )  # fmt: skip
+            write_results(out, result, facts, config.cloud.voxel_m)
+    return result
+
+
+def _span(flight: Flight, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
+    start_ns = flight.start_ns + int((start_s or 0.0) * 1e9)
+    stop_ns = flight.stop_ns if stop_s is None else flight.start_ns + int(stop_s * 1e9)
+    if start_ns > flight.stop_ns:
+        length = (flight.stop_ns - flight.start_ns) * 1e-9
+        raise FlightError(f"--start {start_s:g}: the flight is only {length:.1f} s long")
+    return start_ns, stop_ns
+
+
+def _depth_stage(config: Config, flight: Flight, device: ComputeDevice | None) -> DepthStage | None:
+    if device is None:
+        return None
+    return DepthStage(config.depth, config.cloud, flight.camera, device)
+
+
+def _run(
+    pipeline: Pipeline, result: FlightResult, flight: Flight, log: TelemetryLog,
+    start_ns: int, stop_ns: int, paced: bool, progress: Progress,
+) -> dict[str, int]:  # fmt: skip
+    for warning in log.warnings:
+        pipeline.feed(warning)
+    samples = [s for s in log.samples if start_ns - LEAD_NS <= s.t_ns <= stop_ns]
+    feed: Iterable[Message] = in_order_of_time(samples, flight.frames(start_ns, stop_ns))
+    player = PacedFeed(feed) if paced else None
+    progress.start(_frames_between(flight, start_ns, stop_ns))
+    done = 0
+    for message in player or feed:
+        pipeline.feed(message)
+        if isinstance(message, Frame):
+            done += 1
+            progress.update(done, pipeline.state, result.n_points)
+    return {"frames": player.n_dropped if player else 0}
+
+
+def _frames_between(flight: Flight, start_ns: int, stop_ns: int) -> int:
+    whole = max(flight.stop_ns - flight.start_ns, 1)
+    return max(round(flight.n_frames * (min(stop_ns, flight.stop_ns) - start_ns) / whole), 1)
+
+
+def _versions() -> dict[str, str]:
+    found = {name: metadata.version(name) for name in LIBRARIES}
+    return {"companion": __version__, "python": platform.python_version(), **found}
+
+
+def _peak_memory_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
