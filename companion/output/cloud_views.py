@@ -158,7 +158,7 @@ def _view(
 
 
 def _splat_px(pixels: Array) -> int:
-    """Side of the squares that just close the gaps between neighbours, from how dense points lie."""
+    """Side of squares that just close the gaps between neighbours, by how dense points lie."""
     cells = np.unique(np.floor(pixels / 16).astype(np.int64), axis=0)
     per_cell = len(pixels) / len(cells)
     return int(np.clip(np.ceil(1.3 * 16 / np.sqrt(per_cell)), 1, MAX_SPLAT_PX))

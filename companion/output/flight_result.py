@@ -102,6 +102,7 @@ class FlightResult:
         self.update: MapUpdate | None = None
         self._tracks: dict[int, Track] = {}
         self._chunks: dict[int, PointChunk] = {}
+        self._n_points = 0
         self._positions: dict[PositionSource, list[tuple[int, Array]]] = {}
         self._pictures = DepthPictures()
 
@@ -120,6 +121,7 @@ class FlightResult:
             self.update = message
         elif isinstance(message, PointChunk):
             self._chunks[message.keyframe_id] = message
+            self._n_points += len(message.points_camera)
         elif isinstance(message, DepthMap):
             self._pictures.take(message)
         elif isinstance(message, PositionSample):
@@ -147,6 +149,11 @@ class FlightResult:
     def n_keyframes(self) -> int:
         """Keyframes of the map as it ended."""
         return len(self.update.map_from_camera) if self.update is not None else 0
+
+    @property
+    def n_points(self) -> int:
+        """Points of all keyframes, before they are thinned together."""
+        return self._n_points
 
     @property
     def n_depth_maps(self) -> int:

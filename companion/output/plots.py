@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -46,7 +48,7 @@ MAX_POINTS = 3000
 def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> str:
     """The way from above, north up and east right; positions (N, 3) north, east, down."""
     everything = [*stretches, *([autopilot] if autopilot is not None else [])]
-    with matplotlib.rc_context({**STYLE, "svg.hashsalt": "plan"}):
+    with _style("plan"):
         low, high = _bounds(everything)
         tall = float(np.clip((high[0] - low[0]) / max(high[1] - low[1], 1e-9), 0.45, 1.1))
         figure = Figure(figsize=(6.4, 5.6 * tall + 0.8), layout="constrained")
@@ -74,7 +76,7 @@ def height_svg(
     duration_s: float,
 ) -> str:
     """Height over time, of pairs of seconds (N,) and positions (N, 3) north, east, down."""
-    with matplotlib.rc_context({**STYLE, "svg.hashsalt": "height"}):
+    with _style("height"):
         figure = Figure(figsize=(6.4, 2.9), layout="constrained")
         axes = figure.add_subplot()
         if autopilot is not None:
@@ -82,7 +84,7 @@ def height_svg(
             line = _thin(np.stack([t_s, -position[:, 2]], 1))
             axes.plot(*line.T, color=OTHER, lw=1.4, label="autopilot")
         _draw_stretches(axes, [np.stack([t, -p[:, 2]], 1) for t, p in stretches])
-        axes.set_ylabel("height [m]" if unit == "m" else f"−z [{unit}]")
+        axes.set_ylabel("height [m]" if unit == "m" else f"-z [{unit}]")
         _time_axis(axes, duration_s)
         _legend(axes)
         return _svg(figure)
@@ -90,7 +92,7 @@ def height_svg(
 
 def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
     """Map points found in each frame, over bands where the place was not known."""
-    with matplotlib.rc_context({**STYLE, "svg.hashsalt": "tracking"}):
+    with _style("tracking"):
         figure = Figure(figsize=(11.6, 2.6), layout="constrained")
         axes = figure.add_subplot()
         t_s = np.array([(track.t_ns - tracks[0].t_ns) * 1e-9 for track in tracks])
@@ -114,7 +116,7 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
 
 def stages_svg(stage_times: Mapping[str, Mapping[str, float]]) -> str:
     """Milliseconds for one call of each stage: bars to the median, lines to the 95th percentile."""
-    with matplotlib.rc_context({**STYLE, "svg.hashsalt": "stages"}):
+    with _style("stages"):
         names = sorted(stage_times, key=lambda name: -stage_times[name]["total_s"])
         figure = Figure(figsize=(6.4, 0.32 * len(names) + 0.9), layout="constrained")
         axes = figure.add_subplot()
@@ -135,6 +137,12 @@ def stages_svg(stage_times: Mapping[str, Mapping[str, float]]) -> str:
         return _svg(figure)
 
 
+def _style(name: str) -> AbstractContextManager[None]:
+    """The report's style; the plot's name keeps its element ids apart from those of others."""
+    style: Any = {**STYLE, "svg.hashsalt": name}
+    return matplotlib.rc_context(style)
+
+
 def _draw_stretches(axes: Axes, lines: Sequence[Array]) -> None:
     for n, line in enumerate(lines):
         axes.plot(*_thin(line).T, color=PATH, lw=1.8, label="camera" if n == 0 else "_")
@@ -144,7 +152,8 @@ def _thin(line: Array) -> Array:
     """At most `MAX_POINTS` of a line's points, its ends among them."""
     if len(line) <= MAX_POINTS:
         return line
-    return line[np.linspace(0, len(line) - 1, MAX_POINTS).round().astype(int)]
+    thinned: Array = line[np.linspace(0, len(line) - 1, MAX_POINTS).round().astype(int)]
+    return thinned
 
 
 def _bounds(parts: Sequence[Array]) -> tuple[Array, Array]:
