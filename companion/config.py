@@ -54,6 +54,16 @@ class CameraConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class TelemetryConfig:
+    """How the autopilot's log is put on the flight's clock."""
+
+    offset_s: Annotated[float, Range(-1e10, 1e10)] = 0.0
+    """Added to all times of the log, for a log or a video whose clock was set wrong."""
+    starts_with_video: bool = False
+    """Whether a log without absolute time is taken to begin with the video; else it is not used."""
+
+
+@dataclass(frozen=True, slots=True)
 class FeaturesConfig:
     """The ORB front end."""
 
@@ -172,6 +182,7 @@ class Config:
     """All sections."""
 
     camera: CameraConfig = field(default_factory=CameraConfig)
+    telemetry: TelemetryConfig = field(default_factory=TelemetryConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)

@@ -1,1 +1,1 @@
-"""The edge towards cameras, autopilots and recorded flights: everything becomes stamped messages."""
+"""The edge towards cameras, autopilots and recorded flights: all becomes stamped messages."""
