@@ -26,7 +26,8 @@ from companion.paced import PacedFeed
 from companion.pipeline import Pipeline, Sink, in_order_of_time
 from companion.progress import Progress
 from companion.viewer import FileViewer, LiveViewer
-from drivers.flight_folder import Flight, TelemetryLog, open_flight
+from drivers.flight_folder import Flight, open_flight
+from drivers.telemetry_log import TelemetryLog
 
 LIBRARIES = ("numpy", "opencv-python-headless", "pyopencl", "pymavlink", "filterpy", "rerun-sdk")
 LEAD_NS = 10_000_000_000
@@ -48,7 +49,7 @@ def replay(
 
     What was done so far is written also when it is interrupted or fails on the way.
     """
-    flight = open_flight(flight_path, config.camera)
+    flight = open_flight(flight_path, config.camera, config.telemetry)
     start_ns, stop_ns = _span(flight, start_s, stop_s)
     log = flight.telemetry()
     device = open_device(config.opencl) if config.depth.enabled else None
@@ -82,7 +83,7 @@ def replay(
                 stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
                 origin=log.origin, device=device.name if device else "none (depth.enabled = false)",
                 config=dump(config), versions=_versions(), command=shlex.join(sys.argv),
-                peak_memory_mb=_peak_memory_mb(), camera=flight.camera, n_frames_total=flight.n_frames,
+                peak_memory_mb=_peak_memory_mb(), camera=flight.camera, n_frames_total=flight.n_frames_between(start_ns, stop_ns),
                 completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
             )  # fmt: skip
             write_results(out, result, facts, config.cloud.voxel_m)
@@ -92,9 +93,11 @@ def replay(
 def _span(flight: Flight, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
     start_ns = flight.start_ns + int((start_s or 0.0) * 1e9)
     stop_ns = flight.stop_ns if stop_s is None else flight.start_ns + int(stop_s * 1e9)
-    if start_ns > flight.stop_ns:
-        length = (flight.stop_ns - flight.start_ns) * 1e-9
-        raise FlightError(f"--start {start_s:g}: the flight is only {length:.1f} s long")
+    if flight.n_frames_between(start_ns, stop_ns) == 0:
+        length_s = (flight.stop_ns - flight.start_ns) * 1e-9
+        raise FlightError(
+            f"{flight.path}: no frame between --start and --stop; it is {length_s:.1f} s long"
+        )
     return start_ns, stop_ns
 
 
@@ -108,12 +111,12 @@ def _run(
     pipeline: Pipeline, result: FlightResult, flight: Flight, log: TelemetryLog,
     start_ns: int, stop_ns: int, paced: bool, progress: Progress,
 ) -> dict[str, int]:  # fmt: skip
-    for warning in log.warnings:
+    for warning in (*flight.warnings, *log.warnings):
         pipeline.feed(warning)
     samples = [s for s in log.samples if start_ns - LEAD_NS <= s.t_ns <= stop_ns]
     feed: Iterable[Message] = in_order_of_time(samples, flight.frames(start_ns, stop_ns))
     player = PacedFeed(feed) if paced else None
-    progress.start(_frames_between(flight, start_ns, stop_ns))
+    progress.start(flight.n_frames_between(start_ns, stop_ns))
     done = 0
     for message in player or feed:
         pipeline.feed(message)
@@ -121,11 +124,6 @@ def _run(
             done += 1
             progress.update(done, pipeline.state, result.n_points)
     return {"frames": player.n_dropped if player else 0}
-
-
-def _frames_between(flight: Flight, start_ns: int, stop_ns: int) -> int:
-    whole = max(flight.stop_ns - flight.start_ns, 1)
-    return max(round(flight.n_frames * (min(stop_ns, flight.stop_ns) - start_ns) / whole), 1)
 
 
 def _versions() -> dict[str, str]:

@@ -61,7 +61,7 @@ class Scene:
         self._state: TrackState | None = None
         self._speed_from: tuple[int, Array] | None = None
         recording.log("world", rr.ViewCoordinates.FRD, static=True)
-        recording.log("world/map", rr.Transform3D(), static=False)
+        recording.log("world/map", rr.Transform3D(translation=[0.0, 0.0, 0.0]), static=True)
         width, height = round(camera.width * self._shrink), round(camera.height * self._shrink)
         matrix = camera.matrix()
         matrix[:2] *= self._shrink
