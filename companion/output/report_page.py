@@ -37,7 +37,7 @@ def report_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(length=length, count=count, number=number)
+    environment.filters.update(distance=distance, thousands=thousands, number=number)
     stretches = path_stretches(poses)
     page = environment.get_template("report.html.j2").render(
         n=numbers,
@@ -74,10 +74,10 @@ def when(t_ns: int | None) -> str | None:
     return f"{moment.day} {moment:%B %Y, %H:%M:%S} UTC"
 
 
-def length(value: float, unit: str = "m") -> str:
+def distance(value: float, unit: str = "m") -> str:
     """A length to three digits or so.
 
-    >>> length(0.0342), length(7.26), length(1234.5)
+    >>> distance(0.0342), distance(7.26), distance(1234.5)
     ('0.034 m', '7.26 m', '1,234 m')
     """
     return f"{number(value)} {unit}"
@@ -91,7 +91,7 @@ def number(value: float) -> str:
     return f"{value:,.{digits}f}"
 
 
-def count(value: int) -> str:
+def thousands(value: int) -> str:
     """A count in thousands, with commas."""
     return f"{value:,}"
 
