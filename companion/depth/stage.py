@@ -57,6 +57,8 @@ class DepthStage:
         self._held: OrderedDict[int, _Held] = OrderedDict()
         self._waiting: list[KeyframeAdded] = []
         self._update: MapUpdate | None = None
+        self._last_reference: int | None = None
+        self._half_view_rad = float(np.arctan(0.5 * camera.width / fx))
 
     def step(self, message: Message) -> list[Message]:
         """Take one message, in order of time."""
@@ -105,10 +107,13 @@ class DepthStage:
             return []
         z = keyframe.points_camera[:, 2]
         z = z[z > 0]
+        if not self._view_has_moved(keyframe, place, float(np.median(z))):
+            return []
         near, far = 0.5 * float(np.quantile(z, 0.02)), 2.5 * float(np.quantile(z, 0.98))
         chosen = self._choose(keyframe, update, place, float(np.median(z)))
         if len(chosen) < 3:
             return []
+        self._last_reference = keyframe.keyframe_id
         self._engine.begin(held.grey, near, far)
         for seq, current_from_reference in chosen:
             self._engine.update(self._held[seq].grey, current_from_reference)
@@ -119,6 +124,21 @@ class DepthStage:
         self._forget(keyframe)
         chunks: list[PointChunk] = self._fusion.add(depth_map, update)
         return [depth_map, *chunks]
+
+    def _view_has_moved(
+        self, keyframe: KeyframeAdded, place: Similarity, median_depth: float
+    ) -> bool:
+        """Whether a keyframe sees enough that the last reference did not."""
+        last = self._last_reference
+        update = self._update
+        before = None if last is None or update is None else update.place_of(last)
+        if before is None:
+            return True
+        relative = before.inverse() @ place
+        step = float(np.linalg.norm(relative.translation)) / relative.scale / median_depth
+        turn = float(np.arccos(np.clip(relative.rotation[2, 2], -1, 1)))
+        # a step towards a far point shows little, a turn by a tenth of the image a tenth
+        return step > self._config.reference_step or turn > 0.2 * self._half_view_rad
 
     def _choose(
         self, keyframe: KeyframeAdded, update: MapUpdate, place: Similarity, median_depth: float
