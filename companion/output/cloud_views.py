@@ -14,7 +14,6 @@ from companion.messages import Bytes
 from companion.output.flight_result import Cloud
 
 WIDTH_PX = 1100
-MAX_HEIGHT_PX = 900
 FINER = 2
 """Views are drawn so much larger and then reduced, which smooths edges."""
 MAX_SPLAT_PX = 9
@@ -51,9 +50,9 @@ def cloud_views(cloud: Cloud, stretches: Sequence[Array]) -> list[CloudView]:
     slant_heading = heading + np.radians(30)
     slant = f"At a slant, looking {compass_point(slant_heading)}"
     return [
-        _view("From above", cloud, stretches, 0.0, np.pi / 2),
-        _view(side, cloud, stretches, heading, 0.0),
-        _view(slant, cloud, stretches, slant_heading, np.radians(35)),
+        _view("From above", cloud, stretches, 0.0, np.pi / 2, (1.3, 3.0)),
+        _view(side, cloud, stretches, heading, 0.0, (1.6, 1.6)),
+        _view(slant, cloud, stretches, slant_heading, np.radians(35), (1.6, 1.6)),
     ]
 
 
@@ -127,20 +126,19 @@ def splat(
 
 
 def _view(
-    title: str, cloud: Cloud, stretches: Sequence[Array], heading_rad: float, pitch_rad: float
+    title: str,
+    cloud: Cloud,
+    stretches: Sequence[Array],
+    heading_rad: float,
+    pitch_rad: float,
+    aspects: tuple[float, float],
 ) -> CloudView:
     axes = view_axes(heading_rad, pitch_rad)
     seen = cloud.points.astype(np.float64) @ axes.T
     flown = [stretch @ axes.T for stretch in stretches]
-    low, high = np.percentile(seen[:, :2], [0.5, 99.5], axis=0)
-    for stretch in flown:
-        low = np.minimum(low, stretch[:, :2].min(0))
-        high = np.maximum(high, stretch[:, :2].max(0))
-    margin = 0.03 * max(float((high - low).max()), 1e-6)
-    low, high = low - margin, high + margin
-    extent = high - low
-    px_per_unit = min(WIDTH_PX / extent[0], MAX_HEIGHT_PX / extent[1])
-    width, height = (max(16, int(np.ceil(v * px_per_unit))) for v in extent)
+    low, high = _frame(seen, flown, aspects)
+    px_per_unit = WIDTH_PX / (high[0] - low[0])
+    width, height = WIDTH_PX, round((high[1] - low[1]) * px_per_unit)
 
     def to_pixels(points: Array) -> Array:
         across = (points[:, 0] - low[0]) * px_per_unit
@@ -157,11 +155,30 @@ def _view(
     )  # fmt: skip
 
 
+def _frame(
+    seen: Array, flown: Sequence[Array], aspects: tuple[float, float]
+) -> tuple[Array, Array]:
+    """Corners (2,), low and high, around the path and all but stray points.
+
+    Width over height lies within `aspects`: what is too narrow or too low gets room beside it.
+    """
+    low, high = np.percentile(seen[:, :2], [0.2, 99.8], axis=0)
+    for line in flown:
+        low = np.minimum(low, line[:, :2].min(0))
+        high = np.maximum(high, line[:, :2].max(0))
+    extent = high - low + 0.08 * max(float((high - low).max()), 1e-6)
+    least, most = aspects
+    width = max(extent[0], least * extent[1])
+    half = np.array([width, max(extent[1], width / most)]) / 2
+    middle = (low + high) / 2
+    return middle - half, middle + half
+
+
 def _splat_px(pixels: Array) -> int:
     """Side of squares that just close the gaps between neighbours, by how dense points lie."""
     cells = np.unique(np.floor(pixels / 16).astype(np.int64), axis=0)
     per_cell = len(pixels) / len(cells)
-    return int(np.clip(np.ceil(1.3 * 16 / np.sqrt(per_cell)), 1, MAX_SPLAT_PX))
+    return int(np.clip(np.ceil(1.6 * 16 / np.sqrt(per_cell)), 1, MAX_SPLAT_PX))
 
 
 def _shade(nearest: Array, unit_per_px: float) -> Array:

@@ -106,7 +106,7 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
                 transform=axes.get_xaxis_transform(), color=colour, alpha=0.35, lw=0,
                 label=state.value if here.any() else "_",
             )  # fmt: skip
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.08 * max(float(np.nanmax(found, initial=0.0)), 1.0))
         axes.set_ylabel("points")
         axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
         _time_axis(axes, duration_s)

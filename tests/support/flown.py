@@ -1,4 +1,4 @@
-"""A made-up flight's messages: a square flown over a coloured hill, all of whose numbers are known."""
+"""A made-up flight: a square flown over a coloured hill, all of whose numbers are known."""
 
 from __future__ import annotations
 
