@@ -16,7 +16,7 @@ from companion.output.flight_result import Cloud
 WIDTH_PX = 1100
 FINER = 2
 """Views are drawn so much larger and then reduced, which smooths edges."""
-MAX_SPLAT_PX = 9
+MAX_SPLAT_PX = 25
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
@@ -106,23 +106,16 @@ def splat(
 
     Returns the picture (H, W, 3) and how far ahead each pixel is (H, W), inf where nothing is.
     """
-    picture = np.zeros((height * width, 3), np.uint8)
-    nearest = np.full(height * width, np.inf)
-    order = np.argsort(-ahead, kind="stable")  # the last one written to a pixel is the nearest
-    corner = np.floor(pixels[order] - (size - 1) / 2 + 0.5).astype(np.int64)
-    ahead, rgb = ahead[order], rgb[order]
-    for down in range(size):
-        for along in range(size):
-            u, v = corner[:, 0] + along, corner[:, 1] + down
-            inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-            index = v[inside] * width + u[inside]
-            layer = np.full(height * width, -1, np.int64)
-            layer[index] = np.flatnonzero(inside)
-            hit = np.flatnonzero(layer >= 0)
-            hit = hit[ahead[layer[hit]] < nearest[hit]]
-            nearest[hit] = ahead[layer[hit]]
-            picture[hit] = rgb[layer[hit]]
-    return picture.reshape(height, width, 3), nearest.reshape(height, width)
+    order = np.argsort(-ahead, kind="stable")
+    columns, rows = np.floor(pixels[order] + 0.5).astype(np.int64).T
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    rank = np.zeros((height, width))  # 0 is nothing, then the nearer the higher
+    rank[rows[inside], columns[inside]] = np.flatnonzero(inside) + 1.0
+    rank = np.asarray(cv2.dilate(rank, np.ones((size, size), np.uint8)))
+    point = order[rank.astype(np.int64) - 1]
+    known = rank > 0
+    picture: Bytes = np.where(known[..., None], rgb[point], np.uint8(0))
+    return picture, np.where(known, ahead[point], np.inf)
 
 
 def _view(

@@ -43,6 +43,8 @@ STYLE = {
     "legend.frameon": False,
 }
 MAX_POINTS = 3000
+MIN_HALF = 0.5
+"""Half the least extent of a plan: a camera that stood still is a point with room around it."""
 
 
 def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> str:
@@ -50,7 +52,8 @@ def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> 
     everything = [*stretches, *([autopilot] if autopilot is not None else [])]
     with _style("plan"):
         low, high = _bounds(everything)
-        tall = float(np.clip((high[0] - low[0]) / max(high[1] - low[1], 1e-9), 0.45, 1.1))
+        middle, half = (low + high) / 2, np.maximum(0.53 * (high - low), MIN_HALF)
+        tall = float(np.clip(half[0] / half[1], 0.45, 1.1))
         figure = Figure(figsize=(6.4, 5.6 * tall + 0.8), layout="constrained")
         axes = figure.add_subplot()
         if autopilot is not None:
@@ -63,8 +66,9 @@ def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> 
         metric = unit == "m"
         axes.set_xlabel("east [m]" if metric else f"y [{unit}]")
         axes.set_ylabel("north [m]" if metric else f"x [{unit}]")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.06)
+        axes.set_aspect("equal", adjustable="box")
+        axes.set_xlim(middle[1] - half[1], middle[1] + half[1])
+        axes.set_ylim(middle[0] - half[0], middle[0] + half[0])
         _legend(axes)
         return _svg(figure)
 
