@@ -14,7 +14,7 @@ from companion.geometry import Array, Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
 
 RADIUS = 3
-MAX_STEPS = 128
+MAX_STEPS = 48
 GROUP = 64
 BORDER_PX = RADIUS + 1
 A0, B0 = 4.0, 2.0

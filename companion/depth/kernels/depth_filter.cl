@@ -147,7 +147,7 @@ __kernel void update(__global const float *reference, __global const float *curr
         template_[j] *= scale;
 
     /* one pixel beyond both ends, so that a peak at an end has two sides */
-    const int steps = max((int)ceil((length_px + 2.0f) / 0.8f), 4);
+    const int steps = max((int)ceil((length_px + 2.0f) / 1.0f), 4);
     if (steps > MAX_STEPS)
         return;
     const float step = (length_px + 2.0f) / steps;
