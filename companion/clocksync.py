@@ -27,9 +27,11 @@ Times = NDArray[np.int64]
 REBOOT_NS = 1_000_000_000
 """A step back of autopilot time by more than this is a reboot; less is a message overtaken."""
 WINDOW_S = 2.0
-MAX_WINDOWS = 120
+MAX_WINDOWS = 60
 MIN_SIGMA_S = 1e-4
 """Trust in the best of exchanges: stamps are made by software at both ends."""
+FIX_LATENCY_S = 0.1
+"""What GPS receivers and drivers typically take from the time of a fix to its place in a log."""
 HUBER = 1.5
 LATE_DISCOUNT = 0.3
 """Least delays err to one side only: one that is late tells less than one that is early."""
@@ -68,6 +70,13 @@ class _Curve:
         offset_s = np.interp(inside, self.knots_s, self.offset_s) + self.slope * (t_s - inside)
         host: Times = remote_ns + self.base_ns + np.rint(offset_s * 1e9).astype(np.int64)
         return host
+
+    def reversed(self) -> _Curve:
+        """The curve of the same clocks when both run backwards."""
+        return _Curve(
+            -self.origin_ns, -self.base_ns, -self.knots_s[::-1], -self.offset_s[::-1],
+            self.slope, self.sigma_s,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +135,29 @@ def estimate_clock(
         n_reboots=len(numbers) - 1,
     )
     return ClockMap(report, curves)
+
+
+def clock_from_utc(stamps: NDArray[Any] | Sequence[tuple[int, int]]) -> ClockMap | None:
+    """Estimate the clock from UTC that a log itself holds, as by GPS; None where it holds none.
+
+    `stamps` (N, 2): autopilot time under which a fix was logged, UTC of the fix, in ns. A fix is
+    logged some time after it is valid, so the offset is above all of them by at least the least of
+    these delays, which cannot be seen and is counted in the uncertainty.
+    """
+    table = np.asarray(stamps, np.int64).reshape(-1, 2)
+    if not len(table):
+        return None
+    # seen in reversed time the fix is a message that comes after its stamp
+    singles = np.c_[-table, np.zeros(len(table), np.int64)]
+    curve = _fit(np.empty((0, 4), np.int64), singles).reversed()
+    report = ClockReport(
+        method="UTC of the log",
+        offset_s=float((curve.base_ns + curve.offset_s[0] * 1e9) * 1e-9),
+        drift_ppm=float(-1e6 * curve.slope / (1 + curve.slope)),
+        sigma_ms=1e3 * float(np.hypot(curve.sigma_s, FIX_LATENCY_S)),
+        n_reboots=0,
+    )
+    return ClockMap(report, {0: curve})
 
 
 def _fit(pairs: Times, singles: Times) -> _Curve:
@@ -236,15 +268,16 @@ def _cross_validated(basis: Array, stiffness: Array, weight: Array, value_s: Arr
     along = turn.T @ np.linalg.solve(root, right)
     back = np.linalg.solve(root.T, turn)
     n = len(value_s)
-    best_score = np.inf
-    best: Array = back @ along
-    for penalty in 10.0 ** np.arange(-1, 10):
+    level = float((weight * value_s).sum() / weight.sum())
+    best: Array = np.full(basis.shape[1], level)
+    best_score = n * float((weight * (value_s - level) ** 2).sum()) / (n - 1.4) ** 2
+    for penalty in 10.0 ** np.arange(9, -2, -1):  # of equals the stiffest, which is a constant
         gain = 1 / (1 + (penalty - 1) * bends)
         curve = back @ (gain * along)
         freedom = n - 1.4 * float((gain * (1 - bends)).sum())
         if freedom <= 0:
             continue
         score = n * float((weight * (value_s - basis @ curve) ** 2).sum()) / freedom**2
-        if score <= best_score * (1 + 1e-6):  # of equals the stiffest
+        if score < best_score * (1 - 1e-6):
             best_score, best = score, curve
     return best

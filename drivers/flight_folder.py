@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.camera import Camera
 from companion.config import CameraConfig, TelemetryConfig
@@ -17,7 +18,7 @@ from drivers.ahead import Ahead
 from drivers.calibration import assumed_camera, read_calibration
 from drivers.frame_source import FrameSource, find_frames
 from drivers.frame_times import read_frame_times
-from drivers.telemetry_folder import read_telemetry
+from drivers.telemetry_folder import Pictures, read_telemetry
 from drivers.telemetry_log import TelemetryLog
 
 FRAMES_AHEAD = 4
@@ -86,10 +87,22 @@ class Flight:
         FlightError where none of it is of the time of the frames.
         """
         if self._telemetry is None:
-            self._telemetry = read_telemetry(
-                self.path, self._source.path, self.start_ns, self.stop_ns, self._telemetry_config
+            pictures = Pictures(
+                self._source.path, self.start_ns, self.stop_ns, self._host_from_file_ns
             )
+            self._telemetry = read_telemetry(self.path, pictures, self._telemetry_config)
         return self._telemetry
+
+    def _host_from_file_ns(self, file_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Times on the flight's clock of times by the video's own, beyond its ends at its rate."""
+        own_ns = np.array(self._source.own_times_ns(), np.int64)[self._numbers]
+        inside = np.clip(file_ns, own_ns[0], own_ns[-1])
+        after_ns = np.interp(inside - own_ns[0], own_ns - own_ns[0], self._since_start())
+        out: NDArray[np.int64] = self.start_ns + after_ns.astype(np.int64) + (file_ns - inside)
+        return out
+
+    def _since_start(self) -> NDArray[np.int64]:
+        return np.array(self._times_ns, np.int64) - self.start_ns
 
     def _part(self, start_ns: int | None, stop_ns: int | None) -> tuple[int, int]:
         first = 0 if start_ns is None else bisect_left(self._times_ns, start_ns)
@@ -145,7 +158,8 @@ def open_flight(
 def _times(path: Path, source: FrameSource) -> tuple[list[int], list[int], list[Warned]]:
     listed = path / "frames.csv"
     if not listed.exists():
-        times_ns, epoch = source.own_times_ns()
+        epoch_ns, epoch = source.epoch()
+        times_ns = [epoch_ns + t_ns for t_ns in source.own_times_ns()]
         warned = Warned(
             times_ns[0], "no frames.csv: times are the file's own", f"counted from {epoch}"
         )

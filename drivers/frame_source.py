@@ -34,8 +34,11 @@ class FrameSource(Protocol):
     def n_frames(self) -> int:
         """How many there are."""
 
-    def own_times_ns(self) -> tuple[list[int], str]:
-        """Times that the pictures carry themselves, and in words what they count from."""
+    def own_times_ns(self) -> list[int]:
+        """Times of the pictures in their file, which begin about zero."""
+
+    def epoch(self) -> tuple[int, str]:
+        """Unix time in ns of zero of these, as far as the file knows, and that in words."""
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
         """Number and RGB image (H, W, 3) of pictures first..last, both included."""
@@ -89,13 +92,15 @@ class Video:
         """How many pictures the file holds, decodable or not."""
         return len(self._pts)
 
-    def own_times_ns(self) -> tuple[list[int], str]:
-        """Presentation times after the time of creation that the file states, else after zero."""
+    def own_times_ns(self) -> list[int]:
+        """Presentation times."""
         assert self._time_base is not None
         unit_ns = self._time_base * 1_000_000_000
-        epoch_ns = self._created_ns or 0
-        words = "the file's time of creation" if self._created_ns else "zero"
-        return [epoch_ns + round(pts * unit_ns) for pts in self._pts], words
+        return [round(pts * unit_ns) for pts in self._pts]
+
+    def epoch(self) -> tuple[int, str]:
+        """The time of creation that the file states, else zero."""
+        return self._created_ns, "the file's time of creation" if self._created_ns else "zero"
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
         """Number and RGB image of pictures first..last; None where one cannot be decoded."""
@@ -189,9 +194,13 @@ class ImageFolder:
         """How many image files there are."""
         return len(self._files)
 
-    def own_times_ns(self) -> tuple[list[int], str]:
+    def own_times_ns(self) -> list[int]:
         """Ten images a second: image files say nothing of time."""
-        return [number * 100_000_000 for number in range(self.n_frames)], "zero, at 10 images/s"
+        return [number * 100_000_000 for number in range(self.n_frames)]
+
+    def epoch(self) -> tuple[int, str]:
+        """Zero."""
+        return 0, "zero, at 10 images/s"
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
         """Number and RGB image of images first..last; None for a damaged or odd-sized one."""

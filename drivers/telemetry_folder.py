@@ -1,4 +1,4 @@
-"""Which log a flight folder has, and whether it is of the same flight as the video."""
+"""Which log a flight folder has, and whether it is of the same flight as the pictures."""
 
 from __future__ import annotations
 
@@ -6,32 +6,119 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from companion.config import TelemetryConfig
 from companion.errors import FlightError
 from companion.messages import Warned
-from drivers.telemetry_log import TelemetryLog
+from drivers.telemetry_dataflash import read_dataflash
+from drivers.telemetry_gpmf import read_gpmf
+from drivers.telemetry_log import HostTimes, LogContent, TelemetryLog
 from drivers.telemetry_tlog import read_tlog
+from drivers.telemetry_ulog import read_ulog
 
-READERS: dict[str, Callable[[Path], TelemetryLog]] = {".tlog": read_tlog}
+READERS: dict[str, Callable[[Path], LogContent]] = {
+    ".tlog": read_tlog,
+    ".bin": read_dataflash,
+    ".ulg": read_ulog,
+}
+Times = NDArray[np.int64]
 
 
-def read_telemetry(
-    folder: Path, pictures: Path, start_ns: int, stop_ns: int, config: TelemetryConfig
-) -> TelemetryLog:
-    """The log in a folder, shifted as configured; FlightError where it is of another time."""
-    logs = sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS)
-    if not logs:
-        missing = Warned(start_ns, "no telemetry: neither scale nor level will be known")
-        return TelemetryLog("", (), warnings=(missing,))
-    log = READERS[logs[0].suffix.lower()](logs[0])
-    if not log.samples:
-        empty = Warned(start_ns, "the telemetry is empty", logs[0].name)
-        return dataclasses.replace(log, warnings=(*log.warnings, empty))
-    first_ns, last_ns = log.samples[0].t_ns, log.samples[-1].t_ns
-    if last_ns < start_ns or first_ns >= stop_ns:
-        raise FlightError(
-            f"{logs[0]}: it is of another time than the video: telemetry "
-            f"{first_ns * 1e-9:.1f} to {last_ns * 1e-9:.1f} s, video {start_ns * 1e-9:.1f} to "
-            f"{stop_ns * 1e-9:.1f} s Unix time; set telemetry.offset_s if a clock was wrong"
+@dataclasses.dataclass(frozen=True, slots=True)
+class Pictures:
+    """When the pictures of a flight were taken, and their file with its times by its own clock."""
+
+    path: Path
+    start_ns: int
+    stop_ns: int
+    host_from_file_ns: Callable[[Times], Times]
+
+
+def read_telemetry(folder: Path, pictures: Pictures, config: TelemetryConfig) -> TelemetryLog:
+    """The log in a folder or in its video, on the flight's clock.
+
+    Of several logs the one that has most of the pictures' time. FlightError where there are logs
+    and none is of that time.
+    """
+    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS)
+    found = []
+    for path in paths:
+        found.append((path, _aligned(READERS[path.suffix.lower()](path), pictures, config)))
+    if not paths:
+        inside = read_gpmf(pictures.path, pictures.host_from_file_ns)
+        if inside is None:
+            missing = Warned(
+                pictures.start_ns, "no telemetry", "neither scale nor level will be known"
+            )
+            return TelemetryLog("", (), warnings=(missing,))
+        found.append((pictures.path, _aligned(inside, pictures, config)))
+    usable = [(path, log) for path, log in found if _overlap_ns(log, pictures) > 0]
+    if usable:
+        path, log = max(usable, key=lambda each: _overlap_ns(each[1], pictures))
+        if len(found) == 1:
+            return log
+        names = ", ".join(other.name for other, _ in found)
+        several = Warned(
+            pictures.start_ns, "several telemetry logs", f"{names}; taken: {path.name}"
         )
-    return log
+        return dataclasses.replace(log, warnings=(several, *log.warnings))
+    apart = [(path, log) for path, log in found if log.samples]
+    if apart:
+        raise FlightError(_of_another_time(*apart[0], pictures))
+    path, log = found[0]
+    empty = Warned(pictures.start_ns, "no telemetry that can be used", path.name)
+    return dataclasses.replace(log, warnings=(*log.warnings, empty))
+
+
+def _aligned(content: LogContent, pictures: Pictures, config: TelemetryConfig) -> TelemetryLog:
+    shift_ns = round(config.offset_s * 1e9)
+    host_ns, warnings = content.host_ns, list(content.warnings)
+    if host_ns is None and len(content.collected):
+        if not config.starts_with_video:
+            what = "telemetry has no absolute time and is not used"
+            detail = f"{content.collected.source}; telemetry.starts_with_video takes it as it is"
+            warnings.append(Warned(pictures.start_ns, what, detail))
+            return TelemetryLog(content.collected.source, (), warnings=tuple(warnings))
+        what = "telemetry has no absolute time and is taken to begin with the video"
+        warnings.append(Warned(pictures.start_ns, what, content.collected.source))
+        to_start_ns = pictures.start_ns - int(content.collected.stamps()[0].min())
+        host_ns = _shifted(_unchanged, to_start_ns)
+    clock = content.clock
+    if clock is not None and shift_ns:
+        clock = dataclasses.replace(clock, offset_s=clock.offset_s + config.offset_s)
+    armed = [
+        dataclasses.replace(sample, t_ns=sample.t_ns + shift_ns) for sample in content.on_host_clock
+    ]
+    return content.collected.finish(
+        _shifted(host_ns or _unchanged, shift_ns), clock, warnings, armed
+    )
+
+
+def _shifted(host_ns: HostTimes, shift_ns: int) -> HostTimes:
+    def times(remote_ns: Times, segment: Times) -> Times:
+        moved: Times = host_ns(remote_ns, segment) + shift_ns
+        return moved
+
+    return times
+
+
+def _unchanged(remote_ns: Times, segment: Times) -> Times:
+    return remote_ns
+
+
+def _overlap_ns(log: TelemetryLog, pictures: Pictures) -> int:
+    if not log.samples:
+        return 0
+    first_ns, last_ns = log.samples[0].t_ns, log.samples[-1].t_ns
+    return min(last_ns + 1, pictures.stop_ns) - max(first_ns, pictures.start_ns)
+
+
+def _of_another_time(path: Path, log: TelemetryLog, pictures: Pictures) -> str:
+    first_s, last_s = log.samples[0].t_ns * 1e-9, log.samples[-1].t_ns * 1e-9
+    return (
+        f"{path}: it is of another time than the pictures: telemetry {first_s:.1f} to {last_s:.1f}"
+        f" s, pictures {pictures.start_ns * 1e-9:.1f} to {pictures.stop_ns * 1e-9:.1f} s Unix time;"
+        " set telemetry.offset_s if a clock was wrong"
+    )

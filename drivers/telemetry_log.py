@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from companion.geometry import Array
 from companion.messages import (
+    ArmedSample,
     AttitudeSample,
     ClockReport,
     GeoOrigin,
@@ -99,7 +100,7 @@ class TelemetryCollector:
         host_ns: HostTimes,
         clock: ClockReport | None,
         warnings: Sequence[Warned] = (),
-        on_host_clock: Sequence[Telemetry] = (),
+        on_host_clock: Sequence[ArmedSample] = (),
     ) -> TelemetryLog:
         """Everything on the flight's clock and about one origin; `on_host_clock` already was."""
         times = host_ns(*self.stamps())
@@ -209,3 +210,18 @@ def _placed(
             content, t_ns=t_ns, position_ned_m=content.position_ned_m + moved
         )
     return dataclasses.replace(content, t_ns=t_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogContent:
+    """What a reader found in a log: samples, and how to put them on the flight's clock.
+
+    `host_ns` is None where the log has no absolute time. `on_host_clock` are samples that are on
+    the flight's clock already.
+    """
+
+    collected: TelemetryCollector
+    host_ns: HostTimes | None = None
+    clock: ClockReport | None = None
+    warnings: tuple[Warned, ...] = ()
+    on_host_clock: tuple[ArmedSample, ...] = ()

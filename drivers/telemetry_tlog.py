@@ -22,14 +22,14 @@ from drivers.mavlink_samples import (
     SAMPLE_OF,
     boot_ns,
 )
-from drivers.telemetry_log import TelemetryCollector, TelemetryLog
+from drivers.telemetry_log import LogContent, TelemetryCollector
 from drivers.tlog_records import Record, TlogRecords
 
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAX_ROUND_TRIP_NS = 2_000_000_000
 
 
-def read_tlog(path: Path) -> TelemetryLog:
+def read_tlog(path: Path) -> LogContent:
     """All that the autopilot of one vehicle said; an empty log where there is nothing to read."""
     log = path.read_bytes()
     packets = TlogRecords(log)
@@ -42,7 +42,7 @@ def read_tlog(path: Path) -> TelemetryLog:
     vehicle, n_vehicles = _vehicle(records)
     if vehicle is None:
         warnings.append(Warned(first_ns, "no autopilot in the telemetry", path.name))
-        return TelemetryLog(path.name, (), warnings=tuple(warnings))
+        return LogContent(TelemetryCollector(path.name), warnings=tuple(warnings))
     if n_vehicles > 1:
         detail = f"{n_vehicles} in {path.name}; taken is system {vehicle}"
         warnings.append(Warned(first_ns, "several vehicles in the telemetry", detail))
@@ -73,7 +73,7 @@ class _Reader:
         self._armed: bool | None = None
         self._unix_minus_boot_ns: int | None = None
 
-    def read(self, records: list[Record], warnings: list[Warned]) -> TelemetryLog:
+    def read(self, records: list[Record], warnings: list[Warned]) -> LogContent:
         mine = [
             record
             for record in records
@@ -85,11 +85,13 @@ class _Reader:
             if record.message_id in chosen:
                 self._take(record)
         clock = estimate_clock(self._exchanges, self._one_way)
-        if clock is None:
-            first_ns = records[0].unix_us * 1000
-            what = Warned(first_ns, "no telemetry with a stamp of the autopilot")
-            return TelemetryLog(self._collected.source, (), warnings=(*warnings, what))
-        return self._collected.finish(clock.host_ns, clock.report, warnings, self._unstamped)
+        return LogContent(
+            self._collected,
+            clock.host_ns if clock else None,
+            clock.report if clock else None,
+            tuple(warnings),
+            tuple(self._unstamped),
+        )
 
     def _take(self, record: Record) -> None:
         message = self._packets.decode(record)
@@ -109,9 +111,11 @@ class _Reader:
             return
         if kind == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME and message.time_unix_usec:
             self._unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
+        sample = SAMPLE_OF[kind](message) if kind in SAMPLE_OF else None
         remote_ns = boot_ns(message, self._unix_minus_boot_ns)
         if remote_ns is None:
-            self._collected.count("messages without boot time left out")
+            if sample is not None:
+                self._collected.count("messages without boot time left out")
             return
         segment = self._segments.segment_of(remote_ns)
         self._one_way.append((remote_ns, receive_ns, segment))
@@ -122,10 +126,8 @@ class _Reader:
                     message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3
                 ),
             )
-        elif kind in SAMPLE_OF:
-            sample = SAMPLE_OF[kind](message)
-            if sample is not None:
-                self._collected.add(remote_ns, segment, sample)
+        elif sample is not None:
+            self._collected.add(remote_ns, segment, sample)
 
     def _take_timesync(self, tc1: int, ts1: int, receive_ns: int) -> None:
         if tc1 == 0:  # the autopilot asks, and states its own time in doing so

@@ -1,0 +1,216 @@
+"""Telemetry as an ArduPilot autopilot logged it itself: DataFlash .BIN, of version 3.2 and later.
+
+The simulator's truth in simulated logs (SIM, SIM2) is not read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.clocksync import clock_from_utc
+from companion.geometry import Array, quaternion_from_euler
+from companion.messages import (
+    ArmedSample,
+    AttitudeSample,
+    GeoOrigin,
+    HeightSample,
+    ImuSample,
+    PositionSample,
+    PositionSource,
+    RangeSample,
+    Telemetry,
+    Warned,
+)
+from drivers.dataflash_records import DataflashRecords
+from drivers.mavlink_samples import FIX_3D, GPS_RANGE_ERROR_M
+from drivers.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
+
+KINDS = frozenset({
+    "ATT", "IMU", "XKF1", "NKF1", "EKF1", "POS", "GPS", "RFND", "BARO", "ARM", "EV", "ORGN",
+})  # fmt: skip
+FILTERS = ("XKF1", "NKF1", "EKF1")
+GPS_EPOCH_S = 315_964_800
+LEAP_SECONDS = 18
+"""UTC is behind GPS time by this since 2017."""
+EV_ARMED, EV_DISARMED = 10, 11
+EKF_ORIGIN = 0
+DOWN = 25
+RANGE_GOOD = 4
+MAX_BACK_NS, MAX_AHEAD_NS = 2_000_000_000, 60_000_000_000
+N_TO_BELIEVE = 50
+"""So many stamps in a row that jump are a gap in the log; fewer are damaged records."""
+
+Values = Mapping[str, Any]
+
+
+def read_dataflash(path: Path) -> LogContent:
+    """All of a log that can be read; without absolute time where it holds no GPS fix."""
+    log = path.read_bytes()
+    records = DataflashRecords(log, KINDS)
+    rows = list(records)
+    warnings = []
+    if records.n_damaged:
+        detail = f"{records.n_damaged} of {len(log)} bytes of {path.name} passed over"
+        warnings.append(Warned(0, "damaged telemetry", detail))
+    collected = TelemetryCollector(path.name)
+    counts = Counter(name for name, values in rows if values.get("C", 0) == 0)
+    chosen = _chosen(counts)
+    has_arm = counts["ARM"] > 0
+    clock = _Stamps()
+    utc: list[tuple[int, int]] = []
+    for name, values in rows:
+        boot_ns = clock.take(_boot_ns(name, values))
+        if boot_ns is None:
+            collected.count("records with an impossible time left out")
+            continue
+        if name == "ORGN" and values.get("Type") == EKF_ORIGIN:
+            origin = GeoOrigin(values["Lat"], values["Lng"], values["Alt"])
+            collected.origin.setdefault(0, origin)
+        if name == "GPS" and (fix_ns := _utc_ns(values)) is not None:
+            utc.append((boot_ns, fix_ns))
+        if name == "EV" and has_arm:
+            continue
+        for sample in _samples(name, values, chosen):
+            collected.add(boot_ns, 0, sample)
+    found = clock_from_utc(utc)
+    return LogContent(
+        collected,
+        found.host_ns if found else None,
+        found.report if found else None,
+        tuple(warnings),
+    )
+
+
+class _Stamps:
+    """Passes stamps on that can follow those before."""
+
+    def __init__(self) -> None:
+        self._latest_ns: int | None = None
+        self._n_jumped = 0
+
+    def take(self, boot_ns: int | None) -> int | None:
+        """The stamp itself, that of the record before for one without, None for a wild one."""
+        if boot_ns is None or self._latest_ns is None:
+            self._latest_ns = self._latest_ns if boot_ns is None else boot_ns
+            return self._latest_ns
+        if -MAX_BACK_NS <= boot_ns - self._latest_ns <= MAX_AHEAD_NS:
+            self._n_jumped = 0
+        else:
+            self._n_jumped += 1
+            if self._n_jumped < N_TO_BELIEVE:
+                return None
+        self._latest_ns = boot_ns
+        return boot_ns
+
+
+def _boot_ns(name: str, values: Values) -> int | None:
+    if "TimeUS" in values:
+        return int(values["TimeUS"]) * 1000
+    milliseconds = values.get("T") if name == "GPS" else values.get("TimeMS")
+    return None if milliseconds is None else int(milliseconds) * 1_000_000
+
+
+def _utc_ns(values: Values) -> int | None:
+    week = values.get("GWk", values.get("Week", 0))
+    in_week_ms = values.get("GMS", values.get("TimeMS", 0))
+    if values["Status"] < FIX_3D or week < 1000:
+        return None
+    seconds = GPS_EPOCH_S - LEAP_SECONDS + int(week) * 7 * 86400
+    return seconds * 10**9 + int(in_week_ms) * 10**6
+
+
+def _chosen(counts: Counter[str]) -> frozenset[str]:
+    """Which record gives the attitude and which the local position, of those that several do."""
+    filtered = next((name for name in FILTERS if counts[name]), None)
+    attitude = "ATT" if filtered is None or counts["ATT"] >= counts[filtered] else filtered
+    return frozenset({f"{attitude} attitude", f"{filtered} position"})
+
+
+def _samples(name: str, values: Values, chosen: frozenset[str]) -> list[Telemetry | GeodeticFix]:
+    # several of a kind are told apart by an instance or, for filters, a core: the first is taken
+    if values.get("I", 0) != 0 or values.get("C", 0) != 0 or values.get("Instance", 0) != 0:
+        return []
+    out: list[Telemetry | GeodeticFix | None] = []
+    if f"{name} attitude" in chosen:
+        out.append(_attitude(values))
+    if f"{name} position" in chosen:
+        out.append(_local_position(values))
+    elif name in _SAMPLE_OF:
+        out.append(_SAMPLE_OF[name](values))
+    return [sample for sample in out if sample is not None]
+
+
+def _attitude(values: Values) -> Telemetry | None:
+    angles = [math.radians(values[key]) for key in ("Roll", "Pitch", "Yaw")]
+    if not any(angles):  # before the filter runs
+        return None
+    return AttitudeSample(0, quaternion_from_euler(*angles))
+
+
+def _local_position(values: Values) -> Telemetry | None:
+    position = _vector(values, "PN", "PE", "PD")
+    return PositionSample(0, PositionSource.LOCAL, position, _vector(values, "VN", "VE", "VD"))
+
+
+def _global_position(values: Values) -> GeodeticFix | None:
+    if values["Lat"] == 0 and values["Lng"] == 0:
+        return None
+    return GeodeticFix(PositionSource.GLOBAL, values["Lat"], values["Lng"], float(values["Alt"]))
+
+
+def _gps(values: Values) -> GeodeticFix | None:
+    if values["Status"] < FIX_3D:
+        return None
+    course = math.radians(values["GCrs"])
+    velocity = np.array(
+        [values["Spd"] * math.cos(course), values["Spd"] * math.sin(course), values["VZ"]]
+    )
+    sigma = values["HDop"] * GPS_RANGE_ERROR_M
+    return GeodeticFix(
+        PositionSource.GPS, values["Lat"], values["Lng"], values["Alt"], velocity, sigma
+    )
+
+
+def _imu(values: Values) -> Telemetry:
+    gyro = _vector(values, "GyrX", "GyrY", "GyrZ")
+    return ImuSample(0, gyro, _vector(values, "AccX", "AccY", "AccZ"))
+
+
+def _range(values: Values) -> Telemetry | None:
+    distance = values.get("Dist", values.get("Dist1", 0.0))
+    down = values.get("Orient", values.get("Orient1", DOWN)) == DOWN
+    good = values.get("Stat", values.get("Stat1", RANGE_GOOD)) == RANGE_GOOD
+    return RangeSample(0, float(distance)) if down and good and distance > 0 else None
+
+
+def _height(values: Values) -> Telemetry:
+    return HeightSample(0, float(values["Alt"]))
+
+
+def _armed(values: Values) -> Telemetry:
+    return ArmedSample(0, bool(values["ArmState"]))
+
+
+def _event(values: Values) -> Telemetry | None:
+    return {EV_ARMED: ArmedSample(0, True), EV_DISARMED: ArmedSample(0, False)}.get(values["Id"])
+
+
+def _vector(values: Values, *keys: str) -> Array:
+    return np.array([values[key] for key in keys], np.float64)
+
+
+_SAMPLE_OF = {
+    "POS": _global_position,
+    "GPS": _gps,
+    "IMU": _imu,
+    "RFND": _range,
+    "BARO": _height,
+    "ARM": _armed,
+    "EV": _event,
+}
