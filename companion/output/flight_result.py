@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from companion.camera import Camera
+from companion.clock import StageTimes
 from companion.geometry import Array, Pose
 from companion.messages import (
     Bytes,
@@ -103,6 +105,7 @@ class FlightResult:
         self._tracks: dict[int, Track] = {}
         self._chunks: dict[int, PointChunk] = {}
         self._n_points = 0
+        self._kernel_ms: defaultdict[str, list[float]] = defaultdict(list)
         self._positions: dict[PositionSource, list[tuple[int, Array]]] = {}
         self._pictures = DepthPictures()
 
@@ -120,10 +123,14 @@ class FlightResult:
         elif isinstance(message, MapUpdate):
             self.update = message
         elif isinstance(message, PointChunk):
-            self._chunks[message.keyframe_id] = message
+            before = self._chunks.get(message.keyframe_id)
             self._n_points += len(message.points_camera)
+            self._n_points -= len(before.points_camera) if before is not None else 0
+            self._chunks[message.keyframe_id] = message
         elif isinstance(message, DepthMap):
             self._pictures.take(message)
+            for name, ms in message.kernel_ms.items():
+                self._kernel_ms[name].append(ms)
         elif isinstance(message, PositionSample):
             path = self._positions.setdefault(message.source, [])
             if not path or message.t_ns - path[-1][0] >= POSITION_STEP_NS:
@@ -159,6 +166,14 @@ class FlightResult:
     def n_depth_maps(self) -> int:
         """Depth maps that were made."""
         return self._pictures.n_seen
+
+    def kernel_times(self) -> dict[str, dict[str, float]]:
+        """What each kernel took for one depth map, in the form of `StageTimes.summary()`."""
+        times = StageTimes()
+        for name, durations in self._kernel_ms.items():
+            for ms in durations:
+                times.add(name, ms)
+        return times.summary()
 
     @property
     def tracks(self) -> list[Track]:

@@ -43,6 +43,10 @@ STYLE = {
     "legend.frameon": False,
 }
 MAX_POINTS = 3000
+AUTOPILOT: Any = {"color": OTHER, "lw": 4, "alpha": 0.55, "label": "autopilot"}
+"""Broad, since the camera's way often lies right on it."""
+MIN_HEIGHT_M = 4.0
+"""Least range of a height plot."""
 MIN_HALF = 0.5
 """Half the least extent of a plan: a camera that stood still is a point with room around it."""
 
@@ -57,7 +61,7 @@ def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> 
         figure = Figure(figsize=(6.4, 5.6 * tall + 0.8), layout="constrained")
         axes = figure.add_subplot()
         if autopilot is not None:
-            axes.plot(*_thin(autopilot)[:, 1::-1].T, color=OTHER, lw=1.4, label="autopilot")
+            axes.plot(*_thin(autopilot)[:, 1::-1].T, **AUTOPILOT)
         _draw_stretches(axes, [stretch[:, 1::-1] for stretch in stretches])
         if stretches:
             first, last = stretches[0][0], stretches[-1][-1]
@@ -86,9 +90,13 @@ def height_svg(
         if autopilot is not None:
             t_s, position = autopilot
             line = _thin(np.stack([t_s, -position[:, 2]], 1))
-            axes.plot(*line.T, color=OTHER, lw=1.4, label="autopilot")
+            axes.plot(*line.T, **AUTOPILOT)
         _draw_stretches(axes, [np.stack([t, -p[:, 2]], 1) for t, p in stretches])
         axes.set_ylabel("height [m]" if unit == "m" else f"-z [{unit}]")
+        low, high = axes.get_ylim()
+        if unit == "m" and high - low < MIN_HEIGHT_M:  # else centimetres look like mountains
+            middle = (low + high) / 2
+            axes.set_ylim(middle - MIN_HEIGHT_M / 2, middle + MIN_HEIGHT_M / 2)
         _time_axis(axes, duration_s)
         _legend(axes)
         return _svg(figure)

@@ -46,6 +46,7 @@ def report(
             "peak_memory_mb": round(facts.peak_memory_mb, 1),
         },
         "stages": {name: dict(times) for name, times in facts.stage_times.items()},
+        "kernels": result.kernel_times(),
         "dropped": dict(facts.dropped),
         "rates_hz": {name: round(rate, 2) for name, rate in facts.rates_hz.items()},
         "states": dict(Counter(track.state.value for track in result.tracks)),

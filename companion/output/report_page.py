@@ -46,9 +46,15 @@ def report_page(
         autopilot=_autopilot_name(result),
         views=[_view(view) for view in cloud_views(cloud, [p for _, p in stretches])],
         depths=_depths(result),
+        stages={**numbers["stages"], **kernel_stages(result)},
         config=json.dumps(numbers["config"], indent=2, ensure_ascii=False),
     )
     return page.encode("utf-8")
+
+
+def kernel_stages(result: FlightResult) -> dict[str, dict[str, float]]:
+    """Times of the kernels, named so that they can stand among the stages."""
+    return {f"{name} (kernel)": times for name, times in result.kernel_times().items()}
 
 
 def path_stretches(poses: Sequence[WorldPose]) -> list[tuple[Array, Array]]:
@@ -114,13 +120,14 @@ def _plots(
     unit = "m" if autopilot is not None else result.unit
     flown = [((t_ns - first) * 1e-9, position) for t_ns, position in stretches]
     some_path = bool(stretches) or autopilot is not None
+    stages = {**facts.stage_times, **kernel_stages(result)}
     drawn = {
         "plan": plots.plan_svg([p for _, p in flown], autopilot[1] if autopilot else None, unit)
         if some_path
         else None,
         "height": plots.height_svg(flown, autopilot, unit, duration_s) if some_path else None,
         "tracking": plots.tracking_svg(result.tracks, duration_s) if result.tracks else None,
-        "stages": plots.stages_svg(facts.stage_times) if facts.stage_times else None,
+        "stages": plots.stages_svg(stages) if stages else None,
     }
     return {name: None if svg is None else Markup(svg) for name, svg in drawn.items()}
 

@@ -126,7 +126,8 @@ def depth_map(keyframe_id: int) -> DepthMap:
     rgb = np.dstack([rows * 5, columns * 3, np.full(SIZE, keyframe_id * 10)]).astype(np.uint8)
     return DepthMap(
         keyframe_id, time_ns(keyframe_id * PER_KEYFRAME), (60.0, 60.0, 31.5, 23.5), depth,
-        depth * np.float32(0.01), state, np.ones(SIZE, np.float32), rgb, 12, {},
+        depth * np.float32(0.01), state, np.ones(SIZE, np.float32), rgb, 12,
+        {"search": 20.0 + keyframe_id},
     )  # fmt: skip
 
 

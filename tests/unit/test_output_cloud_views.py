@@ -40,8 +40,13 @@ def decode(view: CloudView) -> tuple[Bytes, Bytes]:
     return image[..., 2::-1].astype(np.uint8), image[..., 3].astype(np.uint8)
 
 
-def test_from_above_north_is_up_and_east_is_right() -> None:
-    rgb, opacity = decode(cloud_views(plate(), [])[0])
+@pytest.fixture(scope="module")
+def from_above() -> CloudView:
+    return cloud_views(plate(), [])[0]
+
+
+def test_from_above_north_is_up_and_east_is_right(from_above: CloudView) -> None:
+    rgb, opacity = decode(from_above)
     rows, columns = np.nonzero(opacity > 200)
     middle = (rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2
     red = rgb[rows, columns, 0] > rgb[rows, columns, 1]
@@ -51,8 +56,8 @@ def test_from_above_north_is_up_and_east_is_right() -> None:
     assert red[elsewhere].mean() < 0.02
 
 
-def test_a_dense_plate_has_no_holes() -> None:
-    _, opacity = decode(cloud_views(plate(), [])[0])
+def test_a_dense_plate_has_no_holes(from_above: CloudView) -> None:
+    _, opacity = decode(from_above)
     rows, columns = np.nonzero(opacity > 200)
     inner = opacity[rows.min() + 5 : rows.max() - 5, columns.min() + 5 : columns.max() - 5]
     assert (inner > 200).mean() > 0.995

@@ -102,6 +102,14 @@ def test_cloud_does_not_depend_on_the_order_of_chunks() -> None:
     assert np.array_equal(one.rgb, two.rgb)
 
 
+def test_a_chunk_that_comes_again_replaces_the_first() -> None:
+    result = flight()
+    before = result.n_points
+    result.take(flown.chunk(2, n=100))
+    assert result.n_points == before - 4000 + 100
+    assert len(result.cloud(0.001)) == result.n_points
+
+
 def test_without_a_map_there_are_neither_poses_nor_points() -> None:
     result = FlightResult()
     result.take(flown.track(50))
