@@ -57,6 +57,7 @@ def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> 
     with _style("plan"):
         low, high = _bounds(everything)
         middle, half = (low + high) / 2, np.maximum(0.53 * (high - low), MIN_HALF)
+        half[:2] = np.maximum(half[:2], [0.45 * half[1], 0.8 * half[0]])  # no slivers
         tall = float(np.clip(half[0] / half[1], 0.45, 1.1))
         figure = Figure(figsize=(6.4, 5.6 * tall + 0.8), layout="constrained")
         axes = figure.add_subplot()
