@@ -18,6 +18,7 @@ from companion.config_file import dump
 from companion.depth.opencl import ComputeDevice, open_device
 from companion.depth.stage import DepthStage
 from companion.errors import FlightError
+from companion.gaps import with_gaps_named
 from companion.localisation import LocalisationStage
 from companion.messages import Frame, Message
 from companion.output.flight_result import FlightResult, RunFacts
@@ -114,7 +115,9 @@ def _run(
     for warning in (*flight.warnings, *log.warnings):
         pipeline.feed(warning)
     samples = [s for s in log.samples if start_ns - LEAD_NS <= s.t_ns <= stop_ns]
-    feed: Iterable[Message] = in_order_of_time(samples, flight.frames(start_ns, stop_ns))
+    feed: Iterable[Message] = with_gaps_named(
+        in_order_of_time(samples, flight.frames(start_ns, stop_ns))
+    )
     player = PacedFeed(feed) if paced else None
     progress.start(flight.n_frames_between(start_ns, stop_ns))
     done = 0

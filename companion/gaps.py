@@ -1,0 +1,115 @@
+"""Notices what does not come: missing frames, an image that stands still, telemetry that stops.
+
+It changes nothing in the flow of messages; it adds a `Warned` where something is amiss.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from companion.messages import AttitudeSample, Bytes, Frame, Message, PositionSample, Warned
+
+GAP_IN_INTERVALS = 5
+"""A silence is a gap from so many usual intervals on."""
+MIN_INTERVALS = 3
+"""With fewer nothing is usual yet."""
+MIN_FRAME_GAP_S = 0.3
+MIN_TELEMETRY_GAP_S = 2.0
+STILL_S = 0.5
+STILL_GREY = 0.3
+"""Images that differ by less than this, in grey levels, are the same one, encoded again."""
+SAMPLE_STEP = 8
+
+
+class Rhythm:
+    """How often something comes: its usual interval and its last time."""
+
+    def __init__(self, min_gap_s: float) -> None:
+        self._min_gap_s = min_gap_s
+        self._intervals_s: deque[float] = deque(maxlen=31)
+        self._last_ns: int | None = None
+
+    def silence_s(self, t_ns: int) -> float | None:
+        """How long nothing has come at this time if that is a gap, else None."""
+        if self._last_ns is None or len(self._intervals_s) < MIN_INTERVALS:
+            return None
+        silence_s = (t_ns - self._last_ns) * 1e-9
+        usual_s = float(np.median(self._intervals_s))
+        limit_s = max(self._min_gap_s, GAP_IN_INTERVALS * usual_s)
+        return silence_s if silence_s > limit_s else None
+
+    def beat(self, t_ns: int) -> None:
+        """It came."""
+        if self._last_ns is not None:
+            self._intervals_s.append((t_ns - self._last_ns) * 1e-9)
+        self._last_ns = t_ns
+
+
+class GapWatch:
+    """Hears every message, in order of time, and says what is amiss."""
+
+    def __init__(self) -> None:
+        self._frames = Rhythm(MIN_FRAME_GAP_S)
+        self._telemetry = {
+            "attitude": Rhythm(MIN_TELEMETRY_GAP_S),
+            "position": Rhythm(MIN_TELEMETRY_GAP_S),
+        }
+        self._silent: set[str] = set()
+        self._image: Bytes | None = None
+        self._still_since_ns = 0
+        self._still = False
+
+    def step(self, message: Message) -> list[Warned]:
+        """Take one message."""
+        if isinstance(message, AttitudeSample):
+            self._hear("attitude", message.t_ns)
+        elif isinstance(message, PositionSample):
+            self._hear("position", message.t_ns)
+        elif isinstance(message, Frame):
+            return [
+                *self._missing_frames(message),
+                *self._silent_telemetry(message.t_ns),
+                *self._still_image(message),
+            ]
+        return []
+
+    def _hear(self, kind: str, t_ns: int) -> None:
+        self._telemetry[kind].beat(t_ns)
+        self._silent.discard(kind)
+
+    def _missing_frames(self, frame: Frame) -> Iterator[Warned]:
+        silence_s = self._frames.silence_s(frame.t_ns)
+        self._frames.beat(frame.t_ns)
+        if silence_s is not None:
+            yield Warned(frame.t_ns, "frames are missing", f"none for {silence_s:.1f} s")
+
+    def _silent_telemetry(self, t_ns: int) -> Iterator[Warned]:
+        for kind, rhythm in self._telemetry.items():
+            silence_s = rhythm.silence_s(t_ns)
+            if silence_s is not None and kind not in self._silent:
+                self._silent.add(kind)
+                yield Warned(t_ns, f"{kind} telemetry stops", f"none for {silence_s:.1f} s")
+
+    def _still_image(self, frame: Frame) -> Iterator[Warned]:
+        image = frame.grey[::SAMPLE_STEP, ::SAMPLE_STEP]
+        before, self._image = self._image, image.copy()
+        if before is None or _difference(before, image) > STILL_GREY:
+            self._still_since_ns, self._still = frame.t_ns, False
+        elif not self._still and frame.t_ns - self._still_since_ns > STILL_S * 1e9:
+            self._still = True
+            yield Warned(frame.t_ns, "the image stands still", f"for {STILL_S:g} s or more")
+
+
+def with_gaps_named(messages: Iterable[Message]) -> Iterator[Message]:
+    """The same messages, and before the one that shows a gap a `Warned`."""
+    watch = GapWatch()
+    for message in messages:
+        yield from watch.step(message)
+        yield message
+
+
+def _difference(a: Bytes, b: Bytes) -> float:
+    return float(np.abs(a.astype(np.int16) - b).mean())
