@@ -72,6 +72,11 @@ class Similarity:
     rotation: Array
     translation: Array
 
+    @staticmethod
+    def identity() -> Similarity:
+        """The transform of a frame to itself."""
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+
     def apply(self, points: Array) -> Array:
         """Transform points (..., 3)."""
         moved: Array = self.scale * (points @ self.rotation.T) + self.translation

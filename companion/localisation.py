@@ -7,6 +7,7 @@ pose, the tracker's keyframes tell where the map lies in the world.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -50,6 +51,9 @@ class LocalisationStage:
         self._georeferencer = Georeferencer(config.georeference, camera.body_from_camera)
         self._georeferences: dict[int, Georeference] = {}
         self._use_attitude = camera.body_from_camera is not None
+        self._main_from_newest = Similarity.identity()
+        self._attitudes: dict[int, Array | None] = {}
+        """`ned_from_camera` of keyframes, kept when the history has moved on"""
         self._revision = 0
         self._t_ns = 0
 
@@ -95,11 +99,15 @@ class LocalisationStage:
         tracked = self._tracker.step(frame, Prior(predicted, attitude))
         if len(self._tracker.segments) != n_segments or self.state is TrackState.INITIALISING:
             self._motion.reset()
-        out: list[Message] = list(tracked)
+        out: list[Message] = []
         for message in tracked:
-            if isinstance(message, Track) and message.seq == frame.seq:
-                if message.map_from_camera is not None:
+            if isinstance(message, Track) and message.map_from_camera is not None:
+                if message.seq == frame.seq:
                     self._motion.correct(frame.t_ns, message.map_from_camera, attitude)
+                placed = self._main_from_newest.apply_to_pose(message.map_from_camera)
+                out.append(replace(message, map_from_camera=placed))
+            else:
+                out.append(message)
         if any(isinstance(m, KeyframeAdded) for m in tracked):
             with self._times("georeference"):
                 out.append(self._map_update(final=False))
@@ -121,7 +129,7 @@ class LocalisationStage:
         """The map, all segments in the frame of the main one (the one with most keyframes)."""
         self._revision += 1
         segments = self._segments()
-        for index, segment in enumerate(segments):
+        for segment in segments:
             newest = segment is segments[-1]
             if final or (newest and self._due(segment)):
                 found = self._georeferencer.solve([self._place(k) for k in _spread(segment, final)])
@@ -137,11 +145,13 @@ class LocalisationStage:
         for segment in segments:
             own = self._georeferences.get(next(iter(segment.keyframes)))
             if segment is main:
-                main_from_own = Similarity(1.0, np.eye(3), np.zeros(3))
+                main_from_own = Similarity.identity()
             elif anchor is not None and own is not None:
                 main_from_own = anchor.world_from_map.inverse() @ own.world_from_map
             else:
                 continue  # nothing says how this segment lies to the main one
+            if segment is segments[-1]:
+                self._main_from_newest = main_from_own
             for key, keyframe in segment.keyframes.items():
                 poses[key] = main_from_own.apply_to_pose(keyframe.camera_from_map.inverse())
                 if main_from_own.scale != 1.0:
@@ -158,10 +168,21 @@ class LocalisationStage:
 
     def _place(self, keyframe: Keyframe) -> Place:
         return Place(
-            keyframe.t_ns, keyframe.camera_from_map.inverse(),
-            self._ned_from_camera(keyframe.t_ns) if keyframe.body_attitude is not None else None,
+            keyframe.t_ns,
+            keyframe.camera_from_map.inverse(),
+            self._attitude_of(keyframe) if self._use_attitude else None,
             self._ground_below(keyframe),
-        )  # fmt: skip
+        )
+
+    def _attitude_of(self, keyframe: Keyframe) -> Array | None:
+        """A keyframe's attitude, interpolated once samples from after it have come."""
+        key = keyframe.keyframe_id
+        if key not in self._attitudes:
+            attitude = self._ned_from_camera(keyframe.t_ns)
+            if self._attitude.newest_t_ns < keyframe.t_ns:
+                return attitude
+            self._attitudes[key] = attitude
+        return self._attitudes[key]
 
     def _ground_below(self, keyframe: Keyframe) -> float | None:
         """Distance from the camera down the body's axis to the map, in map units."""

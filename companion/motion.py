@@ -47,6 +47,11 @@ class AttitudeHistory:
         if len(self._times) > 2 * self._keep:
             del self._times[: -self._keep], self._samples[: -self._keep]
 
+    @property
+    def newest_t_ns(self) -> int:
+        """Time of the last sample; 0 before the first."""
+        return self._times[-1] if self._times else 0
+
     def at(self, t_ns: int) -> Array | None:
         """Rotation `ned_from_body` (3, 3) at a time; None where no sample is near enough."""
         if not self._times:
