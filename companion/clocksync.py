@@ -30,6 +30,7 @@ WINDOW_S = 2.0
 MAX_WINDOWS = 60
 MIN_SIGMA_S = 1e-4
 """Trust in the best of exchanges: stamps are made by software at both ends."""
+ABSURD_NS, ABSURD_DRIFT = 60_000_000_000, 0.05
 FIX_LATENCY_S = 0.1
 """What GPS receivers and drivers typically take from the time of a fix to its place in a log."""
 HUBER = 1.5
@@ -123,14 +124,14 @@ def estimate_clock(
     with_exchanges = {}
     for number in numbers:
         mine = pairs[pairs[:, 3] == number]
-        curves[int(number)] = _fit(mine, singles[singles[:, 2] == number])
+        curves[int(number)] = _fit(mine, _credible(singles[singles[:, 2] == number]))
         with_exchanges[int(number)] = len(mine) > 0
     main = int(numbers[int(np.argmax(counts))])
     curve = curves[main]
     report = ClockReport(
         method="TIMESYNC" if with_exchanges[main] else "least delay",
         offset_s=float((curve.base_ns + curve.offset_s[0] * 1e9) * 1e-9),
-        drift_ppm=float(-1e6 * curve.slope / (1 + curve.slope)),
+        drift_ppm=round(float(-1e6 * curve.slope / (1 + curve.slope)), 3) + 0.0,
         sigma_ms=curve.sigma_s * 1e3,
         n_reboots=len(numbers) - 1,
     )
@@ -149,15 +150,23 @@ def clock_from_utc(stamps: NDArray[Any] | Sequence[tuple[int, int]]) -> ClockMap
         return None
     # seen in reversed time the fix is a message that comes after its stamp
     singles = np.c_[-table, np.zeros(len(table), np.int64)]
-    curve = _fit(np.empty((0, 4), np.int64), singles).reversed()
+    curve = _fit(np.empty((0, 4), np.int64), _credible(singles)).reversed()
     report = ClockReport(
         method="UTC of the log",
         offset_s=float((curve.base_ns + curve.offset_s[0] * 1e9) * 1e-9),
-        drift_ppm=float(-1e6 * curve.slope / (1 + curve.slope)),
+        drift_ppm=round(float(-1e6 * curve.slope / (1 + curve.slope)), 3) + 0.0,
         sigma_ms=1e3 * float(np.hypot(curve.sigma_s, FIX_LATENCY_S)),
         n_reboots=0,
     )
     return ClockMap(report, {0: curve})
+
+
+def _credible(singles: Times) -> Times:
+    """Those whose delay is not absurd: a damaged stamp may be off by years."""
+    delay_ns = singles[:, 1] - singles[:, 0]
+    away_ns = np.abs(delay_ns - np.sort(delay_ns)[len(delay_ns) // 2])
+    credible: Times = singles[away_ns <= ABSURD_NS + ABSURD_DRIFT * float(np.ptp(singles[:, 0]))]
+    return credible
 
 
 def _fit(pairs: Times, singles: Times) -> _Curve:

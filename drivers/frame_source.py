@@ -137,20 +137,19 @@ def _decoded(
     container: av.container.InputContainer, stream: av.VideoStream
 ) -> Iterator[av.VideoFrame]:
     packets = container.demux(stream)
+    packet: av.Packet[av.VideoStream] | None
     while True:
         try:
             packet = next(packets, None)
         except av.error.FFmpegError:
             packet = None  # the file ends here, however long it says it is
-        if packet is None:
-            return
         try:
-            frames = packet.decode()
+            frames = stream.codec_context.decode(packet)
         except av.error.FFmpegError:
-            continue  # its picture stays missing, which the numbers show
-        for frame in frames:
-            assert isinstance(frame, av.VideoFrame)
-            yield frame
+            frames = []  # its picture stays missing, which the numbers show
+        yield from frames
+        if packet is None or not packet.size:  # the decoder has given what it held back
+            return
 
 
 def _stamps_of_packets(container: av.container.InputContainer, stream: av.VideoStream) -> list[int]:

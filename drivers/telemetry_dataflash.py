@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from companion.messages import (
 )
 from drivers.dataflash_records import DataflashRecords
 from drivers.mavlink_samples import FIX_3D, GPS_RANGE_ERROR_M
+from drivers.stamp_filter import believable
 from drivers.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
 
 KINDS = frozenset({
@@ -38,13 +39,12 @@ FILTERS = ("XKF1", "NKF1", "EKF1")
 GPS_EPOCH_S = 315_964_800
 LEAP_SECONDS = 18
 """UTC is behind GPS time by this since 2017."""
+FIRST_WEEK, LAST_WEEK = 1000, 6000
 EV_ARMED, EV_DISARMED = 10, 11
 EKF_ORIGIN = 0
 DOWN = 25
 RANGE_GOOD = 4
-MAX_BACK_NS, MAX_AHEAD_NS = 2_000_000_000, 60_000_000_000
-N_TO_BELIEVE = 50
-"""So many stamps in a row that jump are a gap in the log; fewer are damaged records."""
+MAX_BOOT_NS = 366 * 86_400 * 10**9
 
 Values = Mapping[str, Any]
 
@@ -62,22 +62,23 @@ def read_dataflash(path: Path) -> LogContent:
     counts = Counter(name for name, values in rows if values.get("C", 0) == 0)
     chosen = _chosen(counts)
     has_arm = counts["ARM"] > 0
-    clock = _Stamps()
+    stamps_ns = _boot_times_ns(rows)
     utc: list[tuple[int, int]] = []
-    for name, values in rows:
-        boot_ns = clock.take(_boot_ns(name, values))
-        if boot_ns is None:
+    good = believable(stamps_ns, 0, MAX_BOOT_NS)
+    for (name, values), boot_ns, believed in zip(rows, stamps_ns, good, strict=True):
+        if not believed:
             collected.count("records with an impossible time left out")
             continue
-        if name == "ORGN" and values.get("Type") == EKF_ORIGIN:
-            origin = GeoOrigin(values["Lat"], values["Lng"], values["Alt"])
-            collected.origin.setdefault(0, origin)
-        if name == "GPS" and (fix_ns := _utc_ns(values)) is not None:
-            utc.append((boot_ns, fix_ns))
-        if name == "EV" and has_arm:
-            continue
-        for sample in _samples(name, values, chosen):
-            collected.add(boot_ns, 0, sample)
+        try:
+            if name == "ORGN" and values.get("Type") == EKF_ORIGIN:
+                origin = GeoOrigin(values["Lat"], values["Lng"], values["Alt"])
+                collected.origin.setdefault(0, origin)
+            if name == "GPS" and (fix_ns := _utc_ns(values)) is not None:
+                utc.append((boot_ns, fix_ns))
+            for sample in _samples(name, values, chosen) if name != "EV" or not has_arm else ():
+                collected.add(boot_ns, 0, sample)
+        except (KeyError, TypeError):  # another version's fields, or a damaged description
+            collected.count("records of unknown form left out")
     found = clock_from_utc(utc)
     return LogContent(
         collected,
@@ -87,39 +88,25 @@ def read_dataflash(path: Path) -> LogContent:
     )
 
 
-class _Stamps:
-    """Passes stamps on that can follow those before."""
-
-    def __init__(self) -> None:
-        self._latest_ns: int | None = None
-        self._n_jumped = 0
-
-    def take(self, boot_ns: int | None) -> int | None:
-        """The stamp itself, that of the record before for one without, None for a wild one."""
-        if boot_ns is None or self._latest_ns is None:
-            self._latest_ns = self._latest_ns if boot_ns is None else boot_ns
-            return self._latest_ns
-        if -MAX_BACK_NS <= boot_ns - self._latest_ns <= MAX_AHEAD_NS:
-            self._n_jumped = 0
-        else:
-            self._n_jumped += 1
-            if self._n_jumped < N_TO_BELIEVE:
-                return None
-        self._latest_ns = boot_ns
-        return boot_ns
-
-
-def _boot_ns(name: str, values: Values) -> int | None:
-    if "TimeUS" in values:
-        return int(values["TimeUS"]) * 1000
-    milliseconds = values.get("T") if name == "GPS" else values.get("TimeMS")
-    return None if milliseconds is None else int(milliseconds) * 1_000_000
+def _boot_times_ns(rows: Sequence[tuple[str, Values]]) -> list[int]:
+    out: list[int] = []
+    for name, values in rows:
+        stamp_us = values.get("TimeUS")
+        stamp_ms = values.get("T") if name == "GPS" else values.get("TimeMS")
+        if isinstance(stamp_us, int):
+            out.append(stamp_us * 1000)
+        elif isinstance(stamp_ms, int):
+            out.append(stamp_ms * 1_000_000)
+        else:  # events of old firmware: the time is that of the record before
+            out.append(out[-1] if out else -1)
+    return out
 
 
 def _utc_ns(values: Values) -> int | None:
     week = values.get("GWk", values.get("Week", 0))
     in_week_ms = values.get("GMS", values.get("TimeMS", 0))
-    if values["Status"] < FIX_3D or week < 1000:
+    good = FIRST_WEEK <= week <= LAST_WEEK and in_week_ms < 7 * 86_400_000
+    if values["Status"] < FIX_3D or not good:
         return None
     seconds = GPS_EPOCH_S - LEAP_SECONDS + int(week) * 7 * 86400
     return seconds * 10**9 + int(in_week_ms) * 10**6

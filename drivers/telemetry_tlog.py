@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from itertools import compress
 from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -22,8 +23,9 @@ from drivers.mavlink_samples import (
     SAMPLE_OF,
     boot_ns,
 )
+from drivers.stamp_filter import believable
 from drivers.telemetry_log import LogContent, TelemetryCollector
-from drivers.tlog_records import Record, TlogRecords
+from drivers.tlog_records import LEAST_US, MOST_US, Record, TlogRecords
 
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAX_ROUND_TRIP_NS = 2_000_000_000
@@ -33,7 +35,10 @@ def read_tlog(path: Path) -> LogContent:
     """All that the autopilot of one vehicle said; an empty log where there is nothing to read."""
     log = path.read_bytes()
     packets = TlogRecords(log)
-    records = list(packets)
+    found = list(packets)
+    times_ns = [record.unix_us * 1000 for record in found]
+    good = believable(times_ns, LEAST_US * 1000, MOST_US * 1000)
+    records = list(compress(found, good))
     warnings = []
     first_ns = records[0].unix_us * 1000 if records else 0
     if packets.n_damaged:

@@ -25,9 +25,11 @@ from companion.messages import (
     PositionSample,
     PositionSource,
     RangeSample,
+    Telemetry,
     Warned,
 )
 from drivers.mavlink_samples import FIX_3D, UNIX_SINCE_NS
+from drivers.stamp_filter import believable
 from drivers.telemetry_log import GeodeticFix, HostTimes, LogContent, TelemetryCollector
 
 TOPICS = [
@@ -37,6 +39,8 @@ TOPICS = [
 ]  # fmt: skip
 ARMING_STATE_ARMED = 2
 DOWN = 25
+LATEST_NS = 4_102_444_800 * 10**9  # the year 2100
+MAX_LATENCY_US = 1_000_000
 DAMAGE = (ULogException, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error)
 """What pyulog raises for a file that is none, or for definitions that are damaged."""
 
@@ -48,8 +52,9 @@ def read_ulog(path: Path) -> LogContent:
     collected = TelemetryCollector(path.name)
     told = io.StringIO()
     try:
-        with contextlib.redirect_stdout(told):  # pyulog prints what it thinks of the file
-            log = ULog(str(path), TOPICS, True)
+        # pyulog prints what it thinks of a file, and leaves open one that it opened and cannot read
+        with contextlib.redirect_stdout(told), path.open("rb") as file:
+            log = ULog(file, TOPICS, True)
     except DAMAGE as error:
         warned = Warned(0, "damaged telemetry", f"{path.name} cannot be read: {error}")
         return LogContent(collected, warnings=(warned,))
@@ -89,10 +94,12 @@ def _host_times(collected: TelemetryCollector, gps: Columns | None) -> tuple[Hos
         return (lambda remote_ns, segment: remote_ns), None
     if gps is None or "time_utc_usec" not in gps:
         return None, None
-    known = gps["time_utc_usec"].astype(np.int64) * 1000 > UNIX_SINCE_NS
-    boot_ns = gps["timestamp"].astype(np.int64) * 1000
-    utc_ns = gps["time_utc_usec"].astype(np.int64) * 1000
-    clock = clock_from_utc(np.c_[boot_ns, utc_ns][known])
+    pairs = [
+        (boot_ns, int(utc_us) * 1000)
+        for boot_ns, utc_us in zip(_stamps_ns(gps), gps["time_utc_usec"].tolist(), strict=True)
+        if boot_ns >= 0 and UNIX_SINCE_NS < int(utc_us) * 1000 < LATEST_NS
+    ]
+    clock = clock_from_utc(pairs)
     if clock is None:
         return None, None
     # segments are origins of local position here, not reboots
@@ -100,13 +107,27 @@ def _host_times(collected: TelemetryCollector, gps: Columns | None) -> tuple[Hos
 
 
 def _stamps_ns(columns: Columns) -> list[int]:
-    """When the sensor measured, where that is told apart from when it was published."""
-    published = columns["timestamp"].astype(np.int64)
-    sampled = columns.get("timestamp_sample")
-    if sampled is not None:
-        published = np.where(sampled > 0, sampled.astype(np.int64), published)
-    out: list[int] = (published * 1000).tolist()
+    """When the sensor measured, where that is told apart from when it was published.
+
+    A stamp that damage made wild is -1, which `_add` leaves out.
+    """
+    published = columns["timestamp"].tolist()
+    sampled = columns["timestamp_sample"].tolist() if "timestamp_sample" in columns else published
+    good = believable([us * 1000 for us in published], 0, LATEST_NS)
+    out = []
+    for us, sampled_us, believed in zip(published, sampled, good, strict=True):
+        near = 0 <= us - sampled_us <= MAX_LATENCY_US
+        out.append((sampled_us if near else us) * 1000 if believed else -1)
     return out
+
+
+def _add(
+    collected: TelemetryCollector, t_ns: int, segment: int, content: Telemetry | GeodeticFix
+) -> None:
+    if t_ns < 0:
+        collected.count("records with an impossible time left out")
+    else:
+        collected.add(t_ns, segment, content)
 
 
 def _stacked(columns: Columns, *keys: str) -> Array:
@@ -120,14 +141,14 @@ def _take_attitude(collected: TelemetryCollector, columns: Columns) -> None:
         if not 0.5 < length < 2:
             collected.count("telemetry with values that are no numbers left out")
             continue
-        collected.add(t_ns, 0, AttitudeSample(0, (each if each[0] >= 0 else -each) / length))
+        _add(collected, t_ns, 0, AttitudeSample(0, (each if each[0] >= 0 else -each) / length))
 
 
 def _take_imu(collected: TelemetryCollector, columns: Columns) -> None:
     gyro = _stacked(columns, *(f"gyro_rad[{k}]" for k in range(3)))
     accel = _stacked(columns, *(f"accelerometer_m_s2[{k}]" for k in range(3)))
     for t_ns, turn, force in zip(_stamps_ns(columns), gyro, accel, strict=True):
-        collected.add(t_ns, 0, ImuSample(0, turn, force))
+        _add(collected, t_ns, 0, ImuSample(0, turn, force))
 
 
 def _take_local_position(collected: TelemetryCollector, columns: Columns) -> None:
@@ -145,7 +166,7 @@ def _take_local_position(collected: TelemetryCollector, columns: Columns) -> Non
                 0, PositionSource.LOCAL, position[k], velocity[k] if moving[k] else None,
                 _sigma(sigma[k, 0]), _sigma(sigma[k, 1]),
             )  # fmt: skip
-            collected.add(t_ns, int(segment[k]), sample)
+            _add(collected, t_ns, int(segment[k]), sample)
 
 
 def _origins(collected: TelemetryCollector, columns: Columns) -> NDArray[np.int64]:
@@ -169,7 +190,7 @@ def _origins(collected: TelemetryCollector, columns: Columns) -> NDArray[np.int6
 def _take_global_position(collected: TelemetryCollector, columns: Columns) -> None:
     place = _stacked(columns, "lat", "lon", "alt")
     for t_ns, (lat, lon, alt) in zip(_stamps_ns(columns), place.tolist(), strict=True):
-        collected.add(t_ns, 0, GeodeticFix(PositionSource.GLOBAL, lat, lon, alt))
+        _add(collected, t_ns, 0, GeodeticFix(PositionSource.GLOBAL, lat, lon, alt))
 
 
 def _take_gps(collected: TelemetryCollector, columns: Columns) -> None:
@@ -185,7 +206,7 @@ def _take_gps(collected: TelemetryCollector, columns: Columns) -> None:
             lat, lon, alt = map(float, place[k])
             accuracy = _sigma(sigma[k, 0]), _sigma(sigma[k, 1])
             fix = GeodeticFix(PositionSource.GPS, lat, lon, alt, moving, *accuracy)
-            collected.add(t_ns, 0, fix)
+            _add(collected, t_ns, 0, fix)
 
 
 def _sigma(value: float) -> float | None:
@@ -201,12 +222,12 @@ def _take_range(collected: TelemetryCollector, columns: Columns) -> None:
         within &= columns["orientation"] == DOWN
     for t_ns, each, good in zip(_stamps_ns(columns), distance, within, strict=True):
         if good:
-            collected.add(t_ns, 0, RangeSample(0, float(each)))
+            _add(collected, t_ns, 0, RangeSample(0, float(each)))
 
 
 def _take_height(collected: TelemetryCollector, columns: Columns) -> None:
     for t_ns, height in zip(_stamps_ns(columns), columns["baro_alt_meter"], strict=True):
-        collected.add(t_ns, 0, HeightSample(0, float(height)))
+        _add(collected, t_ns, 0, HeightSample(0, float(height)))
 
 
 def _take_armed(collected: TelemetryCollector, columns: Columns) -> None:
@@ -214,7 +235,7 @@ def _take_armed(collected: TelemetryCollector, columns: Columns) -> None:
     changes = np.flatnonzero(np.diff(armed, prepend=~armed[:1]))
     stamps = _stamps_ns(columns)
     for k in changes:
-        collected.add(stamps[k], 0, ArmedSample(0, bool(armed[k])))
+        _add(collected, stamps[k], 0, ArmedSample(0, bool(armed[k])))
 
 
 _TAKERS = {

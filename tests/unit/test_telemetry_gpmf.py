@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from drivers.gpmf_records import GpmfError, read_streams
+from drivers.telemetry_gpmf import _offset
+from tests.support.logs import klv
+
+SCALES = struct.pack(">8i", 1000, 1, 1, 1, 1, 1, 1, 1)
+ROWS = [(146_065, 0.1, -0.4, 2.0, 1, 2, 3, 0), (146_317, 0.2, -0.5, 2.1, 4, 5, 6, 0)]
+ATTITUDE = (
+    klv("STNM", "c", 1, b"Attitude")
+    + klv("TYPE", "c", 1, b"LffffffB")
+    + klv("SCAL", "l", 4, SCALES)
+    + klv("ATTD", "?", 29, b"".join(struct.pack(">L6fB", *row) for row in ROWS))
+)
+GYRO = klv("SCAL", "s", 2, struct.pack(">h", 100)) + klv(
+    "GYRO", "s", 6, struct.pack(">3h", 1, -2, 3)
+)
+PAYLOAD = klv("DEVC", "\0", 1, klv("STRM", "\0", 1, ATTITUDE) + klv("STRM", "\0", 1, GYRO))
+
+
+def test_streams_in_their_units() -> None:
+    attitude, gyro = read_streams(PAYLOAD)
+    assert (attitude.key, gyro.key) == ("ATTD", "GYRO")
+    np.testing.assert_allclose(attitude.rows[0, :4], [146.065, 0.1, -0.4, 2.0], atol=1e-6)
+    assert attitude.rows.shape == (2, 8)
+    np.testing.assert_allclose(gyro.rows, [[0.01, -0.02, 0.03]])
+
+
+def test_damage_is_an_error_or_fewer_streams(rng: np.random.Generator) -> None:
+    for _ in range(300):
+        damaged = bytearray(PAYLOAD)
+        for at in rng.integers(0, len(PAYLOAD), 3):
+            damaged[at] = rng.integers(0, 256)
+        try:
+            streams = read_streams(bytes(damaged))
+        except GpmfError:
+            continue
+        assert all(stream.rows.ndim == 2 for stream in streams)
+
+
+def test_blocks_bound_the_clock() -> None:
+    """Four samples a second, collected in blocks of a second of a video 140.3 s younger."""
+    offset_ns = -140_300_000_000
+    stamps = np.arange(140_400_000_000, 152_000_000_000, 252_000_000)
+    spans = []
+    for second in range(11):
+        begin, end = second * 10**9, (second + 1) * 10**9
+        inside = stamps[(stamps + offset_ns >= begin) & (stamps + offset_ns < end)]
+        spans.append((begin, end, int(inside[0]), int(inside[-1])))
+    found, sigma_ns = _offset(spans)
+    assert abs(found - offset_ns) < 126_000_000
+    assert abs(found - offset_ns) < 2 * sigma_ns
+
+
+def test_a_block_that_is_late() -> None:
+    spans = [
+        (k * 10**9, (k + 1) * 10**9, (k + 50) * 10**9, (k + 50) * 10**9 + 9 * 10**8)
+        for k in range(9)
+    ]
+    spans[4] = (spans[4][0], spans[4][1], spans[4][2] - 2 * 10**9, spans[4][3] - 2 * 10**9)
+    found, sigma_ns = _offset(spans)
+    assert found == pytest.approx(-50e9, abs=1e8)
+    assert sigma_ns > 1e8
