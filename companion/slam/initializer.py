@@ -20,6 +20,7 @@ from companion.slam.triangulation import consistent, triangulate
 MAX_PRIOR_DISAGREEMENT_RAD = np.radians(8.0)
 MIN_POINTS = 60
 GAMMA = 5.991
+TURNED_PX = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +49,8 @@ def initialise(
     if len(index_a) < MIN_POINTS:
         return None
     xa, xb = a.normalised[index_a], b.normalised[index_b]
+    if rotation_prior is None and _turned_only(xa, xb, focal_px):
+        return None
     candidates: list[tuple[Pose, bool]] = []
     essential, homography = _models(xa * focal_px, xb * focal_px, focal_px, seed)
     planar = False
@@ -74,6 +77,25 @@ def initialise(
     if best is None:
         return None
     return _refined(best, a, b, index_a, index_b, min_parallax_rad, planar)
+
+
+def _turned_only(xa: Array, xb: Array, focal_px: float) -> bool:
+    """Whether a rotation alone explains most of what moved: then any baseline would be made up."""
+    rays_a, rays_b = _unit_rays(xa), _unit_rays(xb)
+    weight = np.ones(len(rays_a))
+    error_px = np.zeros(len(rays_a))
+    for _ in range(15):  # robust Kabsch
+        u, _, vt = np.linalg.svd((rays_b * weight[:, None]).T @ rays_a)
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        error_px = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1) * focal_px
+        weight = 1.0 / (1.0 + (error_px / TURNED_PX) ** 2) ** 2
+    return float(np.mean(error_px < TURNED_PX)) > 0.5
+
+
+def _unit_rays(normalised: Array) -> Array:
+    rays = np.c_[normalised, np.ones(len(normalised))]
+    out: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return out
 
 
 def _models(pa: Array, pb: Array, focal_px: float, seed: int) -> tuple[Array | None, Array | None]:
@@ -162,7 +184,7 @@ def _best(
             angle_between(rival.rotation, pose.rotation) > np.radians(3)
             or float(rival.translation @ pose.translation) < 0.9
         )
-        if different and other > 0.8 * top and not with_prior:
+        if different and other > 0.7 * top and not with_prior:
             return None
     return pose if top >= MIN_POINTS // 2 else None
 
