@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import sys
 
-# Before numpy loads: its matrices here are small, and threads of its own would take the cores from the
-# stages that run side by side, and let sums come out in another order.
+# Before numpy loads: its matrices here are small, and threads of its own would take the cores
+# from the stages that run side by side, and let sums come out in another order.
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 

@@ -98,7 +98,7 @@ class Camera:
         return np.stack([self.fx * d[..., 0] + self.cx, self.fy * d[..., 1] + self.cy], -1)
 
     def normalise(self, pixels: NDArray[Any]) -> Array:
-        """Ideal normalised coordinates (N, 2) of distorted pixels (N, 2); nan where there are none."""
+        """Ideal normalised coordinates (N, 2) of distorted pixels (N, 2); nan where none."""
         px = np.asarray(pixels, np.float64)
         d = np.stack([(px[..., 0] - self.cx) / self.fx, (px[..., 1] - self.cy) / self.fy], -1)
         if self.distortion is Distortion.NONE:
@@ -113,7 +113,7 @@ class Camera:
         return np.where(np.abs(self.distort(n) - d).max(-1, keepdims=True) < 1e-6, n, np.nan)
 
     def pixel_from_normalised_jacobian(self, normalised: Array) -> Array:
-        """Derivative (N, 2, 2) of the distorted pixel with respect to ideal normalised coordinates."""
+        """Derivative (N, 2, 2) of the distorted pixel by ideal normalised coordinates."""
         j = self._distortion_jacobian(np.asarray(normalised, np.float64))
         out: Array = j * np.array([[self.fx], [self.fy]])
         return out

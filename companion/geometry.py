@@ -88,7 +88,7 @@ class Similarity:
         )
 
     def apply_to_pose(self, pose: Pose) -> Pose:
-        """Return the rigid pose of a frame whose pose is given in b: its position scaled, its axes turned."""
+        """Return the pose in a of a frame given in b: its position scaled, its axes turned."""
         return Pose(self.rotation @ pose.rotation, self.apply(pose.translation))
 
     def inverse(self) -> Similarity:
@@ -182,7 +182,7 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
 
 
 def interpolate_rotation(rotation_a: Array, rotation_b: Array, fraction: float) -> Array:
-    """Rotation on the shortest arc from a (fraction 0) to b (fraction 1); outside it extrapolates."""
+    """Rotation on the shortest arc from a (fraction 0) to b (1); outside it extrapolates."""
     out: Array = rotation_a @ rotation_from_vector(
         fraction * vector_from_rotation(rotation_a.T @ rotation_b)
     )

@@ -1,9 +1,10 @@
 """How a map lies in the world: scale, heading, tilt and origin from the autopilot's positions.
 
 A monocular map has neither unit nor north. Both come from comparing where the camera was in the map
-with where the autopilot says it was. Position errors of a GPS wander slowly: they are modelled as an
-Ornstein-Uhlenbeck process, so that a metre of drift over a minute does not pass for scale; velocity,
-whose errors do not add up, is used beside it. Attitude gives the tilt, and heading until the path does.
+with where the autopilot says it was. Position errors of a GPS wander slowly: they are modelled as
+an Ornstein-Uhlenbeck process, so that a metre of drift over a minute does not pass for scale;
+velocity, whose errors do not add up, is used beside it. Attitude gives the tilt, and heading until
+the path does.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from companion.config import GeoreferenceConfig
@@ -31,6 +33,7 @@ from companion.messages import (
     Telemetry,
 )
 
+Bools = NDArray[np.bool_]
 MAX_GAP_NS = 1_500_000_000
 MIN_SPACING_NS = 45_000_000
 DRIFT_TAU_S = 40.0
@@ -69,7 +72,7 @@ class _Series:
             self.times.append(t_ns)
             self.values.append(value)
 
-    def at(self, t_ns: Array) -> tuple[Array, np.ndarray]:  # type: ignore[type-arg]
+    def at(self, t_ns: Array) -> tuple[Array, Bools]:
         """Interpolated values, and where samples on both sides are near enough."""
         times = np.array(self.times)
         values = np.stack(self.values)
@@ -250,7 +253,7 @@ def _drift_root(t_s: Array) -> Array:
     """Cholesky factor of the covariance of slowly wandering positions, for one axis."""
     gap = np.abs(t_s[:, None] - t_s[None, :])
     covariance = SIGMA_DRIFT_M**2 * np.exp(-gap / DRIFT_TAU_S) + SIGMA_WHITE_M**2 * np.eye(len(gap))
-    return np.linalg.cholesky(covariance)
+    return np.asarray(np.linalg.cholesky(covariance), np.float64)
 
 
 def _fit(
@@ -312,7 +315,7 @@ def _fit(
         else:
             information[1:4, 1:4] += np.diag(prior**2)
         try:
-            delta = np.linalg.solve(information, gradient)
+            delta = np.asarray(np.linalg.solve(information, gradient), np.float64)
         except np.linalg.LinAlgError:
             return None
         delta[:4] = np.clip(delta[:4], -0.5, 0.5)
@@ -321,6 +324,7 @@ def _fit(
             rotation_from_vector(delta[1:4]) @ guess.rotation,
             guess.translation + delta[4:],
         )
-    covariance = np.linalg.inv(information) * max(chi2 / max(n_rows - 7, 1), 1.0)
+    inflation = max(chi2 / max(n_rows - 7, 1), 1.0)
+    covariance = np.asarray(np.linalg.inv(information) * inflation, np.float64)
     error = target - guess.apply(mapped)
     return guess, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))

@@ -120,7 +120,8 @@ class LocalisationStage:
         if not self._use_attitude or disagreement is None or disagreement < MAX_DISAGREEMENT_RAD:
             return []
         self._use_attitude = False
-        detail = f"turns between frames differ by {np.degrees(disagreement):.1f} degrees; is the camera on a gimbal?"
+        degrees = float(np.degrees(disagreement))
+        detail = f"turns between frames differ by {degrees:.1f} degrees; is there a gimbal?"
         return [
             Warned(t_ns, "the autopilot's attitude is not the camera's and is not used", detail)
         ]

@@ -120,9 +120,9 @@ class Track:
     """Where one frame was taken, or that it is not known.
 
     Its pose is `map_from_camera` as believed at that time, and `keyframe_from_camera` relative to
-    keyframe `keyframe_id`, which stays true when the map is corrected. All are None unless tracking.
-    `keypoints_px` (N, 2) are distorted pixels of the map points found. `backfilled` marks frames
-    that were placed after the fact (the ones between the two initial keyframes, for instance).
+    keyframe `keyframe_id`, which stays true when the map is corrected. All are None unless
+    tracking. `keypoints_px` (N, 2) are distorted pixels of the map points found. `backfilled` marks
+    frames that were placed after the fact (those between the two initial keyframes, say).
     """
 
     seq: int
@@ -172,9 +172,9 @@ class Georeference:
 class MapUpdate:
     """The map as it now stands: every keyframe's pose, and the sparse points (N, 3) in map units.
 
-    `unit_of` holds, for keyframes of segments with a scale of their own, how many map units one unit
-    of the keyframe's camera frame is; all others are 1. A keyframe that is missing here has no known
-    place, and what hangs on it has none either.
+    `unit_of` holds, for keyframes of segments with a scale of their own, how many map units one
+    unit of the keyframe's camera frame is; all others are 1. A keyframe that is missing here has no
+    known place, and what hangs on it has none either.
     """
 
     revision: int
@@ -185,7 +185,7 @@ class MapUpdate:
     unit_of: Mapping[int, float] = field(default_factory=dict)
 
     def place_of(self, keyframe_id: int) -> Similarity | None:
-        """The transform `map_from_camera` of a keyframe, unit included; None where it is not known."""
+        """The transform `map_from_camera` of a keyframe, unit included; None if not known."""
         pose = self.map_from_camera.get(keyframe_id)
         if pose is None:
             return None
@@ -226,8 +226,8 @@ class DepthMap:
 class PointChunk:
     """Fused points of one keyframe, in its camera frame and map units.
 
-    `points_camera` (N, 3) f32, `rgb` (N, 3) u8, `confidence` (N,) f32 in 0..1. A moved keyframe moves
-    its chunk: nothing here changes.
+    `points_camera` (N, 3) f32, `rgb` (N, 3) u8, `confidence` (N,) f32 in 0..1. A moved keyframe
+    moves its chunk: nothing here changes.
     """
 
     keyframe_id: int
@@ -239,7 +239,7 @@ class PointChunk:
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """Something the user should know of; `what` is a short constant, by which warnings are counted."""
+    """Something the user should know of; `what` is a constant, by which it is counted."""
 
     t_ns: int
     what: str

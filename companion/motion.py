@@ -79,7 +79,7 @@ class AttitudeHistory:
 
 
 class MotionFilter:
-    """Kalman filter over position and velocity (map units) and the autopilot's attitude error (rad).
+    """Kalman filter over position, velocity (map units) and attitude error (rad).
 
     State x = [position (3), velocity (3), attitude error (3)]: constant velocity, and an attitude
     error that wanders slowly, so that the autopilot's attitude predicts the camera's rotation even
@@ -100,7 +100,7 @@ class MotionFilter:
 
     @property
     def attitude_disagreement_rad(self) -> float | None:
-        """Median change between frames that the autopilot's attitude did not see; None until known."""
+        """Median turn between frames that the attitude did not see; None until known."""
         if len(self._disagreement_rad) < 20:
             return None
         return float(np.median(self._disagreement_rad))

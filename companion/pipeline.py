@@ -167,7 +167,7 @@ def in_order_of_time(telemetry: Iterable[Message], frames: Iterable[Message]) ->
     waiting = next(samples, None)
     for frame in frames:
         if isinstance(frame, Frame):
-            while waiting is not None and waiting.t_ns <= frame.t_ns:  # type: ignore[union-attr]
+            while waiting is not None and waiting.t_ns <= frame.t_ns:
                 yield waiting
                 waiting = next(samples, None)
         yield frame

@@ -84,7 +84,8 @@ def replay(
                 stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
                 origin=log.origin, device=device.name if device else "none (depth.enabled = false)",
                 config=dump(config), versions=_versions(), command=shlex.join(sys.argv),
-                peak_memory_mb=_peak_memory_mb(), camera=flight.camera, n_frames_total=flight.n_frames_between(start_ns, stop_ns),
+                peak_memory_mb=_peak_memory_mb(), camera=flight.camera,
+                n_frames_total=flight.n_frames_between(start_ns, stop_ns),
                 completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
             )  # fmt: skip
             write_results(out, result, facts, config.cloud.voxel_m)

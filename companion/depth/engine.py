@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from companion.config import DepthConfig
 from companion.depth.opencl import ComputeDevice, event_ms
 from companion.geometry import Array, Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
 
+Mask = NDArray[np.bool_]
 RADIUS = 3
 MAX_STEPS = 48
 GROUP = 64
@@ -69,7 +71,7 @@ class DepthEngine:
         self._kernel_ms: defaultdict[str, float] = defaultdict(float)
         self._n_updates = 0
 
-    def _find_border(self) -> np.ndarray:  # type: ignore[type-arg]
+    def _find_border(self) -> Mask:
         height, width = self._size
         v = np.arange(self._grid[0]) * self._config.stride
         u = np.arange(self._grid[1]) * self._config.stride
@@ -78,7 +80,7 @@ class DepthEngine:
         return ~(inside_v[:, None] & inside_u[None, :]).ravel()
 
     def begin(self, grey: Bytes, near: float, far: float) -> None:
-        """Start on a reference image (H, W) whose depths lie between `near` and `far` (map units)."""
+        """Start on an image (H, W) whose depths lie between `near` and `far` (map units)."""
         self._grey = np.ascontiguousarray(grey, np.float32)
         self._device.write(self._reference, self._grey)
         self._rho = (1.0 / far, 1.0 / near)
@@ -102,12 +104,10 @@ class DepthEngine:
         if len(active) == 0 or baseline * self._rho[1] * self.intrinsics.fx < 0.5:
             return 0
         device, config, k = self._device, self._config, self.intrinsics
+        pose = current_from_reference
         device.write(self._current, np.ascontiguousarray(grey, np.float32))
         device.write(self._active, active)
-        rows = [
-            _float4(*current_from_reference.rotation[i], current_from_reference.translation[i])
-            for i in range(3)
-        ]
+        rows = [np.array([*pose.rotation[i], pose.translation[i]], np.float32) for i in range(3)]
         height, width = self._size
         area = (2 * RADIUS + 1) ** 2
         self._update.set_args(
@@ -115,7 +115,10 @@ class DepthEngine:
             self._active, np.int32(len(active)), self._state, self._label,
             np.int32(self._grid[1]), np.int32(config.stride), _float4(k.fx, k.fy, k.cx, k.cy),
             *rows, np.array(self._rho, np.float32),
-            _float4(config.min_zncc, config.peak_margin, area * config.noise_grey**2, config.pose_error_px),
+            _float4(
+                config.min_zncc, config.peak_margin, area * config.noise_grey**2,
+                config.pose_error_px,
+            ),
             _float4(config.converged_sigma, config.min_inlier_ratio, 0.2, 0.0),
         )  # fmt: skip
         event = cl.enqueue_nd_range_kernel(
@@ -133,7 +136,7 @@ class DepthEngine:
         rho, sigma_rho = state[:, 0], np.sqrt(state[:, 1])
         ratio = state[:, 2] / (state[:, 2] + state[:, 3])
         good = (self._labels == PixelState.CONVERGED.value) & (rho > 0)
-        smooth = rho
+        smooth: Array = rho.astype(np.float64)
         if self._config.regularise_iterations and good.any():
             smooth = self._regularise(rho, sigma_rho, good)
             # smoothing may move a value within its error, not replace it
@@ -149,8 +152,8 @@ class DepthEngine:
             self._n_updates, dict(self._kernel_ms),
         )  # fmt: skip
 
-    def _regularise(self, rho: Floats, sigma_rho: Floats, good: np.ndarray) -> Array:  # type: ignore[type-arg]
-        """Huber-TV on inverse depth, weighted by confidence and image edges (Chambolle & Pock 2011)."""
+    def _regularise(self, rho: Floats, sigma_rho: Floats, good: Mask) -> Array:
+        """Huber-TV on inverse depth, weighted by confidence and edges (Chambolle & Pock 2011)."""
         device, config = self._device, self._config
         height, width = self._grid
         low = self._rho[0]
@@ -182,9 +185,8 @@ class DepthEngine:
         self._kernel_ms["regularise"] *= config.regularise_iterations
         out = np.empty(height * width, np.float32)
         device.read(out, self._x)
-        result: Array = out * span + low
-        return result
+        return out.astype(np.float64) * span + low
 
 
-def _float4(a: float, b: float, c: float, d: float) -> np.ndarray:  # type: ignore[type-arg]
+def _float4(a: float, b: float, c: float, d: float) -> Floats:
     return np.array([a, b, c, d], np.float32)

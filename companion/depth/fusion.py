@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import OrderedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.config import CloudConfig
 from companion.geometry import Array, Similarity
-from companion.messages import DepthMap, MapUpdate, PointChunk
+from companion.messages import DepthMap, Floats, MapUpdate, PointChunk
 from companion.voxel import thin_by_voxel
 
+Mask = NDArray[np.bool_]
 N_HELD = 7
 MAX_STEP = 0.04
 """Relative step of depth to a neighbour pixel at which a surface ends."""
@@ -82,7 +84,7 @@ class Fusion:
             return 0.01 * float(np.median(points[:, 2]))
         return self._config.voxel_m / (update.georeference.world_from_map.scale * place.scale)
 
-    def _agrees(self, points: Array, other_from_here: Similarity, other: DepthMap) -> Array:
+    def _agrees(self, points: Array, other_from_here: Similarity, other: DepthMap) -> Mask:
         p = other_from_here.apply(points)
         fx, fy, cx, cy = other.intrinsics
         height, width = other.depth.shape
@@ -93,10 +95,11 @@ class Fusion:
         inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
         seen = np.zeros(len(points))
         seen[inside] = other.depth[v[inside].astype(int), u[inside].astype(int)]
-        return (seen > 0) & (np.abs(seen - z) < self._config.agreement * z)
+        agrees: Mask = (seen > 0) & (np.abs(seen - z) < self._config.agreement * z)
+        return agrees
 
 
-def _smooth(depth: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def _smooth(depth: Floats) -> Mask:
     """Pixels that have a neighbour on the same surface, and none where a nearer surface ends."""
     ok = np.zeros(depth.shape, bool)
     edge = np.zeros(depth.shape, bool)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import os
 import warnings
 from importlib import resources
+from typing import Any
 
-import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from companion.config import OpenclConfig
 from companion.errors import DeviceError
 
-WANT = "install PoCL (pip install 'companion[cpu]' on x86-64, apt install pocl-opencl-icd elsewhere), or set depth.enabled=false"
+WANT = (
+    "install PoCL (pip install 'companion[cpu]' on x86-64, apt install pocl-opencl-icd elsewhere),"
+    " or set depth.enabled=false"
+)
 
 
 class ComputeDevice:
@@ -27,13 +31,14 @@ class ComputeDevice:
         )
 
     def build(self, source_name: str, constants: dict[str, int]) -> cl.Program:
-        """Build companion/depth/kernels/`source_name` with -D constants; DeviceError with the log."""
+        """Build kernels/`source_name` with -D constants; DeviceError with the compiler's log."""
         source = (resources.files("companion.depth") / "kernels" / source_name).read_text()
         options = [f"-D{name}={value}" for name, value in constants.items()]
         try:
             with warnings.catch_warnings():  # a compiler's remarks on a build that went well
                 warnings.simplefilter("ignore", cl.CompilerWarning)
-                return cl.Program(self.context, source).build(options=options)
+                program: cl.Program = cl.Program(self.context, source).build(options=options)
+                return program
         except cl.RuntimeError as error:
             raise DeviceError(f"{self.name}: kernels do not build: {error}") from error
 
@@ -41,11 +46,11 @@ class ComputeDevice:
         """A read-write buffer."""
         return cl.Buffer(self.context, cl.mem_flags.READ_WRITE, n_bytes)
 
-    def write(self, buffer: cl.Buffer, array: np.ndarray) -> cl.Event:  # type: ignore[type-arg]
+    def write(self, buffer: cl.Buffer, array: NDArray[Any]) -> cl.Event:
         """Copy a contiguous array to a buffer and wait."""
         return cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
 
-    def read(self, array: np.ndarray, buffer: cl.Buffer) -> None:  # type: ignore[type-arg]
+    def read(self, array: NDArray[Any], buffer: cl.Buffer) -> None:
         """Copy a buffer to a contiguous array and wait."""
         cl.enqueue_copy(self.queue, array, buffer, is_blocking=True)
 
@@ -69,7 +74,7 @@ def _devices() -> list[tuple[str, cl.Device]]:
 
 
 def open_device(config: OpenclConfig) -> ComputeDevice:
-    """The device that the configuration names; "auto" prefers a GPU. DeviceError when there is none."""
+    """The device that the configuration names; "auto" prefers a GPU; DeviceError if none."""
     # PoCL: one thread of work per core, and no spinning while waiting
     os.environ.setdefault("POCL_AFFINITY", "0")
     found = _devices()

@@ -1,23 +1,25 @@
 """The depth stage: keyframes and the frames around them become depth maps and points.
 
-A keyframe waits until some later ones have come, so that its frames' poses are adjusted and both sides
-are at hand. Images wait undistorted, and no more of them than a bound.
+A keyframe waits until some later ones have come, so that its frames' poses are adjusted and both
+sides are at hand. Images wait undistorted, and no more of them than a bound.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.camera import Camera
 from companion.config import CloudConfig, DepthConfig
 from companion.depth.engine import DepthEngine, Intrinsics
 from companion.depth.fusion import Fusion
 from companion.depth.opencl import ComputeDevice
-from companion.geometry import Array, Similarity
+from companion.geometry import Pose, Similarity
 from companion.messages import (
     Bytes,
     Frame,
@@ -142,7 +144,7 @@ class DepthStage:
 
     def _choose(
         self, keyframe: KeyframeAdded, update: MapUpdate, place: Similarity, median_depth: float
-    ) -> list:  # type: ignore[type-arg]
+    ) -> list[tuple[int, Pose]]:
         """Frames in order of use: baselines from short to long, both sides in turn."""
         candidates = []
         for seq, held in self._held.items():
@@ -198,7 +200,9 @@ class DepthStage:
             del self._held[seq]
 
 
-def _undistortion(camera: Camera) -> tuple[Array, Array, tuple[float, float, float, float]]:
+def _undistortion(
+    camera: Camera,
+) -> tuple[NDArray[Any], NDArray[Any], tuple[float, float, float, float]]:
     """Remap tables to an ideal pinhole image of the same size, and its fx, fy, cx, cy.
 
     The focal length is kept, unless the field of view would be too wide for a plane.
@@ -214,4 +218,4 @@ def _undistortion(camera: Camera) -> tuple[Array, Array, tuple[float, float, flo
     map_u = (d[:, 0] * camera.fx + camera.cx).reshape(shape).astype(np.float32)
     map_v = (d[:, 1] * camera.fy + camera.cy).reshape(shape).astype(np.float32)
     a, b = cv2.convertMaps(map_u, map_v, cv2.CV_16SC2)
-    return a, b, (fx, fy, camera.cx, camera.cy)
+    return np.asarray(a), np.asarray(b), (fx, fy, camera.cx, camera.cy)

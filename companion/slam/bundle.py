@@ -1,4 +1,4 @@
-"""Bundle adjustment: camera poses and points together, by the Schur complement (Triggs et al., 1999).
+"""Bundle adjustment: cameras and points together, by the Schur complement (Triggs et al. 1999).
 
 Levenberg-Marquardt with Huber's loss. The camera-point blocks are a block-sparse matrix, so that a
 window of ten cameras and a whole flight of hundreds are the same code and little memory.
@@ -36,7 +36,7 @@ class Bundle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """The adjusted poses and points, which observations agree (O,), and the cost before and after."""
+    """Adjusted poses and points, which observations agree (O,), and the cost before and after."""
 
     poses: list[Pose]
     points: Array
@@ -136,7 +136,7 @@ def _sum_by(index: Ints, values: Array, n: int) -> Array:
     """Sums of `values` (O, ...) over equal `index`, in order."""
     flat = values.reshape(len(values), -1)
     out = np.stack([np.bincount(index, flat[:, k], n) for k in range(flat.shape[1])], 1)
-    return out.reshape(n, *values.shape[1:])
+    return np.asarray(out.reshape(n, *values.shape[1:]), np.float64)
 
 
 def _jacobians(rotation: Array, p: Array, b: Bundle) -> tuple[Array, Array]:

@@ -22,10 +22,10 @@ Bools = NDArray[np.bool_]
 class Features:
     """The N features of one image.
 
-    `pixels` (N, 2) distorted; `normalised` (N, 2) ideal coordinates x/z, y/z; `octaves` (N,) pyramid
-    level; `angles_deg` (N,); `descriptors` (N, 32); `sigma_px` (N,) the expected error of a position;
-    `whitening` (N, 2, 2) turns an error in normalised coordinates into one in units of sigma;
-    `tree` finds features near a pixel.
+    `pixels` (N, 2) distorted; `normalised` (N, 2) ideal coordinates x/z, y/z; `octaves` (N,)
+    pyramid level; `angles_deg` (N,); `descriptors` (N, 32); `sigma_px` (N,) the expected error of a
+    position; `whitening` (N, 2, 2) turns an error in normalised coordinates into one in units of
+    sigma; `tree` finds features near a pixel.
     """
 
     pixels: Floats
@@ -47,7 +47,7 @@ class FeatureExtractor:
     def __init__(self, config: FeaturesConfig, camera: Camera) -> None:
         self._camera = camera
         self._config = config
-        self._orb = cv2.ORB_create(
+        self._orb = cv2.ORB.create(
             nfeatures=4 * config.n_features,
             scaleFactor=config.scale_factor,
             nlevels=config.n_levels,
@@ -58,11 +58,12 @@ class FeatureExtractor:
     def extract(self, grey: Bytes) -> Features:
         """Features of an image (H, W); as few as none where it shows nothing."""
         keypoints = self._detect(grey)
+        words = None
         if keypoints:
-            keypoints = [keypoints[i] for i in self._spread(keypoints)]
-            keypoints, descriptors = self._orb.compute(grey, keypoints)
-        if not keypoints:
-            descriptors = np.zeros((0, 32), np.uint8)
+            chosen = [keypoints[i] for i in self._spread(keypoints)]
+            described, words = self._orb.compute(grey, chosen)
+            keypoints = list(described)
+        descriptors = np.zeros((0, 32), np.uint8) if words is None else np.asarray(words, np.uint8)
         pixels = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
         octaves = np.array([k.octave for k in keypoints], np.int64)
         angles = np.array([k.angle for k in keypoints], np.float32)
@@ -78,7 +79,7 @@ class FeatureExtractor:
         )  # fmt: skip
 
     def _detect(self, grey: Bytes) -> list[cv2.KeyPoint]:
-        """Corners by a contrast threshold that follows the scene, so that dull ground has some too."""
+        """Corners by a threshold that follows the scene, so that dull ground has some too."""
         config = self._config
         while True:
             self._orb.setFastThreshold(self._threshold)
@@ -99,7 +100,7 @@ class FeatureExtractor:
         if len(keypoints) <= n:
             return list(range(len(keypoints)))
         cell_px = self._config.cell_px
-        points = cv2.KeyPoint.convert(keypoints)
+        points = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
         response = np.array([k.response for k in keypoints])
         cells = (points // cell_px).astype(np.int64)
         cell = cells[:, 1] * 100_000 + cells[:, 0]

@@ -60,13 +60,16 @@ def initialise(
         planar = score_h > 0.45 * (score_h + score_e)
     if essential is not None:
         r1, r2, t = cv2.decomposeEssentialMat(essential)
-        candidates += [(Pose(r, s * t.ravel()), False) for r in (r1, r2) for s in (1.0, -1.0)]
+        direction = np.asarray(t, np.float64).ravel()
+        rotations = (np.asarray(r1, np.float64), np.asarray(r2, np.float64))
+        candidates += [(Pose(r, s * direction), False) for r in rotations for s in (1.0, -1.0)]
     if homography is not None and (planar or essential is None):
-        _, rotations, translations, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
-        for r, t in zip(rotations, translations, strict=True):
+        _, turns, shifts, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
+        for r, t in zip(turns, shifts, strict=True):
             norm = float(np.linalg.norm(t))
             if norm > 1e-6 and np.linalg.det(r) > 0:
-                candidates.append((Pose(np.asarray(r), t.ravel() / norm), True))
+                unit = np.asarray(t, np.float64).ravel() / norm
+                candidates.append((Pose(np.asarray(r, np.float64), unit), True))
     if rotation_prior is not None:
         candidates += [(c, False) for c in _with_known_rotation(rotation_prior, xa, xb)]
         candidates = [
@@ -108,13 +111,15 @@ def _models(pa: Array, pb: Array, focal_px: float, seed: int) -> tuple[Array | N
     params.sampler = cv2.SAMPLING_UNIFORM
     k = np.diag([focal_px, focal_px, 1.0])
     zero = np.zeros(5)
-    essential, _ = cv2.findEssentialMat(pa, pb, k, k, zero, zero, params)
-    homography, _ = cv2.findHomography(pa, pb, params)
-    if essential is not None and essential.shape != (3, 3):
-        essential = None
-    if homography is not None:
-        inverse = np.diag([1 / focal_px, 1 / focal_px, 1.0])
-        homography = inverse @ homography @ k
+    found_e, _ = cv2.findEssentialMat(pa, pb, k, k, zero, zero, params)
+    found_h, _ = cv2.findHomography(pa, pb, params)
+    essential = homography = None
+    if found_e is not None and found_e.shape == (3, 3):
+        essential = np.asarray(found_e, np.float64)
+    if found_h is not None:
+        homography = (
+            np.diag([1 / focal_px, 1 / focal_px, 1.0]) @ np.asarray(found_h, np.float64) @ k
+        )
     return essential, homography
 
 
@@ -145,7 +150,7 @@ def _score_homography(h: Array, xa: Array, xb: Array, focal_px: float) -> float:
 
 
 def _with_known_rotation(rotation: Array, xa: Array, xb: Array) -> list[Pose]:
-    """Both signs of the translation that, with this rotation, fits most rays (a plane hides nothing here)."""
+    """Both signs of the translation that, with this rotation, fits most rays."""
     rays_a = np.c_[xa, np.ones(len(xa))] @ rotation.T
     normals = np.cross(rays_a, np.c_[xb, np.ones(len(xb))])
     length = np.linalg.norm(normals, axis=1)

@@ -26,7 +26,7 @@ class Visible:
 
 
 class Projector:
-    """Projects map points into one camera, with all the reasons for which a point cannot be seen."""
+    """Projects map points into one camera, with all the reasons not to see a point."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera

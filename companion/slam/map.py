@@ -114,7 +114,7 @@ class SlamMap:
         return features, ids[features]
 
     def refresh(self, points: Ints, keyframes: list[Keyframe]) -> None:
-        """Recompute viewing direction and base distance of `points` from the keyframes that see them.
+        """Recompute direction and base distance of `points` from the keyframes that see them.
 
         Only `keyframes` are looked at; a point's base distance comes from the last of them.
         """
@@ -139,7 +139,7 @@ class SlamMap:
         self.normals[ok] = total[ok] / norm[ok][:, None]
 
     def covisible(self, points: Ints, minimum: int = 15) -> list[tuple[int, int]]:
-        """Keyframes that share living `points`: (count, keyframe id), most first, older first on a tie."""
+        """Keyframes that share living `points`: (count, id), most first, older first on a tie."""
         mask = np.zeros(self.n_points + 1, bool)
         mask[points] = True
         mask[:-1] &= self.alive[: self.n_points]
@@ -153,7 +153,7 @@ class SlamMap:
         """Pyramid level at which each of `points` is seen from `distance`."""
         ratio = self.base_distance[points] / np.maximum(distance, 1e-9)
         level = np.round(np.log(np.maximum(ratio, 1e-9)) / np.log(self.scale_factor))
-        return np.clip(level, 0, self.n_levels - 1).astype(np.int64)
+        return np.asarray(np.clip(level, 0, self.n_levels - 1), np.int64)
 
     def living_positions(self) -> Array:
         """Positions (M, 3) of all living points."""

@@ -7,7 +7,7 @@ import numpy as np
 from companion.camera import Camera
 from companion.config import MappingConfig
 from companion.slam.bundle import Bundle, adjust
-from companion.slam.features import Ints
+from companion.slam.features import Bools, Ints
 from companion.slam.local_map import Projector
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.matching import match_epipolar
@@ -91,7 +91,7 @@ class Mapper:
         return np.concatenate(created) if created else np.zeros(0, np.int64)
 
     def _extend(self, keyframe: Keyframe, neighbours: list[Keyframe], created: Ints) -> None:
-        """Look for this keyframe's points in its neighbours, and for theirs in it; merge doubles."""
+        """Look for this keyframe's points in its neighbours, and theirs in it; merge doubles."""
         slam_map = self._map
         for other in neighbours:
             _, mine = slam_map.seen_by(keyframe)
@@ -145,7 +145,7 @@ class Mapper:
         return [k for k in self._map.keyframes.values() if np.any(k.point_ids == point)]
 
     def adjust_locally(self, keyframe: Keyframe) -> None:
-        """Adjust the newest keyframes and those that share most with them, with all points they see."""
+        """Adjust a keyframe and those that share most with it, and all points they see."""
         slam_map, config = self._map, self._config
         _, points = slam_map.seen_by(keyframe)
         ranked = [slam_map.keyframes[k] for _, k in slam_map.covisible(points, 15)]
@@ -185,9 +185,9 @@ class Mapper:
         self,
         variable: list[Keyframe],
         fixed: list[Keyframe],
-        mask: np.ndarray,
+        mask: Bools,
         iterations: int | None = None,
-    ) -> None:  # type: ignore[type-arg]
+    ) -> None:
         slam_map = self._map
         cameras, obs_cam, obs_feat, obs_id = [*variable, *fixed], [], [], []
         for i, k in enumerate(cameras):

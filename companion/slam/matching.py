@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from companion.geometry import Array, Pose, skew
-from companion.messages import Bytes
+from companion.messages import Bytes, Floats
 from companion.slam.features import Bools, Features, Ints
 
 MAX_DISTANCE = 64
@@ -18,16 +18,14 @@ MAX_DISTANCE_STRICT = 50
 FAR = np.float32(1000.0)
 
 
-def hamming_matrix(
-    descriptors_a: Bytes, descriptors_b: Bytes
-) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+def hamming_matrix(descriptors_a: Bytes, descriptors_b: Bytes) -> Floats:
     """Distances (Na, Nb) in bits, as float32; by one matrix product of signs."""
     signs_a = np.unpackbits(descriptors_a, axis=1).astype(np.float32) * 2 - 1
     signs_b = np.unpackbits(descriptors_b, axis=1).astype(np.float32) * 2 - 1
-    return np.float32(128.0) - np.float32(0.5) * (signs_a @ signs_b.T)  # type: ignore[no-any-return]
+    return np.asarray(np.float32(128.0) - np.float32(0.5) * (signs_a @ signs_b.T), np.float32)
 
 
-def mutual_matches(distances: np.ndarray, max_distance: float, ratio: float) -> tuple[Ints, Ints]:  # type: ignore[type-arg]
+def mutual_matches(distances: Floats, max_distance: float, ratio: float) -> tuple[Ints, Ints]:
     """Index pairs that are each other's best; ties go to the first."""
     none = np.zeros(0, np.int64)
     if distances.shape[0] == 0 or distances.shape[1] < 2:
@@ -117,7 +115,8 @@ def match_projected(
     """Match M points, seen to lie at `projected_px` (M, 2), with the features around there.
 
     `octaves` (M,) is the pyramid level at which each is expected; `radius_px` (M,) how far to look;
-    `usable` (N,) features that may be taken. Returns indices into points and features, each at most once.
+    `usable` (N,) features that may be taken. Returns indices into points and features, each at most
+    once.
     """
     none = np.zeros(0, np.int64)
     if len(projected_px) == 0 or len(features) < 2:

@@ -69,4 +69,5 @@ class Relocalizer:
         )
         if not ok or inliers is None or len(inliers) < MIN_INLIERS:
             return None
-        return Pose(cv2.Rodrigues(rotvec)[0], translation.ravel())
+        rotation = np.asarray(cv2.Rodrigues(rotvec)[0], np.float64)
+        return Pose(rotation, np.asarray(translation, np.float64).ravel())

@@ -1,7 +1,8 @@
 """The tracking state machine: every frame gets a pose, or an honest LOST.
 
 Initialising (two views) -> tracking (project the local map, refine) -> lost (match keyframes) and
-back. Knows no clock: times come with the frames, durations are measured by whoever hands in `times`.
+back. Knows no clock: times come with the frames, durations are measured by whoever hands in
+`times`.
 """
 
 from __future__ import annotations
@@ -249,7 +250,7 @@ class Tracker:
         if reference is None:
             return True
         config = self._config
-        features, ids = self.map.seen_by(reference)
+        _, ids = self.map.seen_by(reference)
         firm = ids[self.map.n_observers[ids] >= min(3, len(self.map.keyframes))]
         share = view.n_inliers / max(len(firm), 1)
         tracked = view.point_ids[view.point_ids >= 0]

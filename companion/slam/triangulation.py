@@ -11,7 +11,7 @@ from companion.slam.features import Bools
 def triangulate(normalised_a: Array, normalised_b: Array, b_from_a: Pose) -> tuple[Array, Array]:
     """Linear triangulation (Hartley & Sturm 1997) of N pairs.
 
-    Returns points in a (N, 3), nan where the rays are parallel, and the cosine of each parallax (N,).
+    Returns points in a (N, 3), nan where rays are parallel, and the cosine of each parallax (N,).
     """
     n = len(normalised_a)
     rows = np.empty((n, 4, 4))

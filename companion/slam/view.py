@@ -24,4 +24,5 @@ class View:
 
     @property
     def n_inliers(self) -> int:
+        """Features that show a map point."""
         return int(np.count_nonzero(self.point_ids >= 0))

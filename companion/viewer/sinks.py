@@ -1,7 +1,7 @@
 """Where a scene goes: a file, or a live viewer that must not stall the flight.
 
-Each has its own thread. The file's queue makes the caller wait, since a recording is complete; a live
-viewer's queue gives up what it has no room for, and counts it.
+Each has its own thread. The file's queue makes the caller wait, since a recording is complete; a
+live viewer's queue gives up what it has no room for, and counts it.
 """
 
 from __future__ import annotations

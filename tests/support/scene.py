@@ -18,11 +18,11 @@ def texture(rng: np.random.Generator, size: int = 1024) -> Bytes:
         noise = rng.normal(size=(n, n)).astype(np.float32)
         out += cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC) / octave**0.5
     out = (out - out.min()) / (out.max() - out.min())
-    return (out * 255).astype(np.uint8)
+    return np.asarray(out * 255, np.uint8)
 
 
 class PlaneWorld:
-    """Planes z = const in NED (down positive), each covering a rectangle; the highest is seen first."""
+    """Planes z = const in NED (down positive), each a rectangle; the highest is seen first."""
 
     def __init__(self, rng: np.random.Generator, metres_per_texel: float = 0.05) -> None:
         self._metres_per_texel = metres_per_texel
@@ -67,12 +67,13 @@ def _sample(pattern: Bytes, texel: Array) -> Array:
     f = texel - i
     p = pattern.astype(np.float64)
     i1 = i + 1
-    return (
+    out: Array = (
         p[i[:, 0], i[:, 1]] * (1 - f[:, 0]) * (1 - f[:, 1])
         + p[i1[:, 0], i[:, 1]] * f[:, 0] * (1 - f[:, 1])
         + p[i[:, 0], i1[:, 1]] * (1 - f[:, 0]) * f[:, 1]
         + p[i1[:, 0], i1[:, 1]] * f[:, 0] * f[:, 1]
     )
+    return out
 
 
 DOWN_LOOKING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

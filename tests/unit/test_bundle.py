@@ -32,11 +32,18 @@ def project(pose: Pose, points: Array) -> Array:
 
 
 def scene(rng: np.random.Generator, n: int = 150) -> Array:
-    return np.c_[rng.uniform(-2, 4, n), rng.uniform(-2, 2, n), rng.uniform(5, 9, n)]
+    columns = (rng.uniform(-2, 4, n), rng.uniform(-2, 2, n), rng.uniform(5, 9, n))
+    return np.stack(columns, 1)
+
+
+def disturb(pose: Pose, rng: np.random.Generator) -> Pose:
+    turn = rotation_from_vector(rng.normal(scale=0.01, size=3))
+    return Pose(turn @ pose.rotation, pose.translation + rng.normal(scale=0.05, size=3))
 
 
 def whitening(n: int) -> Array:
-    return np.broadcast_to(np.eye(2) * FOCAL, (n, 2, 2))
+    out: Array = np.broadcast_to(np.eye(2) * FOCAL, (n, 2, 2))
+    return out
 
 
 def test_bundle_recovers_disturbed_cameras_and_points(rng: np.random.Generator) -> None:
@@ -45,11 +52,7 @@ def test_bundle_recovers_disturbed_cameras_and_points(rng: np.random.Generator) 
     point = np.tile(np.arange(len(points)), 5)
     seen = np.concatenate([project(p, points) for p in poses])
     order = [2, 3, 4, 0, 1]  # the first three of `order` move
-    disturbed = [
-        Pose(rotation_from_vector(rng.normal(scale=0.01, size=3)) @ poses[i].rotation, poses[i].translation + rng.normal(scale=0.05, size=3))
-        if k < 3 else poses[i]
-        for k, i in enumerate(order)
-    ]  # fmt: skip
+    disturbed = [disturb(poses[i], rng) if k < 3 else poses[i] for k, i in enumerate(order)]
     place = np.argsort(order)
     bundle = Bundle(
         disturbed,
@@ -112,8 +115,8 @@ def features(normalised: Array) -> Features:
     n = len(normalised)
     pixels = (normalised * FOCAL + 300).astype(np.float32)
     return Features(
-        pixels, normalised, np.zeros(n, np.int64), np.zeros(n, np.float32), np.zeros((n, 32), np.uint8),
-        np.ones(n), whitening(n), cKDTree(pixels),
+        pixels, normalised, np.zeros(n, np.int64), np.zeros(n, np.float32),
+        np.zeros((n, 32), np.uint8), np.ones(n), whitening(n), cKDTree(pixels),
     )  # fmt: skip
 
 

@@ -66,6 +66,7 @@ def positions(tracker: Tracker, tracks: dict[int, Track]) -> tuple[Array, Array]
     """Estimated positions with the map as it is now, and the true ones."""
     estimated, truth = [], []
     for seq, track in sorted(tracks.items()):
+        assert track.keyframe_id is not None
         keyframe = tracker.map.keyframes[track.keyframe_id]
         assert track.keyframe_from_camera is not None
         estimated.append(
@@ -86,7 +87,7 @@ def test_every_frame_of_an_easy_flight_is_tracked_to_centimetres(
 
 
 def test_attitude_levels_the_map_and_turns_it_north(images: list[np.ndarray]) -> None:
-    tracker, tracks, _ = run(images, attitude=True)
+    _tracker, tracks, _ = run(images, attitude=True)
     track = tracks[max(tracks)]
     assert track.map_from_camera is not None
     off = track.map_from_camera.rotation.T @ path(track.seq).rotation
