@@ -5,10 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
+
+
+Timer = Callable[[str], AbstractContextManager[None]]
+"""What a stage is handed to have its parts timed, without knowing a clock."""
 
 
 class StageTimes:

@@ -13,6 +13,7 @@ from types import MappingProxyType
 import numpy as np
 
 from companion.camera import Camera
+from companion.clock import Timer
 from companion.config import Config
 from companion.geometry import Array, Pose, Similarity
 from companion.georeference import Georeferencer, Place
@@ -30,7 +31,7 @@ from companion.messages import (
 from companion.motion import AttitudeHistory, MotionFilter
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.mapper import Mapper
-from companion.slam.tracker import Prior, Timer, Tracker
+from companion.slam.tracker import Prior, Tracker
 
 MAX_DISAGREEMENT_RAD = np.radians(4.0)
 """An attitude that misses this much of the camera's turning between frames is not the camera's."""

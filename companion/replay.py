@@ -27,7 +27,7 @@ from companion.paced import PacedFeed
 from companion.pipeline import Pipeline, Sink, in_order_of_time
 from companion.progress import Progress
 from companion.viewer import FileViewer, LiveViewer
-from drivers.flight_folder import Flight, open_flight
+from drivers.flight_folder import ENDS_EARLY, Flight, open_flight
 from drivers.telemetry_log import TelemetryLog
 
 LIBRARIES = ("numpy", "opencv-python-headless", "pyopencl", "pymavlink", "filterpy", "rerun-sdk")
@@ -69,7 +69,7 @@ def replay(
         if viewer != "none":
             live = stack.enter_context(LiveViewer(config.viewer, flight.camera, viewer))
             sinks.append(live)
-        depth = _depth_stage(config, flight, device)
+        depth = _depth_stage(config, flight, device, times)
         pipeline = Pipeline(
             LocalisationStage(config, flight.camera, times), depth, sinks, lossless=not paced
         )
@@ -95,6 +95,13 @@ def replay(
 def _span(flight: Flight, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
     start_ns = flight.start_ns + int((start_s or 0.0) * 1e9)
     stop_ns = flight.stop_ns if stop_s is None else flight.start_ns + int(stop_s * 1e9)
+    short = next((w for w in flight.warnings if w.what == ENDS_EARLY), None)
+    if short is not None and (stop_s is None or stop_ns > flight.stop_ns):
+        there_s = (flight.stop_ns - flight.start_ns) * 1e-9
+        raise FlightError(
+            f"{flight.path}: {short.what}: {short.detail}; "
+            f"--stop {int(there_s * 10) / 10:g} replays what is there"
+        )
     if flight.n_frames_between(start_ns, stop_ns) == 0:
         length_s = (flight.stop_ns - flight.start_ns) * 1e-9
         raise FlightError(
@@ -103,10 +110,12 @@ def _span(flight: Flight, start_s: float | None, stop_s: float | None) -> tuple[
     return start_ns, stop_ns
 
 
-def _depth_stage(config: Config, flight: Flight, device: ComputeDevice | None) -> DepthStage | None:
+def _depth_stage(
+    config: Config, flight: Flight, device: ComputeDevice | None, times: StageTimes
+) -> DepthStage | None:
     if device is None:
         return None
-    return DepthStage(config.depth, config.cloud, flight.camera, device)
+    return DepthStage(config.depth, config.cloud, flight.camera, device, times)
 
 
 def _run(

@@ -24,6 +24,10 @@ from drivers.telemetry_log import TelemetryLog
 FRAMES_AHEAD = 4
 
 
+ENDS_EARLY = "the video ends early"
+"""What a flight with fewer frames than frames.csv lists warns of."""
+
+
 class Flight:
     """A flight that can be read; `open_flight` makes one."""
 
@@ -173,7 +177,7 @@ def _times(path: Path, source: FrameSource) -> tuple[list[int], list[int], list[
         )
     if n_there < len(numbers):
         detail = f"{source.n_frames} frames, frames.csv goes on to {numbers[-1]}"
-        warnings.append(Warned(times_ns[n_there - 1], "the video ends early", detail))
+        warnings.append(Warned(times_ns[n_there - 1], ENDS_EARLY, detail))
     elif numbers[-1] + 1 < source.n_frames:
         detail = f"{source.n_frames - numbers[-1] - 1} frames at the end have no time"
         warnings.append(Warned(times_ns[-1], "frames.csv ends early", detail))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.camera import Camera
+from companion.clock import Timer
 from companion.config import CloudConfig, DepthConfig
 from companion.depth.engine import DepthEngine, Intrinsics
 from companion.depth.fusion import Fusion
@@ -47,7 +48,12 @@ class DepthStage:
     """Frames, tracks, keyframes and map updates in; DepthMaps and PointChunks out."""
 
     def __init__(
-        self, config: DepthConfig, cloud: CloudConfig, camera: Camera, device: ComputeDevice
+        self,
+        config: DepthConfig,
+        cloud: CloudConfig,
+        camera: Camera,
+        device: ComputeDevice,
+        times: Timer,
     ) -> None:
         self._config = config
         self._fusion = Fusion(cloud)
@@ -56,6 +62,7 @@ class DepthStage:
         self._engine = DepthEngine(
             device, camera.width, camera.height, Intrinsics(fx, fy, cx, cy), config
         )
+        self._times = times
         self._held: OrderedDict[int, _Held] = OrderedDict()
         self._waiting: list[KeyframeAdded] = []
         self._update: MapUpdate | None = None
@@ -76,7 +83,8 @@ class DepthStage:
             self._update = message
             out: list[Message] = []
             while len(self._waiting) > self._config.lag_keyframes:
-                out += self._process(self._waiting.pop(0))
+                with self._times("depth"):
+                    out += self._process(self._waiting.pop(0))
             return out
         return []
 
@@ -84,7 +92,8 @@ class DepthStage:
         """Process the keyframes that still wait."""
         out: list[Message] = []
         for keyframe in self._waiting:
-            out += self._process(keyframe)
+            with self._times("depth"):
+                out += self._process(keyframe)
         self._waiting.clear()
         if self._update is not None:
             out += self._fusion.flush(self._update)

@@ -7,13 +7,12 @@ back. Knows no clock: times come with the frames, durations are measured by whoe
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
 
 from companion.camera import Camera
+from companion.clock import Timer
 from companion.config import Config
 from companion.geometry import Array, Pose
 from companion.messages import Frame, KeyframeAdded, Track, TrackState
@@ -26,7 +25,6 @@ from companion.slam.pose_refinement import refine_pose
 from companion.slam.relocalizer import Relocalizer
 from companion.slam.view import View
 
-Timer = Callable[[str], AbstractContextManager[None]]
 MAX_YOUNG_KEYFRAMES = 5
 """A map that is lost again with so few keyframes was not worth keeping."""
 
