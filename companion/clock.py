@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
 
-
 Timer = Callable[[str], AbstractContextManager[None]]
 """What a stage is handed to have its parts timed, without knowing a clock."""
 
