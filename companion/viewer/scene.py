@@ -2,8 +2,9 @@
 
 world                       local NED in metres (z down)
   autopilot/<n>             the autopilot's own path, in pieces
+  camera                    the camera now, with its image and the points found in it; not below
+                            the map, whose scale no pinhole may have above it
   map                       the map, placed by the georeference
-    camera                  the camera now, with its image and the points found in it
     path/<n>                the camera's path, in pieces
     keyframes/<id>          a keyframe; its points lie in its own frame and move with it
     sparse                  the tracker's points (hidden at first)
@@ -13,9 +14,12 @@ plots/…, log
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import cv2
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from companion.camera import Camera
 from companion.config import ViewerConfig
@@ -35,14 +39,31 @@ from companion.messages import (
     Warned,
 )
 
+APPLICATION = "companion"
 PIECE = 50
 """Poses in a piece of a path: only the last piece grows, so that long flights cost no more."""
+PIECE_STEP = 5
+"""A piece is logged anew when it has grown by so many."""
 PATH_STEP_NS = 200_000_000
 SPARSE_EVERY = 5
 MOVED_UNITS = 1e-4
+IMAGE_PLANE_UNITS = 0.15
+STATE_LEVEL = {TrackState.LOST: 0.0, TrackState.INITIALISING: 1.0, TrackState.TRACKING: 2.0}
 COLOUR_PATH = [255, 176, 32]
 COLOUR_AUTOPILOT = [120, 150, 255]
 COLOUR_FOUND = [80, 230, 120]
+
+
+@dataclass(slots=True)
+class _Path:
+    """A path as it grows: the piece that is still open, and how much of it is not logged yet."""
+
+    piece: int = 0
+    strip: list[NDArray[np.float32]] = field(default_factory=list)
+    waiting: int = 0
+    broken: bool = False
+    last_t_ns: int = -(2**63)
+    colour: list[int] = field(default_factory=list)
 
 
 class Scene:
@@ -55,21 +76,21 @@ class Scene:
         self._shrink = min(1.0, config.image_width / camera.width)
         self._places: dict[int, Similarity] = {}
         self._update: MapUpdate | None = None
-        self._paths: dict[str, list[Array]] = {}
+        self._paths: dict[str, _Path] = {}
         self._autopilot_source = PositionSource.GPS
         self._autopilot_t_ns = 0
         self._state: TrackState | None = None
         self._speed_from: tuple[int, Array] | None = None
         recording.log("world", rr.ViewCoordinates.FRD, static=True)
-        recording.log("world/map", rr.Transform3D(translation=[0.0, 0.0, 0.0]), static=True)
         width, height = round(camera.width * self._shrink), round(camera.height * self._shrink)
         matrix = camera.matrix()
+        matrix[:2, 2] += 0.5  # Rerun has pixel centres at halves
         matrix[:2] *= self._shrink
         recording.log(
-            "world/map/camera/image",
+            "world/camera/image",
             rr.Pinhole(
                 image_from_camera=matrix, resolution=[width, height],
-                camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.15,
+                camera_xyz=rr.ViewCoordinates.RDF,
             ),
             static=True,
         )  # fmt: skip
@@ -78,7 +99,7 @@ class Scene:
         """Log one message at its own time."""
         self._rec.set_time("flight", timestamp=np.datetime64(message.t_ns, "ns"))
         if isinstance(message, Frame):
-            self._rec.log("world/map/camera/image", self._encoded(message.rgb))
+            self._rec.log("world/camera/image", self._encoded(message.rgb))
         elif isinstance(message, Track):
             self._track(message)
         elif isinstance(message, MapUpdate):
@@ -121,17 +142,23 @@ class Scene:
             )
         if not track.backfilled:
             self._rec.log("plots/points", rr.Scalars(float(track.n_inliers)))
+            self._rec.log("plots/state", rr.Scalars(STATE_LEVEL[track.state]))
         pose = track.map_from_camera
+        path = self._paths.setdefault("world/map/path", _Path())
         if pose is None:
+            path.broken = True
             return
         if not track.backfilled:
-            self._rec.log("world/map/camera", _transform(_similarity(pose)))
+            self._rec.log("world/camera", _transform(_similarity(self._in_world(pose))))
             if track.keypoints_px is not None:
                 self._rec.log(
-                    "world/map/camera/image/found",
-                    rr.Points2D(track.keypoints_px * self._shrink, colors=COLOUR_FOUND, radii=1.5),
+                    "world/camera/image/found",
+                    rr.Points2D(
+                        (track.keypoints_px + 0.5) * self._shrink, colors=COLOUR_FOUND, radii=1.5
+                    ),
                 )
-        self._extend("world/map/path", pose.translation, COLOUR_PATH)
+        if track.t_ns > path.last_t_ns:  # what is placed after the fact may come too late
+            self._extend("world/map/path", track.t_ns, pose.translation, COLOUR_PATH)
         if (
             self._update is not None
             and self._update.georeference is not None
@@ -150,19 +177,41 @@ class Scene:
             self._rec.log("plots/speed", rr.Scalars(speed))
             self._speed_from = (t_ns, world)
 
-    def _extend(self, entity: str, position: Array, colour: list[int]) -> None:
-        path = self._paths.setdefault(entity, [])
-        path.append(np.asarray(position, np.float32))
-        n = len(path)
-        if n % 5 and n % PIECE:
+    def close(self) -> None:
+        """Log what of the paths still waits."""
+        for entity, path in self._paths.items():
+            self._log_piece(entity, path)
+
+    def _in_world(self, pose: Pose) -> Pose:
+        if self._update is None or self._update.georeference is None:
+            return pose
+        return self._update.georeference.world_from_map.apply_to_pose(pose)
+
+    def _extend(self, entity: str, t_ns: int, position: Array, colour: list[int]) -> None:
+        path = self._paths.setdefault(entity, _Path())
+        path.colour = colour
+        path.last_t_ns = t_ns
+        if path.broken and path.strip:
+            self._log_piece(entity, path)
+            path.piece, path.strip = path.piece + 1, []
+        path.broken = False
+        path.strip.append(np.asarray(position, np.float32))
+        path.waiting += 1
+        if len(path.strip) > PIECE:
+            self._log_piece(entity, path)
+            # a piece begins where the last one ends
+            path.piece, path.strip = path.piece + 1, path.strip[-1:]
+        elif path.waiting >= PIECE_STEP:
+            self._log_piece(entity, path)
+
+    def _log_piece(self, entity: str, path: _Path) -> None:
+        if path.waiting == 0 or len(path.strip) < 2:
             return
-        piece = (n - 1) // PIECE
-        # a piece begins where the last one ends
-        strip = path[max(piece * PIECE - 1, 0) :]
-        self._rec.log(
-            f"{entity}/{piece}",
-            rr.LineStrips3D([np.stack(strip)], colors=colour, radii=rr.Radius.ui_points(1.5)),
+        path.waiting = 0
+        strip = rr.LineStrips3D(
+            [np.stack(path.strip)], colors=path.colour, radii=rr.Radius.ui_points(1.5)
         )
+        self._rec.log(f"{entity}/{path.piece}", strip)
 
     def _autopilot(self, sample: PositionSample) -> None:
         order = list(PositionSource)
@@ -173,13 +222,18 @@ class Scene:
         if sample.t_ns - self._autopilot_t_ns < PATH_STEP_NS:
             return
         self._autopilot_t_ns = sample.t_ns
-        self._extend("world/autopilot", sample.position_ned_m, COLOUR_AUTOPILOT)
+        self._extend("world/autopilot", sample.t_ns, sample.position_ned_m, COLOUR_AUTOPILOT)
 
     def _map(self, update: MapUpdate) -> None:
         self._update = update
         if update.georeference is not None:
             self._rec.log("world/map", _transform(update.georeference.world_from_map))
-            self._rec.log("plots/scale", rr.Scalars(update.georeference.world_from_map.scale))
+            scale = update.georeference.world_from_map.scale
+            self._rec.log("plots/scale", rr.Scalars(scale))
+            self._rec.log(
+                "world/camera/image",
+                rr.Pinhole.from_fields(image_plane_distance=IMAGE_PLANE_UNITS * scale),
+            )
         for keyframe_id in update.map_from_camera:
             place = update.place_of(keyframe_id)
             if place is not None:
@@ -202,6 +256,8 @@ class Scene:
         self._rec.log(f"world/map/keyframes/{keyframe_id}", _transform(place))
 
     def _depth(self, depth_map: DepthMap) -> None:
+        for kernel, ms in depth_map.kernel_ms.items():
+            self._rec.log(f"plots/kernels/{kernel}", rr.Scalars(float(ms)))
         depth = depth_map.depth
         known = depth > 0
         if not known.any():

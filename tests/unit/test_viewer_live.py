@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.camera import Camera
+from companion.config import ViewerConfig
+from companion.errors import InputError
+from companion.messages import Frame
+from companion.viewer import LiveViewer
+from companion.viewer.inbox import Inbox, size_bytes
+from companion.viewer.live_process import GRPC_PORT, WEB_PORT, listens
+from tests.support import flown
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+
+
+def image(seq: int) -> Frame:
+    rgb = np.random.default_rng(seq).integers(0, 255, (480, 640, 3)).astype(np.uint8)
+    return Frame(seq, flown.time_ns(seq), rgb[..., 0].copy(), rgb)
+
+
+@contextmanager
+def hanging_peer() -> Iterator[str]:
+    """The address of a server that accepts, and then neither reads nor answers."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen(50)
+        yield f"rerun+http://127.0.0.1:{server.getsockname()[1]}/proxy"
+
+
+def test_a_viewer_that_hangs_neither_stalls_nor_outlives_the_flight() -> None:
+    frame = image(0)
+    with hanging_peer() as address:
+        with LiveViewer(ViewerConfig(jpeg_quality=95), CAMERA, address) as viewer:
+            slowest = 0.0
+            for _ in range(1500):
+                start = time.perf_counter()
+                viewer.take(frame)
+                slowest = max(slowest, time.perf_counter() - start)
+            child = viewer._child.pid
+            start = time.perf_counter()
+        assert time.perf_counter() - start < 10
+        assert slowest < 0.5
+        assert viewer.n_dropped > 0
+        assert not os.path.exists(f"/proc/{child}")
+
+
+def test_a_viewer_that_dies_does_not_end_the_flight() -> None:
+    with hanging_peer() as address, LiveViewer(ViewerConfig(), CAMERA, address) as viewer:
+        viewer._child.kill()
+        viewer._child.wait()
+        for seq in range(200):
+            viewer.take(flown.frame(seq))
+    assert viewer.n_dropped > 0
+
+
+@pytest.mark.parametrize("where", ["rerun+http://127.0.0.1:1/proxy", "rerun+http:///proxy"])
+def test_an_address_where_nothing_listens_is_bad_input(where: str) -> None:
+    with pytest.raises(InputError, match="no viewer listens there") as raised:
+        LiveViewer(ViewerConfig(), CAMERA, where)
+    assert "\n" not in str(raised.value)
+
+
+def free(port: int) -> bool:
+    return not listens("127.0.0.1", port)
+
+
+@pytest.mark.skipif(not (free(GRPC_PORT) and free(WEB_PORT)), reason="a viewer runs here")
+def test_the_web_viewer_listens_on_loopback_only_and_ends_with_the_flight() -> None:
+    with LiveViewer(ViewerConfig(), CAMERA, "web") as viewer:
+        for seq in range(20):
+            viewer.take(image(seq))
+        with pytest.raises(InputError, match=f"port {GRPC_PORT} is taken"):
+            LiveViewer(ViewerConfig(), CAMERA, "web")
+        listening = {
+            (line.split()[1].split(":")[0], int(line.split()[1].split(":")[1], 16))
+            for table in ("tcp", "tcp6")
+            for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+            if line.split()[3] == "0A"
+        }
+        ours = {place for place in listening if place[1] in (GRPC_PORT, WEB_PORT)}
+        assert ours == {("0100007F", GRPC_PORT), ("0100007F", WEB_PORT)}  # 127.0.0.1
+    assert viewer.n_dropped == 0
+    assert free(GRPC_PORT) and free(WEB_PORT)
+
+
+def test_inbox_is_bounded_by_bytes_and_keeps_room_for_what_is_small() -> None:
+    inbox = Inbox(20 * size_bytes(image(0)))
+    taken = [inbox.offer(image(seq)) for seq in range(40)]
+    assert sum(taken) == 10
+    assert all(inbox.offer(flown.position(seq)) for seq in range(1000))
+    inbox.close()
+    seqs = []
+    while (message := inbox.get()) is not None:
+        if isinstance(message, Frame):
+            seqs.append(message.seq)
+    assert seqs == list(range(10))
+
+
+def test_inbox_lets_in_what_is_larger_than_its_room() -> None:
+    inbox = Inbox(10)
+    inbox.put(image(0))
+    assert not inbox.offer(flown.position(0))
+    assert inbox.get() is not None
+    assert inbox.offer(flown.position(0))
+
+
+def test_inbox_makes_its_caller_wait_until_there_is_room_or_it_is_closed() -> None:
+    inbox = Inbox(10)
+    inbox.put(image(0))
+    waiting = threading.Thread(target=inbox.put, args=(image(1),))
+    waiting.start()
+    waiting.join(0.2)
+    assert waiting.is_alive()
+    inbox.get()
+    waiting.join(5)
+    assert not waiting.is_alive()
+    second = threading.Thread(target=inbox.put, args=(image(2),))
+    second.start()
+    inbox.close()
+    second.join(5)
+    assert not second.is_alive()
+    first = inbox.get()
+    assert isinstance(first, Frame) and first.seq == 1
+    assert inbox.get() is None
