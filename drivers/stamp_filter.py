@@ -6,6 +6,9 @@ from collections.abc import Sequence
 
 MAX_BACK_NS, MAX_AHEAD_NS = 2_000_000_000, 60_000_000_000
 
+MAX_BOOT_NS = 366 * 86_400 * 10**9
+"""No autopilot runs for longer than this."""
+
 
 def believable(stamps_ns: Sequence[int], least_ns: int, most_ns: int) -> list[bool]:
     """Which stamps of a log, in its order, are true.

@@ -29,7 +29,7 @@ from companion.messages import (
 )
 from drivers.dataflash_records import DataflashRecords
 from drivers.mavlink_samples import FIX_3D, GPS_RANGE_ERROR_M
-from drivers.stamp_filter import believable
+from drivers.stamp_filter import MAX_BOOT_NS, believable
 from drivers.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
 
 KINDS = frozenset({
@@ -44,7 +44,6 @@ EV_ARMED, EV_DISARMED = 10, 11
 EKF_ORIGIN = 0
 DOWN = 25
 RANGE_GOOD = 4
-MAX_BOOT_NS = 366 * 86_400 * 10**9
 
 Values = Mapping[str, Any]
 
@@ -77,7 +76,11 @@ def read_dataflash(path: Path) -> LogContent:
                 utc.append((boot_ns, fix_ns))
             for sample in _samples(name, values, chosen) if name != "EV" or not has_arm else ():
                 collected.add(boot_ns, 0, sample)
-        except (KeyError, TypeError):  # another version's fields, or a damaged description
+        except (
+            KeyError,
+            TypeError,
+            ValueError,
+        ):  # another version's fields, or a damaged description
             collected.count("records of unknown form left out")
     found = clock_from_utc(utc)
     return LogContent(

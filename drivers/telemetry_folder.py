@@ -45,7 +45,11 @@ def read_telemetry(folder: Path, pictures: Pictures, config: TelemetryConfig) ->
     paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS)
     found = []
     for path in paths:
-        found.append((path, _aligned(READERS[path.suffix.lower()](path), pictures, config)))
+        try:
+            content = READERS[path.suffix.lower()](path)
+        except OSError as error:
+            raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
+        found.append((path, _aligned(content, pictures, config)))
     if not paths:
         inside = read_gpmf(pictures.path, pictures.host_from_file_ns)
         if inside is None:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 
 import av
@@ -27,6 +29,7 @@ from companion.messages import (
 )
 from drivers.gpmf_records import GpmfError, read_streams
 from drivers.mavlink_samples import FIX_3D, STANDARD_GRAVITY, height_from_pressure
+from drivers.stamp_filter import MAX_BOOT_NS, believable
 from drivers.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
 
 HANDLER = "GoPro MET"
@@ -44,26 +47,23 @@ def read_gpmf(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogCo
     if not payloads:
         return None
     collected = TelemetryCollector(video.name)
-    spans: list[tuple[int, int, int, int]] = []
+    rows: list[_Row] = []
     n_damaged = 0
-    for begin_ns, end_ns, payload in payloads:
+    for number, (_, _, payload) in enumerate(payloads):
         try:
-            streams = read_streams(payload)
+            rows += _rows(number, payload)
         except GpmfError:
             n_damaged += 1
-            continue
-        stamps = []
-        for stream in streams:
-            take = _TAKERS.get((stream.key, stream.rows.shape[1]))
-            for row in stream.rows if take is not None else ():
-                assert take is not None
-                remote_ns = round(row[0] * 1e9)
-                stamps.append(remote_ns)
-                sample = take(row)
-                if sample is not None:
-                    collected.add(remote_ns, 0, sample)
-        if stamps:
-            spans.append((begin_ns, end_ns, min(stamps), max(stamps)))
+    good = believable([row.remote_ns for row in rows], 0, MAX_BOOT_NS)
+    stamps: dict[int, list[int]] = {}
+    for row in compress(rows, good):
+        stamps.setdefault(row.payload, []).append(row.remote_ns)
+        if row.sample is not None:
+            collected.add(row.remote_ns, 0, row.sample)
+    spans = [
+        (payloads[number][0], payloads[number][1], min(each), max(each))
+        for number, each in stamps.items()
+    ]
     warnings = []
     if n_damaged:
         detail = f"{n_damaged} of {len(payloads)} blocks in {video.name}"
@@ -80,6 +80,23 @@ def read_gpmf(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogCo
         "blocks in the video", (int(begin) - spans[0][2]) * 1e-9, 0.0, sigma_ns * 1e-6, 0
     )
     return LogContent(collected, host_ns, report, tuple(warnings))
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    payload: int
+    remote_ns: int
+    sample: Telemetry | GeodeticFix | None
+
+
+def _rows(number: int, payload: bytes) -> list[_Row]:
+    out = []
+    for stream in read_streams(payload):
+        take = _TAKERS.get((stream.key, stream.rows.shape[1]))
+        if take is not None:
+            for row in stream.rows[np.isfinite(stream.rows).all(1)]:
+                out.append(_Row(number, round(float(row[0]) * 1e9), take(row)))
+    return out
 
 
 def _offset(spans: list[tuple[int, int, int, int]]) -> tuple[int, float]:

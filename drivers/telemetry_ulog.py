@@ -40,6 +40,7 @@ TOPICS = [
 ARMING_STATE_ARMED = 2
 DOWN = 25
 LATEST_NS = 4_102_444_800 * 10**9  # the year 2100
+MAX_SHORT_READS = 100
 MAX_LATENCY_US = 1_000_000
 DAMAGE = (ULogException, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error)
 """What pyulog raises for a file that is none, or for definitions that are damaged."""
@@ -52,9 +53,8 @@ def read_ulog(path: Path) -> LogContent:
     collected = TelemetryCollector(path.name)
     told = io.StringIO()
     try:
-        # pyulog prints what it thinks of a file, and leaves open one that it opened and cannot read
-        with contextlib.redirect_stdout(told), path.open("rb") as file:
-            log = ULog(file, TOPICS, True)
+        with contextlib.redirect_stdout(told):  # pyulog prints what it thinks of the file
+            log = ULog(_Bytes(path.read_bytes()), TOPICS, True)
     except DAMAGE as error:
         warned = Warned(0, "damaged telemetry", f"{path.name} cannot be read: {error}")
         return LogContent(collected, warnings=(warned,))
@@ -79,6 +79,20 @@ def read_ulog(path: Path) -> LogContent:
         _take_whole(_take_gps, collected, gps)
     host_ns, clock = _host_times(collected, gps)
     return LogContent(collected, host_ns, clock.report if clock else None, tuple(warnings))
+
+
+class _Bytes(io.BytesIO):
+    """A log that ends: with damaged definitions pyulog can seek back from the end without end."""
+
+    _n_short = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read; ULogException where the end has been met too often."""
+        found = super().read(size)
+        self._n_short += size is not None and len(found) < size
+        if self._n_short > MAX_SHORT_READS:
+            raise ULogException("its definitions are damaged")
+        return found
 
 
 def _take_whole(take: Any, collected: TelemetryCollector, columns: Columns) -> None:
@@ -131,7 +145,8 @@ def _add(
 
 
 def _stacked(columns: Columns, *keys: str) -> Array:
-    return np.stack([columns[key].astype(np.float64) for key in keys], 1)
+    with np.errstate(invalid="ignore"):  # damage makes numbers that are none; they are left out
+        return np.stack([columns[key].astype(np.float64) for key in keys], 1)
 
 
 def _take_attitude(collected: TelemetryCollector, columns: Columns) -> None:
