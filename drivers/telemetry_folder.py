@@ -78,7 +78,12 @@ def read_telemetry(folder: Path, pictures: Pictures, config: TelemetryConfig) ->
 
 def _aligned(content: LogContent, pictures: Pictures, config: TelemetryConfig) -> TelemetryLog:
     shift_ns = round(config.offset_s * 1e9)
-    host_ns, warnings = content.host_ns, list(content.warnings)
+    host_ns = content.host_ns
+    # a reader that knows the autopilot's clock only cannot say when
+    warnings = [
+        dataclasses.replace(warned, t_ns=warned.t_ns or pictures.start_ns)
+        for warned in content.warnings
+    ]
     if host_ns is None and len(content.collected):
         if not config.starts_with_video:
             what = "telemetry has no absolute time and is not used"
