@@ -216,7 +216,9 @@ class Georeferencer:
     ) -> Georeference:
         start = places[0].map_from_camera.translation
         similarity = Similarity(scale, level, -scale * (level @ start))
-        return Georeference(similarity, sigma, float(SIGMA_YAW_RAD), method, n, 0.0)
+        return Georeference(
+            similarity, sigma, float(SIGMA_YAW_RAD), method, n, 0.0, has_origin=False
+        )
 
 
 def _mean_rotation(places: list[Place]) -> Array | None:

@@ -166,6 +166,8 @@ class Georeference:
     method: str
     n_positions: int
     residual_m: float
+    has_origin: bool = True
+    """False where only the scale is known: the world then begins at the first camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -66,6 +66,7 @@ def replay(
             FileViewer(config.viewer, flight.camera, out / "flight.rrd")
         )
         sinks.append(recording)
+        live: LiveViewer | None = None
         if viewer != "none":
             live = stack.enter_context(LiveViewer(config.viewer, flight.camera, viewer))
             sinks.append(live)
@@ -80,9 +81,12 @@ def replay(
             progress.finish()
             pipeline.finish()
             dropped["depth frames"] = pipeline.n_depth_frames_dropped
+            if live is not None:
+                dropped["viewer messages"] = live.n_dropped
             facts = RunFacts(
                 stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
-                origin=log.origin, device=device.name if device else "none (depth.enabled = false)",
+                origin=log.origin if _has_origin(result) else None,
+                device=device.name if device else "none (depth.enabled = false)",
                 config=dump(config), versions=_versions(), command=shlex.join(sys.argv),
                 peak_memory_mb=_peak_memory_mb(), camera=flight.camera,
                 n_frames_total=flight.n_frames_between(start_ns, stop_ns),
@@ -137,6 +141,10 @@ def _run(
             done += 1
             progress.update(done, pipeline.state, result.n_points)
     return {"frames": player.n_dropped if player else 0}
+
+
+def _has_origin(result: FlightResult) -> bool:
+    return result.georeference is not None and result.georeference.has_origin
 
 
 def _versions() -> dict[str, str]:

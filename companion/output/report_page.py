@@ -112,7 +112,8 @@ def _plots(
     first = result.first_t_ns or 0
     found = result.autopilot_path()
     autopilot = None
-    if found is not None and (result.georeference is not None or not stretches):
+    placed = result.georeference is not None and result.georeference.has_origin
+    if found is not None and (placed or not stretches):
         _, t_ns, position = found
         during = (t_ns >= first) & (t_ns <= (result.last_t_ns or first))
         if during.any():

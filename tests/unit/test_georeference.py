@@ -104,6 +104,7 @@ def test_rangefinder_gives_scale_where_there_is_no_position() -> None:
     found = georeferencer.solve(kept)
     assert found is not None
     assert found.method == "rangefinder"
+    assert not found.has_origin
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=0.01)
 
 
