@@ -133,7 +133,7 @@ class DepthConfig:
     enabled: bool = True
     stride: Annotated[int, Range(1, 8)] = 2
     """Depth is estimated for every so many pixels; images are matched at full size."""
-    reference_step: Annotated[float, Range(0, 10)] = 0.2
+    reference_step: Annotated[float, Range(0, 10)] = 0.15
     """A keyframe gets a depth map when it is this far from the last, as a share of the depth."""
     n_updates: Annotated[int, Range(3, 100)] = 7
     """Frames that a keyframe's depth is made of, chosen by their baselines."""

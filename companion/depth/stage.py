@@ -148,8 +148,8 @@ class DepthStage:
         relative = before.inverse() @ place
         step = float(np.linalg.norm(relative.translation)) / relative.scale / median_depth
         turn = float(np.arccos(np.clip(relative.rotation[2, 2], -1, 1)))
-        # a step towards a far point shows little, a turn by a tenth of the image a tenth
-        return step > self._config.reference_step or turn > 0.2 * self._half_view_rad
+        # a turn by so much shows a sixth of the image anew
+        return step > self._config.reference_step or turn > 0.35 * self._half_view_rad
 
     def _choose(
         self, keyframe: KeyframeAdded, update: MapUpdate, place: Similarity, median_depth: float
