@@ -1,0 +1,95 @@
+"""The depth stage on a rendered flight: points in the right place, memory bounded."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+from companion.camera import Camera, Distortion
+from companion.config import CloudConfig, DepthConfig, OpenclConfig
+from companion.depth.opencl import open_device
+from companion.depth.stage import MAX_HELD, DepthStage
+from companion.geometry import Pose, rotation_from_vector
+from companion.messages import (
+    DepthMap,
+    Frame,
+    KeyframeAdded,
+    MapUpdate,
+    Message,
+    PointChunk,
+    Track,
+    TrackState,
+)
+from tests.support.scene import DOWN_LOOKING, PlaneWorld
+
+RADTAN = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
+FISHEYE = Camera(242, 181, 170.0, 170.0, 121.0, 90.0, Distortion.EQUIDISTANT, (0.01, 0, 0, 0))
+
+
+def at(k: int) -> Pose:
+    turn = rotation_from_vector(np.array([0.01 * np.sin(k), 0.15, 0.004 * k])) @ DOWN_LOOKING
+    return Pose(turn, np.array([0.05 * k, 0.2 * k - 3, -12.0]))
+
+
+def stage(camera: Camera) -> DepthStage:
+    device = open_device(OpenclConfig())
+    return DepthStage(DepthConfig(), CloudConfig(), camera, device, lambda _: nullcontext())
+
+
+def fly(camera: Camera, n: int = 34, unit_of: dict[int, float] | None = None) -> list[Message]:
+    """A flight with true poses and a keyframe every fourth frame; all that the stage gives."""
+    world = PlaneWorld(np.random.default_rng(21))
+    it, out = stage(camera), []
+    poses: dict[int, Pose] = {}
+    for k in range(n):
+        grey, depth = world.render(camera, at(k))
+        out += it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
+        if k % 4 == 0:
+            poses[k // 4] = at(k)
+        reference = poses[k // 4]
+        relative = reference.inverse() @ at(k)
+        out += it.step(Track(k, k, TrackState.TRACKING, at(k), k // 4, relative))
+        if k % 4 == 0:
+            v, u = np.nonzero(depth)
+            some = slice(None, None, 97)
+            n2 = camera.normalise(np.stack([u[some], v[some]], 1))
+            z = depth[v[some], u[some]]
+            points = np.c_[n2 * z[:, None], z]
+            out += it.step(KeyframeAdded(k // 4, k, k, at(k), points[np.isfinite(points).all(1)]))
+            out += it.step(MapUpdate(k, k, dict(poses), np.zeros((0, 3)), None, unit_of or {}))
+    return out + it.flush()
+
+
+@pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=["radtan", "fisheye"])
+def test_points_lie_on_the_surfaces(camera: Camera) -> None:
+    out = fly(camera)
+    chunks = [m for m in out if isinstance(m, PointChunk)]
+    assert [m for m in out if isinstance(m, DepthMap)]
+    assert sum(len(c.points_camera) for c in chunks) > 1000
+    heights = np.concatenate(
+        [at(4 * c.keyframe_id).apply(c.points_camera.astype(np.float64))[:, 2] for c in chunks]
+    )
+    # the ground, and the roofs of PlaneWorld half a metre apart
+    surfaces = np.array([0.0, -1.5, -2.0, -2.5, -3.0, -3.5, -4.0])
+    off = np.abs(heights[:, None] - surfaces).min(1)
+    assert np.median(off) < 0.06  # metres, from 12 m above
+    assert (off < 0.24).mean() > 0.95
+    for chunk in chunks:
+        assert len(chunk.points_camera) == len(chunk.rgb) == len(chunk.confidence)
+        assert ((chunk.confidence >= 0) & (chunk.confidence <= 1)).all()
+
+
+def test_keyframes_of_other_segments_do_not_meet() -> None:
+    alone = fly(RADTAN, unit_of={k: 1.0 + 0.1 * k for k in range(20)})
+    assert not [m for m in alone if isinstance(m, PointChunk)], "no two keyframes share a unit"
+
+
+def test_images_do_not_pile_up_while_hovering() -> None:
+    it = stage(RADTAN)
+    grey = np.zeros((RADTAN.height, RADTAN.width), np.uint8)
+    for k in range(3 * MAX_HELD):
+        it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
+        it.step(Track(k, k, TrackState.TRACKING, Pose.identity(), 0, Pose.identity(), 50))
+    assert len(it._held) <= MAX_HELD + 1
