@@ -14,7 +14,7 @@ import numpy as np
 from companion.camera import Camera
 from companion.clock import Timer
 from companion.config import Config
-from companion.geometry import Array, Pose
+from companion.geometry import Array, Pose, angle_between
 from companion.messages import Frame, KeyframeAdded, Track, TrackState
 from companion.slam.bootstrap import Bootstrap
 from companion.slam.features import FeatureExtractor, Features, Ints
@@ -25,6 +25,7 @@ from companion.slam.pose_refinement import refine_pose
 from companion.slam.relocalizer import Relocalizer
 from companion.slam.view import View
 
+MAX_TURN_UNSEEN_RAD = np.radians(15.0)
 MAX_YOUNG_KEYFRAMES = 5
 """A map that is lost again with so few keyframes was not worth keeping."""
 
@@ -185,7 +186,9 @@ class Tracker:
         if not found:
             return False
         self._refresh_local(view)
-        return self._match(view, view.camera_from_map, self._local, 5.0, count=True)
+        if not self._match(view, view.camera_from_map, self._local, 5.0, count=True):
+            return False
+        return _believable(view, prior)
 
     def _match(
         self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False
@@ -306,3 +309,11 @@ class Tracker:
 
     def _backfilled(self, view: View, first: Keyframe) -> Track:
         return self._report(view, first, backfilled=True)
+
+
+def _believable(view: View, prior: Prior) -> bool:
+    """Whether the attitude allows a pose: no camera turns so far unseen by the autopilot."""
+    if prior.map_from_camera is None or prior.ned_from_camera is None:
+        return True
+    off_rad = angle_between(prior.map_from_camera.rotation, view.camera_from_map.rotation.T)
+    return off_rad < float(MAX_TURN_UNSEEN_RAD)

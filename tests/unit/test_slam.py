@@ -143,3 +143,15 @@ def test_an_image_of_nothing_yields_no_pose(level: int) -> None:
         )
         assert isinstance(track, Track)
         assert track.map_from_camera is None
+
+
+def test_a_pose_that_the_attitude_rules_out_is_not_taken(images: list[np.ndarray]) -> None:
+    tracker, tracks, _ = run(images[:20], attitude=True)
+    last = tracks[19].map_from_camera
+    assert last is not None
+    turned = Pose(last.rotation @ rotation_from_vector(np.array([0, 0, 0.5])), last.translation)
+    grey = images[20]
+    frame = Frame(20, 2_000_000_000, grey, np.repeat(grey[..., None], 3, 2))
+    (track,) = tracker.step(frame, Prior(turned, path(20).rotation))
+    assert isinstance(track, Track)
+    assert track.state is TrackState.LOST
