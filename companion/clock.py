@@ -1,4 +1,4 @@
-"""The only file of the package that asks the time, and only to measure how long things take."""
+"""The only file of the package that asks the time."""
 
 from __future__ import annotations
 
@@ -12,6 +12,25 @@ import numpy as np
 
 Timer = Callable[[str], AbstractContextManager[None]]
 """What a stage is handed to have its parts timed, without knowing a clock."""
+
+
+class FlightClock:
+    """The time of a live flight: monotonic, counted from the Unix time at which this was made.
+
+    It looks like Unix time and never jumps, whatever is done to the system's clock meanwhile.
+    """
+
+    def __init__(self, epoch_ns: int | None = None) -> None:
+        self.epoch_ns = time.time_ns() - time.monotonic_ns() if epoch_ns is None else epoch_ns
+        """Unix time at which the monotonic clock was zero, as far as was known."""
+
+    def now_ns(self) -> int:
+        """Now."""
+        return time.monotonic_ns() + self.epoch_ns
+
+    def from_monotonic_ns(self, monotonic_ns: int) -> int:
+        """The time of the flight at a time by CLOCK_MONOTONIC."""
+        return monotonic_ns + self.epoch_ns
 
 
 class StageTimes:

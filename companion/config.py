@@ -3,7 +3,7 @@
 Each section is a frozen dataclass; a stage takes its own section only. `config/companion.toml`
 describes every key. An unknown key or a wrong type is a ConfigError that names the nearest key.
 
-A key is a bool, int, float or str; `Annotated` with a `Range` or `OneOf` says what values it takes,
+A key is a bool, int, float, str or a list of these last; `Annotated` with a `Range` or `OneOf` says what values it takes,
 which is checked where a configuration is read (`companion.config_file`).
 """
 
@@ -47,10 +47,145 @@ class OneOf:
 
 @dataclass(frozen=True, slots=True)
 class CameraConfig:
-    """What to do about a camera without calibration."""
+    """The camera: which one a live run opens, and what is known of it."""
 
+    source: Annotated[str, OneOf(("v4l2", "gstreamer", "network", "file", "pattern"))] = "v4l2"
+    """What kind of camera a live run opens."""
+    device: str = "auto"
+    """v4l2: a path, best of /dev/v4l/by-id; "auto" takes the only camera there is."""
+    pipeline: str = ""
+    """gstreamer: the pipeline up to, not including, its appsink."""
+    url: str = ""
+    """network: rtsp://… or what else FFmpeg opens."""
+    transport: Annotated[str, OneOf(("tcp", "udp"))] = "tcp"
+    """network: how RTSP brings its packets."""
+    path: str = ""
+    """file: a flight folder, a folder of images, or a video, played in real time."""
+    repeat: bool = False
+    """file: begin again at the end, else the camera is silent from then on."""
+    width: Annotated[int, Range(32, 8192)] = 640
+    height: Annotated[int, Range(32, 8192)] = 480
+    rate_hz: Annotated[float, Range(1, 240)] = 30.0
+    pixel_format: str = "auto"
+    """v4l2: a four-letter code such as YUYV or MJPG."""
+    exposure_us: Annotated[int, Range(0, 1000000)] = 0
+    """v4l2: exposure time; 0 leaves it to the camera."""
+    gain: Annotated[int, Range(-1, 100000)] = -1
+    """v4l2: in the camera's own steps; -1 leaves it to the camera."""
+    focus: Annotated[int, Range(-1, 100000)] = -1
+    """v4l2: in the camera's own steps; -1 leaves it to the camera."""
+    stamp_offset_ms: Annotated[float, Range(-1000, 1000)] = 0.0
+    """Added to stamps: from what the source states to the middle of the exposure."""
+    calibration: str = ""
+    """Calibration file of a live camera, as `companion calibrate` writes it."""
     assumed_hfov_deg: Annotated[float, Range(0, 150)] = 75.0
-    """Horizontal field of view taken when a flight has no camera.json; 0 refuses such flights."""
+    """Horizontal field of view taken where there is no calibration; 0 refuses that."""
+
+
+@dataclass(frozen=True, slots=True)
+class MountConfig:
+    """How a live camera sits on the body, where its calibration file does not say.
+
+    The angles turn a camera that looks forward, upright: first by yaw to the right, then by pitch
+    upwards, then by roll clockwise about its own axis.
+    """
+
+    known: bool = False
+    """Whether what follows is true; without it the autopilot's attitude cannot be used."""
+    roll_deg: Annotated[float, Range(-180, 180)] = 0.0
+    pitch_deg: Annotated[float, Range(-180, 180)] = 0.0
+    """-90 looks straight down."""
+    yaw_deg: Annotated[float, Range(-180, 180)] = 0.0
+    x_m: Annotated[float, Range(-100, 100)] = 0.0
+    """Place of the lens from the autopilot: forward, right, down."""
+    y_m: Annotated[float, Range(-100, 100)] = 0.0
+    z_m: Annotated[float, Range(-100, 100)] = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfig:
+    """The autopilot's link."""
+
+    url: str = ""
+    """serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT; "" for none. A baud
+    of "auto" is found out."""
+    backend: Annotated[str, OneOf(("pymavlink", "mavsdk"))] = "pymavlink"
+    system_id: Annotated[int, Range(0, 255)] = 0
+    """The vehicle's; 0 takes the first autopilot heard."""
+    component_id: Annotated[int, Range(1, 255)] = 197
+    """Ours; 197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
+    attitude_hz: Annotated[float, Range(0, 400)] = 50.0
+    """Rates asked of the autopilot; 0 asks for nothing."""
+    imu_hz: Annotated[float, Range(0, 1000)] = 0.0
+    position_hz: Annotated[float, Range(0, 100)] = 10.0
+    """Of local, global and GPS position."""
+    height_hz: Annotated[float, Range(0, 100)] = 10.0
+    """Of pressure and rangefinder."""
+    timesync_hz: Annotated[float, Range(0.1, 50)] = 10.0
+    silent_after_s: Annotated[float, Range(0.2, 60)] = 3.0
+    """Without a heartbeat for so long the autopilot counts as gone."""
+    signing_key_file: str = ""
+    """A file with 64 hexadecimal digits; "" for unsigned MAVLink."""
+
+
+@dataclass(frozen=True, slots=True)
+class RouterConfig:
+    """Who else talks to the autopilot over our link."""
+
+    clients: tuple[str, ...] = ()
+    """udpin:HOST:PORT, udpout:HOST:PORT or tcpin:HOST:PORT each; HOST may be left out: loopback."""
+    queue_kb: Annotated[int, Range(4, 65536)] = 256
+    """What waits for a slow client at most; what is older is given up."""
+
+
+@dataclass(frozen=True, slots=True)
+class FeedbackConfig:
+    """The pose that the autopilot is given."""
+
+    mode: Annotated[str, OneOf(("off", "odometry", "vision_position"))] = "off"
+    rate_hz: Annotated[float, Range(4, 100)] = 30.0
+    """At least so many poses a second; between frames they are predicted."""
+    max_sigma_m: Annotated[float, Range(0.01, 100)] = 1.0
+    """Positions with a larger standard deviation are not sent."""
+    min_quality: Annotated[int, Range(1, 100)] = 20
+    """Poses of a lower quality are not sent."""
+    max_gap_ms: Annotated[float, Range(30, 300)] = 200.0
+    """A pose may be predicted for so long after the frame that it comes from."""
+    resume_after_s: Annotated[float, Range(0.1, 60)] = 1.0
+    """Belief must have held for so long before poses are sent again."""
+    max_jump_m: Annotated[float, Range(0.05, 100)] = 1.0
+    """What a pose may be away from where motion has it, before that counts as a reset."""
+    set_origin: bool = True
+    """Give the autopilot an origin where it has none, so that it can use a pose."""
+    origin_latitude_deg: Annotated[float, Range(-90, 90)] = 0.0
+    """That origin, where no GPS has told one."""
+    origin_longitude_deg: Annotated[float, Range(-180, 180)] = 0.0
+    origin_altitude_m: Annotated[float, Range(-500, 9000)] = 0.0
+    obstacle_distance: bool = False
+    """Send OBSTACLE_DISTANCE from the newest part of the cloud."""
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonConfig:
+    """The long-running program."""
+
+    flights: str = "flights"
+    """Folder under which each flight gets one of its own."""
+    flight: Annotated[str, OneOf(("armed", "always"))] = "armed"
+    """A flight lasts from arming to disarming, or as long as the daemon runs."""
+    missing_device_s: Annotated[float, Range(0, 3600)] = 60.0
+    """A camera or autopilot missing for so long ends the daemon with status 1; 0: never. Not while
+    armed."""
+    socket: str = "auto"
+    """Unix socket of `companion status`; "auto" lies in $RUNTIME_DIRECTORY or $XDG_RUNTIME_DIR."""
+    prometheus_port: Annotated[int, Range(0, 65535)] = 0
+    """Loopback port of metrics; 0 for none."""
+    status_every_s: Annotated[float, Range(1, 3600)] = 10.0
+    """Between two status lines in the journal."""
+    viewer: str = "none"
+    """none, web, native, or the rerun+http://… of a running viewer."""
+    hot_c: Annotated[float, Range(30, 120)] = 85.0
+    """A processor hotter than this has its work cut down."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +319,11 @@ class Config:
     """All sections."""
 
     camera: CameraConfig = field(default_factory=CameraConfig)
+    mount: MountConfig = field(default_factory=MountConfig)
+    link: LinkConfig = field(default_factory=LinkConfig)
+    router: RouterConfig = field(default_factory=RouterConfig)
+    feedback: FeedbackConfig = field(default_factory=FeedbackConfig)
+    daemon: DaemonConfig = field(default_factory=DaemonConfig)
     telemetry: TelemetryConfig = field(default_factory=TelemetryConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from companion.config import Config, OneOf, Range
 from companion.errors import ConfigError
@@ -24,7 +24,10 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a string"}
+_KINDS = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "a string",
+    tuple: "a list of strings",
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -85,8 +88,8 @@ def _sections() -> Mapping[str, Mapping[str, _Key]]:
     for name, section in get_type_hints(Config).items():
         sections[name] = {}
         for key, hint in get_type_hints(section, include_extras=True).items():
-            kind, *limits = get_args(hint) or (hint,)
-            sections[name][key] = _Key(kind, tuple(limits))
+            kind, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+            sections[name][key] = _Key(get_origin(kind) or kind, tuple(limits))
     return sections
 
 
@@ -143,6 +146,8 @@ def _checked(section: str, key: str, value: Any, where: str) -> Any:
     wanted = _key(section, key, where)
     if wanted.kind is float and type(value) is int:
         value = float(value)
+    if wanted.kind is tuple and type(value) is list and all(type(v) is str for v in value):
+        value = tuple(value)
     if type(value) is not wanted.kind:
         given = _KINDS.get(type(value), f"a {type(value).__name__}")
         raise ConfigError(

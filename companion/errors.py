@@ -5,6 +5,7 @@ CompanionError            one clear line for the user: what, where, what to do
 │   ├── ConfigError       an unknown key, a wrong type or value
 │   ├── FlightError       a flight folder, video, calibration or log that cannot be read
 │   └── DeviceError       no OpenCL device, or not the one asked for
+├── SourceError           a camera or a link is not there, or has gone; it may come back
 └── StageError            a stage failed on input that it should have handled; exit status 1
 """
 
@@ -29,6 +30,10 @@ class FlightError(InputError):
 
 class DeviceError(InputError):
     """The OpenCL device asked for is not there or does not compute correctly."""
+
+
+class SourceError(CompanionError):
+    """A camera or an autopilot's link cannot be opened now, or has gone; it may come back."""
 
 
 class StageError(CompanionError):

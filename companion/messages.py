@@ -138,6 +138,30 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Where the body is, as an autopilot may be told: metric, level, and without jumps.
+
+    `world_from_body` is in local NED metres, or, where no position tells where its zero is, in
+    metres from where the map began. It follows the camera smoothly: what the map learns later is
+    worked in slowly, and only a real discontinuity, which raises `reset_counter`, moves it at once.
+    None while lost or without a metric scale. `velocity_world_m_s` (3,); `sigma_position_m` is one
+    standard deviation of the position since the last reset, `sigma_attitude_rad` of the attitude;
+    `quality` is 1..100, or -1 while the pose is not known.
+    """
+
+    seq: int
+    t_ns: int
+    state: TrackState
+    reset_counter: int
+    quality: int = -1
+    world_from_body: Pose | None = None
+    velocity_world_m_s: Array | None = None
+    sigma_position_m: float = float("inf")
+    sigma_velocity_m_s: float = float("inf")
+    sigma_attitude_rad: float = float("inf")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class KeyframeAdded:
     """A new keyframe: which frame it is, and how deep the map points that it sees lie.
 
@@ -260,7 +284,8 @@ class ClockReport:
 
 
 Message = (
-    Frame | Telemetry | Track | KeyframeAdded | MapUpdate | DepthMap | PointChunk | Warned
+    Frame | Telemetry | Track | Odometry | KeyframeAdded | MapUpdate | DepthMap | PointChunk
+    | Warned
 )  # fmt: skip
 
 Details = Mapping[str, Any]
