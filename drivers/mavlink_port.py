@@ -1,0 +1,32 @@
+"""MAVLink messages in and out, whatever library and whatever wire carries them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+OnMessage = Callable[[Any, int], None]
+"""Takes a message as pymavlink has it, and the flight's time at which it came, ns."""
+
+
+class MavlinkPort(Protocol):
+    """One end of a MAVLink link. Used from one event loop; nothing here blocks or raises."""
+
+    name: str
+    """For people: what it is plugged into."""
+    identity: tuple[int, int]
+    """System and component that `send` speaks as; may be set at any time, by who knows it."""
+    connected: bool
+    """Whether the wire is there; it says nothing about an autopilot at its other end."""
+    n_received: int
+    n_sent: int
+    n_dropped: int
+    """Messages that could not be sent."""
+    n_bad: int
+    """Packets that were refused: damaged, or not signed as they should be."""
+
+    async def run(self, on_message: OnMessage) -> None:
+        """Receive for ever, reconnecting as needed; ends when it is cancelled."""
+
+    def send(self, message: Any) -> None:
+        """Send a pymavlink message that has not been packed yet; dropped and counted if need be."""
