@@ -6,11 +6,13 @@ handed in. What they report is frozen: `SourceHealth`, `StageHealth`, and all of
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 WINDOW_S = 5.0
 """Rates and latencies are those of the last so many seconds."""
@@ -52,6 +54,173 @@ class StageHealth:
     n_dropped: int = 0
     n_restarted: int = 0
     detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FeedbackHealth:
+    """The pose that the autopilot is given, or why it is not.
+
+    `why_not` is one of a few constant phrases, by which a change is noticed; numbers belong in
+    `detail`. Latency counts from exposure to sending.
+    """
+
+    mode: str = "off"
+    sending: bool = False
+    why_not: str = ""
+    detail: str = ""
+    rate_hz: float = 0.0
+    latency_p50_ms: float | None = None
+    latency_p95_ms: float | None = None
+    n_sent: int = 0
+    n_resets: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessLoad:
+    """One of our processes. `cpu_cores` is 1.5 where it keeps one and a half cores busy."""
+
+    name: str
+    pid: int
+    cpu_cores: float
+    memory_mib: float
+
+
+@dataclass(frozen=True, slots=True)
+class ComputerLoad:
+    """The computer that this runs on. Shares are 0 to 1; None is what it does not tell."""
+
+    uptime_s: float = 0.0
+    cpu_share: float | None = None
+    core_shares: tuple[float, ...] = ()
+    gpu_share: float | None = None
+    temperatures_c: Mapping[str, float] = field(default_factory=dict)
+    """By the name of the sensor."""
+    fans_rpm: tuple[int, ...] = ()
+    memory_used_mib: float | None = None
+    memory_total_mib: float | None = None
+    disk_kind: str = ""
+    """hdd, ssd, emmc or sd: what the flights are written to; "" where that is not known."""
+    disk_used_mib: float | None = None
+    disk_total_mib: float | None = None
+    disk_free_mib: float | None = None
+    """What we may still write, which is less than total minus used."""
+    processes: tuple[ProcessLoad, ...] = ()
+
+    @property
+    def temperature_c(self) -> float | None:
+        """The hottest sensor."""
+        return max(self.temperatures_c.values(), default=None)
+
+    @property
+    def memory_share(self) -> float | None:
+        """Share of the memory that is in use."""
+        if self.memory_used_mib is None or not self.memory_total_mib:
+            return None
+        return self.memory_used_mib / self.memory_total_mib
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """All of it, at one time. `tracker` is in plain words; `quality` 1 to 100, -1 while lost."""
+
+    t_ns: int
+    uptime_s: float = 0.0
+    sources: tuple[SourceHealth, ...] = ()
+    stages: tuple[StageHealth, ...] = ()
+    tracker: str = "waiting for the camera"
+    quality: int = -1
+    scale: str = ""
+    """Where the metric scale comes from, in words; "" while there is none."""
+    pose_latency_p95_ms: float | None = None
+    feedback: FeedbackHealth = field(default_factory=FeedbackHealth)
+    flight: str = ""
+    """Name of the flight that goes on; "" between flights."""
+    load: ComputerLoad = field(default_factory=ComputerLoad)
+    degradation: int = 0
+    """0 is everything; see companion.governor."""
+    degraded: str = ""
+    """What is left out and why, in words."""
+    loop_delay_p99_ms: float | None = None
+    n_warnings: Mapping[str, int] = field(default_factory=dict)
+    """How often each thing was warned of since the start."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain types only; what is not a finite number is null."""
+        document = _plain(dataclasses.asdict(self))
+        document["load"]["temperature_c"] = _plain(self.load.temperature_c)
+        document["load"]["memory_share"] = _plain(self.load.memory_share)
+        document["line"] = self.line()
+        return dict(document)
+
+    def line(self) -> str:
+        """One line for the journal: what matters in flight first."""
+        parts = [self._pose(), self._feedback()]
+        parts += [_source(source) for source in self.sources]
+        parts += [_stage(stage) for stage in self.stages if not stage.alive or stage.n_restarted]
+        parts.append(self._computer())
+        if self.degraded:
+            parts.append(f"reduced: {self.degraded}")
+        parts.append(f"flight {self.flight}" if self.flight else "no flight")
+        return "; ".join(part for part in parts if part)
+
+    def key(self) -> Hashable:
+        """Equal as long as nothing has changed that is worth a line at once."""
+        return (
+            self.tracker,
+            bool(self.scale),
+            tuple((source.name, source.state, source.n_reopened) for source in self.sources),
+            tuple((stage.name, stage.alive, stage.n_restarted) for stage in self.stages),
+            (self.feedback.mode, self.feedback.sending, self.feedback.why_not),
+            self.flight,
+            self.degradation,
+        )
+
+    def _pose(self) -> str:
+        text = self.tracker
+        if self.quality > 0:
+            text += f", quality {self.quality}"
+        if self.pose_latency_p95_ms is not None:
+            text += f", {self.pose_latency_p95_ms:.0f} ms"
+        return text + ("" if self.scale else ", no scale")
+
+    def _feedback(self) -> str:
+        feedback = self.feedback
+        if feedback.mode == "off":
+            return "feedback off"
+        if feedback.sending:
+            return f"feedback {feedback.rate_hz:.0f}/s"
+        return f"no feedback: {feedback.why_not or 'not yet'}" + _in_brackets(feedback.detail)
+
+    def _computer(self) -> str:
+        load = self.load
+        parts = []
+        if load.cpu_share is not None:
+            parts.append(f"cpu {100 * load.cpu_share:.0f} %")
+        if load.memory_share is not None:
+            parts.append(f"memory {100 * load.memory_share:.0f} %")
+        if load.temperature_c is not None:
+            parts.append(f"{load.temperature_c:.0f} C")
+        if load.disk_free_mib is not None:
+            parts.append(f"disk {load.disk_free_mib / 1024:.1f} GiB free")
+        return ", ".join(parts)
+
+
+class StatusLines:
+    """Says when a status line is due: every so often, and at once when something has changed."""
+
+    def __init__(self, every_s: float) -> None:
+        self._every_ns = round(every_s * 1e9)
+        self._key: Hashable = None
+        self._last_ns: int | None = None
+
+    def step(self, health: Health) -> str | None:
+        """The line that is due now, or None; to be asked several times a second."""
+        since_ns = None if self._last_ns is None else health.t_ns - self._last_ns
+        if since_ns is not None and since_ns < self._every_ns:
+            if health.key() == self._key or since_ns < MIN_BETWEEN_LINES_S * 1e9:
+                return None
+        self._key, self._last_ns = health.key(), health.t_ns
+        return health.line()
 
 
 class RateMeter:
@@ -166,3 +335,34 @@ class LatencyMeter:
         if not recent:
             return None
         return recent[max(0, math.ceil(percent / 100 * len(recent)) - 1)]
+
+
+def _source(source: SourceHealth) -> str:
+    text = f"{source.name} "
+    if source.state == "running":
+        text += f"{source.rate_hz:.0f}/s"
+    elif source.state == "silent" and source.age_s is not None:
+        text += f"silent for {source.age_s:.0f} s"
+    else:
+        text += source.state + _in_brackets(source.detail)
+    return text + (f" ({source.n_dropped} dropped)" if source.n_dropped else "")
+
+
+def _stage(stage: StageHealth) -> str:
+    if not stage.alive:
+        return f"{stage.name} down" + _in_brackets(stage.detail)
+    return f"{stage.name} restarted {stage.n_restarted} x"
+
+
+def _in_brackets(detail: str) -> str:
+    return f" ({detail})" if detail else ""
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value
