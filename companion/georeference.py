@@ -87,10 +87,20 @@ class _Series:
 
 
 class Georeferencer:
-    """Collects what the autopilot says of its place; puts a map there when asked."""
+    """Collects what the autopilot says of its place; puts a map there when asked.
 
-    def __init__(self, config: GeoreferenceConfig, body_from_camera: Pose | None) -> None:
+    With `sensors_only` the autopilot's own estimates are left aside: one that flies on our pose
+    would give us our own errors back as truth.
+    """
+
+    def __init__(
+        self,
+        config: GeoreferenceConfig,
+        body_from_camera: Pose | None,
+        sensors_only: bool = False,
+    ) -> None:
         self._config = config
+        self._sources = [PositionSource.GPS] if sensors_only else list(PositionSource)
         self._body_from_camera = body_from_camera
         self._positions = {source: _Series() for source in PositionSource}
         self._travel = {source: _Series() for source in PositionSource}
@@ -123,7 +133,7 @@ class Georeferencer:
             chosen = np.unique(np.linspace(0, len(places) - 1, MAX_PLACES).astype(int))
             places = [places[int(i)] for i in chosen]
         level = _mean_rotation(places)
-        for source in PositionSource:
+        for source in self._sources:
             if len(self._positions[source]) >= 4:
                 found = self._from_positions(places, level, source)
                 if found is not None:

@@ -21,14 +21,19 @@ from companion.messages import (
     AttitudeSample,
     Frame,
     Georeference,
+    HeightSample,
     KeyframeAdded,
     MapUpdate,
     Message,
+    Odometry,
+    PositionSample,
+    RangeSample,
     Track,
     TrackState,
     Warned,
 )
 from companion.motion import AttitudeHistory, MotionFilter
+from companion.odometry import SmoothOdometry
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.mapper import Mapper
 from companion.slam.tracker import Prior, Tracker
@@ -39,17 +44,26 @@ MIN_DOWN_COSINE = np.cos(np.radians(8.0))
 
 
 class LocalisationStage:
-    """Knows where the camera is."""
+    """Knows where the camera is.
 
-    def __init__(self, config: Config, camera: Camera, times: Timer) -> None:
+    With `beside` keyframes are worked into the map in another thread, so that no frame waits for
+    it. What an autopilot thinks of its place is left aside where it flies on ours.
+    """
+
+    def __init__(
+        self, config: Config, camera: Camera, times: Timer, *, beside: bool = False
+    ) -> None:
         self._config = config
         self._camera = camera
         self._times = times
-        self._tracker = Tracker(config, camera, times)
+        self._tracker = Tracker(config, camera, times, beside)
         self._mapper_config = config.mapping
         self._attitude = AttitudeHistory()
         self._motion = MotionFilter()
-        self._georeferencer = Georeferencer(config.georeference, camera.body_from_camera)
+        self._georeferencer = Georeferencer(
+            config.georeference, camera.body_from_camera, sensors_only=config.feedback.mode != "off"
+        )
+        self._odometry = SmoothOdometry(camera, config.feedback.max_jump_m)
         self._georeferences: dict[int, Georeference] = {}
         self._use_attitude = camera.body_from_camera is not None
         self._main_from_newest = Similarity.identity()
@@ -69,18 +83,21 @@ class LocalisationStage:
             return self._frame(message)
         if isinstance(message, AttitudeSample):
             self._attitude.add(message)
-        elif not isinstance(message, (Track, KeyframeAdded, MapUpdate, Warned)):
-            self._georeferencer.take(message)  # type: ignore[arg-type]
+        elif isinstance(message, (PositionSample, RangeSample, HeightSample)):
+            self._georeferencer.take(message)
         return []
 
     def finish(self) -> list[Message]:
         """Adjust the whole map at the end of a flight."""
+        out: list[Message] = [*self._tracker.close()]
         with self._times("final adjustment"):
             for segment in self._segments():
-                Mapper(self._mapper_config, self._camera, segment).adjust_all(
-                    self._config.mapping.final_iterations
-                )
-        return [self._map_update(final=True)] if self._segments() else []
+                Mapper(
+                    self._mapper_config, self._camera, segment, self._tracker.turn
+                ).adjust_all(self._config.mapping.final_iterations)
+        if self._segments():
+            out.append(self._map_update(final=True))
+        return out
 
     def _segments(self) -> list[SlamMap]:
         return [s for s in self._tracker.segments if s.keyframes]
@@ -105,15 +122,25 @@ class LocalisationStage:
             if isinstance(message, Track) and message.map_from_camera is not None:
                 if message.seq == frame.seq:
                     self._motion.correct(frame.t_ns, message.map_from_camera, attitude)
+                    out.append(self._odometry_of(message))
                 placed = self._main_from_newest.apply_to_pose(message.map_from_camera)
                 out.append(replace(message, map_from_camera=placed))
             else:
+                if isinstance(message, Track):
+                    out.append(self._odometry_of(message))
                 out.append(message)
         if any(isinstance(m, KeyframeAdded) for m in tracked):
-            with self._times("georeference"):
+            with self._times("georeference"), self._tracker.turn.tracking():
                 out.append(self._map_update(final=False))
         out += self._judge_attitude(frame.t_ns)
         return out
+
+    def _odometry_of(self, track: Track) -> Odometry:
+        """A track of the newest segment, in that segment's own frame, as an autopilot wants it."""
+        key = next(iter(self._tracker.map.keyframes), -1)
+        return self._odometry.step(
+            track, key, self._georeferences.get(key), self._motion.velocity
+        )  # fmt: skip
 
     def _judge_attitude(self, t_ns: int) -> list[Message]:
         """Stop using an attitude that is not the camera's (a gimbal), and say so once."""

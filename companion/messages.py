@@ -122,7 +122,8 @@ class Track:
     Its pose is `map_from_camera` as believed at that time, and `keyframe_from_camera` relative to
     keyframe `keyframe_id`, which stays true when the map is corrected. All are None unless
     tracking. `keypoints_px` (N, 2) are distorted pixels of the map points found. `backfilled` marks
-    frames that were placed after the fact (those between the two initial keyframes, say).
+    frames that were placed after the fact (those between the two initial keyframes, say). The sigmas
+    are of the pose in the map by this image alone, the position's in map units.
     """
 
     seq: int
@@ -135,6 +136,8 @@ class Track:
     n_matches: int = 0
     keypoints_px: Floats | None = None
     backfilled: bool = False
+    sigma_position: float = float("inf")
+    sigma_rotation_rad: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

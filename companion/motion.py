@@ -105,6 +105,14 @@ class MotionFilter:
             return None
         return float(np.median(self._disagreement_rad))
 
+    @property
+    def velocity(self) -> tuple[Array, float] | None:
+        """Velocity (3,) in map units per second and its standard deviation; None until known."""
+        if self._filter is None:
+            return None
+        variance = float(np.diag(self._filter.P)[3:6].max())
+        return self._filter.x.ravel()[3:6].copy(), float(np.sqrt(max(variance, 0.0)))
+
     def predict(self, t_ns: int, ned_from_camera: Array | None) -> Pose | None:
         """Predicted `map_from_camera`; None when nothing is known."""
         if self._filter is None or self._t_ns is None:

@@ -72,7 +72,8 @@ def replay(
             sinks.append(live)
         depth = _depth_stage(config, flight, device, times)
         pipeline = Pipeline(
-            LocalisationStage(config, flight.camera, times), depth, sinks, lossless=not paced
+            LocalisationStage(config, flight.camera, times, beside=paced), depth, sinks,
+            lossless=not paced,
         )
         try:
             dropped = _run(pipeline, result, flight, log, start_ns, stop_ns, paced, progress)

@@ -6,6 +6,7 @@ window of ten cameras and a whole flight of hundreds are the same code and littl
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,8 +59,10 @@ def _cost(residual: Array, depth: Array) -> float:
     return float(np.where(depth > 0, robust, HUBER * 100.0).sum())
 
 
-def adjust(bundle: Bundle, iterations: int = 6) -> Adjusted:
-    """Adjust; the input is left as it is."""
+def adjust(
+    bundle: Bundle, iterations: int = 6, between: Callable[[], None] = lambda: None
+) -> Adjusted:
+    """Adjust; the input is left as it is. `between` is called before each iteration."""
     b = bundle
     n_var, n_points = b.n_variable, len(b.points)
     rotation = np.stack([p.rotation for p in b.poses])
@@ -76,6 +79,7 @@ def adjust(bundle: Bundle, iterations: int = 6) -> Adjusted:
     shape = (6 * n_var, 3 * n_points)
     accepted = True
     for _ in range(iterations):
+        between()
         if accepted:
             jc, jp = _jacobians(rotation, p, b)
             size = np.sqrt((residual * residual).sum(1))

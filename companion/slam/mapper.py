@@ -12,6 +12,7 @@ from companion.slam.local_map import Projector
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.matching import match_epipolar
 from companion.slam.triangulation import consistent, triangulate
+from companion.slam.worker import MapTurn
 
 MIN_PARALLAX_RAD = np.radians(0.8)
 N_NEIGHBOURS = 8
@@ -20,8 +21,11 @@ N_NEIGHBOURS = 8
 class Mapper:
     """Owns the work done once for each keyframe."""
 
-    def __init__(self, config: MappingConfig, camera: Camera, slam_map: SlamMap) -> None:
+    def __init__(
+        self, config: MappingConfig, camera: Camera, slam_map: SlamMap, turn: MapTurn
+    ) -> None:
         self._config = config
+        self._turn = turn
         self._map = slam_map
         self._projector = Projector(camera)
 
@@ -45,6 +49,7 @@ class Mapper:
         created = []
         slam_map = self._map
         for other in neighbours:
+            self._turn.give_way()
             free_a = np.flatnonzero(keyframe.point_ids < 0)
             free_b = np.flatnonzero(other.point_ids < 0)
             other_from_here = other.camera_from_map @ keyframe.camera_from_map.inverse()
@@ -94,6 +99,7 @@ class Mapper:
         """Look for this keyframe's points in its neighbours, and theirs in it; merge doubles."""
         slam_map = self._map
         for other in neighbours:
+            self._turn.give_way()
             _, mine = slam_map.seen_by(keyframe)
             self._search_in(other, mine)
         theirs = (
@@ -209,7 +215,7 @@ class Mapper:
             np.concatenate([k.features.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
             np.concatenate([k.features.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
         )  # fmt: skip
-        result = adjust(bundle, iterations or self._config.iterations)
+        result = adjust(bundle, iterations or self._config.iterations, self._turn.give_way)
         for i, k in enumerate(variable):
             k.camera_from_map = result.poses[i]
         slam_map.positions[points] = result.points

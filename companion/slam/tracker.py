@@ -24,6 +24,7 @@ from companion.slam.mapper import Mapper
 from companion.slam.pose_refinement import refine_pose
 from companion.slam.relocalizer import Relocalizer
 from companion.slam.view import View
+from companion.slam.worker import AtOnce, Beside, MappingWorker, MapTurn
 
 MAX_TURN_UNSEEN_RAD = np.radians(15.0)
 MAX_YOUNG_KEYFRAMES = 5
@@ -42,9 +43,13 @@ class Prior:
 
 
 class Tracker:
-    """Frames and priors in; Tracks and KeyframeAdded out."""
+    """Frames and priors in; Tracks and KeyframeAdded out.
 
-    def __init__(self, config: Config, camera: Camera, times: Timer) -> None:
+    With `beside` the map is extended in another thread, and keyframes are told of when they are
+    done; without it each is done within its frame.
+    """
+
+    def __init__(self, config: Config, camera: Camera, times: Timer, beside: bool = False) -> None:
         self._config = config.tracking
         self._camera = camera
         self._times = times
@@ -53,6 +58,9 @@ class Tracker:
         self._mapping = config.mapping
         self._features = config.features
         self._next_keyframe_id = 0
+        self.turn = MapTurn()
+        """Taken by whoever else looks at the map."""
+        self._worker: MappingWorker = Beside(self.turn) if beside else AtOnce()
         self.segments: list[SlamMap] = []
         """Maps that stand for themselves: one more each time a lost camera had to begin anew."""
         self.state = TrackState.INITIALISING
@@ -70,7 +78,7 @@ class Tracker:
         if self.segments and len(self.map.keyframes) <= MAX_YOUNG_KEYFRAMES:
             self.segments.pop()
         self.segments.append(SlamMap(self._features.scale_factor, self._features.n_levels))
-        self.mapper = Mapper(self._mapping, self._camera, self.map)
+        self.mapper = Mapper(self._mapping, self._camera, self.map, self.turn)
         self._relocalizer = Relocalizer(self.map, self._camera.focal_px)
         self._last: View | None = None
         self._reference: Keyframe | None = None
@@ -80,6 +88,18 @@ class Tracker:
         """Take one frame; frames come in order of time."""
         with self._times("features"):
             features = self._extractor.extract(frame.grey)
+        with self.turn.tracking():
+            out = self._place_frame(frame, features, prior)
+        return out + self._worker.done()
+
+    def close(self) -> list[KeyframeAdded]:
+        """Finish the mapping that is under way; what it gave."""
+        self._worker.close()
+        return self._worker.done()
+
+    def _place_frame(
+        self, frame: Frame, features: Features, prior: Prior
+    ) -> list[Track | KeyframeAdded]:
         if self.state is TrackState.INITIALISING:
             return self._initialise(frame, features, prior)
         view = View(
@@ -92,13 +112,10 @@ class Tracker:
             return self._lost(frame, features, prior)
         self.state = TrackState.TRACKING
         self._lost_since_ns = None
-        out: list[Track | KeyframeAdded] = []
         self._last = view
-        if self._wants_keyframe(view):
-            with self._times("mapping"):
-                out.append(self._insert(view))
-        out.insert(0, self._report(view))
-        return out
+        if not self._worker.busy and self._wants_keyframe(view):
+            self._insert(view)
+        return [self._report(view)]
 
     # -- initialising ---------------------------------------------------------------------------
 
@@ -132,7 +149,7 @@ class Tracker:
         out: list[Track | KeyframeAdded] = [
             self._backfilled(v, first) for v in self._backfill(first, second)
         ]
-        out += [self._report(start.second), self._added(first), self._added(second)]
+        out += [self._report(start.second), _added(self.map, first), _added(self.map, second)]
         return out
 
     def _backfill(self, first: Keyframe, second: Keyframe) -> list[View]:
@@ -198,13 +215,13 @@ class Tracker:
         if len(points) < self._config.min_inliers:
             return False
         features = view.features
-        pose, inlier, _ = refine_pose(
+        pose, inlier, information = refine_pose(
             guess, self.map.positions[points], features.normalised[found], features.whitening[found]
         )
         n = int(inlier.sum())
         if n < self._config.min_inliers or n < 0.3 * len(points):
             return False
-        view.camera_from_map = pose
+        view.camera_from_map, view.information = pose, information
         view.point_ids[:] = -1
         view.point_ids[found[inlier]] = points[inlier]
         view.n_matches = len(points)
@@ -267,16 +284,23 @@ class Tracker:
         weak = share < config.keyframe_min_share and (parallax > 0.4 or share < 0.5)
         return weak or parallax > config.keyframe_parallax_deg or late
 
-    def _insert(self, view: View) -> KeyframeAdded:
+    def _insert(self, view: View) -> None:
         keyframe = self._keyframe(view)
         features = np.flatnonzero(view.point_ids >= 0)
         self.map.observe(keyframe, features, view.point_ids[features])
         keyframe.n_tracked_at_creation = len(features)
         self._reference = keyframe
-        self.mapper.add(keyframe)
+        mapper, slam_map = self.mapper, self.map
+
+        def extend() -> KeyframeAdded:
+            with self._times("mapping"):
+                mapper.add(keyframe)
+            return _added(slam_map, keyframe)
+
+        self._worker.submit(extend)
+        # already adjusted, where it was done at once
         view.camera_from_map = keyframe.camera_from_map
         view.point_ids = keyframe.point_ids.copy()
-        return self._added(keyframe)
 
     def _keyframe(self, view: View) -> Keyframe:
         keyframe = Keyframe(
@@ -285,13 +309,6 @@ class Tracker:
         )  # fmt: skip
         self._next_keyframe_id += 1
         return keyframe
-
-    def _added(self, keyframe: Keyframe) -> KeyframeAdded:
-        _, ids = self.map.seen_by(keyframe)
-        return KeyframeAdded(
-            keyframe.keyframe_id, keyframe.seq, keyframe.t_ns, keyframe.camera_from_map.inverse(),
-            keyframe.camera_from_map.apply(self.map.positions[ids]),
-        )  # fmt: skip
 
     # -- reporting ------------------------------------------------------------------------------
 
@@ -304,11 +321,31 @@ class Tracker:
         return Track(
             view.seq, view.t_ns, TrackState.TRACKING, map_from_camera, reference.keyframe_id,
             reference.camera_from_map @ map_from_camera, view.n_inliers, view.n_matches,
-            view.features.pixels[view.point_ids >= 0], backfilled,
+            view.features.pixels[view.point_ids >= 0], backfilled, *_sigmas(view),
         )  # fmt: skip
 
     def _backfilled(self, view: View, first: Keyframe) -> Track:
         return self._report(view, first, backfilled=True)
+
+
+def _sigmas(view: View) -> tuple[float, float]:
+    """Standard deviations by the image alone: of position, map units, and attitude, rad."""
+    if view.information is None:
+        return float("inf"), float("inf")
+    try:
+        covariance = np.linalg.inv(view.information)
+    except np.linalg.LinAlgError:
+        return float("inf"), float("inf")
+    variance = np.maximum(np.diag(covariance), 0.0)
+    return float(np.sqrt(variance[3:].max())), float(np.sqrt(variance[:3].max()))
+
+
+def _added(slam_map: SlamMap, keyframe: Keyframe) -> KeyframeAdded:
+    _, ids = slam_map.seen_by(keyframe)
+    return KeyframeAdded(
+        keyframe.keyframe_id, keyframe.seq, keyframe.t_ns, keyframe.camera_from_map.inverse(),
+        keyframe.camera_from_map.apply(slam_map.positions[ids]),
+    )  # fmt: skip
 
 
 def _believable(view: View, prior: Prior) -> bool:

@@ -21,6 +21,8 @@ class View:
     camera_from_map: Pose
     point_ids: Ints
     n_matches: int = 0
+    information: Array | None = None
+    """(6, 6) of the pose: rotation, translation in the camera frame"""
 
     @property
     def n_inliers(self) -> int:

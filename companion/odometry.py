@@ -1,0 +1,169 @@
+"""Where the body is, smoothly: the pose that an autopilot can fly on.
+
+The map keeps learning: its scale, its heading and its place in the world are refined all the time,
+and each refinement moves the pose of a camera that has not moved. Here the pose goes on from where
+it was, and what was learned is worked in as slowly as an autopilot can follow.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from companion.camera import Camera
+from companion.geometry import Array, Pose, yaw_rotation
+from companion.messages import Georeference, Odometry, Track, TrackState
+
+MAX_WORKED_IN_M_S = 0.15
+MAX_WORKED_IN_RAD_S = np.radians(0.5)
+MAX_ACCELERATION_M_S2 = 4.0
+DOUBTED_FRAMES = 6
+"""A pose where motion cannot have brought the camera is believed when so many others agree."""
+WAY_KEPT_NS = 10_000_000_000
+FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
+SIGMAS_BEYOND_NOISE = 3.0
+"""How much more matches of one image err together than each by itself says."""
+FULL_COUNT = 150
+GRID = 4
+
+
+class SmoothOdometry:
+    """Tracks of the newest map and its georeference in, Odometry out; one for each frame."""
+
+    def __init__(self, camera: Camera, max_jump_m: float) -> None:
+        mount = camera.body_from_camera
+        self._camera_from_body = mount.inverse() if mount is not None else Pose.identity()
+        self._size = np.array([camera.width, camera.height], np.float64)
+        self._max_jump_m = max_jump_m
+        self._segment: int | None = None
+        self._georeference: Georeference | None = None
+        self._odometry_from_world = Pose.identity()
+        self._last: tuple[int, Pose, Pose] | None = None
+        """time, `map_from_camera`, `odometry_from_body` of the last frame that was believed"""
+        self._velocity = np.zeros(3)
+        self._n_doubted = 0
+        self._way: deque[tuple[int, Array]] = deque()
+        self.reset_counter = 0
+
+    def step(
+        self,
+        track: Track,
+        segment: int,
+        georeference: Georeference | None,
+        velocity_map: tuple[Array, float] | None,
+    ) -> Odometry:
+        """Odometry of a frame.
+
+        `segment` names the map that the track is in, `georeference` is that map's own, and
+        `velocity_map` the camera's velocity in it with its standard deviation.
+        """
+        pose = track.map_from_camera
+        if track.state is not TrackState.TRACKING or pose is None or georeference is None:
+            return self._unknown(track)
+        if segment != self._segment or self._georeference is None:
+            self._begin(segment, georeference, pose)
+        elif georeference is not self._georeference:
+            self._change(georeference)
+        raw = self._raw(georeference, pose)
+        self._work_in(raw, track.t_ns)
+        placed = self._odometry_from_world @ raw
+        if not self._believable(placed, track.t_ns):
+            self._n_doubted += 1
+            if self._n_doubted < DOUBTED_FRAMES:
+                return self._unknown(track)
+            self.reset_counter += 1
+            self._way.clear()
+        self._n_doubted = 0
+        sigma_velocity = float("inf")
+        if velocity_map is not None:
+            to_world = georeference.world_from_map
+            self._velocity = (
+                self._odometry_from_world.rotation
+                @ to_world.rotation
+                @ velocity_map[0]
+                * to_world.scale
+            )
+            sigma_velocity = velocity_map[1] * to_world.scale
+        self._last = (track.t_ns, pose, placed)
+        self._way.append((track.t_ns, placed.translation))
+        while self._way[0][0] < track.t_ns - WAY_KEPT_NS:
+            self._way.popleft()
+        way_m = float(np.linalg.norm(placed.translation - self._way[0][1]))
+        noise_m = SIGMAS_BEYOND_NOISE * track.sigma_position * georeference.world_from_map.scale
+        return Odometry(
+            track.seq, track.t_ns, track.state, self.reset_counter, self._quality(track), placed,
+            self._velocity.copy(),
+            float(np.linalg.norm([FLOOR_M, noise_m, georeference.sigma_scale * way_m])),
+            sigma_velocity,
+            float(np.hypot(FLOOR_RAD, SIGMAS_BEYOND_NOISE * track.sigma_rotation_rad)),
+        )  # fmt: skip
+
+    def _unknown(self, track: Track) -> Odometry:
+        return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
+
+    def _raw(self, georeference: Georeference, map_from_camera: Pose) -> Pose:
+        """`world_from_body` as the map has it now."""
+        return georeference.world_from_map.apply_to_pose(map_from_camera) @ self._camera_from_body
+
+    def _begin(self, segment: int, georeference: Georeference, pose: Pose) -> None:
+        """Another map than before, or the first: nothing ties its poses to those of the last."""
+        offset = np.zeros(3)
+        if self._last is not None:
+            self.reset_counter += 1
+            if not georeference.has_origin:  # go on from the place last known
+                offset = self._last[2].translation - self._raw(georeference, pose).translation
+        self._odometry_from_world = Pose(np.eye(3), offset)
+        self._segment, self._georeference = segment, georeference
+        self._last = None
+        self._way.clear()
+
+    def _change(self, georeference: Georeference) -> None:
+        """The same map, better placed: the last pose stays where it was."""
+        if self._last is not None:
+            _, pose, placed = self._last
+            raw = self._raw(georeference, pose)
+            turn = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
+            self._odometry_from_world = Pose(turn, placed.translation - turn @ raw.translation)
+        self._georeference = georeference
+
+    def _work_in(self, raw: Pose, t_ns: int) -> None:
+        """Move towards the pose that the map has, where its place in the world is known."""
+        if self._last is None or self._georeference is None or not self._georeference.has_origin:
+            return
+        dt_s = min((t_ns - self._last[0]) * 1e-9, 1.0)
+        here = self._odometry_from_world @ raw
+        yaw = _yaw(self._odometry_from_world.rotation)
+        most = float(MAX_WORKED_IN_RAD_S) * dt_s
+        turn = yaw_rotation(yaw - float(np.clip(yaw, -most, most)))
+        away = here.translation - raw.translation
+        far = float(np.linalg.norm(away))
+        kept = max(far - MAX_WORKED_IN_M_S * dt_s, 0.0) / max(far, 1e-12)
+        at = raw.translation + kept * away
+        self._odometry_from_world = Pose(turn, at - turn @ raw.translation)
+
+    def _believable(self, placed: Pose, t_ns: int) -> bool:
+        """Whether motion can have brought the body here."""
+        if self._last is None:
+            return True
+        dt_s = (t_ns - self._last[0]) * 1e-9
+        before = self._last[2]
+        expected = before.translation + self._velocity * min(dt_s, 1.0)
+        away_m = float(np.linalg.norm(placed.translation - expected))
+        speed = float(np.linalg.norm(self._velocity))
+        beyond_s = max(dt_s - 1.0, 0.0)
+        return away_m < self._max_jump_m + 0.5 * MAX_ACCELERATION_M_S2 * dt_s**2 + speed * beyond_s
+
+    def _quality(self, track: Track) -> int:
+        """1..100: how many map points were found, over how much of the image, by how many tries."""
+        if track.keypoints_px is None or not len(track.keypoints_px):
+            return 1
+        cells = np.clip((track.keypoints_px / self._size * GRID).astype(int), 0, GRID - 1)
+        spread = len(np.unique(cells @ [1, GRID])) / GRID**2
+        count = min(1.0, track.n_inliers / FULL_COUNT)
+        found = track.n_inliers / max(track.n_matches, 1)
+        return int(np.clip(round(100 * count * np.sqrt(spread) * np.sqrt(found)), 1, 100))
+
+
+def _yaw(rotation: Array) -> float:
+    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))

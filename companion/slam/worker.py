@@ -1,0 +1,149 @@
+"""Where mapping runs: at once, so that results do not depend on speed, or beside the tracking."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from companion.messages import KeyframeAdded
+
+Job = Callable[[], KeyframeAdded]
+MAX_WAITING = 2
+
+
+class MapTurn:
+    """Whose turn it is to touch the map: the tracker's whenever it wants, else the mapper's.
+
+    The mapper gives way at places where the map is whole, so that a frame waits for a few
+    milliseconds of mapping at most. Not reentrant.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._wanted = self._tracking = self._mapping = False
+
+    @contextmanager
+    def tracking(self) -> Iterator[None]:
+        """Have the map for a frame; comes before any mapping that waits."""
+        with self._changed:
+            self._wanted = True
+            self._changed.wait_for(lambda: not self._mapping)
+            self._wanted, self._tracking = False, True
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._tracking = False
+                self._changed.notify_all()
+
+    @contextmanager
+    def mapping(self) -> Iterator[None]:
+        """Have the map while no frame needs it."""
+        self._take()
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._mapping = False
+                self._changed.notify_all()
+
+    def give_way(self) -> None:
+        """Let a frame that waits go first; for use within `mapping`, nothing outside of it."""
+        if self._wanted and self._mapping:
+            with self._changed:
+                self._mapping = False
+                self._changed.notify_all()
+            self._take()
+
+    def _take(self) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: not (self._wanted or self._tracking))
+            self._mapping = True
+
+
+class MappingWorker(Protocol):
+    """Runs one mapping job after the other."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether so much waits that another keyframe would come too late to be of use."""
+
+    def submit(self, job: Job) -> None:
+        """Have a job done."""
+
+    def done(self) -> list[KeyframeAdded]:
+        """What was finished since the last call; raises what a job raised."""
+
+    def close(self) -> None:
+        """Finish what waits."""
+
+
+class AtOnce:
+    """Does each job while it is handed in."""
+
+    busy = False
+
+    def __init__(self) -> None:
+        self._finished: list[KeyframeAdded] = []
+
+    def submit(self, job: Job) -> None:
+        """Do it."""
+        self._finished.append(job())
+
+    def done(self) -> list[KeyframeAdded]:
+        """What was finished since the last call."""
+        finished, self._finished = self._finished, []
+        return finished
+
+    def close(self) -> None:
+        """Nothing waits."""
+
+
+class Beside:
+    """Does the jobs in a thread of its own, in the tracker's pauses."""
+
+    def __init__(self, turn: MapTurn) -> None:
+        self._turn = turn
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._finished: queue.SimpleQueue[KeyframeAdded] = queue.SimpleQueue()
+        self._fault: BaseException | None = None
+        self._waiting = 0
+        self._thread = threading.Thread(target=self._work, name="mapping", daemon=True)
+        self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        """Whether so much waits that another keyframe would come too late to be of use."""
+        return self._waiting >= MAX_WAITING
+
+    def submit(self, job: Job) -> None:
+        """Queue a job."""
+        self._waiting += 1
+        self._jobs.put(job)
+
+    def done(self) -> list[KeyframeAdded]:
+        """What was finished since the last call; raises what a job raised."""
+        if self._fault is not None:
+            raise self._fault
+        out: list[KeyframeAdded] = []
+        while not self._finished.empty():
+            out.append(self._finished.get())
+        self._waiting -= len(out)
+        return out
+
+    def close(self) -> None:
+        """Finish what waits, and end the thread."""
+        self._jobs.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                with self._turn.mapping():
+                    self._finished.put(job())
+            except BaseException as fault:  # handed to the tracker's thread, which raises it
+                self._fault = fault
+                return
