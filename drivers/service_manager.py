@@ -1,0 +1,100 @@
+"""What systemd is told: ready, still alive, stopping (the sd_notify protocol of Type=notify).
+
+Without $NOTIFY_SOCKET there is no service manager and nothing is sent. Sending never blocks and
+never raises: a service manager that does not listen must not stop a flight.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Mapping
+
+MAX_STATUS = 512
+
+
+class ServiceManager:
+    """The service manager that started this process, where there is one."""
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        self.watchdog_s = _watchdog_s(environment)
+        """It must hear `alive` at least this often (half of what it allows); None: it need not."""
+        self.n_lost = 0
+        """Notices that could not be handed over."""
+        self.problem = ""
+        """Why nothing can be sent although it should, in words."""
+        self._address = ""
+        self._socket: socket.socket | None = None
+        address = environment.get("NOTIFY_SOCKET", "")
+        if not address:
+            return
+        if address[0] not in "/@" or len(address) < 2:
+            self.problem = f"$NOTIFY_SOCKET is {address}: only paths and @names are known"
+            return
+        # "@name" lies in the abstract namespace, whose names begin with a zero byte.
+        self._address = "\0" + address[1:] if address[0] == "@" else address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.setblocking(False)
+
+    @property
+    def present(self) -> bool:
+        """Whether there is one to be told anything."""
+        return self._socket is not None
+
+    def ready(self, status: str = "") -> None:
+        """All is up; also said when a reload is over."""
+        self._send("READY=1", _status(status))
+
+    def status(self, text: str) -> None:
+        """One line for `systemctl status`."""
+        self._send(_status(text))
+
+    def alive(self) -> None:
+        """To be said at least every `watchdog_s`, and only while the work goes on."""
+        self._send("WATCHDOG=1")
+
+    def reloading(self) -> None:
+        """The configuration is read again; `ready` ends it."""
+        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+
+    def stopping(self, status: str = "") -> None:
+        """The end has begun."""
+        self._send("STOPPING=1", _status(status))
+
+    def extend_timeout(self, seconds: float) -> None:
+        """Starting or stopping goes on and takes so much longer from now on."""
+        self._send(f"EXTEND_TIMEOUT_USEC={round(seconds * 1e6)}")
+
+    def close(self) -> None:
+        """Say nothing more."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _send(self, *assignments: str) -> None:
+        if self._socket is None:
+            return
+        notice = "\n".join(each for each in assignments if each).encode()
+        try:
+            self._socket.sendto(notice, self._address)
+        except OSError as error:
+            self.n_lost += 1
+            self.problem = f"the service manager cannot be told: {error.strerror}"
+
+
+def _status(text: str) -> str:
+    # A line break would begin another assignment.
+    return "STATUS=" + " ".join(text.split())[:MAX_STATUS] if text else ""
+
+
+def _watchdog_s(environment: Mapping[str, str]) -> float | None:
+    """Half the time after which the service counts as hung; None where nothing is watched."""
+    try:
+        interval_us = int(environment.get("WATCHDOG_USEC", "0"))
+        pid = int(environment.get("WATCHDOG_PID", "0"))
+    except ValueError:
+        return None
+    if interval_us <= 0 or pid not in (0, os.getpid()):
+        return None
+    return interval_us * 0.5e-6

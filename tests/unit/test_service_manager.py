@@ -1,0 +1,114 @@
+"""Against a real datagram socket, as systemd holds one."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from drivers.service_manager import ServiceManager
+
+
+@pytest.fixture(params=["path", "abstract"])
+def listener(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str, socket.socket]]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        if request.param == "path":
+            name = str(tmp_path / "notify")
+            listening.bind(name)
+        else:
+            name = f"@companion-test-{os.getpid()}"
+            listening.bind("\0" + name[1:])
+        listening.settimeout(1)
+        yield name, listening
+
+
+def test_notices_arrive_as_systemd_reads_them(listener: tuple[str, socket.socket]) -> None:
+    name, listening = listener
+    manager = ServiceManager({"NOTIFY_SOCKET": name})
+    assert manager.present
+    manager.ready("tracking; feedback 30/s")
+    manager.status("one\nREADY=0\nline")
+    manager.alive()
+    manager.stopping()
+    manager.extend_timeout(1.5)
+    heard = [listening.recv(4096).decode() for _ in range(5)]
+    assert heard == [
+        "READY=1\nSTATUS=tracking; feedback 30/s",
+        "STATUS=one READY=0 line",
+        "WATCHDOG=1",
+        "STOPPING=1",
+        "EXTEND_TIMEOUT_USEC=1500000",
+    ]
+    manager.close()
+    manager.alive()  # says nothing, and does not fail
+    assert manager.n_lost == 0
+
+
+def test_reloading_bears_the_monotonic_time(listener: tuple[str, socket.socket]) -> None:
+    name, listening = listener
+    manager = ServiceManager({"NOTIFY_SOCKET": name})
+    before_us = time.monotonic_ns() // 1000
+    manager.reloading()
+    first, second = listening.recv(4096).decode().split("\n")
+    assert first == "RELOADING=1"
+    key, value = second.split("=")
+    assert key == "MONOTONIC_USEC"
+    assert before_us <= int(value) <= time.monotonic_ns() // 1000
+    manager.close()
+
+
+def test_a_manager_that_does_not_read_neither_blocks_nor_raises(
+    listener: tuple[str, socket.socket],
+) -> None:
+    name, _ = listener
+    manager = ServiceManager({"NOTIFY_SOCKET": name})
+    begun = time.monotonic()
+    for _ in range(5000):
+        manager.alive()
+    assert time.monotonic() - begun < 1
+    assert 0 < manager.n_lost < 5000
+    manager.close()
+
+
+def test_a_manager_that_is_gone_is_named(tmp_path: Path) -> None:
+    manager = ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "gone")})
+    manager.ready()
+    assert manager.n_lost == 1
+    assert manager.problem == "the service manager cannot be told: No such file or directory"
+    manager.close()
+
+
+def test_without_a_manager_nothing_is_said() -> None:
+    manager = ServiceManager({})
+    assert not manager.present
+    manager.ready()
+    manager.alive()
+    assert (manager.n_lost, manager.problem, manager.watchdog_s) == (0, "", None)
+
+
+@pytest.mark.parametrize("address", ["vsock:2:1234", "relative", "/", "@"])
+def test_an_address_of_another_kind_is_named(address: str) -> None:
+    manager = ServiceManager({"NOTIFY_SOCKET": address})
+    assert not manager.present
+    assert address in manager.problem
+
+
+@pytest.mark.parametrize(
+    ("environment", "wanted_s"),
+    [
+        ({"WATCHDOG_USEC": "10000000"}, 5.0),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": str(os.getpid())}, 5.0),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),
+        ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "soon"}, None),
+        ({}, None),
+    ],
+)
+def test_watchdog_is_told_twice_as_often_as_it_must(
+    environment: dict[str, str], wanted_s: float | None
+) -> None:
+    assert ServiceManager(environment).watchdog_s == wanted_s
