@@ -16,14 +16,31 @@ class MavlinkPort(Protocol):
     """For people: what it is plugged into."""
     identity: tuple[int, int]
     """System and component that `send` speaks as; may be set at any time, by who knows it."""
-    connected: bool
-    """Whether the wire is there; it says nothing about an autopilot at its other end."""
-    n_received: int
-    n_sent: int
-    n_dropped: int
-    """Messages that could not be sent."""
-    n_bad: int
-    """Packets that were refused: damaged, or not signed as they should be."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the wire is there; it says nothing about an autopilot at its other end."""
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the wire, for people; "" when nothing is known to be."""
+        return ""
+
+    @property
+    def n_received(self) -> int:
+        """Good packets that came, those of unknown messages too."""
+
+    @property
+    def n_sent(self) -> int:
+        """Messages handed to the wire."""
+
+    @property
+    def n_dropped(self) -> int:
+        """Messages that could not be sent."""
+
+    @property
+    def n_bad(self) -> int:
+        """Times that something came which was refused: damaged, or not signed as it should be."""
 
     async def run(self, on_message: OnMessage) -> None:
         """Receive for ever, reconnecting as needed; ends when it is cancelled."""
