@@ -6,9 +6,7 @@ pose, the tracker's keyframes tell where the map lies in the world.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -87,11 +85,15 @@ class LocalisationStage:
             self._georeferencer.take(message)
         return []
 
-    def finish(self) -> list[Message]:
-        """Adjust the whole map at the end of a flight."""
+    def set_effort(self, share: float) -> None:
+        """Look for this share of the features from now on, where time is short."""
+        self._tracker.set_effort(share)
+
+    def finish(self, adjust: bool = True) -> list[Message]:
+        """Give the map as it is at the end of a flight, all of it adjusted once more or not."""
         out: list[Message] = [*self._tracker.close()]
         with self._times("final adjustment"):
-            for segment in self._segments():
+            for segment in self._segments() if adjust else ():
                 Mapper(
                     self._mapper_config, self._camera, segment, self._tracker.turn
                 ).adjust_all(self._config.mapping.final_iterations)
@@ -187,8 +189,7 @@ class LocalisationStage:
                     scales[key] = main_from_own.scale
             points.append(main_from_own.apply(segment.living_positions()))
         return MapUpdate(
-            self._revision, self._t_ns, MappingProxyType(poses), np.concatenate(points), anchor,
-            _read_only(scales),
+            self._revision, self._t_ns, poses, np.concatenate(points), anchor, scales,
         )  # fmt: skip
 
     def _due(self, segment: SlamMap) -> bool:
@@ -232,7 +233,3 @@ def _spread(segment: SlamMap, final: bool) -> list[Keyframe]:
     if len(keyframes) <= most:
         return keyframes
     return [keyframes[int(i)] for i in np.linspace(0, len(keyframes) - 1, most).astype(int)]
-
-
-def _read_only(scales: dict[int, float]) -> Mapping[int, float]:
-    return MappingProxyType(scales)

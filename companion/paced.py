@@ -7,10 +7,10 @@ the latest wins and the rest are counted. Telemetry is never dropped.
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Iterable, Iterator
 
 from companion.clock import monotonic_s, wait_s
+from companion.latest import LatestWins
 from companion.messages import Frame, Message
 
 
@@ -20,25 +20,20 @@ class PacedFeed:
     def __init__(self, messages: Iterable[Message], speed: float = 1.0) -> None:
         self._messages = messages
         self._speed = speed
-        self._waiting: deque[Message] = deque()
-        self._frame_waits = False
-        self._done = False
+        self._waiting: LatestWins[Message] = LatestWins(lambda message: isinstance(message, Frame))
         self._stop = threading.Event()
         self._fault: BaseException | None = None
-        self._changed = threading.Condition()
-        self.n_dropped = 0
+
+    @property
+    def n_dropped(self) -> int:
+        """Frames passed over."""
+        return self._waiting.n_dropped
 
     def __iter__(self) -> Iterator[Message]:
         player = threading.Thread(target=self._play, name="paced", daemon=True)
         player.start()
         try:
-            while True:
-                with self._changed:
-                    while not self._waiting and not self._done:
-                        self._changed.wait()
-                    if not self._waiting:
-                        break
-                    message = self._waiting.popleft()
+            while (message := self._waiting.get()) is not None:
                 yield message
             if self._fault is not None:
                 raise self._fault
@@ -57,20 +52,8 @@ class PacedFeed:
                     wait_s(self._stop, due_s - monotonic_s())
                 if self._stop.is_set():
                     return
-                self._put(message)
+                self._waiting.put(message)
         except BaseException as fault:  # handed to the working thread, which raises it
             self._fault = fault
         finally:
-            with self._changed:
-                self._done = True
-                self._changed.notify()
-
-    def _put(self, message: Message) -> None:
-        with self._changed:
-            if isinstance(message, Frame):
-                old = next((m for m in self._waiting if isinstance(m, Frame)), None)
-                if old is not None:
-                    self._waiting.remove(old)
-                    self.n_dropped += 1
-            self._waiting.append(message)
-            self._changed.notify()
+            self._waiting.close()

@@ -67,7 +67,12 @@ class DepthStage:
         self._waiting: list[KeyframeAdded] = []
         self._update: MapUpdate | None = None
         self._last_reference: int | None = None
+        self._share, self._credit = 1.0, 0.0
         self._half_view_rad = float(np.arctan(0.5 * camera.width / fx))
+
+    def set_share(self, share: float) -> None:
+        """Give only this share of the keyframes a depth map from now on, 0 to 1."""
+        self._share = share
 
     def step(self, message: Message) -> list[Message]:
         """Take one message, in order of time."""
@@ -122,7 +127,7 @@ class DepthStage:
             return []
         near, far = 0.5 * float(np.quantile(z, 0.02)), 2.5 * float(np.quantile(z, 0.98))
         chosen = self._choose(keyframe, update, place, float(np.median(z)))
-        if len(chosen) < 3:
+        if len(chosen) < 3 or not self._may():
             return []
         self._last_reference = keyframe.keyframe_id
         self._engine.begin(held.grey, near, far)
@@ -135,6 +140,14 @@ class DepthStage:
         self._forget(keyframe)
         chunks: list[PointChunk] = self._fusion.add(depth_map, update)
         return [depth_map, *chunks]
+
+    def _may(self) -> bool:
+        """Whether it is this keyframe's turn, where not all are to have depth."""
+        self._credit = min(self._credit + self._share, 1.0)
+        if self._credit < 1.0 - 1e-9:
+            return False
+        self._credit -= 1.0
+        return True
 
     def _view_has_moved(
         self, keyframe: KeyframeAdded, place: Similarity, median_depth: float

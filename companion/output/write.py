@@ -12,10 +12,13 @@ from companion.output.report_page import report_page
 from companion.output.trajectory import trajectory_tum
 
 
-def write_results(out: Path, result: FlightResult, facts: RunFacts, voxel_m: float) -> None:
+def write_results(
+    out: Path, result: FlightResult, facts: RunFacts, voxel_m: float, page: bool = True
+) -> None:
     """Write trajectory.tum, cloud.ply, report.json and report.html into folder `out`.
 
-    Each is replaced in one step, the page last; raises OSError where the folder cannot be written.
+    Without `page` the last, which takes longest, is left out. Each is replaced in one step, the page
+    last; raises OSError where the folder cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     poses, cloud = result.poses(), result.cloud(voxel_m)
@@ -24,5 +27,6 @@ def write_results(out: Path, result: FlightResult, facts: RunFacts, voxel_m: flo
     write_atomically(out / "trajectory.tum", trajectory_tum(poses, unit, origin))
     write_atomically(out / "cloud.ply", cloud_ply(cloud, unit, origin))
     write_atomically(out / "report.json", report_json(numbers))
-    page = report_page(result, facts, poses, cloud, numbers)
-    write_atomically(out / "report.html", page)
+    if page:
+        html = report_page(result, facts, poses, cloud, numbers)
+        write_atomically(out / "report.html", html)

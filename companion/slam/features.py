@@ -54,6 +54,8 @@ class FeatureExtractor:
             fastThreshold=config.fast_threshold,
         )
         self._threshold = config.fast_threshold
+        self.effort = 1.0
+        """Share of the configured number of features that is looked for."""
 
     def extract(self, grey: Bytes) -> Features:
         """Features of an image (H, W); as few as none where it shows nothing."""
@@ -78,6 +80,10 @@ class FeatureExtractor:
             cKDTree(pixels) if len(pixels) else cKDTree(np.zeros((0, 2))),
         )  # fmt: skip
 
+    @property
+    def _n_wanted(self) -> int:
+        return round(self.effort * self._config.n_features)
+
     def _detect(self, grey: Bytes) -> list[cv2.KeyPoint]:
         """Corners by a threshold that follows the scene, so that dull ground has some too."""
         config = self._config
@@ -85,18 +91,18 @@ class FeatureExtractor:
             self._orb.setFastThreshold(self._threshold)
             keypoints = list(self._orb.detect(grey, None))
             if (
-                len(keypoints) >= 1.25 * config.n_features
+                len(keypoints) >= 1.25 * self._n_wanted
                 or self._threshold <= config.min_fast_threshold
             ):
                 break
             self._threshold = max(config.min_fast_threshold, int(self._threshold * 0.7))
-        if len(keypoints) > 3 * config.n_features:
+        if len(keypoints) > 3 * self._n_wanted:
             self._threshold = min(config.fast_threshold, self._threshold + 1)
         return keypoints
 
     def _spread(self, keypoints: list[cv2.KeyPoint]) -> list[int]:
         """Take the strongest of every cell in turn, until there are enough."""
-        n = self._config.n_features
+        n = self._n_wanted
         if len(keypoints) <= n:
             return list(range(len(keypoints)))
         cell_px = self._config.cell_px

@@ -92,6 +92,10 @@ class Tracker:
             out = self._place_frame(frame, features, prior)
         return out + self._worker.done()
 
+    def set_effort(self, share: float) -> None:
+        """Look for this share of the features from now on."""
+        self._extractor.effort = share
+
     def close(self) -> list[KeyframeAdded]:
         """Finish the mapping that is under way; what it gave."""
         self._worker.close()

@@ -1,0 +1,99 @@
+"""The process of a stage: python -m companion.stages.child SOCKET_FD RING_FD."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+
+# before numpy loads, as in companion.__main__
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+import threading  # noqa: E402
+from collections.abc import Callable  # noqa: E402
+from multiprocessing.connection import Connection  # noqa: E402
+from typing import Any  # noqa: E402
+
+from companion.clock import monotonic_s  # noqa: E402
+from companion.latest import LatestWins  # noqa: E402
+from companion.messages import Frame  # noqa: E402
+from companion.stages.frame_ring import FrameInRing, FrameRing  # noqa: E402
+from companion.stages.protocol import Finish, Finished, Progress, Setup  # noqa: E402
+from companion.stages.work import work_of  # noqa: E402
+
+REPORT_EVERY_S = 1.0
+
+
+def main() -> int:
+    """Serve one stage until told to finish, or until the daemon is gone."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # the daemon says when
+    pipe = Connection(int(sys.argv[1]))
+    setup: Setup = pipe.recv()
+    os.nice(setup.nice)
+    ring = FrameRing(setup.camera.width, setup.camera.height, int(sys.argv[2]))
+    send = _sender(pipe)
+    work = work_of(setup)
+    send(Progress(device=work.device))
+    inbox: LatestWins[Any] = LatestWins(work.may_skip)
+    n_overwritten = 0
+
+    def read() -> None:
+        nonlocal n_overwritten
+        try:
+            while True:
+                message = pipe.recv()
+                if isinstance(message, FrameInRing) and not work.skips:
+                    frame = ring.get(message) if work.has_room else None
+                    if frame is None:
+                        n_overwritten += 1
+                        continue
+                    message = frame
+                    work.n_held += 1
+                inbox.put(message)
+        except (OSError, EOFError):
+            os._exit(0)  # the daemon is gone, and nobody waits for results
+
+    threading.Thread(target=read, name="from the daemon", daemon=True).start()
+    reported_s = monotonic_s()
+    n_done = 0
+    while (message := inbox.get()) is not None:
+        if isinstance(message, Finish):
+            for out in work.finish(message):
+                send(out)
+            break
+        if isinstance(message, FrameInRing):
+            frame = ring.get(message, colour=False)
+            if frame is None:
+                n_overwritten += 1
+                continue
+            message = frame
+        elif isinstance(message, Frame):
+            work.n_held -= 1
+        for out in work.step(message):
+            send(out)
+        n_done += isinstance(message, Frame)
+        if monotonic_s() - reported_s > REPORT_EVERY_S:
+            reported_s = monotonic_s()
+            n_dropped = inbox.n_dropped + n_overwritten
+            send(Progress(n_done, n_dropped, work.times.summary(), work.device))
+    send(Finished(work.times.summary(), work.device))
+    return 0
+
+
+def _sender(pipe: Connection[Any, Any]) -> Callable[[Any], None]:
+    def send(message: Any) -> None:
+        try:
+            pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
+        except OSError:
+            os._exit(0)  # as above
+
+    return send
+
+
+if __name__ == "__main__":
+    status = main()
+    sys.stderr.flush()
+    os._exit(status)  # no library has a say in whether this ends

@@ -1,0 +1,59 @@
+"""What passes between the daemon and the process of a stage, beside the messages themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from companion.camera import Camera
+from companion.config import Config
+from companion.output.flight_result import RunFacts
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """The first thing a stage's process is told. `kind` is localisation, depth or recorder."""
+
+    kind: str
+    config: Config
+    camera: Camera
+    nice: int
+    folder: Path | None = None
+    first_seq: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Finish:
+    """The last thing it is told: give the last results.
+
+    With `hurry` what takes long is left out. The recorder gets what its report states.
+    """
+
+    hurry: bool
+    facts: RunFacts | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SetShare:
+    """How much of its work a stage is to do, 0 to 1; see companion.governor."""
+
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What a stage's process says of itself, every second or so while it works."""
+
+    n_done: int = 0
+    n_dropped: int = 0
+    times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    device: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """All results are given."""
+
+    times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    device: str = ""

@@ -1,0 +1,132 @@
+"""A stage in a process of its own, seen from the daemon.
+
+Messages go through a pair of sockets as pickles (both ends are ours, and nobody else has them),
+frames through shared memory. Nothing here makes the caller wait but `finish`.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+from companion.latest import LatestWins
+from companion.stages.frame_ring import FrameInRing, FrameRing
+from companion.stages.protocol import Finish, Finished, Progress, Setup
+
+CHILD = "companion.stages.child"
+
+
+class StageProcess:
+    """Starts a stage; `deliver` gets its messages and `ended` one call when it is gone.
+
+    Both are called from a thread of this object. `ended` gets "" after `finish` or `kill`, else
+    what became of the process, in words.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        ring: FrameRing,
+        deliver: Callable[[Any], None],
+        ended: Callable[[str], None],
+    ) -> None:
+        self.name = setup.kind
+        self.progress: Progress | None = None
+        """None until the stage is ready."""
+        self.finished: Finished | None = None
+        self._deliver, self._ended = deliver, ended
+        self._asked_to_end = False
+        self._outbox: LatestWins[Any] = LatestWins(lambda message: isinstance(message, FrameInRing))
+        ours, theirs = socket.socketpair()
+        # a session of its own: Ctrl-C is for the daemon, which tells its stages what to do
+        self._child = subprocess.Popen(
+            [sys.executable, "-m", CHILD, str(theirs.fileno()), str(ring.fd)],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+            pass_fds=(theirs.fileno(), ring.fd), start_new_session=True,
+        )  # fmt: skip
+        theirs.close()
+        self._pipe = Connection(ours.detach())
+        self._outbox.put(setup)
+        self._writer = threading.Thread(target=self._write, name=f"to {self.name}", daemon=True)
+        self._reader = threading.Thread(target=self._read, name=f"from {self.name}", daemon=True)
+        self._writer.start()
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._child.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs."""
+        return self._child.poll() is None
+
+    @property
+    def n_dropped(self) -> int:
+        """Frames that it did not get or did not get round to."""
+        inside = self.progress.n_dropped if self.progress is not None else 0
+        return self._outbox.n_dropped + inside
+
+    def offer(self, message: Any) -> None:
+        """Hand over a message or a FrameInRing; a frame that waits gives way to a newer one."""
+        self._outbox.put(message)
+
+    def finish(self, finish: Finish, patience_s: float) -> bool:
+        """Have it give its last results and end; whether it did so in time."""
+        self._asked_to_end = True
+        self._outbox.put(finish)
+        self._outbox.close()
+        self._reader.join(patience_s)
+        in_time = self.finished is not None
+        self.kill()
+        return in_time
+
+    def kill(self) -> None:
+        """End it now."""
+        self._asked_to_end = True
+        self._outbox.close()
+        if self._child.poll() is None:
+            os.killpg(self._child.pid, signal.SIGKILL)
+        self._child.wait()
+        for thread in (self._reader, self._writer):
+            if thread is not threading.current_thread():
+                thread.join()
+        self._pipe.close()
+
+    def _write(self) -> None:
+        try:
+            while (message := self._outbox.get()) is not None:
+                self._pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
+        except OSError:
+            pass  # it is gone, which the reader tells
+
+    def _read(self) -> None:
+        try:
+            while True:
+                message = self._pipe.recv()
+                if isinstance(message, Progress):
+                    self.progress = message
+                elif isinstance(message, Finished):
+                    self.finished = message
+                else:
+                    self._deliver(message)
+        except (OSError, EOFError):
+            pass
+        self._outbox.close()
+        status = self._child.wait()
+        self._ended("" if self._asked_to_end else _in_words(status))
+
+
+def _in_words(status: int) -> str:
+    if status < 0:
+        return f"killed by {signal.Signals(-status).name}"
+    return f"ended with status {status}"
