@@ -1,0 +1,327 @@
+"""A lens and the board's poses that explain where corners were seen: least squares, robust at will.
+
+Both lens models go through the same solver (Levenberg-Marquardt over the lens, the poses eliminated
+view by view), so that their errors and standard deviations can be compared. OpenCV's own fisheye
+solver gives no deviations and stops on views near the edge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from companion.calibration.views import View
+from companion.camera import Camera, Distortion
+from companion.geometry import Array
+
+N_COEFFICIENTS = {Distortion.RADTAN: 5, Distortion.EQUIDISTANT: 4}
+FIRST_FOV_DEG = {
+    Distortion.RADTAN: (35, 60, 85, 110),
+    Distortion.EQUIDISTANT: (40, 75, 110, 145, 180),
+}
+"""Horizontal fields of view that a fit is begun with; the one that comes furthest is kept."""
+FIRST_VIEWS = 12
+"""Views with which that is found out."""
+MAX_STEPS = 60
+CONVERGED = 1e-9
+"""Relative fall of the cost under which a fit is at its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensModel:
+    """A distortion model, of whose coefficients the last ones may be kept at zero."""
+
+    distortion: Distortion
+    n_free: int
+
+    def free(self) -> Array:
+        """Which of fx fy cx cy k… are solved for, as indices."""
+        return np.arange(4 + self.n_free)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensFit:
+    """A lens, the board's poses, and what they leave unexplained."""
+
+    model: LensModel
+    width: int
+    height: int
+    parameters: Array
+    """fx fy cx cy k…"""
+    poses: tuple[Array, ...]
+    """camera_from_board of each view: rotation vector and translation, (6,)."""
+    residuals_px: tuple[Array, ...]
+    """Seen less computed, (N, 2) of each view."""
+    cost: float
+
+    @property
+    def camera(self) -> Camera:
+        """The lens as the rest of the program has it."""
+        fx, fy, cx, cy, *coefficients = (float(value) for value in self.parameters)
+        return Camera(
+            self.width, self.height, fx, fy, cx, cy, self.model.distortion, tuple(coefficients)
+        )
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance of corners."""
+        return rms_px(self.residuals_px)
+
+    def tilts(self) -> Array:
+        """The board's normal across the optical axis in each view, (V, 2), as sines right, down."""
+        normals = [cv2.Rodrigues(pose[:3])[0][:, 2] for pose in self.poses]
+        return np.array([n[:2] * np.sign(n[2] or 1.0) for n in normals]).reshape(-1, 2)
+
+
+def rms_px(residuals_px: Sequence[Array]) -> float:
+    """Root mean square length of residuals (N, 2)."""
+    every = np.concatenate(residuals_px)
+    return float(np.sqrt((every**2).sum(1).mean()))
+
+
+def first_lens(views: Sequence[View], model: LensModel, huber_px: float) -> LensFit | None:
+    """A lens to begin with, from some of the views; None where no beginning leads anywhere.
+
+    Residuals beyond `huber_px` count linearly.
+    """
+    width, height = views[0].width, views[0].height
+    at = np.unique(np.linspace(0, len(views) - 1, min(FIRST_VIEWS, len(views))).round().astype(int))
+    rough = LensModel(model.distortion, min(2, model.n_free))
+    best: LensFit | None = None
+    for fov_deg in FIRST_FOV_DEG[model.distortion]:
+        half = math.radians(fov_deg) / 2
+        focal = width / 2 / (math.tan(half) if model.distortion is Distortion.RADTAN else half)
+        guess = np.zeros(4 + N_COEFFICIENTS[model.distortion])
+        guess[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
+        some = [views[i] for i in at if _first_pose(views[i], rough, guess) is not None]
+        if len(some) < max(3, len(at) // 2):
+            continue
+        tried = _solved(some, rough, guess, huber_px, 15)
+        if tried is not None and (best is None or _mean_cost(tried) < _mean_cost(best)):
+            best = tried
+    return best
+
+
+def fit_lens(
+    views: Sequence[View], model: LensModel, start: LensFit, *, huber_px: float = math.inf
+) -> LensFit | None:
+    """The lens that explains the views best, from one that is roughly right.
+
+    None where a view has no pose under `start`. Residuals beyond `huber_px` count linearly.
+    """
+    if start.model.distortion is not model.distortion:
+        raise ValueError("a lens of another kind is no beginning")
+    parameters = start.parameters.copy()
+    parameters[4 + model.n_free :] = 0
+    return _solved(views, model, parameters, huber_px, MAX_STEPS)
+
+
+def residuals_of(lens: LensFit, view: View) -> Array:
+    """What a view leaves unexplained when only the board's pose is fitted; (N, 2)."""
+    pose = _first_pose(view, lens.model, lens.parameters)
+    if pose is None:
+        return np.full((view.n_corners, 2), np.nan)
+    return _residuals(view, lens.model, lens.parameters, pose)
+
+
+def standard_deviations(lens: LensFit, views: Sequence[View]) -> Array:
+    """Of fx fy cx cy k…, from the residuals and what the lens does to the corners; 0 where kept."""
+    free = lens.model.free()
+    n_free = len(free)
+    schur = np.zeros((n_free, n_free))
+    for view, pose in zip(views, lens.poses, strict=True):
+        _, by_lens, by_pose = _projected(view, lens.model, lens.parameters, pose)
+        a, b = by_lens[:, free], by_pose
+        schur += a.T @ a - a.T @ b @ np.linalg.pinv(b.T @ b) @ b.T @ a
+    n_measured = 2 * sum(view.n_corners for view in views)
+    n_known = n_measured - n_free - 6 * len(views)
+    squares = sum(float((r**2).sum()) for r in lens.residuals_px)
+    variance = squares / max(n_known, 1)
+    scale = 1 / np.sqrt(np.maximum(np.diag(schur), 1e-300))  # coefficients and pixels differ much
+    covariance = np.linalg.pinv(schur * np.outer(scale, scale), rcond=1e-14, hermitian=True)
+    out = np.zeros(len(lens.parameters))
+    out[free] = scale * np.sqrt(np.maximum(np.diag(covariance), 0) * variance)
+    return out
+
+
+def _solved(
+    views: Sequence[View], model: LensModel, parameters: Array, huber_px: float, max_steps: int
+) -> LensFit | None:
+    first = [_first_pose(view, model, parameters) for view in views]
+    if sum(pose is not None for pose in first) < len(views):
+        return None
+    poses = [pose for pose in first if pose is not None]
+    parameters = parameters.copy()
+    free = model.free()
+    damping = 1e-3
+    residuals = _all_residuals(views, model, parameters, poses)
+    cost = _cost(residuals, huber_px)
+    if not math.isfinite(cost):
+        return None
+    for _ in range(max_steps):
+        blocks = [
+            _block(view, model, parameters, pose, free, huber_px)
+            for view, pose in zip(views, poses, strict=True)
+        ]
+        fell = False
+        while damping < 1e8:
+            step, pose_steps = _step(blocks, damping)
+            tried = parameters.copy()
+            tried[free] += step
+            tried_poses = [pose + d for pose, d in zip(poses, pose_steps, strict=True)]
+            tried_cost = math.inf
+            if (tried[:2] > 0).all():
+                residuals = _all_residuals(views, model, tried, tried_poses)
+                tried_cost = _cost(residuals, huber_px)
+            if tried_cost < cost:
+                fell = True
+                break
+            damping *= 10
+        if not fell:
+            break
+        gain = (cost - tried_cost) / max(cost, 1e-300)
+        parameters, poses, cost = tried, tried_poses, tried_cost
+        damping = max(damping / 10, 1e-9)
+        if gain < CONVERGED:
+            break
+    residuals = _all_residuals(views, model, parameters, poses)
+    return LensFit(
+        model, views[0].width, views[0].height, parameters, tuple(poses), tuple(residuals), cost
+    )
+
+
+Block = tuple[Array, Array, Array, Array, Array]
+
+
+def _block(
+    view: View, model: LensModel, parameters: Array, pose: Array, free: Array, huber_px: float
+) -> Block:
+    """Normal equations of one view: lens, lens by pose, pose, and both right-hand sides."""
+    pixels, by_lens, by_pose = _projected(view, model, parameters, pose)
+    residual = view.sighting.image_px - pixels
+    weight = np.repeat(np.sqrt(_weights(residual, huber_px)), 2)
+    a, b = by_lens[:, free] * weight[:, None], by_pose * weight[:, None]
+    r = residual.reshape(-1) * weight
+    return a.T @ a, a.T @ b, b.T @ b, a.T @ r, b.T @ r
+
+
+def _step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array]]:
+    n = len(blocks[0][0])
+    left, right = np.zeros((n, n)), np.zeros(n)
+    diagonal = np.zeros(n)
+    inverses = []
+    for aa, ab, bb, ar, br in blocks:
+        inverse = np.linalg.pinv(bb + damping * np.diag(np.diag(bb)))
+        inverses.append(inverse)
+        left += aa - ab @ inverse @ ab.T
+        right += ar - ab @ inverse @ br
+        diagonal += np.diag(aa)
+    scale = 1 / np.sqrt(np.maximum(diagonal, 1e-300))
+    scaled = left * np.outer(scale, scale) + damping * np.eye(n)
+    step: Array = scale * np.linalg.lstsq(scaled, right * scale, rcond=None)[0]
+    pose_steps: list[Array] = [
+        inverse @ (br - ab.T @ step)
+        for inverse, (_, ab, _, _, br) in zip(inverses, blocks, strict=True)
+    ]
+    return step, pose_steps
+
+
+def _weights(residual: Array, huber_px: float) -> Array:
+    away = np.linalg.norm(residual, axis=1)
+    weights: Array = np.minimum(1.0, huber_px / np.maximum(away, 1e-12))
+    return weights
+
+
+def _mean_cost(lens: LensFit) -> float:
+    return lens.cost / sum(len(residuals) for residuals in lens.residuals_px)
+
+
+def _cost(residuals: Sequence[Array], huber_px: float) -> float:
+    away = np.linalg.norm(np.concatenate(residuals), axis=1)
+    near = np.minimum(away, huber_px)
+    return float((near * (2 * away - near)).sum())
+
+
+def _all_residuals(
+    views: Sequence[View], model: LensModel, parameters: Array, poses: Sequence[Array]
+) -> list[Array]:
+    return [
+        _residuals(view, model, parameters, pose) for view, pose in zip(views, poses, strict=True)
+    ]
+
+
+def _residuals(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
+    pixels, _, _ = _projected(view, model, parameters, pose)
+    out: Array = view.sighting.image_px - pixels
+    return out
+
+
+def _projected(
+    view: View, model: LensModel, parameters: Array, pose: Array
+) -> tuple[Array, Array, Array]:
+    """Corners (N, 2) of a view, and their derivatives (2 N, …) by the lens and by the pose."""
+    fx, fy, cx, cy = parameters[:4]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    board_m = np.ascontiguousarray(view.sighting.board_m)
+    if model.distortion is Distortion.RADTAN:
+        pixels, by = cv2.projectPoints(board_m, pose[:3], pose[3:], matrix, parameters[4:])
+        by_pose, by_lens = by[:, :6], by[:, 6:15]
+    else:
+        pixels, by = cv2.fisheye.projectPoints(
+            board_m[:, None], pose[:3], pose[3:], matrix, parameters[4:]
+        )
+        by_lens, by_pose = by[:, :8], by[:, 8:14]
+    return np.asarray(pixels, np.float64).reshape(-1, 2), by_lens, by_pose
+
+
+def _first_pose(view: View, model: LensModel, parameters: Array) -> Array | None:
+    """The board's pose under a known lens; of the two that a flat board allows, the better one."""
+    fx, fy, cx, cy, *coefficients = (float(value) for value in parameters)
+    camera = Camera(
+        view.width, view.height, fx, fy, cx, cy, model.distortion, tuple(coefficients)
+    )
+    normalised = camera.normalise(view.sighting.image_px)
+    usable = np.isfinite(normalised).all(1)
+    if usable.sum() < 6:
+        return None
+    try:
+        n, turns, shifts, _ = cv2.solvePnPGeneric(
+            view.sighting.board_m[usable], normalised[usable], np.eye(3), None,
+            flags=cv2.SOLVEPNP_IPPE,
+        )  # fmt: skip
+    except cv2.error:  # corners in one line, or a lens guess that makes them so
+        return None
+    best: tuple[float, Array] | None = None
+    for turn, shift in list(zip(turns, shifts, strict=True))[:n]:
+        pose = np.concatenate([np.ravel(turn), np.ravel(shift)])
+        if not (np.isfinite(pose).all() and pose[5] > 0):
+            continue
+        pose = _refined_pose(view, model, parameters, pose)
+        cost = float((_residuals(view, model, parameters, pose) ** 2).sum())
+        if math.isfinite(cost) and (best is None or cost < best[0]):
+            best = cost, pose
+    return None if best is None else best[1]
+
+
+def _refined_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
+    damping = 1e-3
+    cost = math.inf
+    for _ in range(12):
+        pixels, _, by = _projected(view, model, parameters, pose)
+        residual = (view.sighting.image_px - pixels).reshape(-1)
+        cost = float(residual @ residual)
+        normal = by.T @ by
+        step = np.linalg.pinv(normal + damping * np.diag(np.diag(normal))) @ (by.T @ residual)
+        tried = pose + step
+        tried_cost = float((_residuals(view, model, parameters, tried) ** 2).sum())
+        if tried_cost < cost:
+            pose, damping = tried, max(damping / 10, 1e-9)
+            if tried_cost > (1 - 1e-8) * cost:
+                break
+        else:
+            damping *= 10
+    return pose

@@ -1,0 +1,169 @@
+"""Pictures of a calibration board through a lens known exactly: rendered, with noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from companion.camera import Camera
+from companion.chart import ChessboardChart, parse_chart
+from companion.geometry import Array
+from companion.messages import Bytes
+
+CHARUCO = "charuco:7x5:0.04:0.03:DICT_5X5_100"
+CHESSBOARD = "chessboard:9x6:0.025"
+MARGIN = 0.4
+"""White around the board, in squares."""
+PX_PER_SQUARE = 70
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Where a board is: its middle at this place of the picture, this wide, tilted and turned."""
+
+    u: float
+    v: float
+    """Shares of the picture."""
+    width: float
+    """Of the board as seen squarely, share of the picture's."""
+    tilt_right_deg: float = 0.0
+    tilt_down_deg: float = 0.0
+    turn_deg: float = 0.0
+
+
+def placings(n: int, *, tilt_deg: float = 35.0, width: float = 0.5, seed: int = 1) -> list[Placing]:
+    """A board shown as it should be: in every corner, at the edges, near and far, tilted."""
+    rng = np.random.default_rng(seed)
+    places = [
+        (u, v) for v in (0.22, 0.5, 0.78) for u in (0.2, 0.5, 0.8)
+    ]  # fmt: skip
+    out = []
+    for i in range(n):
+        u, v = places[i % len(places)]
+        about = rng.uniform(-1, 1, 3)
+        way = 2 * np.pi * (i * 0.381966)
+        out.append(
+            Placing(
+                u + 0.04 * about[0], v + 0.04 * about[1], width * rng.uniform(0.85, 1.25),
+                tilt_deg * np.cos(way), tilt_deg * np.sin(way), 20 * about[2],
+            )
+        )  # fmt: skip
+    return out
+
+
+class BoardPictures:
+    """Renders one board through one camera."""
+
+    def __init__(self, camera: Camera, board: str = CHARUCO, *, seed: int = 7) -> None:
+        self.camera = camera
+        self._rng = np.random.default_rng(seed)
+        self._texture, self._square_m = _texture(board)
+        self._size_m = np.array(self._texture.shape[1::-1]) / PX_PER_SQUARE * self._square_m
+        # four samples a pixel, against stairs at the edges
+        v, u = np.mgrid[0 : camera.height * 2, 0 : camera.width * 2]
+        pixels = np.stack([u, v], -1) / 2.0 - 0.25
+        self._rays = camera.normalise(pixels.reshape(-1, 2)).reshape(*pixels.shape)
+        self._background = self._scene()
+
+    def picture(
+        self, placing: Placing | None, *, blur_px: float = 0.0, noise: float = 2.0, bend: float = 0.0
+    ) -> Bytes:
+        """The board there; None for the scene without it.
+
+        `blur_px` is motion to the right; `bend` bows the board by so many of its widths.
+        """
+        picture = self._background
+        if placing is not None:
+            picture = self._with_board(placing, bend)
+        small = cv2.resize(
+            picture, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA
+        )
+        small = cv2.GaussianBlur(small, (0, 0), 0.6)
+        if blur_px > 1:
+            n = round(blur_px)
+            small = cv2.filter2D(small, -1, np.full((1, n), 1 / n, np.float32))
+        noisy = small + self._rng.normal(0, noise, small.shape)
+        return np.clip(noisy, 0, 255).astype(np.uint8)
+
+    def pictures(self, places: Sequence[Placing]) -> list[Bytes]:
+        """One for each placing."""
+        return [self.picture(placing) for placing in places]
+
+    def _with_board(self, placing: Placing, bend: float) -> Array:
+        rotation, shift = self._pose(placing)
+        # texture from ray: the plane's homography, undone
+        plane = np.stack([rotation[:, 0], rotation[:, 1], shift], 1)
+        back = np.linalg.inv(plane)
+        x, y = self._rays[..., 0], self._rays[..., 1]
+        w = back[2, 0] * x + back[2, 1] * y + back[2, 2]
+        at = np.where(w > 1e-6, w, np.nan)
+        across = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / at
+        down = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / at
+        if bend:  # as a sheet that was rolled: what lies beside its middle is out of place
+            away = across / self._size_m[0] - 0.5
+            across = across + bend * 4 * self._size_m[0] * away * np.abs(away)
+            down = down + bend * 2 * self._size_m[0] * away**2
+        scale = PX_PER_SQUARE / self._square_m
+        u, v = across * scale - 0.5, down * scale - 0.5
+        board = cv2.remap(
+            self._texture, np.nan_to_num(u, nan=-9).astype(np.float32),
+            np.nan_to_num(v, nan=-9).astype(np.float32), cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0,
+        )  # fmt: skip
+        height, width = self._texture.shape
+        inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+        return np.where(inside, board, self._background)
+
+    def _pose(self, placing: Placing) -> tuple[Array, Array]:
+        camera = self.camera
+        middle = np.array([placing.u * camera.width, placing.v * camera.height])
+        half = 0.5 * placing.width * min(camera.width, 1.4 * camera.height)
+        rays = camera.normalise(np.array([middle, middle - [half, 0], middle + [half, 0]]))
+        ray = np.append(rays[0], 1.0)
+        angle = _angle(rays[1], rays[2])
+        distance = self._size_m[0] / 2 / np.tan(angle / 2)
+        # squarely to the ray, then tilted and turned
+        forward = ray / np.linalg.norm(ray)
+        right = np.cross([0.0, 1.0, 0.0], forward)
+        right /= np.linalg.norm(right)
+        facing = np.stack([right, np.cross(forward, right), forward], 1)
+        tilts = np.radians([-placing.tilt_down_deg, placing.tilt_right_deg, placing.turn_deg])
+        rotation = facing @ cv2.Rodrigues(tilts)[0]
+        shift = forward * distance - rotation @ np.append(self._size_m / 2, 0)
+        return rotation, shift
+
+    def _scene(self) -> Array:
+        coarse = self._rng.uniform(60, 190, (9, 12)).astype(np.float32)
+        size = (self._rays.shape[1], self._rays.shape[0])
+        scene = np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC), np.float32)
+        return np.where(np.isfinite(self._rays[..., 0]), scene, 0.0).astype(np.float32)
+
+
+def _texture(board: str) -> tuple[Array, float]:
+    """Drawn by other means than the program's own, as far as there are any."""
+    chart = parse_chart(board)
+    columns, rows = chart.columns + 1, chart.rows + 1
+    if isinstance(chart, ChessboardChart):
+        squares = (np.indices((rows, columns)).sum(0) % 2).astype(np.uint8) * 255
+        image = np.kron(squares, np.ones((PX_PER_SQUARE, PX_PER_SQUARE), np.uint8))
+    else:
+        _, _, square, marker, dictionary, *legacy = board.split(":")
+        drawn = cv2.aruco.CharucoBoard(
+            (columns, rows), float(square), float(marker),
+            cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)),
+        )  # fmt: skip
+        drawn.setLegacyPattern(bool(legacy))
+        image = drawn.generateImage((columns * PX_PER_SQUARE, rows * PX_PER_SQUARE))
+    margin = round(MARGIN * PX_PER_SQUARE)
+    image = cv2.copyMakeBorder(
+        image, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=255
+    )
+    return image.astype(np.float32) * 0.8 + 25, chart.square_m
+
+
+def _angle(one: Array, other: Array) -> float:
+    a, b = np.append(one, 1.0), np.append(other, 1.0)
+    return float(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
