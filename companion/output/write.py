@@ -17,8 +17,8 @@ def write_results(
 ) -> None:
     """Write trajectory.tum, cloud.ply, report.json and report.html into folder `out`.
 
-    Without `page` the last, which takes longest, is left out. Each is replaced in one step, the page
-    last; raises OSError where the folder cannot be written.
+    Without `page` the last, which takes longest, is left out. Each is replaced in one step, the
+    page last; raises OSError where the folder cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     poses, cloud = result.poses(), result.cloud(voxel_m)
