@@ -1,0 +1,187 @@
+"""No bad pose leaves; a good one does, at the rate and with the stamp that an autopilot wants."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.config import FeedbackConfig
+from companion.feedback import PoseGate, PoseToSend
+from companion.geometry import Pose, quaternion_from_euler, rotation_from_quaternion
+from companion.messages import AttitudeSample, Odometry, TrackState
+from drivers.pose_messages import euler_of, odometry_message, vision_messages
+
+MS = 1_000_000
+LATENCY_NS = 40 * MS
+ATTITUDE = quaternion_from_euler(0.1, -0.2, 2.0)
+
+
+def odometry(t_ns: int, **changes: Any) -> Odometry:
+    good = Odometry(
+        t_ns // (50 * MS), t_ns, TrackState.TRACKING, 0, 80,
+        Pose(rotation_from_quaternion(ATTITUDE), np.array([1.0 + t_ns * 1e-9 * 2, 2.0, -3.0])),
+        np.array([2.0, 0.0, 0.0]), 0.1, 0.2, 0.01,
+    )  # fmt: skip
+    return replace(good, **changes)
+
+
+class Flight:
+    """Frames each `period_ms`, and the gate asked every 5 ms as the daemon does."""
+
+    def __init__(self, period_ms: int = 50, **config: Any) -> None:
+        self.gate = PoseGate(FeedbackConfig(mode="odometry", **config))
+        self.period_ns = period_ms * MS
+        self.now_ns = 10**12
+        self.sent: list[tuple[int, PoseToSend]] = []
+        self.yaw_rate_rad_s = 0.0
+
+    def yaw(self, t_ns: int) -> float:
+        return 2.0 + self.yaw_rate_rad_s * (t_ns - 10**12) * 1e-9
+
+    def run(self, seconds: float, frames: bool = True, **changes: Any) -> list[PoseToSend]:
+        first = len(self.sent)
+        for _ in range(round(seconds * 200)):
+            self.now_ns += 5 * MS
+            if self.now_ns % (20 * MS) == 0:
+                attitude = quaternion_from_euler(0.1, -0.2, self.yaw(self.now_ns))
+                self.gate.take_attitude(AttitudeSample(self.now_ns, attitude))
+            if frames and self.now_ns % self.period_ns == 0:
+                t_ns = self.now_ns - LATENCY_NS
+                sample = odometry(t_ns, **changes)
+                if self.yaw_rate_rad_s and sample.world_from_body is not None:
+                    turned = quaternion_from_euler(0.1, -0.2, self.yaw(t_ns))
+                    at = sample.world_from_body.translation
+                    pose = Pose(rotation_from_quaternion(turned), at)
+                    sample = replace(sample, world_from_body=pose)
+                self._keep(self.gate.take(sample, self.now_ns))
+            self._keep(self.gate.due(self.now_ns))
+        return [pose for _, pose in self.sent[first:]]
+
+    def _keep(self, pose: PoseToSend | None) -> None:
+        if pose is not None:
+            self.sent.append((self.now_ns, pose))
+
+
+def test_nothing_before_belief_has_held() -> None:
+    flight = Flight()
+    assert not flight.run(0.9)
+    assert flight.gate.why_not == "belief must hold first"
+    assert flight.run(0.5)
+
+
+@pytest.mark.parametrize(("period_ms", "least_hz"), [(100, 30), (50, 30), (30, 30)])
+def test_rate_and_order(period_ms: int, least_hz: int) -> None:
+    flight = Flight(period_ms)
+    flight.run(2)
+    poses = flight.run(2)
+    assert len(poses) >= 2 * least_hz - 1
+    stamps = [pose.t_ns for pose in poses]
+    assert all(b > a for a, b in zip(stamps, stamps[1:], strict=False))
+    # between frames the body goes on as it moved
+    off = [p.world_from_body.translation[0] - 1.0 - p.t_ns * 1e-9 * 2 for p in poses]
+    assert np.abs(off).max() < 1e-6
+    assert any(pose.predicted for pose in poses) == (period_ms > 40)
+
+
+def test_prediction_turns_with_the_autopilot() -> None:
+    flight = Flight(100)
+    flight.yaw_rate_rad_s = 0.5
+    flight.run(2)
+    poses = [pose for pose in flight.run(1) if pose.predicted]
+    assert len(poses) > 10
+    for pose in poses:
+        assert euler_of(pose.world_from_body.rotation)[2] == pytest.approx(
+            flight.yaw(pose.t_ns), abs=2e-3
+        )
+
+
+@pytest.mark.parametrize(
+    ("changes", "why_not"),
+    [
+        ({"state": TrackState.LOST, "world_from_body": None, "quality": -1}, "lost"),
+        ({"sigma_position_m": 5.0}, "position too uncertain"),
+        ({"sigma_position_m": math.nan}, "position too uncertain"),
+        ({"quality": 5}, "quality too low"),
+        (
+            {"world_from_body": Pose(rotation_from_quaternion(quaternion_from_euler(0.4, -0.2, 2)),
+                                     np.zeros(3))},
+            "tilt differs from the autopilot's",
+        ),
+        ({"world_from_body": Pose(np.eye(3), np.array([math.nan, 0, 0]))}, "position too uncertain"),
+    ],
+)  # fmt: skip
+def test_stops_in_time_and_takes_up_again(changes: dict[str, Any], why_not: str) -> None:
+    flight = Flight()
+    flight.run(2)
+    assert flight.gate.sending
+    lost_ns = flight.now_ns
+    flight.run(0.6, **changes)
+    assert max(at for at, _ in flight.sent) - lost_ns <= 300 * MS
+    assert not flight.gate.sending and flight.gate.why_not == why_not
+    poses = flight.run(0.9)
+    assert not poses
+    assert flight.run(0.4)
+
+
+def test_no_frames_at_all() -> None:
+    flight = Flight()
+    flight.run(2)
+    stopped_ns = flight.now_ns
+    flight.run(1, frames=False)
+    assert max(at for at, _ in flight.sent) - stopped_ns <= 300 * MS
+    assert flight.gate.why_not == "no frames"
+
+
+def test_a_single_bad_frame_is_bridged() -> None:
+    flight = Flight()
+    flight.run(2)
+    flight.run(0.05, state=TrackState.LOST, world_from_body=None)
+    assert flight.run(0.5) and flight.gate.sending
+
+
+def test_old_and_repeated_stamps_are_not_sent() -> None:
+    flight = Flight()
+    flight.run(2)
+    again = odometry(flight.now_ns - 500 * MS)
+    assert flight.gate.take(again, flight.now_ns) is None
+    late = odometry(flight.now_ns + 1)
+    assert flight.gate.take(late, flight.now_ns + 400 * MS) is None
+
+
+def test_discontinuities_are_counted_across_restarts() -> None:
+    flight = Flight()
+    flight.run(2)
+    assert flight.sent[-1][1].reset_counter == 0
+    flight.run(0.5, reset_counter=1)
+    assert flight.sent[-1][1].reset_counter == 1
+    flight.gate.restart()
+    flight.run(2)
+    assert flight.sent[-1][1].reset_counter == 2
+
+
+def test_no_scale_is_told() -> None:
+    flight = Flight()
+    assert not flight.run(2, world_from_body=None, quality=-1)
+    assert flight.gate.why_not == "no metric scale"
+
+
+def test_odometry_message() -> None:
+    pose = PoseToSend(
+        1_234_567_890_123, Pose(rotation_from_quaternion(ATTITUDE), np.array([1.0, 2.0, -3.0])),
+        np.array([1.0, 0.5, -0.2]), 0.1, 0.2, 0.01, 80, 7,
+    )  # fmt: skip
+    message = odometry_message(pose)
+    assert (message.frame_id, message.child_frame_id) == (20, 12)
+    assert (message.time_usec, message.reset_counter, message.quality) == (1_234_567_890, 7, 80)
+    assert np.allclose(message.q, ATTITUDE)
+    body = pose.world_from_body.rotation.T @ pose.velocity_world_m_s
+    assert np.allclose([message.vx, message.vy, message.vz], body)
+    diagonal = [message.pose_covariance[i] for i in (0, 6, 11, 15, 18, 20)]
+    assert np.allclose(diagonal, [0.01] * 3 + [1e-4] * 3)
+    position, speed = vision_messages(pose)
+    assert np.allclose([position.roll, position.pitch, position.yaw], [0.1, -0.2, 2.0])
+    assert (speed.x, speed.y, speed.z) == (1.0, 0.5, -0.2)
