@@ -17,7 +17,8 @@ TIMESPEC = struct.Struct("qq")
 MOST_AGE_NS = 500_000_000
 STEP_NS = 1_000_000
 PEER_SILENT_NS = 1_500_000_000
-NETWORK_BYTES_PER_S = 1e6
+NETWORK_BYTES_PER_S = 250e3
+"""More than any autopilot is told or tells."""
 
 
 class KernelStamps:
@@ -137,4 +138,6 @@ class UdpWire(Wire):
         except OSError as error:  # the network is away: the socket stays good
             self.n_unsent += 1
             self.trouble = f"{self.name}: {error.strerror}"
+        else:
+            self.trouble = ""
         return len(data)

@@ -6,13 +6,25 @@ import asyncio
 import os
 import time
 from abc import ABC, abstractmethod
-from typing import Protocol
+from collections.abc import Coroutine
+from typing import Any, Protocol
 
 from companion.errors import SourceError
 from drivers.mavlink_queue import PacketQueue, RateLimit
 
 FIRST_RETRY_S, MOST_RETRY_S = 0.1, 0.5
 STALLED_NS = 30_000_000_000
+
+
+async def run_together(*parts: Coroutine[Any, Any, None]) -> None:
+    """Run all until one fails or this is cancelled; none is left running."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        await asyncio.gather(*tasks)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 class WireEnd(Protocol):
@@ -22,7 +34,7 @@ class WireEnd(Protocol):
         """The wire is there, for the first time or again; no bytes of before belong to it."""
 
     def received(self, data: bytes, monotonic_ns: int) -> int:
-        """Take what came; answers how many good packets there were in it."""
+        """Take what came; answers how many packets of known messages there were in it."""
 
 
 class Wire(ABC):
@@ -166,6 +178,8 @@ class Wire(ABC):
             asyncio.get_running_loop().add_reader(self._fd, self._readable, end)
 
     def _flush(self) -> None:
+        if not self._waiting:
+            self._progress_ns = time.monotonic_ns()
         try:
             while self.queue:
                 wait_s = self._room()

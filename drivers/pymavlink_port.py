@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -10,9 +11,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.clock import FlightClock
 from companion.config import LinkConfig, RouterConfig
 from drivers.mavlink_port import OnMessage
-from drivers.mavlink_stream import MavlinkStream, decode
+from drivers.mavlink_router import Router
+from drivers.mavlink_signing import MavlinkSigning, read_key
+from drivers.mavlink_stream import MavlinkStream, Packet, decode
 from drivers.mavlink_transport import link_wire
 from drivers.mavlink_url import link_endpoint
+from drivers.mavlink_wire import run_together
 
 FIRST_SYSTEM = 1
 """What ArduPilot and PX4 are numbered unless somebody changed it."""
@@ -21,23 +25,38 @@ FIRST_SYSTEM = 1
 class PymavlinkPort:
     """One end of the autopilot's link, which others share through the router.
 
-    ConfigError if the configuration names nothing that can be opened. It begins as a component of
-    the configured vehicle, or of system 1; set `identity` when the vehicle has been heard.
+    ConfigError if the configuration names nothing that can be opened, or a key that is none. It
+    begins as a component of the configured vehicle, or of system 1; set `identity` when the vehicle
+    has been heard. With a key only signed messages are delivered, and clients of the router must
+    sign what they send as well; what the autopilot says they get as it is.
     """
 
     def __init__(self, config: LinkConfig, router: RouterConfig, clock: FlightClock) -> None:
         self._wire = link_wire(link_endpoint(config.url))
-        self._stream = MavlinkStream()
-        self._codec = mavlink.MAVLink(None)
-        self._seqs: dict[tuple[int, int], int] = {}
-        self._clock = clock
-        self._on_message: OnMessage = lambda message, t_ns: None
         self.name = self._wire.name
         self.identity = (config.system_id or FIRST_SYSTEM, config.component_id)
+        self.router = Router(
+            router, self._wire, lambda: self.identity, self._deliver, self._is_signed
+        )
         self.n_received = 0
         self.n_sent = 0
-        self.n_unpacked = 0
-        """Messages that could not be packed: a field out of its range."""
+        self.n_lost = 0
+        """Packets that others sent and that never came, by their sequence numbers."""
+        self.n_unsigned = 0
+        """Packets of the link refused for want of a valid signature."""
+        self._n_unpacked = 0
+        self._clock = clock
+        self._stream = MavlinkStream()
+        self._reader = mavlink.MAVLink(None)
+        self._writer = mavlink.MAVLink(None)
+        self._signing: MavlinkSigning | None = None
+        if config.signing_key_file:
+            self._signing = MavlinkSigning(read_key(Path(config.signing_key_file)))
+            self._writer.signing.secret_key = self._signing.key
+            self._writer.signing.sign_outgoing = True
+        self._seq_out: dict[tuple[int, int], int] = {}
+        self._seq_in: dict[tuple[int, int], int] = {}
+        self._on_message: OnMessage = _ignore
 
     @property
     def connected(self) -> bool:
@@ -46,49 +65,93 @@ class PymavlinkPort:
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the wire, in words; "" when nothing is."""
-        return self._wire.trouble
+        """What is wrong with the wire or the router's places, for people; "" when nothing is."""
+        return "; ".join(text for text in (self._wire.trouble, self.router.trouble) if text)
 
     @property
     def n_dropped(self) -> int:
-        """Messages that could not be sent."""
-        return self._wire.n_dropped + self.n_unpacked
+        """Messages that could not be sent: no wire, no room, or a field out of its range."""
+        return self._wire.n_dropped + self._n_unpacked
 
     @property
     def n_bad(self) -> int:
-        """Times that the stream of packets was broken."""
-        return self._stream.n_breaks
+        """Times that the stream of packets was broken, and packets not signed as they should be."""
+        return self._stream.n_breaks + self.n_unsigned
+
+    @property
+    def n_bad_bytes(self) -> int:
+        """Bytes that belonged to no packet."""
+        return self._stream.n_bad_bytes
 
     async def run(self, on_message: OnMessage) -> None:
-        """Receive until cancelled."""
+        """Receive, and serve the router's clients, until cancelled."""
         self._on_message = on_message
-        await self._wire.run(self)
+        try:
+            await run_together(self._wire.run(self), self.router.run())
+        finally:
+            self._on_message = _ignore
 
     def send(self, message: Any) -> None:
-        """Pack a message as ours and send it."""
-        codec, identity = self._codec, self.identity
-        codec.srcSystem, codec.srcComponent = identity
-        codec.seq = self._seqs.get(identity, 0)
+        """Pack a message as ours, signed if there is a key, and send it."""
+        writer, identity = self._writer, self.identity
+        writer.srcSystem, writer.srcComponent = identity
+        writer.seq = self._seq_out.get(identity, 0)
+        if self._signing is not None:
+            writer.signing.timestamp = self._signing.next_stamp(self._clock.now_ns())
         try:
-            packet = bytes(message.pack(codec))
-        except (struct.error, ValueError, TypeError, OverflowError):
-            self.n_unpacked += 1
+            raw = bytes(message.pack(writer))
+        except (struct.error, ValueError, TypeError, OverflowError, AttributeError):
+            self._n_unpacked += 1
             return
-        self._seqs[identity] = (codec.seq + 1) % 256
-        self._wire.write(packet)
+        self._seq_out[identity] = (writer.seq + 1) % 256
+        self._wire.write(raw)
+        self.router.from_us(raw)
         self.n_sent += 1
 
     def opened(self) -> None:
         """See `WireEnd`."""
         self._stream.restart()
+        self._seq_in.clear()
 
     def received(self, data: bytes, monotonic_ns: int) -> int:
         """See `WireEnd`."""
+        ours = self.identity
         packets = self._stream.feed(data, monotonic_ns)
-        t_ns = self._clock.from_monotonic_ns(monotonic_ns)
-        for packet in packets:
-            self.n_received += 1
-            message = decode(self._codec, packet)
-            if message is not None:
-                self._on_message(message, t_ns)
-        return len(packets)
+        if any((packet.system, packet.component) == ours for packet in packets):
+            # an echo of what we sent: whoever joined the wire's ends, it goes no further
+            packets = [packet for packet in packets if (packet.system, packet.component) != ours]
+        self.n_received += len(packets)
+        try:
+            for packet in packets:
+                self._follow(packet)
+                if self._is_signed(packet, monotonic_ns):
+                    self._deliver(packet, monotonic_ns)
+                else:
+                    self.n_unsigned += 1
+        finally:
+            self.router.from_link(packets, monotonic_ns)
+        return sum(packet.known for packet in packets)
+
+    def _follow(self, packet: Packet) -> None:
+        source = packet.system, packet.component
+        last = self._seq_in.get(source)
+        self._seq_in[source] = packet.seq
+        if last is not None:
+            missing = (packet.seq - last - 1) % 256
+            if missing < 128:  # else it came twice or late
+                self.n_lost += missing
+
+    def _is_signed(self, packet: Packet, monotonic_ns: int) -> bool:
+        """As well as it has to be."""
+        if self._signing is None:
+            return True
+        return self._signing.accepts(packet, self._clock.from_monotonic_ns(monotonic_ns))
+
+    def _deliver(self, packet: Packet, monotonic_ns: int) -> None:
+        message = decode(self._reader, packet)
+        if message is not None:
+            self._on_message(message, self._clock.from_monotonic_ns(monotonic_ns))
+
+
+def _ignore(message: Any, t_ns: int) -> None:
+    """Takes messages while nobody receives."""
