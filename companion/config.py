@@ -63,6 +63,8 @@ class CameraConfig:
     """file: a flight folder, a folder of images, or a video, played in real time."""
     repeat: bool = False
     """file: begin again at the end, else the camera is silent from then on."""
+    starts_at_unix_s: Annotated[float, Range(0, 1e11)] = 0.0
+    """file: when its first picture is due; 0: when the camera is opened."""
     width: Annotated[int, Range(32, 8192)] = 640
     height: Annotated[int, Range(32, 8192)] = 480
     rate_hz: Annotated[float, Range(1, 240)] = 30.0

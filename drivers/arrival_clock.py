@@ -1,0 +1,44 @@
+"""When pictures were taken that come by a network: the sender's stamps, put on our clock."""
+
+from __future__ import annotations
+
+MAX_DRIFT = 200e-6
+"""Two clocks of computers do not run apart faster than this."""
+MAX_LATE_NS = 1_000_000_000
+STEPPED_AFTER_NS = 3_000_000_000
+"""What is later than that for so long is not late: the sender's stamps were set back."""
+
+
+class ArrivalClock:
+    """Follows the least delayed of what arrives: a delay only ever makes a picture late.
+
+    What all pictures are delayed by (encoding, the network at its best) it cannot see; that is
+    what `camera.stamp_offset_ms` is for.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns: float | None = None
+        self._last_ns = 0
+        self._late_since_ns: int | None = None
+
+    def monotonic_ns(self, sent_ns: int, arrived_ns: int) -> int:
+        """Our time of what the sender stamped `sent_ns`; never later than it arrived."""
+        offset_ns = float(arrived_ns - sent_ns)
+        if self._offset_ns is None or self._stepped_back(offset_ns, arrived_ns):
+            self._offset_ns = offset_ns
+        risen_ns = self._offset_ns + MAX_DRIFT * max(0, arrived_ns - self._last_ns)
+        self._offset_ns = min(offset_ns, risen_ns)
+        self._last_ns = arrived_ns
+        return round(sent_ns + self._offset_ns)
+
+    def _stepped_back(self, offset_ns: float, arrived_ns: int) -> bool:
+        assert self._offset_ns is not None
+        if offset_ns - self._offset_ns < MAX_LATE_NS:
+            self._late_since_ns = None
+            return False
+        if self._late_since_ns is None:
+            self._late_since_ns = arrived_ns
+        if arrived_ns - self._late_since_ns < STEPPED_AFTER_NS:
+            return False
+        self._late_since_ns = None
+        return True

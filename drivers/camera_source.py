@@ -1,0 +1,109 @@
+"""What a camera is to the rest: something that opens, gives stamped pictures, and may go away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from companion.config import CameraConfig
+from companion.errors import ConfigError, SourceError
+from companion.messages import Bytes
+
+
+class EndOfPictures(SourceError):  # noqa: N818 - an end, not a fault
+    """The source has shown all that there is; it will show no more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """One picture of a camera, as it came.
+
+    `monotonic_ns` is CLOCK_MONOTONIC at mid-exposure, as well as the source knows; `grey` (H, W)
+    u8; `rgb` (H, W, 3) u8. Both are the receiver's own: no driver writes to them any more.
+    """
+
+    monotonic_ns: int
+    grey: Bytes
+    rgb: Bytes
+
+
+class CameraSource(Protocol):
+    """One kind of camera; used from one thread."""
+
+    name: str
+    """For people: a path, a URL without its password."""
+    live: bool
+    """Whether opening it anew can help where it gives nothing, or one picture for ever."""
+    start_s: float
+    """The first picture may take so long after opening."""
+    silent_s: float
+    """No picture for so long, once there were some, means that it is silent."""
+    n_dropped: int
+    """Pictures that came, and were damaged or too late to be handed on."""
+    remarks: list[str]
+    """What it does otherwise than asked; the reader takes them out."""
+
+    def open(self) -> None:
+        """Begin. SourceError: it is not there now. ConfigError: as configured it never will be."""
+
+    def read(self, timeout_s: float) -> Picture | None:
+        """The newest picture, None if none came in time; SourceError when the camera has gone."""
+
+    def close(self) -> None:
+        """End, whatever state it is in; can be called twice."""
+
+
+def camera_source(config: CameraConfig) -> CameraSource:
+    """The camera that is configured, not yet opened; ConfigError where a key that it needs lacks.
+
+    Its library is loaded here and not before: a machine need only have what its own camera wants.
+    """
+    return _MAKERS[config.source](config)
+
+
+def _v4l2(config: CameraConfig) -> CameraSource:
+    from drivers.v4l2_camera import V4l2Camera
+
+    return V4l2Camera(config)
+
+
+def _gstreamer(config: CameraConfig) -> CameraSource:
+    from drivers.gstreamer_camera import GstreamerCamera
+
+    _require(config.pipeline, "camera.pipeline", 'for example "nvarguscamerasrc ! nvvidconv"')
+    return GstreamerCamera(config)
+
+
+def _network(config: CameraConfig) -> CameraSource:
+    from drivers.network_camera import NetworkCamera
+
+    _require(config.url, "camera.url", 'for example "rtsp://192.168.1.10/stream"')
+    return NetworkCamera(config)
+
+
+def _file(config: CameraConfig) -> CameraSource:
+    from drivers.file_camera import FileCamera
+
+    _require(config.path, "camera.path", "a flight folder, a folder of images, or a video")
+    return FileCamera(config)
+
+
+def _pattern(config: CameraConfig) -> CameraSource:
+    from drivers.pattern_camera import PatternCamera
+
+    return PatternCamera(config)
+
+
+def _require(value: str, key: str, example: str) -> None:
+    if not value.strip():
+        raise ConfigError(f"{key} is not set: give {example}")
+
+
+_MAKERS: dict[str, Callable[[CameraConfig], CameraSource]] = {
+    "v4l2": _v4l2,
+    "gstreamer": _gstreamer,
+    "network": _network,
+    "file": _file,
+    "pattern": _pattern,
+}
