@@ -16,7 +16,7 @@ from drivers.mavlink_signing import MavlinkSigning, read_key
 from drivers.mavlink_stream import MavlinkStream, Packet, decode
 from drivers.mavlink_transport import link_wire
 from drivers.mavlink_url import link_endpoint
-from drivers.mavlink_wire import run_together
+from drivers.mavlink_wire import Wire, run_together
 
 FIRST_SYSTEM = 1
 """What ArduPilot and PX4 are numbered unless somebody changed it."""
@@ -31,8 +31,10 @@ class PymavlinkPort:
     sign what they send as well; what the autopilot says they get as it is.
     """
 
-    def __init__(self, config: LinkConfig, router: RouterConfig, clock: FlightClock) -> None:
-        self._wire = link_wire(link_endpoint(config.url))
+    def __init__(
+        self, config: LinkConfig, router: RouterConfig, clock: FlightClock, wire: Wire | None = None
+    ) -> None:
+        self._wire = link_wire(link_endpoint(config.url)) if wire is None else wire
         self.name = self._wire.name
         self.identity = (config.system_id or FIRST_SYSTEM, config.component_id)
         self.router = Router(

@@ -1,0 +1,105 @@
+"""MAVSDK as a carrier of packets: whole ones come out of its connection and go in, unchanged.
+
+Between a connection and its raw bytes MAVSDK passes packets on as they are, whatever their
+message, system or signature. Its own identity is one that nobody speaks to, since what is meant for
+itself it keeps; and what it has to say itself (heartbeats, requests for versions) is kept from
+going out, so that one component is on the link: ours.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import mavsdk
+from mavsdk import logging as mavsdk_logging
+from mavsdk import types as mavsdk_types
+from mavsdk.cmavsdk_loader import _cmavsdk_lib as library
+
+from companion.errors import ConfigError
+
+NOBODY = (254, 25)
+"""System and component."""
+DROP = 0
+HANDLED = True
+WARNING = 2
+
+
+def check_library() -> None:
+    """ConfigError unless this MAVSDK can be kept quiet, for which only its C interface has a name."""
+    try:
+        intercept = library.mavsdk_subscribe_outgoing_messages_json
+    except AttributeError:
+        raise ConfigError(
+            f"mavsdk {mavsdk.__version__} cannot be kept from sending heartbeats of its own; set "
+            'link.backend = "pymavlink"'
+        ) from None
+    intercept.argtypes = [ctypes.c_void_p, mavsdk_types.InterceptJsonCallback, ctypes.c_void_p]
+    intercept.restype = ctypes.c_void_p
+
+
+class Carrier:
+    """One connection, held by MAVSDK's threads. `start` and `end` may wait; not for the event loop.
+
+    `take` is called in MAVSDK's thread with each packet that comes.
+    """
+
+    def __init__(self, url: str, take: Callable[[bytes], None]) -> None:
+        self._url = url
+        self._take = take
+        self._lock = threading.Lock()
+        self._held: mavsdk.Mavsdk | None = None
+        self._silencer: Any = None
+
+    def start(self) -> None:
+        """Open the connection; MavsdkError if that cannot be done now."""
+        with self._lock:
+            complaints.listen()
+            configuration = mavsdk.Configuration.create_manual(*NOBODY, False)
+            self._held = held = mavsdk.Mavsdk(configuration)
+            configuration.destroy()
+            # kept for as long as MAVSDK may call it
+            self._silencer = mavsdk_types.InterceptJsonCallback(lambda message, data: DROP)
+            library.mavsdk_subscribe_outgoing_messages_json(held._handle, self._silencer, None)
+            on = mavsdk.ForwardingOption.ON
+            held.add_any_connection_with_handle_and_forwarding("raw://", on)
+            held.subscribe_raw_bytes_to_be_sent(self._take)
+            held.add_any_connection_with_handle_and_forwarding(self._url, on)
+
+    def send(self, packet: bytes) -> None:
+        """Give MAVSDK a whole packet; it waits in a queue that has no bound."""
+        if self._held is not None:
+            self._held.pass_received_raw_bytes(packet)
+
+    def end(self) -> None:
+        """Close the connection. MAVSDK first goes through what it was given."""
+        with self._lock:
+            held, self._held = self._held, None
+            if held is not None:
+                held.destroy()
+            self._silencer = None
+
+
+class Complaints:
+    """What MAVSDK last complained of. It has one log for the process, and would print it."""
+
+    def __init__(self) -> None:
+        self.newest = ""
+        self._callback: Any = None
+
+    def listen(self) -> None:
+        """Forget what was; from now on nothing is printed."""
+        self.newest = ""
+        if self._callback is None:
+            self._callback = mavsdk_logging.LogCallback(self._hear)
+            library.mavsdk_log_subscribe(self._callback, None)
+
+    def _hear(self, level: int, text: bytes | None, *_: Any) -> bool:
+        if level >= WARNING:
+            self.newest = (text or b"").decode("utf-8", "replace")
+        return HANDLED
+
+
+complaints = Complaints()
