@@ -153,19 +153,18 @@ class CharucoChart:
     def black_m(self) -> Array:
         """What is black on it."""
         out = []
-        white = {
-            (int(corners[:, 0].mean()), int(corners[:, 1].mean())): (corners, int(number))
-            for corners, number in zip(
-                self._board.getObjPoints(), self._board.getIds().ravel(), strict=True
-            )
-        }
+        corners = np.asarray(self._board.getObjPoints(), np.float64)[..., :2]  # (markers, 4, 2)
+        numbers = np.ravel(np.asarray(self._board.getIds()))
+        white = {tuple(at): i for i, at in enumerate(corners.mean(1).astype(int).tolist())}
         for row in range(self.rows + 1):
             for column in range(self.columns + 1):
-                if (column, row) not in white:
+                i = white.get((column, row))
+                if i is None:
                     out.append([column, row, 1.0, 1.0])
-                    continue
-                corners, number = white[column, row]
-                out += _marker(_dictionary(self._dictionary), number, corners[0], corners[2])
+                else:
+                    out += _marker(
+                        _dictionary(self._dictionary), int(numbers[i]), corners[i, 0], corners[i, 2]
+                    )
         return np.array(out, np.float64) * self.square_m
 
     def _variants(self) -> list[CharucoChart]:
@@ -258,7 +257,7 @@ def _marker(
     """Black rectangles of a marker, in the units of its corners; each row's runs in one piece."""
     n = dictionary.markerSize + 2
     black = dictionary.generateImageMarker(number, n) == 0
-    step = (np.asarray(last, np.float64) - first)[:2] / n
+    step = (last - first) / n
     out = []
     for row in range(n):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], black[row], [False]]).astype(int)))

@@ -1,4 +1,4 @@
-"""How far a replay has come, for whoever watches it."""
+"""How far a replay or a calibration has come, for whoever watches it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class Progress(Protocol):
     """Told of every frame, between frames, when nothing is half done."""
 
     def start(self, total_frames: int) -> None:
-        """Frames are about to come."""
+        """Frames are about to come; 0 where it is not known how many."""
 
     def update(self, done: int, state: str, n_points: int) -> None:
-        """So many frames are done, the tracker is in this state, the cloud has so many points."""
+        """So many frames are done, this is the state, so many points are there (or views)."""
 
     def finish(self) -> None:
         """No more frames come."""
@@ -40,13 +40,13 @@ class NoProgress:
 class TerminalProgress:
     """A line in a terminal: bar, frames done, frames/s, state, points, time to go."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO, counted: str = "points") -> None:
         self._bar = RichProgress(
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("frames"),
             _FramesPerSecond(),
-            TextColumn("{task.fields[state]}  {task.fields[points]:,} points"),
+            TextColumn("{task.fields[state]}  {task.fields[points]:,} " + counted),
             RemainingColumn(),
             console=Console(file=stream),
         )
@@ -54,7 +54,7 @@ class TerminalProgress:
 
     def start(self, total_frames: int) -> None:
         """Show the bar."""
-        self._bar.reset(self._task, total=total_frames, visible=True, state="", points=0)
+        self._bar.reset(self._task, total=total_frames or None, visible=True, state="", points=0)
         self._bar.start()
 
     def update(self, done: int, state: str, n_points: int) -> None:
@@ -72,6 +72,6 @@ class _FramesPerSecond(ProgressColumn):
         return Text("" if speed is None else f"{speed:.1f} frames/s")
 
 
-def progress_on(stream: TextIO) -> Progress:
+def progress_on(stream: TextIO, counted: str = "points") -> Progress:
     """A bar where there is a terminal to show it, nothing elsewhere."""
-    return TerminalProgress(stream) if stream.isatty() else NoProgress()
+    return TerminalProgress(stream, counted) if stream.isatty() else NoProgress()

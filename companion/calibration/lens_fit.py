@@ -8,8 +8,9 @@ solver gives no deviations and stops on views near the edge.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -27,8 +28,10 @@ FIRST_FOV_DEG = {
 FIRST_VIEWS = 12
 """Views with which that is found out."""
 MAX_STEPS = 60
-CONVERGED = 1e-9
+CONVERGED = 1e-8
 """Relative fall of the cost under which a fit is at its end."""
+MIRRORED = 25.0
+"""The second of the two poses that a flat board allows is not tried when it is so much worse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +41,10 @@ class LensModel:
     distortion: Distortion
     n_free: int
 
-    def free(self) -> Array:
-        """Which of fx fy cx cy k… are solved for, as indices."""
-        return np.arange(4 + self.n_free)
+    @property
+    def free(self) -> slice:
+        """Which of fx fy cx cy k… are solved for."""
+        return slice(0, 4 + self.n_free)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +60,8 @@ class LensFit:
     """camera_from_board of each view: rotation vector and translation, (6,)."""
     residuals_px: tuple[Array, ...]
     """Seen less computed, (N, 2) of each view."""
+    numbers: tuple[int, ...]
+    """Of the views."""
     cost: float
 
     @property
@@ -117,7 +123,8 @@ def fit_lens(
         raise ValueError("a lens of another kind is no beginning")
     parameters = start.parameters.copy()
     parameters[4 + model.n_free :] = 0
-    return _solved(views, model, parameters, huber_px, MAX_STEPS)
+    known = dict(zip(start.numbers, start.poses, strict=True))
+    return _solved(views, model, parameters, huber_px, MAX_STEPS, known)
 
 
 def residuals_of(lens: LensFit, view: View) -> Array:
@@ -130,8 +137,7 @@ def residuals_of(lens: LensFit, view: View) -> Array:
 
 def standard_deviations(lens: LensFit, views: Sequence[View]) -> Array:
     """Of fx fy cx cy k…, from the residuals and what the lens does to the corners; 0 where kept."""
-    free = lens.model.free()
-    n_free = len(free)
+    free, n_free = lens.model.free, lens.model.free.stop
     schur = np.zeros((n_free, n_free))
     for view, pose in zip(views, lens.poses, strict=True):
         _, by_lens, by_pose = _projected(view, lens.model, lens.parameters, pose)
@@ -149,14 +155,20 @@ def standard_deviations(lens: LensFit, views: Sequence[View]) -> Array:
 
 
 def _solved(
-    views: Sequence[View], model: LensModel, parameters: Array, huber_px: float, max_steps: int
-) -> LensFit | None:
-    first = [_first_pose(view, model, parameters) for view in views]
+    views: Sequence[View], model: LensModel, parameters: Array, huber_px: float, max_steps: int,
+    known_poses: Mapping[int, Array] = MappingProxyType({}),
+) -> LensFit | None:  # fmt: skip
+    first = [
+        known_poses[view.number]
+        if view.number in known_poses
+        else _first_pose(view, model, parameters)
+        for view in views
+    ]
     if sum(pose is not None for pose in first) < len(views):
         return None
     poses = [pose for pose in first if pose is not None]
     parameters = parameters.copy()
-    free = model.free()
+    free = model.free
     damping = 1e-3
     residuals = _all_residuals(views, model, parameters, poses)
     cost = _cost(residuals, huber_px)
@@ -190,15 +202,16 @@ def _solved(
             break
     residuals = _all_residuals(views, model, parameters, poses)
     return LensFit(
-        model, views[0].width, views[0].height, parameters, tuple(poses), tuple(residuals), cost
-    )
+        model, views[0].width, views[0].height, parameters, tuple(poses), tuple(residuals),
+        tuple(view.number for view in views), cost,
+    )  # fmt: skip
 
 
 Block = tuple[Array, Array, Array, Array, Array]
 
 
 def _block(
-    view: View, model: LensModel, parameters: Array, pose: Array, free: Array, huber_px: float
+    view: View, model: LensModel, parameters: Array, pose: Array, free: slice, huber_px: float
 ) -> Block:
     """Normal equations of one view: lens, lens by pose, pose, and both right-hand sides."""
     pixels, by_lens, by_pose = _projected(view, model, parameters, pose)
@@ -215,7 +228,7 @@ def _step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array]]:
     diagonal = np.zeros(n)
     inverses = []
     for aa, ab, bb, ar, br in blocks:
-        inverse = np.linalg.pinv(bb + damping * np.diag(np.diag(bb)))
+        inverse = np.linalg.inv(bb + damping * np.diag(np.diag(bb)))
         inverses.append(inverse)
         left += aa - ab @ inverse @ ab.T
         right += ar - ab @ inverse @ br
@@ -275,7 +288,10 @@ def _projected(
             board_m[:, None], pose[:3], pose[3:], matrix, parameters[4:]
         )
         by_lens, by_pose = by[:, :8], by[:, 8:14]
-    return np.asarray(pixels, np.float64).reshape(-1, 2), by_lens, by_pose
+    return (
+        np.asarray(pixels, np.float64).reshape(-1, 2),
+        np.asarray(by_lens, np.float64), np.asarray(by_pose, np.float64),
+    )  # fmt: skip
 
 
 def _first_pose(view: View, model: LensModel, parameters: Array) -> Array | None:
@@ -288,39 +304,62 @@ def _first_pose(view: View, model: LensModel, parameters: Array) -> Array | None
     usable = np.isfinite(normalised).all(1)
     if usable.sum() < 6:
         return None
+    # far off the axis normalised coordinates stretch without end: look at the board instead
+    rays = np.concatenate([normalised[usable], np.ones((int(usable.sum()), 1))], 1)
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    facing = _facing(rays.mean(0))
+    faced = rays @ facing.T
     try:
         n, turns, shifts, _ = cv2.solvePnPGeneric(
-            view.sighting.board_m[usable], normalised[usable], np.eye(3), None,
+            view.sighting.board_m[usable], faced[:, :2] / faced[:, 2:], np.eye(3), None,
             flags=cv2.SOLVEPNP_IPPE,
         )  # fmt: skip
     except cv2.error:  # corners in one line, or a lens guess that makes them so
         return None
-    best: tuple[float, Array] | None = None
+    found = []
     for turn, shift in list(zip(turns, shifts, strict=True))[:n]:
-        pose = np.concatenate([np.ravel(turn), np.ravel(shift)])
-        if not (np.isfinite(pose).all() and pose[5] > 0):
-            continue
-        pose = _refined_pose(view, model, parameters, pose)
-        cost = float((_residuals(view, model, parameters, pose) ** 2).sum())
+        back = cv2.Rodrigues(facing.T @ cv2.Rodrigues(turn)[0])[0]
+        pose = np.concatenate([np.ravel(back), facing.T @ np.ravel(shift)])
+        if np.isfinite(pose).all() and pose[5] > 0:
+            found.append((_pose_cost(view, model, parameters, pose), pose))
+    found.sort(key=lambda one: one[0])
+    best: tuple[float, Array] | None = None
+    for before, pose in found:
+        if best is not None and before > MIRRORED * found[0][0]:
+            break
+        refined = _refined_pose(view, model, parameters, pose)
+        cost = _pose_cost(view, model, parameters, refined)
         if math.isfinite(cost) and (best is None or cost < best[0]):
-            best = cost, pose
+            best = cost, refined
     return None if best is None else best[1]
+
+
+def _facing(direction: Array) -> Array:
+    """The rotation that brings a direction to the front onto the axis."""
+    forward = direction / np.linalg.norm(direction)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    out: Array = np.stack([right, np.cross(forward, right), forward])
+    return out
+
+
+def _pose_cost(view: View, model: LensModel, parameters: Array, pose: Array) -> float:
+    return float((_residuals(view, model, parameters, pose) ** 2).sum())
 
 
 def _refined_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
     damping = 1e-3
-    cost = math.inf
-    for _ in range(12):
+    for _ in range(20):
         pixels, _, by = _projected(view, model, parameters, pose)
         residual = (view.sighting.image_px - pixels).reshape(-1)
         cost = float(residual @ residual)
         normal = by.T @ by
-        step = np.linalg.pinv(normal + damping * np.diag(np.diag(normal))) @ (by.T @ residual)
-        tried = pose + step
-        tried_cost = float((_residuals(view, model, parameters, tried) ** 2).sum())
+        damped = normal + damping * np.diag(np.diag(normal))
+        tried = pose + np.linalg.solve(damped, by.T @ residual)
+        tried_cost = _pose_cost(view, model, parameters, tried)
         if tried_cost < cost:
             pose, damping = tried, max(damping / 10, 1e-9)
-            if tried_cost > (1 - 1e-8) * cost:
+            if tried_cost > (1 - 1e-6) * cost:
                 break
         else:
             damping *= 10

@@ -159,11 +159,11 @@ class Coverage:
     def barest_edge(self) -> str:
         """The side of the picture with the least of it covered."""
         down, across = self.seen.shape
-        sides = {
-            "left": np.s_[:, : across // 4],
-            "right": np.s_[:, -(across // 4) :],
-            "upper": np.s_[: down // 4],
-            "lower": np.s_[-(down // 4) :],
+        sides: dict[str, tuple[slice, slice]] = {
+            "left": (slice(None), slice(0, across // 4)),
+            "right": (slice(None), slice(across - across // 4, across)),
+            "upper": (slice(0, down // 4), slice(None)),
+            "lower": (slice(down - down // 4, down), slice(None)),
         }
         shares = {
             name: float(self.seen[at][self.lit[at]].mean()) if self.lit[at].any() else 1.0

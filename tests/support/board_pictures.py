@@ -10,7 +10,7 @@ import numpy as np
 
 from companion.camera import Camera
 from companion.chart import ChessboardChart, parse_chart
-from companion.geometry import Array
+from companion.geometry import Array, rotation_from_vector
 from companion.messages import Bytes
 
 CHARUCO = "charuco:7x5:0.04:0.03:DICT_5X5_100"
@@ -37,9 +37,7 @@ class Placing:
 def placings(n: int, *, tilt_deg: float = 35.0, width: float = 0.5, seed: int = 1) -> list[Placing]:
     """A board shown as it should be: in every corner, at the edges, near and far, tilted."""
     rng = np.random.default_rng(seed)
-    places = [
-        (u, v) for v in (0.22, 0.5, 0.78) for u in (0.2, 0.5, 0.8)
-    ]  # fmt: skip
+    places = [(u, v) for v in (0.22, 0.5, 0.78) for u in (0.2, 0.5, 0.8)]
     out = []
     for i in range(n):
         u, v = places[i % len(places)]
@@ -63,14 +61,13 @@ class BoardPictures:
         self._texture, self._square_m = _texture(board)
         self._size_m = np.array(self._texture.shape[1::-1]) / PX_PER_SQUARE * self._square_m
         # four samples a pixel, against stairs at the edges
-        v, u = np.mgrid[0 : camera.height * 2, 0 : camera.width * 2]
-        pixels = np.stack([u, v], -1) / 2.0 - 0.25
-        self._rays = camera.normalise(pixels.reshape(-1, 2)).reshape(*pixels.shape)
-        self._background = self._scene()
+        self._rays = _rays(camera)
+        self._background: Array = self._scene()
 
     def picture(
-        self, placing: Placing | None, *, blur_px: float = 0.0, noise: float = 2.0, bend: float = 0.0
-    ) -> Bytes:
+        self, placing: Placing | None, *, blur_px: float = 0.0, noise: float = 2.0,
+        bend: float = 0.0,
+    ) -> Bytes:  # fmt: skip
         """The board there; None for the scene without it.
 
         `blur_px` is motion to the right; `bend` bows the board by so many of its widths.
@@ -78,15 +75,14 @@ class BoardPictures:
         picture = self._background
         if placing is not None:
             picture = self._with_board(placing, bend)
-        small = cv2.resize(
-            picture, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA
-        )
+        size = self.camera.width, self.camera.height
+        small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         small = cv2.GaussianBlur(small, (0, 0), 0.6)
         if blur_px > 1:
             n = round(blur_px)
             small = cv2.filter2D(small, -1, np.full((1, n), 1 / n, np.float32))
         noisy = small + self._rng.normal(0, noise, small.shape)
-        return np.clip(noisy, 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(noisy, 0, 255), np.uint8)
 
     def pictures(self, places: Sequence[Placing]) -> list[Bytes]:
         """One for each placing."""
@@ -121,9 +117,10 @@ class BoardPictures:
         camera = self.camera
         middle = np.array([placing.u * camera.width, placing.v * camera.height])
         half = 0.5 * placing.width * min(camera.width, 1.4 * camera.height)
-        rays = camera.normalise(np.array([middle, middle - [half, 0], middle + [half, 0]]))
+        few = np.array([5.0, 0.0])
+        rays = camera.normalise(np.array([middle, middle - few, middle + few]))
         ray = np.append(rays[0], 1.0)
-        angle = _angle(rays[1], rays[2])
+        angle = _angle(rays[1], rays[2]) * half / few[0]
         distance = self._size_m[0] / 2 / np.tan(angle / 2)
         # squarely to the ray, then tilted and turned
         forward = ray / np.linalg.norm(ray)
@@ -131,8 +128,8 @@ class BoardPictures:
         right /= np.linalg.norm(right)
         facing = np.stack([right, np.cross(forward, right), forward], 1)
         tilts = np.radians([-placing.tilt_down_deg, placing.tilt_right_deg, placing.turn_deg])
-        rotation = facing @ cv2.Rodrigues(tilts)[0]
-        shift = forward * distance - rotation @ np.append(self._size_m / 2, 0)
+        rotation: Array = facing @ rotation_from_vector(tilts)
+        shift: Array = forward * distance - rotation @ np.append(self._size_m / 2, 0)
         return rotation, shift
 
     def _scene(self) -> Array:
@@ -140,6 +137,16 @@ class BoardPictures:
         size = (self._rays.shape[1], self._rays.shape[0])
         scene = np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC), np.float32)
         return np.where(np.isfinite(self._rays[..., 0]), scene, 0.0).astype(np.float32)
+
+
+def _rays(camera: Camera) -> Array:
+    """Ray of each sample, (2 H, 2 W, 2): exact at every fourth, straight between."""
+    across, down = (np.arange(n // 2 + 2) * 2.0 for n in (camera.width, camera.height))
+    knots = np.stack(np.meshgrid(across, down), -1) - 1.0
+    exact = camera.normalise(knots.reshape(-1, 2)).reshape(*knots.shape)
+    v, u = np.mgrid[0 : camera.height * 2, 0 : camera.width * 2].astype(np.float32)
+    between = cv2.remap(exact, (u / 2 - 0.25 + 1) / 2, (v / 2 - 0.25 + 1) / 2, cv2.INTER_LINEAR)
+    return np.asarray(between, np.float64)
 
 
 def _texture(board: str) -> tuple[Array, float]:
@@ -161,7 +168,7 @@ def _texture(board: str) -> tuple[Array, float]:
     image = cv2.copyMakeBorder(
         image, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=255
     )
-    return image.astype(np.float32) * 0.8 + 25, chart.square_m
+    return np.asarray(image, np.float64) * 0.8 + 25, chart.square_m
 
 
 def _angle(one: Array, other: Array) -> float:
