@@ -101,7 +101,9 @@ class ClockFilter:
         """The latest stamp that fits."""
         self._n = 0
         self._first_receive_ns = 0
-        self._answered_ns: int | None = None
+        self._heard_ns = 0
+        self._await_ns = 0
+        """Until then answers are waited for, before least delays are taken for them."""
         self._elsewhere: _Elsewhere | None = None
         self._slope = 0.0
         self._line: tuple[int, int] | None = None
@@ -123,7 +125,7 @@ class ClockFilter:
         ):
             self._change(remote_ns, receive_ns)
         self._count(remote_ns, receive_ns)
-        self._answered_ns = receive_ns
+        self._await_ns = receive_ns + ANSWERS_NS
         half_ns = (receive_ns - send_ns) // 2
         offset_ns = float(send_ns + half_ns - remote_ns)
         better = _keep(self._answers, _Point(remote_ns, offset_ns, half_ns))
@@ -143,8 +145,8 @@ class ClockFilter:
         if expected_ns is not None:
             self._excess_ns.append(max(0, receive_ns - expected_ns))
         better = self._note_delay(remote_ns, receive_ns)
-        answers = self._answered_ns is not None and receive_ns - self._answered_ns < ANSWERS_NS
-        if better and not answers and receive_ns - self._first_receive_ns >= ONE_WAY_NS:
+        since_ns = max(self._first_receive_ns + ONE_WAY_NS, self._await_ns)
+        if better and receive_ns >= since_ns:
             self._follow(remote_ns)
         return True
 
@@ -164,7 +166,7 @@ class ClockFilter:
             return None
         anchor_ns, host_ns = self._line
         return ClockReport(
-            method="TIMESYNC" if self._answered_ns is not None else "least delay",
+            method="TIMESYNC" if self._answers else "least delay",
             offset_s=(host_ns - anchor_ns) * 1e-9,
             drift_ppm=round(self.drift_ppm, 3),
             sigma_ms=self.sigma_ns * 1e-6,
@@ -192,8 +194,7 @@ class ClockFilter:
             self._elsewhere = _Elsewhere(receive_ns, offset_ns)
             return False
         seen.n += 1
-        answers = self._answered_ns is not None and receive_ns - self._answered_ns < ANSWERS_NS
-        proof_ns = UNSURE_PROOF_NS if answers else PROOF_NS
+        proof_ns = UNSURE_PROOF_NS if receive_ns < self._await_ns else PROOF_NS
         return seen.n >= PROOF_N and receive_ns - seen.first_ns >= proof_ns
 
     def _change(self, remote_ns: int, receive_ns: int) -> None:
@@ -209,7 +210,10 @@ class ClockFilter:
         if self._n == 0:
             self.n_segments += 1
             self._first_receive_ns = receive_ns
+        elif self._await_ns and receive_ns - self._heard_ns > REBOOT_NS:
+            self._await_ns = receive_ns + ANSWERS_NS  # after a silence they too begin anew
         self._n += 1
+        self._heard_ns = receive_ns
         self._latest_ns = max(self._latest_ns or remote_ns, remote_ns)
 
     # -- where it stands -------------------------------------------------------------------------
