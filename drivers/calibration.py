@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,14 @@ from typing import Any
 import numpy as np
 
 from companion.camera import Camera, Distortion
-from companion.errors import FlightError
-from companion.geometry import Pose
+from companion.config import CameraConfig, MountConfig
+from companion.errors import ConfigError, FlightError
+from companion.geometry import Array, Pose, quaternion_from_euler, rotation_from_quaternion
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 MODELS = {
     "none": Distortion.NONE,
@@ -28,23 +36,21 @@ KEYS = {
     Distortion.EQUIDISTANT: ("k1", "k2", "k3", "k4"),
 }
 MAX_TURN_ERROR = 1e-3
+FORWARD_UPRIGHT: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Rotation body_from_camera of a camera that looks forward, upright."""
 
 
 def read_calibration(path: Path, width: int, height: int) -> Camera:
-    """The camera of `camera.json`, which must be for pictures of this size; FlightError otherwise.
+    """The camera of a JSON or TOML file, which must be for pictures of this size.
 
-    Coefficients stand under their names or as a list `D`, where radtan's fifth may be left out.
+    FlightError otherwise. Coefficients stand under their names or as a list `D`, where radtan's
+    fifth may be left out.
     """
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FlightError(f"{path}: cannot be read as JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise FlightError(f"{path}: wanted an object with keys fx, fy, cx, cy and so on")
+    content = _content(path)
     size = tuple(_number(path, content, key) for key in ("width", "height"))
     if size != (width, height):
         raise FlightError(
-            f"{path}: it is for pictures of {size[0]:g} x {size[1]:g}, those of this flight are "
+            f"{path}: it is for pictures of {size[0]:g} x {size[1]:g}, those that come are "
             f"{width} x {height}; give the calibration for that size"
         )
     fx, fy, cx, cy = (_number(path, content, key) for key in ("fx", "fy", "cx", "cy"))
@@ -64,6 +70,79 @@ def assumed_camera(width: int, height: int, hfov_deg: float) -> Camera:
     focal = 0.5 * width / math.tan(math.radians(hfov_deg) / 2)
     centre = (width - 1) / 2, (height - 1) / 2
     return Camera(width, height, focal, focal, *centre, assumed=True)
+
+
+def live_camera(
+    config: CameraConfig, mount: MountConfig, width: int, height: int
+) -> tuple[Camera, list[str]]:
+    """The camera of a live run with pictures of this size, and in words what is not known of it.
+
+    FlightError or ConfigError where what is configured cannot be. A flight folder played as a
+    camera brings its own calibration, and so does the test pattern.
+    """
+    warnings = []
+    file = _calibration_file(config)
+    if file is not None:
+        camera = read_calibration(file, width, height)
+    elif config.source == "pattern":
+        from drivers.pattern_camera import pattern_optics  # which needs what stands here
+
+        camera = pattern_optics(config)
+    elif config.assumed_hfov_deg > 0:
+        camera = assumed_camera(width, height, config.assumed_hfov_deg)
+        warnings.append(
+            f"no camera.calibration: the camera is taken to be {config.assumed_hfov_deg:g} degrees "
+            "wide and without distortion"
+        )
+    else:
+        raise ConfigError(
+            "no camera.calibration; give one, or a field of view by camera.assumed_hfov_deg"
+        )
+    if mount.known:
+        if camera.body_from_camera is not None:
+            raise ConfigError(
+                f"{file or 'the test pattern'} says how the camera sits on the body, and so does "
+                "[mount]; set mount.known = false, or take body_from_camera out of the file"
+            )
+        camera = dataclasses.replace(camera, body_from_camera=body_from_camera(mount))
+    elif camera.body_from_camera is None:
+        warnings.append(
+            "how the camera sits on the body is not known, so that the autopilot's attitude cannot "
+            "be used; set [mount]"
+        )
+    return camera, warnings
+
+
+def body_from_camera(mount: MountConfig) -> Pose:
+    """The place of a camera that is mounted as configured."""
+    turned = quaternion_from_euler(
+        math.radians(mount.roll_deg), math.radians(mount.pitch_deg), math.radians(mount.yaw_deg)
+    )
+    place = np.array([mount.x_m, mount.y_m, mount.z_m])
+    return Pose(rotation_from_quaternion(turned) @ FORWARD_UPRIGHT, place)
+
+
+def _calibration_file(config: CameraConfig) -> Path | None:
+    if config.calibration:
+        return Path(config.calibration)
+    own = Path(config.path) / "camera.json"
+    return own if config.source == "file" and config.path and own.exists() else None
+
+
+def _content(path: Path) -> Mapping[str, Any]:
+    is_toml = path.suffix.lower() == ".toml"
+    try:
+        text = path.read_text("utf-8")
+        content = tomllib.loads(text) if is_toml else json.loads(text)
+    except OSError as error:
+        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # of both formats, and of text that is none
+        raise FlightError(
+            f"{path}: cannot be read as {'TOML' if is_toml else 'JSON'}: {error}"
+        ) from error
+    if not isinstance(content, dict):
+        raise FlightError(f"{path}: wanted an object with keys fx, fy, cx, cy and so on")
+    return content
 
 
 def _number(path: Path, content: Mapping[str, Any], key: str) -> float:

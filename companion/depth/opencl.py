@@ -73,6 +73,11 @@ def _devices() -> list[tuple[str, cl.Device]]:
     ]
 
 
+def device_names() -> list[tuple[str, str, str]]:
+    """Number, name and platform of every device there is, as `opencl.device` takes them."""
+    return [(n, d.name.strip(), d.platform.name.strip()) for n, d in _devices()]
+
+
 def open_device(config: OpenclConfig) -> ComputeDevice:
     """The device that the configuration names; "auto" prefers a GPU; DeviceError if none."""
     # PoCL: one thread of work per core, and no spinning while waiting

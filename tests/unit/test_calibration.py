@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from companion.camera import Distortion
-from companion.errors import FlightError
-from drivers.calibration import assumed_camera, read_calibration
+from companion.config import CameraConfig, MountConfig
+from companion.errors import ConfigError, FlightError
+from drivers.calibration import assumed_camera, body_from_camera, live_camera, read_calibration
 
 GOOD: dict[str, Any] = {
     "width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 31.0, "cy": 24.0,
@@ -106,3 +107,94 @@ def test_assumed_camera_sees_as_wide_as_said() -> None:
     assert camera.assumed
     left = camera.normalise(np.array([[-0.5, 239.5]]))[0]
     np.testing.assert_allclose(left, [-1, 0], atol=1e-12)
+
+
+TOML = """
+width = 64
+height = 48
+fx = 50.0
+fy = 51
+cx = 31.0
+cy = 24.0
+distortion_model = "radtan"
+k1 = -0.1
+k2 = 0.02
+p1 = 0.001
+p2 = -0.002
+rms_px = 0.21
+"""
+IN_TOML = f"body_from_camera = {TURNED}"
+MOUNT = MountConfig(known=True, roll_deg=10, pitch_deg=-35, yaw_deg=70, x_m=0.1, y_m=-0.2, z_m=0.3)
+
+
+def toml(folder: Path, content: str) -> CameraConfig:
+    path = folder / "front.toml"
+    path.write_text(content)
+    return CameraConfig(calibration=str(path))
+
+
+def test_toml_says_the_same_as_json(tmp_path: Path) -> None:
+    camera, warnings = live_camera(toml(tmp_path, TOML + IN_TOML), MountConfig(), 64, 48)
+    assert (camera.fx, camera.fy, camera.coefficients) == (50, 51, (-0.1, 0.02, 0.001, -0.002, 0.0))
+    assert camera.body_from_camera is not None
+    np.testing.assert_allclose(camera.body_from_camera.matrix(), np.array(TURNED), atol=1e-12)
+    assert not camera.assumed
+    assert warnings == []
+
+
+def test_damaged_toml_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(FlightError, match=r"front\.toml: cannot be read as TOML"):
+        live_camera(toml(tmp_path, "width = = 3"), MountConfig(), 64, 48)
+    with pytest.raises(FlightError, match=r"none\.toml: cannot be read"):
+        live_camera(CameraConfig(calibration="none.toml"), MountConfig(), 64, 48)
+
+
+def test_mount_turns_by_yaw_then_pitch_then_roll() -> None:
+    camera, _ = live_camera(CameraConfig(), MOUNT, 640, 480)
+    assert camera.body_from_camera is not None
+    rotation = camera.body_from_camera.rotation
+    pitch, yaw = np.radians([-35, 70])
+    forward = [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)]
+    np.testing.assert_allclose(rotation @ [0, 0, 1], forward, atol=1e-12)
+    # before the roll the picture's right is level; clockwise by 10 degrees it points down
+    assert (rotation @ [1, 0, 0])[2] == pytest.approx(np.sin(np.radians(10)) * np.cos(pitch))
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    np.testing.assert_allclose(camera.body_from_camera.translation, [0.1, -0.2, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("mount", "forward", "right"),
+    [
+        (MountConfig(known=True), [1, 0, 0], [0, 1, 0]),
+        (MountConfig(known=True, pitch_deg=-90), [0, 0, 1], [0, 1, 0]),
+        (MountConfig(known=True, yaw_deg=90), [0, 1, 0], [-1, 0, 0]),
+        (MountConfig(known=True, roll_deg=90), [1, 0, 0], [0, 0, 1]),
+    ],
+)
+def test_simple_mounts(mount: MountConfig, forward: list[int], right: list[int]) -> None:
+    pose = body_from_camera(mount)
+    np.testing.assert_allclose(pose.rotation @ [0, 0, 1], forward, atol=1e-12)
+    np.testing.assert_allclose(pose.rotation @ [1, 0, 0], right, atol=1e-12)
+
+
+def test_two_places_on_the_body_are_one_too_many(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"front\.toml.*\[mount\]"):
+        live_camera(toml(tmp_path, TOML + IN_TOML), MOUNT, 64, 48)
+    camera, _ = live_camera(toml(tmp_path, TOML), MOUNT, 64, 48)
+    assert camera.body_from_camera is not None
+
+
+def test_what_is_assumed_is_said() -> None:
+    camera, warnings = live_camera(CameraConfig(assumed_hfov_deg=90), MountConfig(), 640, 480)
+    assert camera.assumed
+    assert camera.fx == pytest.approx(320)
+    assert ["90 degrees" in warnings[0], "[mount]" in warnings[1]] == [True, True]
+    with pytest.raises(ConfigError, match="assumed_hfov_deg"):
+        live_camera(CameraConfig(assumed_hfov_deg=0), MountConfig(), 640, 480)
+
+
+def test_a_flight_played_as_camera_has_its_own_calibration(tmp_path: Path) -> None:
+    write(tmp_path, body_from_camera=TURNED)
+    config = CameraConfig(source="file", path=str(tmp_path))
+    camera, warnings = live_camera(config, MountConfig(), 64, 48)
+    assert (camera.fx, warnings) == (50, [])

@@ -1,0 +1,78 @@
+"""`companion devices`: what a configuration can name on this machine."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from itertools import groupby
+from typing import Any
+
+from companion.depth.opencl import device_names
+from drivers.camera_devices import CameraControl, CameraDevice, CameraFormat, cameras
+from drivers.serial_devices import SerialDevice, serial_devices
+
+
+def devices(as_json: bool) -> str:
+    """Cameras, serial ports and OpenCL devices, as text for people or as JSON."""
+    found_cameras, found_ports, compute = cameras(), serial_devices(), device_names()
+    if as_json:
+        document = {
+            "cameras": [_plain(each) for each in found_cameras],
+            "serial_ports": [_plain(each) for each in found_ports],
+            "opencl_devices": [
+                {"number": number, "name": name, "platform": platform}
+                for number, name, platform in compute
+            ],
+        }
+        return json.dumps(document, indent=2, ensure_ascii=False)
+    lines = ["Cameras (camera.device)"]
+    for camera in found_cameras:
+        lines += _camera(camera)
+    if not found_cameras:
+        lines.append("  none")
+    lines.append('Serial ports (link.url = "serial:PORT:auto")')
+    lines += [_port(port) for port in found_ports] or ["  none"]
+    lines.append("OpenCL devices (opencl.device)")
+    lines += [f"  {number}  {name} ({platform})" for number, name, platform in compute] or [
+        "  none"
+    ]
+    return "\n".join(lines)
+
+
+def _plain(device: CameraDevice | SerialDevice) -> dict[str, Any]:
+    return dataclasses.asdict(device)
+
+
+def _camera(camera: CameraDevice) -> list[str]:
+    lines = [f"  {camera.stable_path or camera.path}"]
+    about = [camera.name, camera.path if camera.stable_path else "", camera.driver, camera.bus]
+    if any(about):
+        lines.append("    " + ", ".join(part for part in about if part))
+    if camera.problem:
+        lines.append(f"    {camera.problem}")
+    for code, formats in groupby(camera.formats, key=lambda each: each.code):
+        lines.append(f"    {code}  " + "; ".join(_format(each) for each in formats))
+    lines += [f"    {_control(control)}" for control in camera.controls]
+    return lines
+
+
+def _format(form: CameraFormat) -> str:
+    rates = ", ".join(f"{rate:g}" for rate in form.rates_hz)
+    return f"{form.width} x {form.height}" + (f" at {rates}/s" if rates else "")
+
+
+def _control(control: CameraControl) -> str:
+    value = "?" if control.value is None else str(control.value)
+    if control.choices:
+        known = ", ".join(f"{number} {name}" for number, name in control.choices.items())
+        return f"{control.name} = {value} of: {known}; default {control.default}"
+    step = f" in steps of {control.step}" if control.step > 1 else ""
+    limits = f"{control.minimum} to {control.maximum}{step}"
+    return f"{control.name} = {value}, {limits}, default {control.default}"
+
+
+def _port(port: SerialDevice) -> str:
+    about = [port.name, port.path if port.stable_path else "", port.usb_id]
+    text = ", ".join(part for part in about if part and part != port.path)
+    shown = port.stable_path or port.path
+    return f"  {shown}" + (f"  {text}" if text else "")
