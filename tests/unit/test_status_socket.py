@@ -11,7 +11,7 @@ import stat
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +57,8 @@ async def served(
         await server.stop()
 
 
-def run(test: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(asyncio.wait_for(test(), 10))  # type: ignore[arg-type]
+def run(test: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    asyncio.run(asyncio.wait_for(test(), 10))
 
 
 async def ask(path: Path) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def test_a_client_that_sends_garbage_or_leaves_does_no_harm(path: Path) -> None:
 
 
 def test_a_fault_in_the_document_is_told_and_survived(path: Path) -> None:
-    documents = iter([{"bad": float("nan")}, {"good": 1}])
+    documents: Iterator[dict[str, Any]] = iter([{"bad": float("nan")}, {"good": 1}])
 
     async def test() -> None:
         async with served(path, lambda: next(documents)) as warned:
