@@ -54,9 +54,12 @@ def _own_folders(environment: Mapping[str, str]) -> list[Path]:
 
 def _exists(path: Path) -> bool:
     try:
-        return path.exists()
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
     except OSError:  # a folder that may not be entered: asking there says so
         return True
+    return True
 
 
 class StatusSocket:

@@ -1,9 +1,11 @@
-"""Against a real datagram socket, as systemd holds one."""
+"""Against a real datagram socket, as systemd holds one; and the unit file, as systemd reads it."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import socket
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +13,9 @@ from pathlib import Path
 import pytest
 
 from drivers.service_manager import ServiceManager
+from drivers.status_socket import SERVICE_FOLDER
+
+UNIT = Path(__file__).parents[2] / "systemd/companion.service"
 
 
 @pytest.fixture(params=["path", "abstract"])
@@ -112,3 +117,29 @@ def test_watchdog_is_told_twice_as_often_as_it_must(
     environment: dict[str, str], wanted_s: float | None
 ) -> None:
     assert ServiceManager(environment).watchdog_s == wanted_s
+
+
+def settings() -> dict[str, str]:
+    lines = (line for line in UNIT.read_text("utf-8").splitlines() if "=" in line)
+    return dict(line.split("=", 1) for line in lines if not line.startswith("#"))
+
+
+def test_unit_and_program_agree() -> None:
+    unit = settings()
+    assert unit["Type"] == "notify"
+    assert unit["ExecReload"].endswith("-HUP $MAINPID")
+    assert Path("/run", unit["RuntimeDirectory"]) == SERVICE_FOLDER
+    assert unit["WorkingDirectory"] == f"/var/lib/{unit['StateDirectory']}"
+    assert unit["StartLimitIntervalSec"] == "0"
+    assert not {"After", "Wants", "Requires"} & unit.keys()  # the network above all
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here")
+def test_systemd_has_nothing_to_say_against_the_unit(tmp_path: Path) -> None:
+    unit = tmp_path / UNIT.name
+    text = UNIT.read_text("utf-8")
+    unit.write_text(text.replace("/opt/companion/bin/companion run", "/bin/true run"))
+    verified = subprocess.run(
+        ["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, timeout=20
+    )
+    assert (verified.returncode, verified.stderr.strip()) == (0, "")
