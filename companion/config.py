@@ -3,8 +3,8 @@
 Each section is a frozen dataclass; a stage takes its own section only. `config/companion.toml`
 describes every key. An unknown key or a wrong type is a ConfigError that names the nearest key.
 
-A key is a bool, int, float, str or a list of these last; `Annotated` with a `Range` or `OneOf` says what values it takes,
-which is checked where a configuration is read (`companion.config_file`).
+A key is a bool, int, float, str or a list of these last; `Annotated` with a `Range` or `OneOf` says
+what values it takes, which is checked where a configuration is read (`companion.config_file`).
 """
 
 from __future__ import annotations

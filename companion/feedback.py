@@ -58,10 +58,10 @@ class PoseToSend:
 class PoseGate:
     """Odometry and attitude in; poses to send out. `now_ns` is the time of the call."""
 
-    def __init__(self, config: FeedbackConfig) -> None:
+    def __init__(self, config: FeedbackConfig, n_resets: int = 0) -> None:
         self._config = config
         self._attitude = AttitudeHistory(400)
-        self._resets_before = 0
+        self._resets_before = n_resets
         self._resets = 0
         self._good: Odometry | None = None
         self._good_at_ns = 0

@@ -122,8 +122,8 @@ class Track:
     Its pose is `map_from_camera` as believed at that time, and `keyframe_from_camera` relative to
     keyframe `keyframe_id`, which stays true when the map is corrected. All are None unless
     tracking. `keypoints_px` (N, 2) are distorted pixels of the map points found. `backfilled` marks
-    frames that were placed after the fact (those between the two initial keyframes, say). The sigmas
-    are of the pose in the map by this image alone, the position's in map units.
+    frames that were placed after the fact (those between the two initial keyframes, say). The
+    sigmas are of the pose in the map by this image alone, the position's in map units.
     """
 
     seq: int

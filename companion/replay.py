@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import platform
-import resource
 import shlex
 import sys
 from collections.abc import Iterable
 from contextlib import ExitStack
-from importlib import metadata
 from pathlib import Path
 
-from companion import __version__
 from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
 from companion.config_file import dump
@@ -22,6 +18,7 @@ from companion.gaps import with_gaps_named
 from companion.localisation import LocalisationStage
 from companion.messages import Frame, Message
 from companion.output.flight_result import FlightResult, RunFacts
+from companion.output.surroundings import peak_memory_mb, versions
 from companion.output.write import write_results
 from companion.paced import PacedFeed
 from companion.pipeline import Pipeline, Sink, in_order_of_time
@@ -30,7 +27,6 @@ from companion.viewer import FileViewer, LiveViewer
 from drivers.flight_folder import ENDS_EARLY, Flight, open_flight
 from drivers.telemetry_log import TelemetryLog
 
-LIBRARIES = ("numpy", "opencv-python-headless", "pyopencl", "pymavlink", "filterpy", "rerun-sdk")
 LEAD_NS = 10_000_000_000
 """Telemetry from so long before the first frame is used."""
 
@@ -88,8 +84,8 @@ def replay(
                 stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
                 origin=log.origin if _has_origin(result) else None,
                 device=device.name if device else "none (depth.enabled = false)",
-                config=dump(config), versions=_versions(), command=shlex.join(sys.argv),
-                peak_memory_mb=_peak_memory_mb(), camera=flight.camera,
+                config=dump(config), versions=versions(), command=shlex.join(sys.argv),
+                peak_memory_mb=peak_memory_mb(), camera=flight.camera,
                 n_frames_total=flight.n_frames_between(start_ns, stop_ns),
                 completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
             )  # fmt: skip
@@ -146,12 +142,3 @@ def _run(
 
 def _has_origin(result: FlightResult) -> bool:
     return result.georeference is not None and result.georeference.has_origin
-
-
-def _versions() -> dict[str, str]:
-    found = {name: metadata.version(name) for name in LIBRARIES}
-    return {"companion": __version__, "python": platform.python_version(), **found}
-
-
-def _peak_memory_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

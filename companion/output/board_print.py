@@ -17,7 +17,8 @@ PAPERS_MM = {
 }  # fmt: skip
 LEAST_MARGIN_MM = 4.0
 INCH_MM = 25.4
-DOTS_PER_INCH = 300
+DOTS_PER_INCH, MOST_DOTS = 300, 8000
+"""Of a PNG; a large board is drawn coarser, so that the page fits into memory."""
 
 
 def board_page(chart: Chart, form: str) -> tuple[bytes, str]:
@@ -27,8 +28,9 @@ def board_page(chart: Chart, form: str) -> tuple[bytes, str]:
     across_mm, down_mm = (chart.columns + 1) * square_mm, (chart.rows + 1) * square_mm
     paper, width_mm, height_mm = _paper(across_mm, down_mm)
     left_mm, below_mm = (width_mm - across_mm) / 2, (height_mm - down_mm) / 2
+    dots_per_inch = min(DOTS_PER_INCH, MOST_DOTS / max(width_mm, height_mm) * INCH_MM)
     with matplotlib.rc_context({"pdf.fonttype": 42}):
-        figure = Figure(figsize=(width_mm / INCH_MM, height_mm / INCH_MM), dpi=DOTS_PER_INCH)
+        figure = Figure(figsize=(width_mm / INCH_MM, height_mm / INCH_MM), dpi=dots_per_inch)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         axes.set_xlim(-left_mm, width_mm - left_mm)
@@ -49,7 +51,7 @@ def board_page(chart: Chart, form: str) -> tuple[bytes, str]:
         )  # fmt: skip
         out = io.BytesIO()
         dates = {"CreationDate": None} if form == "pdf" else {"Software": None}
-        figure.savefig(out, format=form, dpi=DOTS_PER_INCH, metadata=dates)
+        figure.savefig(out, format=form, dpi=dots_per_inch, metadata=dates)
     return out.getvalue(), paper
 
 

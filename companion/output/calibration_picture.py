@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 
 from companion.calibration.determine import Calibration
@@ -19,7 +19,7 @@ from companion.geometry import Array
 
 INK, SOFT, GRID, CARD = "#1c1d1f", "#6b6e73", "#dddbd6", "#ffffff"
 PATH, OTHER, BAD, IDLE = "#0b6bcb", "#e08a1e", "#d64545", "#9aa0a6"
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.size": 10.0,
     "axes.edgecolor": GRID, "axes.labelcolor": SOFT, "axes.titlecolor": INK,
     "axes.titlesize": 11.0, "axes.titlelocation": "left", "axes.titleweight": "bold",
@@ -75,12 +75,13 @@ def _draw_coverage(axes: Axes, calibration: Calibration) -> None:
     axes.plot(*points.T, ".", ms=3.5, mew=0, color=PATH)
     for view in calibration.rejected:
         axes.plot(*view.sighting.image_px.T, "x", ms=3.5, mew=0.8, color=BAD)
-    dark = ", dark: no light" if not covered.lit.all() else ""
-    crosses = ", crosses: views left out" if calibration.rejected else ""
-    axes.set_title(
-        f"Corners of {len(calibration.views)} views, {covered.share:.0%} covered "
-        f"(orange: never seen{dark}{crosses})"
-    )
+    axes.set_title(f"Corners of {len(calibration.views)} views, {covered.share:.0%} covered")
+    notes = ["orange: the board never was there"]
+    if not covered.lit.all():
+        notes.append("dark: no light")
+    if calibration.rejected:
+        notes.append("crosses: views left out")
+    axes.set_xlabel(", ".join(notes))
     _frame(axes, camera)
 
 
@@ -98,7 +99,7 @@ def _draw_residuals(axes: Axes, calibration: Calibration) -> None:
     axes.add_collection(lines)
     bar = axes.figure.colorbar(lines, ax=axes, pad=0.01, fraction=0.035)
     bar.set_label("px")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     axes.set_title(f"What the lens leaves unexplained, {magnified:g} times magnified")
     _frame(axes, camera)
 
@@ -115,7 +116,7 @@ def _draw_views(axes: Axes, calibration: Calibration) -> None:
         axes.axhline(limit_px, color=BAD, lw=1, label="limit")
         top = max(top, 1.1 * limit_px)
     numbers = [str(view.number) for view in calibration.views]
-    every = max(1, len(numbers) // 20)
+    every = 1 + (len(numbers) - 1) // 20
     axes.set_xticks(at[::every], numbers[::every])
     axes.set_xlim(-0.8, len(errors) - 0.2)
     axes.set_ylim(0, top)
@@ -125,7 +126,10 @@ def _draw_views(axes: Axes, calibration: Calibration) -> None:
     axes.tick_params(axis="x", length=0)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    axes.legend(loc="upper left", ncols=4, labelcolor=SOFT)
+    axes.legend(
+        loc="upper left", ncols=4, labelcolor=SOFT, frameon=True, facecolor=CARD,
+        edgecolor="none", framealpha=1,
+    )  # fmt: skip
     out = f", {len(calibration.rejected)} left out" if calibration.rejected else ""
     axes.set_title(f"Error of each view{out}")
 
@@ -144,15 +148,16 @@ def _draw_distortion(axes: Axes, camera: Camera) -> None:
     levels = _levels(largest)
     shown = np.ma.masked_invalid(size)
     filled = axes.contourf(
-        across, down, shown, levels=levels, cmap="Blues", alpha=0.75, extend="max"
-    )
+        across, down, shown, levels=levels, alpha=0.75,
+        cmap="Blues", norm=BoundaryNorm(levels, matplotlib.colormaps["Blues"].N),
+    )  # fmt: skip
     lines = axes.contour(across, down, shown, levels=levels[1:], colors=SOFT, linewidths=0.6)
     axes.clabel(lines, fmt="%g", fontsize=8, colors=INK)
     every = (slice(4, None, 12), slice(4, None, 11))
     _arrows(axes, camera, pixels[every], shift[every])
-    bar = axes.figure.colorbar(filled, ax=axes, pad=0.01, fraction=0.035)
+    bar = axes.figure.colorbar(filled, ax=axes, pad=0.01, fraction=0.035, ticks=levels[:-1])
     bar.set_label("px")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     axes.plot(camera.cx, camera.cy, "+", ms=13, mew=1.6, color=BAD)
     kind = "fisheye" if camera.distortion is Distortion.EQUIDISTANT else "lens"
     axes.set_title(f"How far the {kind} moves what it shows; +: principal point")
@@ -174,9 +179,9 @@ def _arrows(axes: Axes, camera: Camera, at: Array, shift: Array) -> None:
 def _levels(largest: float) -> Array:
     """Round steps; closer together where they would all lie at the rim."""
     if largest > 400:  # a fisheye: without its distortion the rim would be far outside
-        top = 10 ** np.ceil(np.log10(largest))
-        steps = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000])
-        return np.concatenate([[0.0], steps[(steps <= top) & (steps <= largest)]])
+        steps = np.array([1.0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000])
+        top = float(steps[np.searchsorted(steps, min(largest, steps[-2])) + 1])
+        return np.concatenate([[0.0], steps[steps < largest], [top]])
     step = _round(max(largest, 1e-3) / 7)
     return np.asarray(np.arange(0, largest + step, step), np.float64)
 

@@ -1,4 +1,4 @@
-"""The process of a stage: python -m companion.stages.child SOCKET_FD RING_FD."""
+"""The process of a stage: python -m companion.stages.child KIND NICE SOCKET_FD RING_FD."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from companion.latest import LatestWins  # noqa: E402
 from companion.messages import Frame  # noqa: E402
 from companion.stages.frame_ring import FrameInRing, FrameRing  # noqa: E402
 from companion.stages.protocol import Finish, Finished, Progress, Setup  # noqa: E402
-from companion.stages.work import work_of  # noqa: E402
+from companion.stages.work import module_of  # noqa: E402
 
 REPORT_EVERY_S = 1.0
 
@@ -30,12 +30,17 @@ def main() -> int:
     """Serve one stage until told to finish, or until the daemon is gone."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the daemon says when
-    pipe = Connection(int(sys.argv[1]))
-    setup: Setup = pipe.recv()
-    os.nice(setup.nice)
-    ring = FrameRing(setup.camera.width, setup.camera.height, int(sys.argv[2]))
+    kind, nice, pipe_fd, ring_fd = sys.argv[1], *map(int, sys.argv[2:5])
+    os.nice(nice)
+    pipe: Connection[Any, Any] = Connection(pipe_fd)
+    module = module_of(kind)  # which takes a second, and may be long before there is a flight
+    try:
+        setup: Setup = pipe.recv()
+    except EOFError:
+        return 0
+    ring = FrameRing(setup.camera.width, setup.camera.height, ring_fd)
     send = _sender(pipe)
-    work = work_of(setup)
+    work = module.work(setup)
     send(Progress(device=work.device))
     inbox: LatestWins[Any] = LatestWins(work.may_skip)
     n_overwritten = 0
@@ -45,7 +50,7 @@ def main() -> int:
         try:
             while True:
                 message = pipe.recv()
-                if isinstance(message, FrameInRing) and not work.skips:
+                if isinstance(message, FrameInRing) and not work.latest_only:
                     frame = ring.get(message) if work.has_room else None
                     if frame is None:
                         n_overwritten += 1

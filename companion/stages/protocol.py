@@ -13,14 +13,11 @@ from companion.output.flight_result import RunFacts
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """The first thing a stage's process is told. `kind` is localisation, depth or recorder."""
+    """The first thing a stage's process is told; the recorder gets the flight's folder."""
 
-    kind: str
     config: Config
     camera: Camera
-    nice: int
     folder: Path | None = None
-    first_seq: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """A stage in a process of its own, seen from the daemon.
 
 Messages go through a pair of sockets as pickles (both ends are ours, and nobody else has them),
-frames through shared memory. Nothing here makes the caller wait but `finish`.
+frames through shared memory. Nothing here makes the caller wait but `wait`.
 """
 
 from __future__ import annotations
@@ -25,20 +25,22 @@ CHILD = "companion.stages.child"
 
 
 class StageProcess:
-    """Starts a stage; `deliver` gets its messages and `ended` one call when it is gone.
+    """Starts the process of a stage, which does nothing before `begin`.
 
-    Both are called from a thread of this object. `ended` gets "" after `finish` or `kill`, else
-    what became of the process, in words.
+    `deliver` gets its messages, and `ended` one call when it is gone. Both are called from a
+    thread of this object. `ended` gets "" where it was asked to end, else what became of the
+    process, in words.
     """
 
     def __init__(
         self,
-        setup: Setup,
+        kind: str,
+        nice: int,
         ring: FrameRing,
         deliver: Callable[[Any], None],
         ended: Callable[[str], None],
     ) -> None:
-        self.name = setup.kind
+        self.name = kind
         self.progress: Progress | None = None
         """None until the stage is ready."""
         self.finished: Finished | None = None
@@ -48,13 +50,12 @@ class StageProcess:
         ours, theirs = socket.socketpair()
         # a session of its own: Ctrl-C is for the daemon, which tells its stages what to do
         self._child = subprocess.Popen(
-            [sys.executable, "-m", CHILD, str(theirs.fileno()), str(ring.fd)],
+            [sys.executable, "-m", CHILD, kind, str(nice), str(theirs.fileno()), str(ring.fd)],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
             pass_fds=(theirs.fileno(), ring.fd), start_new_session=True,
         )  # fmt: skip
         theirs.close()
         self._pipe = Connection(ours.detach())
-        self._outbox.put(setup)
         self._writer = threading.Thread(target=self._write, name=f"to {self.name}", daemon=True)
         self._reader = threading.Thread(target=self._read, name=f"from {self.name}", daemon=True)
         self._writer.start()
@@ -76,19 +77,24 @@ class StageProcess:
         inside = self.progress.n_dropped if self.progress is not None else 0
         return self._outbox.n_dropped + inside
 
+    def begin(self, setup: Setup) -> None:
+        """Say what to do; to be said first."""
+        self._outbox.put(setup)
+
     def offer(self, message: Any) -> None:
         """Hand over a message or a FrameInRing; a frame that waits gives way to a newer one."""
         self._outbox.put(message)
 
-    def finish(self, finish: Finish, patience_s: float) -> bool:
-        """Have it give its last results and end; whether it did so in time."""
+    def ask_to_finish(self, finish: Finish) -> None:
+        """Have it give its last results and end."""
         self._asked_to_end = True
         self._outbox.put(finish)
         self._outbox.close()
-        self._reader.join(patience_s)
-        in_time = self.finished is not None
-        self.kill()
-        return in_time
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until it has ended, at most so long; whether it has."""
+        self._reader.join(seconds)
+        return not self._reader.is_alive()
 
     def kill(self) -> None:
         """End it now."""

@@ -1,0 +1,1 @@
+"""The daemon: what runs while a drone is switched on."""

@@ -1,0 +1,314 @@
+"""The long-running program: camera, autopilot and stages joined, from power on to power off.
+
+The event loop does I/O only. The camera has a thread, every heavy stage a process; what they give
+comes in by `call_soon_threadsafe`. Nothing that comes loose in flight ends it: it is named, waited
+for, and taken up again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from drivers.autopilot_link import AutopilotLink
+from drivers.loop_delay import measure_loop_delay
+
+from companion.camera import Camera
+from companion.clock import FlightClock
+from companion.config import Config
+from companion.errors import CompanionError
+from companion.health import LatencyMeter
+from companion.live.flight import Listener, LiveFlight
+from companion.live.flight_facts import facts_of
+from companion.live.flights import Flights
+from companion.live.health_watch import HealthWatch
+from companion.live.journal import ERROR, INFO, WARNING, Journal
+from companion.live.missing import Missing
+from companion.live.pose_sender import make_pose_sender
+from companion.live.reload import reloaded
+from companion.live.vehicle_reports import VehicleReports
+from companion.messages import (
+    ArmedSample,
+    AttitudeSample,
+    Frame,
+    MapUpdate,
+    Odometry,
+    PointChunk,
+    Telemetry,
+    Track,
+    Warned,
+)
+from drivers.calibration import live_camera
+from drivers.camera_feed import CameraFeed
+from drivers.camera_source import camera_source
+from drivers.link_port import link_port
+from drivers.metrics import Metrics
+from drivers.service_manager import ServiceManager
+from drivers.status_socket import StatusSocket, own_socket_path
+
+WATCH_S = 0.2
+READY_AFTER_S = 5.0
+END_S = 2.6
+"""A stop takes little longer, whatever hangs."""
+
+
+class Daemon:
+    """Everything that runs; `run` gives the exit status. To be made within the event loop."""
+
+    def __init__(self, load: Callable[[], Config]) -> None:
+        self._load = load
+        self._config = config = load()
+        self._clock = clock = FlightClock()
+        self._journal = Journal()
+        self._loop = asyncio.get_running_loop()
+        self._stop = asyncio.Event()
+        self._status = 0
+        self._camera: Camera | None = None
+        self._armed = False
+        self._service = ServiceManager()
+        self._loop_delay = LatencyMeter()
+        self._feed = CameraFeed(
+            camera_source(config.camera), clock, config.camera, self._on_frame, self._on_warned
+        )
+        self._link: AutopilotLink | None = None
+        if config.link.url:
+            port = link_port(config.link, config.router, clock)
+            self._link = AutopilotLink(
+                config.link, port, clock, self._on_telemetry, self._on_warned
+            )
+        self._sender = make_pose_sender(config.feedback, self._link, clock)
+        self._flights = Flights(
+            clock, self._journal, self._listener,
+            lambda flight: facts_of(flight, self._config, self._link),
+        )  # fmt: skip
+        self._watch = HealthWatch(
+            config, clock, self._journal, self._feed, self._link, self._sender, self._flights,
+            self._loop_delay,
+        )  # fmt: skip
+        self._reports: VehicleReports | None = None
+        if self._link is not None:
+            self._reports = VehicleReports(
+                self._link, clock, self._watch, config.feedback.obstacle_distance
+            )
+        self._missing = Missing(config.daemon.missing_device_s)
+
+    async def run(self) -> int:
+        """Run until told to stop or unable to go on; the exit status."""
+        loop, config = self._loop, self._config
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, self._stop.set)
+        loop.add_signal_handler(signal.SIGHUP, self._reload)
+        socket = StatusSocket(
+            own_socket_path(config.daemon.socket), self._watch.document, self._problem
+        )
+        metrics = Metrics(config.daemon.prometheus_port, self._watch.health, self._problem)
+        await socket.start()
+        if config.daemon.prometheus_port:
+            await metrics.start()
+        self._feed.start()
+        work: list[Coroutine[Any, Any, None]] = [
+            self._run_watch(),
+            self._watch.govern(),
+            measure_loop_delay(self._clock, self._loop_delay),
+        ]
+        if self._link is not None:
+            work.append(self._link.run())
+        if self._sender is not None:
+            work.append(self._sender.run())
+        if self._reports is not None:
+            work.append(self._reports.run())
+        tasks = [loop.create_task(each) for each in work]
+        stopped = loop.create_task(self._stop.wait())
+        try:
+            await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
+            for task in tasks:
+                if task.done() and not task.cancelled() and task.exception() is not None:
+                    raise task.exception() or AssertionError
+        finally:
+            self._service.stopping()
+            feed_closed = loop.run_in_executor(None, self._feed.stop)
+            await self._flights.close(END_S)
+            for task in (stopped, *tasks):
+                task.cancel()
+            await asyncio.gather(stopped, *tasks, return_exceptions=True)
+            await metrics.stop()
+            await socket.stop()
+            await asyncio.wait([feed_closed], timeout=0.2)
+            self._service.close()
+        self._journal.say("stopped")
+        return self._status
+
+    # -- what comes in --------------------------------------------------------------------------
+
+    def _on_frame(self, frame: Frame) -> None:
+        """A frame, in the camera's thread."""
+        self._watch.frame_came()
+        if self._camera is None:
+            self._soon(self._camera_known)
+            return
+        self._flights.frame(frame)
+
+    def _on_warned(self, warning: Warned) -> None:
+        """Something to be told, in any thread."""
+        if self._journal.warn(warning):
+            self._soon(self._tell_pilot, warning.what)
+        self._soon(self._flights.take, warning)
+
+    def _on_telemetry(self, sample: Telemetry) -> None:
+        """A sample, in the event loop."""
+        self._flights.take(sample)
+        if isinstance(sample, AttitudeSample):
+            if self._sender is not None:
+                self._sender.take_attitude(sample)
+        elif isinstance(sample, ArmedSample):
+            self._set_armed(sample.armed)
+
+    def _listener(self, flight: LiveFlight) -> Listener:
+        """What a flight gives comes in here, but only as long as it is the one that flies."""
+
+        def current(take: Callable[[Any], None]) -> Callable[[Any], None]:
+            def later(message: Any) -> None:
+                if self._flights.current is flight:
+                    take(message)
+
+            return lambda message: self._soon(later, message)
+
+        return Listener(
+            current(self._on_odometry),
+            current(self._on_mapped),
+            self._on_warned,
+            lambda: self._soon(self._localisation_died, flight),
+        )
+
+    def _on_odometry(self, odometry: Odometry) -> None:
+        self._watch.take_odometry(odometry)
+        if self._sender is not None:
+            self._sender.take(odometry)
+
+    def _on_mapped(self, message: Track | MapUpdate | PointChunk) -> None:
+        self._watch.take_mapped(message)
+        if self._reports is not None:
+            self._reports.take(message)
+
+    # -- flights --------------------------------------------------------------------------------
+
+    def _camera_known(self) -> None:
+        size = self._feed.size
+        if self._camera is not None or size is None:
+            return
+        try:
+            self._camera, remarks = live_camera(self._config.camera, self._config.mount, *size)
+        except CompanionError as error:
+            self._give_up(str(error))
+            return
+        for remark in remarks:
+            self._journal.say(remark, WARNING)
+        self._begin_if_due()
+
+    @property
+    def _always(self) -> bool:
+        return self._config.daemon.flight == "always" or self._link is None
+
+    def _begin_if_due(self) -> None:
+        if self._camera is None or self._flights.current is not None:
+            return
+        if self._always or self._armed:
+            if self._sender is not None:
+                self._sender.restart()
+            if self._reports is not None:
+                self._reports.restart(self._camera)
+            self._watch.restart()
+            self._flights.begin(self._config, self._camera)
+        else:
+            self._flights.prepare(self._config, self._camera)
+
+    def _set_armed(self, armed: bool) -> None:
+        if armed == self._armed:
+            return
+        self._armed = armed
+        self._journal.say("armed" if armed else "disarmed")
+        if not armed and not self._always:
+            self._flights.end()
+        self._begin_if_due()
+
+    def _localisation_died(self, flight: LiveFlight) -> None:
+        if self._flights.current is flight:
+            self._flights.end()
+            self._begin_if_due()
+
+    # -- watching -------------------------------------------------------------------------------
+
+    async def _run_watch(self) -> None:
+        began_ns = self._clock.now_ns()
+        is_ready = False
+        while True:
+            await asyncio.sleep(WATCH_S)
+            health = self._watch.health()
+            now_s = (self._clock.now_ns() - began_ns) * 1e-9
+            if not is_ready and (self._watch.pipeline_up or now_s > READY_AFTER_S):
+                is_ready = True
+                self._service.ready(health.tracker)
+            if self._watch.pose_loop_alive:
+                self._service.alive()
+            else:
+                self._watch.kill_stuck()
+            line = self._watch.line_due()
+            if line:
+                self._journal.say(line)
+                self._service.status(line)
+            if self._feed.fault is not None:
+                self._give_up(str(self._feed.fault))
+            gone = self._missing.step(health, now_s, self._armed)
+            if gone:
+                self._give_up(gone)
+
+    def _reload(self) -> None:
+        """SIGHUP: take over what can be changed while running, and say what cannot."""
+        self._service.reloading()
+        try:
+            config, cannot = reloaded(self._config, self._load())
+        except CompanionError as error:
+            self._journal.say(f"configuration not taken over: {error}", ERROR)
+        else:
+            self._config = config
+            self._missing = Missing(config.daemon.missing_device_s)
+            self._watch.reconfigure(config)
+            if self._sender is not None:
+                self._sender.reconfigure(config.feedback)
+            if self._flights.current is None:
+                self._flights.discard_spare()
+                self._begin_if_due()
+            text = f"; these need a restart: {', '.join(cannot)}" if cannot else ""
+            self._journal.say(f"configuration read again{text}", WARNING if cannot else INFO)
+        self._service.ready()
+
+    def _give_up(self, why: str) -> None:
+        if self._status == 0:
+            self._journal.say(f"error: {why}", ERROR)
+        self._status = 1
+        self._stop.set()
+
+    def _tell_pilot(self, what: str) -> None:
+        if self._link is not None:
+            self._link.say(WARNING, f"Companion: {what}")
+
+    def _problem(self, text: str) -> None:
+        self._on_warned(Warned(self._clock.now_ns(), text))
+
+    def _soon(self, call: Callable[..., object], *arguments: Any) -> None:
+        """Have something done in the event loop; from any thread, nothing once it has ended."""
+        try:
+            self._loop.call_soon_threadsafe(call, *arguments)
+        except RuntimeError:
+            pass
+
+
+async def _run(load: Callable[[], Config]) -> int:
+    return await Daemon(load).run()
+
+
+def run(load: Callable[[], Config]) -> int:
+    """Run the daemon with the configuration that `load` reads; the exit status."""
+    return asyncio.run(_run(load))

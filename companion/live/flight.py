@@ -1,0 +1,257 @@
+"""One live flight: its stages, each in a process, joined from the first frame to the report.
+
+    frames, telemetry -> localisation -> depth -> recorder, viewer
+
+Whoever calls `frame` or `telemetry` never waits. A stage that dies takes nothing with it but its
+own state: depth and recorder begin again within the flight, localisation ends it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.camera import Camera
+from companion.clock import FlightClock, monotonic_s
+from companion.config import Config
+from companion.errors import InputError
+from companion.messages import (
+    Frame,
+    KeyframeAdded,
+    MapUpdate,
+    Message,
+    Odometry,
+    PointChunk,
+    Telemetry,
+    Track,
+    Warned,
+)
+from companion.output.flight_result import RunFacts
+from companion.stages.frame_ring import FrameRing
+from companion.stages.protocol import Finish, SetShare, Setup
+from companion.stages.stage_process import StageProcess
+from companion.viewer import LiveViewer
+
+NICE = {"localisation": 0, "depth": 10, "recorder": 10}
+"""The pose comes first; the others take what is left over."""
+PATIENCE_S = {"localisation": 120.0, "depth": 60.0, "recorder": 180.0}
+HURRIED_S = {"localisation": 0.7, "depth": 0.2, "recorder": 1.6}
+RESTARTED = "a stage has died and is started again"
+LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
+NO_VIEWER = "the viewer cannot be shown"
+NOT_FINISHED = "a stage did not give its last results in time"
+
+
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """Who hears of a flight; all are called from its threads and must not block."""
+
+    odometry: Callable[[Odometry], None]
+    mapped: Callable[[Track | MapUpdate | PointChunk], None]
+    warned: Callable[[Warned], None]
+    localisation_died: Callable[[], None]
+
+
+class LiveFlight:
+    """Processes that wait for a flight to begin, then the flight."""
+
+    def __init__(
+        self,
+        config: Config,
+        camera: Camera,
+        clock: FlightClock,
+        listener: Callable[[LiveFlight], Listener],
+    ) -> None:
+        self._config, self.camera, self._clock = config, camera, clock
+        self._began_s = monotonic_s()
+        self._listener = listener(self)
+        self.folder: Path | None = None
+        """Where the results go; None until it has begun."""
+        self.n_restarted = {"depth": 0, "recorder": 0}
+        self._ring = FrameRing(camera.width, camera.height)
+        self._lock = threading.Lock()
+        self._over = False
+        self._hurry_s: float | None = None
+        self.n_frames = 0
+        self._viewer: LiveViewer | None = None
+        self.viewer_on = True
+        self._last_map: MapUpdate | None = None
+        kinds = ["localisation", "recorder"] + (["depth"] if config.depth.enabled else [])
+        self.stages = {kind: self._start(kind) for kind in kinds}
+
+    @property
+    def ready(self) -> bool:
+        """Whether frames are worked on as they come."""
+        return self.folder is not None and self.stages["localisation"].progress is not None
+
+    def begin(self, folder: Path) -> None:
+        """The flight begins, and leaves its results there."""
+        self.folder, self._began_s = folder, monotonic_s()
+        for kind in self.stages:
+            self._set_up(kind)
+        if self._config.daemon.viewer != "none":
+            threading.Thread(target=self._open_viewer, name="viewer", daemon=True).start()
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame of the camera's size."""
+        if self.folder is None or self._over:
+            return
+        self.n_frames += 1
+        place = self._ring.put(frame)
+        for stage in list(self.stages.values()):
+            stage.offer(place)
+        self._show(frame)
+
+    def take(self, message: Telemetry | Warned) -> None:
+        """Take telemetry, or a warning for the log."""
+        if self.folder is None or self._over:
+            return
+        if not isinstance(message, Warned):
+            self.stages["localisation"].offer(message)
+        self._record(message)
+
+    def set_shares(self, features: float, dense: float, viewer: bool) -> None:
+        """Leave out some of the work, or take it up again; see companion.governor."""
+        self.viewer_on = viewer
+        self.stages["localisation"].offer(SetShare(features))
+        if "depth" in self.stages:
+            self.stages["depth"].offer(SetShare(dense))
+
+    @property
+    def has_origin(self) -> bool:
+        """Whether the map lies in the autopilot's own world."""
+        found = self._last_map.georeference if self._last_map is not None else None
+        return found is not None and found.has_origin
+
+    @property
+    def duration_s(self) -> float:
+        """Since it began."""
+        return monotonic_s() - self._began_s
+
+    def kill_localisation(self) -> None:
+        """End a localisation that hangs."""
+        os.kill(self.stages["localisation"].pid, signal.SIGKILL)
+
+    def hurry(self) -> None:
+        """Whatever `finish` is at, it has little time left."""
+        self._hurry_s = monotonic_s()
+
+    def finish(self, facts: Callable[[LiveFlight], RunFacts]) -> None:
+        """Give all results and end; after `hurry` within three seconds. Waits for it."""
+        with self._lock:
+            self._over = True
+        if self.folder is not None:
+            for kind in ("localisation", "depth"):
+                if kind in self.stages:
+                    self._finish(kind, None)
+            self._finish("recorder", facts(self))
+        for stage in self.stages.values():
+            stage.kill()
+        viewer, self._viewer = self._viewer, None
+        if viewer is not None:
+            viewer.__exit__(None, None, None)
+        self._ring.close()
+
+    def _finish(self, kind: str, facts: RunFacts | None) -> None:
+        stage = self.stages[kind]
+        if not stage.alive:
+            return
+        began_s = monotonic_s()
+        stage.ask_to_finish(Finish(self._hurry_s is not None, facts))
+        while not stage.wait(0.02):
+            now_s = monotonic_s()
+            if now_s > began_s + PATIENCE_S[kind] or (
+                self._hurry_s is not None
+                and now_s > max(began_s, self._hurry_s) + HURRIED_S[kind]
+            ):
+                break
+        if stage.finished is None:
+            self._warn(NOT_FINISHED, kind)
+
+    def _start(self, kind: str) -> StageProcess:
+        def ended(why: str) -> None:
+            self._ended(kind, why)
+
+        return StageProcess(kind, NICE[kind], self._ring, self._deliver, ended)
+
+    def _set_up(self, kind: str) -> None:
+        folder = self.folder
+        if kind == "recorder" and folder is not None and self.n_restarted[kind]:
+            folder = folder / f"part-{self.n_restarted[kind] + 1}"
+        self.stages[kind].begin(Setup(self._config, self.camera, folder))
+
+    def _ended(self, kind: str, why: str) -> None:
+        """A stage's process is gone; called from its own thread."""
+        if not why:
+            return
+        with self._lock:
+            if self._over:
+                return
+            if kind == "localisation":
+                self._over = True
+            else:
+                self.n_restarted[kind] += 1
+                gone, self.stages[kind] = self.stages[kind], self._start(kind)
+                gone.kill()
+                if self.folder is not None:
+                    self._set_up(kind)
+        if kind == "localisation":
+            self._warn(LOCALISATION_DIED, why)
+            self._listener.localisation_died()
+            return
+        self._warn(RESTARTED, f"{kind}: {why}")
+        if self._last_map is not None:
+            self.stages[kind].offer(self._last_map)
+
+    def _deliver(self, message: Message) -> None:
+        """What a stage gives goes to whom it is for; called from the stages' threads."""
+        if isinstance(message, Odometry):
+            self._listener.odometry(message)
+            return
+        if isinstance(message, (Track, KeyframeAdded, MapUpdate)) and "depth" in self.stages:
+            self.stages["depth"].offer(message)
+        if isinstance(message, MapUpdate):
+            self._last_map = message
+        if isinstance(message, (Track, MapUpdate, PointChunk)):
+            self._listener.mapped(message)
+        elif isinstance(message, Warned):
+            self._listener.warned(message)
+        self._record(message)
+
+    def _record(self, message: Message) -> None:
+        self.stages["recorder"].offer(message)
+        self._show(message)
+
+    def _show(self, message: Message) -> None:
+        viewer = self._viewer
+        if viewer is not None and (self.viewer_on or not isinstance(message, Frame)):
+            viewer.take(message)
+
+    def _open_viewer(self) -> None:
+        try:
+            viewer = LiveViewer(self._config.viewer, self.camera, self._config.daemon.viewer)
+        except InputError as error:
+            self._warn(NO_VIEWER, str(error))
+            return
+        viewer.__enter__()
+        with self._lock:
+            if not self._over:
+                self._viewer = viewer
+                return
+        viewer.__exit__(None, None, None)
+
+    def _warn(self, what: str, detail: str) -> None:
+        warning = Warned(self._clock.now_ns(), what, detail)
+        self._listener.warned(warning)
+
+    def dropped(self) -> dict[str, int]:
+        """Frames that stages passed over, by stage, and messages that the viewer did."""
+        counts: dict[str, Any] = {f"{k} frames": s.n_dropped for k, s in self.stages.items()}
+        if self._viewer is not None:
+            counts["viewer messages"] = self._viewer.n_dropped
+        return counts

@@ -1,0 +1,42 @@
+"""What the report of a live flight states beside what the flight itself has shown."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping
+
+from drivers.autopilot_link import AutopilotLink
+
+from companion.config import Config
+from companion.config_file import dump
+from companion.live.flight import LiveFlight
+from companion.output.flight_result import RunFacts
+from companion.output.surroundings import peak_memory_mb, versions
+
+
+def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> RunFacts:
+    """All that is known when its stages have given their last results."""
+    times: dict[str, Mapping[str, float]] = {}
+    device = "none"
+    for stage in flight.stages.values():
+        said = stage.finished or stage.progress
+        if said is not None:
+            times.update(said.times)
+            device = said.device or device
+    return RunFacts(
+        stage_times=times,
+        wall_s=flight.duration_s,
+        clock=link.clock_filter.report() if link is not None else None,
+        origin=link.origin if link is not None and flight.has_origin else None,
+        device=device,
+        config=dump(config),
+        versions=versions(),
+        command=shlex.join(sys.argv),
+        peak_memory_mb=peak_memory_mb(),
+        camera=flight.camera,
+        n_frames_total=flight.n_frames,
+        completed=True,
+        dropped=flight.dropped(),
+        rates_hz=dict(link.rates_hz) if link is not None else {},
+    )

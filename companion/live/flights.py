@@ -1,0 +1,98 @@
+"""Which flight there is: one that waits, one that goes on, and those whose results are written."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from datetime import datetime, timezone
+from pathlib import Path
+
+from companion.camera import Camera
+from companion.clock import FlightClock
+from companion.config import Config
+from companion.live.flight import Listener, LiveFlight
+from companion.live.journal import Journal
+from companion.messages import Frame, Telemetry, Warned
+from companion.output.flight_result import RunFacts
+
+
+class Flights:
+    """Begins and ends flights. To be used in the event loop, but for `frame`."""
+
+    def __init__(
+        self,
+        clock: FlightClock,
+        journal: Journal,
+        listener: Callable[[LiveFlight], Listener],
+        facts: Callable[[LiveFlight], RunFacts],
+    ) -> None:
+        self._clock, self._journal, self._listener, self._facts = clock, journal, listener, facts
+        self.current: LiveFlight | None = None
+        self._spare: LiveFlight | None = None
+        self._ending: dict[LiveFlight, threading.Thread] = {}
+
+    def prepare(self, config: Config, camera: Camera) -> None:
+        """Have processes at hand for the next flight."""
+        if self._spare is None:
+            self._spare = LiveFlight(config, camera, self._clock, self._listener)
+
+    def begin(self, config: Config, camera: Camera) -> LiveFlight:
+        """A flight begins; the one before must have been ended."""
+        self.prepare(config, camera)
+        flight, self._spare = self._spare, None
+        assert flight is not None and self.current is None
+        folder = _free(Path(config.daemon.flights), self._clock.now_ns())
+        flight.begin(folder)
+        self.current = flight
+        self._journal.say(f"flight {folder.name} begins; its results go to {folder}")
+        return flight
+
+    def end(self) -> None:
+        """The flight is over; its results are written while other things go on."""
+        flight, self.current = self.current, None
+        if flight is None:
+            return
+        thread = threading.Thread(target=self._finish, args=(flight,), name="end", daemon=True)
+        self._ending[flight] = thread
+        thread.start()
+
+    def discard_spare(self) -> None:
+        """The next flight is to be prepared anew."""
+        spare, self._spare = self._spare, None
+        if spare is not None:
+            threading.Thread(target=spare.finish, args=(self._facts,), daemon=True).start()
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame; from the camera's thread."""
+        flight = self.current
+        if flight is not None:
+            flight.frame(frame)
+
+    def take(self, message: Telemetry | Warned) -> None:
+        """Take telemetry or a warning."""
+        if self.current is not None:
+            self.current.take(message)
+
+    async def close(self, patience_s: float) -> None:
+        """End all flights in a hurry."""
+        self.end()
+        for flight in list(self._ending):
+            flight.hurry()
+        self.discard_spare()
+        rounds = round(patience_s / 0.02)
+        while rounds and any(thread.is_alive() for thread in self._ending.values()):
+            await asyncio.sleep(0.02)
+            rounds -= 1
+
+    def _finish(self, flight: LiveFlight) -> None:
+        flight.finish(self._facts)
+        self._ending.pop(flight, None)
+        self._journal.say(f"flight over: {flight.folder} ({flight.n_frames} frames)")
+
+
+def _free(parent: Path, t_ns: int) -> Path:
+    """A folder named for the time, UTC, that does not exist yet."""
+    when = datetime.fromtimestamp(t_ns * 1e-9, tz=timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
+    names = [when, *(f"{when}-{number}" for number in range(2, 1000))]
+    return next(parent / name for name in names if not (parent / name).exists())

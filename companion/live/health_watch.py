@@ -1,0 +1,231 @@
+"""What the daemon knows of itself, put together; and what follows from it while it runs.
+
+The governor's levels go to the flight from here, and a pose loop that hangs is noticed here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from drivers.autopilot_link import AutopilotLink
+
+from companion import __version__
+from companion.clock import FlightClock
+from companion.config import Config
+from companion.governor import Governor, Pressure
+from companion.health import (
+    ComputerLoad,
+    FeedbackHealth,
+    Health,
+    LatencyMeter,
+    StageHealth,
+    StageMeter,
+    StatusLines,
+)
+from companion.live.flights import Flights
+from companion.live.journal import Journal
+from companion.live.pose_sender import PoseSender
+from companion.messages import MapUpdate, Odometry, PointChunk, Track, TrackState, Warned
+from drivers.camera_feed import CameraFeed
+from drivers.system_load import SystemLoad
+
+GOVERN_NS = 1_000_000_000
+STUCK_NS = 3_000_000_000
+"""Frames come but no track does: the pose loop hangs."""
+STUCK = "localisation hangs and is ended"
+IN_WORDS = {
+    TrackState.INITIALISING: "initialising",
+    TrackState.TRACKING: "tracking",
+    TrackState.LOST: "lost",
+}
+
+
+class HealthWatch:
+    """Counts what goes by, and says how all is. To be used in the event loop."""
+
+    def __init__(
+        self,
+        config: Config,
+        clock: FlightClock,
+        journal: Journal,
+        feed: CameraFeed,
+        link: AutopilotLink | None,
+        sender: PoseSender | None,
+        flights: Flights,
+        loop_delay: LatencyMeter,
+    ) -> None:
+        self._clock, self._journal, self._flights = clock, journal, flights
+        self._feed, self._link, self._sender = feed, link, sender
+        self._loop_delay = loop_delay
+        self._began_ns = clock.now_ns()
+        self._governor = Governor(config.daemon.hot_c)
+        self._lines = StatusLines(config.daemon.status_every_s)
+        self._load_reader = SystemLoad(Path(config.daemon.flights))
+        self.load = ComputerLoad()
+        self._governed_ns = 0
+        self._n_dropped = 0
+        self._last_frame_ns = 0
+        self._odometry: Odometry | None = None
+        self._odometry_ns = 0
+        self._scale = ""
+        self._recent = LatencyMeter(1.0)
+        self._pose = StageMeter("localisation")
+        self._depth = StageMeter("depth")
+
+    @property
+    def too_hot(self) -> bool:
+        """Whether work is left out because of the temperature."""
+        return "hot" in self._governor.degraded
+
+    def reconfigure(self, config: Config) -> None:
+        """Take over what has changed."""
+        self._governor = Governor(config.daemon.hot_c)
+        self._lines = StatusLines(config.daemon.status_every_s)
+
+    def restart(self) -> None:
+        """Another flight begins."""
+        self._odometry, self._scale, self._n_dropped = None, "", 0
+        self._odometry_ns = self._clock.now_ns()
+        self._governed_ns = 0
+
+    def frame_came(self) -> None:
+        """A frame; from the camera's thread."""
+        self._last_frame_ns = self._clock.now_ns()
+
+    def take_odometry(self, odometry: Odometry) -> None:
+        """The odometry of a frame."""
+        now_ns = self._clock.now_ns()
+        self._odometry, self._odometry_ns = odometry, now_ns
+        self._pose.done(now_ns, odometry.t_ns)
+        self._recent.add(now_ns, (now_ns - odometry.t_ns) * 1e-6)
+
+    def take_mapped(self, message: Track | MapUpdate | PointChunk) -> None:
+        """What the map has become."""
+        if isinstance(message, PointChunk):
+            self._depth.done(self._clock.now_ns(), message.t_ns)
+        elif isinstance(message, MapUpdate):
+            found = message.georeference
+            self._scale = found.method if found is not None else ""
+
+    @property
+    def pipeline_up(self) -> bool:
+        """Whether frames are worked on as they come."""
+        return self._flights.current is not None and self._flights.current.ready
+
+    @property
+    def pose_loop_alive(self) -> bool:
+        """False while frames come to a pose loop that gives nothing."""
+        flight, now_ns = self._flights.current, self._clock.now_ns()
+        if flight is None or not flight.ready or now_ns - self._last_frame_ns > GOVERN_NS:
+            self._odometry_ns = max(self._odometry_ns, now_ns - STUCK_NS // 2)
+            return True
+        return now_ns - self._odometry_ns < STUCK_NS
+
+    def kill_stuck(self) -> None:
+        """End a localisation that hangs, so that another takes its place."""
+        flight, now_ns = self._flights.current, self._clock.now_ns()
+        if flight is not None:
+            self._odometry_ns = now_ns
+            self._journal.warn(Warned(now_ns, STUCK))
+            flight.kill_localisation()
+
+    async def govern(self) -> None:
+        """Read the load and leave out work where there is too much; ends by cancellation."""
+        loop = asyncio.get_running_loop()
+        while True:
+            flight = self._flights.current
+            pids = {"daemon": 0} | ({k: s.pid for k, s in flight.stages.items()} if flight else {})
+            self.load = await loop.run_in_executor(None, self._load_reader.read, pids)
+            self._step_governor()
+            await asyncio.sleep(GOVERN_NS * 1e-9)
+
+    def _step_governor(self) -> None:
+        flight, now_ns = self._flights.current, self._clock.now_ns()
+        if flight is None or not flight.ready:
+            return
+        if not self._governed_ns:  # the levels of the flight before hold for this one
+            self._governed_ns = now_ns
+            self._apply()
+        n_dropped = flight.stages["localisation"].n_dropped
+        dropped_hz = (n_dropped - self._n_dropped) * 1e9 / max(now_ns - self._governed_ns, 10**8)
+        self._n_dropped, self._governed_ns = n_dropped, now_ns
+        changed = self._governor.step(now_ns, Pressure(
+            cpu_share=self.load.cpu_share,
+            memory_share=self.load.memory_share,
+            temperature_c=self.load.temperature_c,
+            pose_latency_p95_ms=self._recent.percentile_ms(95, now_ns),
+            pose_dropped_hz=dropped_hz,
+        ))  # fmt: skip
+        if changed:
+            self._apply()
+
+    def _apply(self) -> None:
+        level = self._governor.level
+        if self._flights.current is not None:
+            self._flights.current.set_shares(
+                level.feature_share, level.dense_share, level.viewer
+            )
+
+    def line_due(self) -> str | None:
+        """The status line, if it is due now."""
+        return self._lines.step(self.health())
+
+    def document(self) -> dict[str, Any]:
+        """What `companion status` shows."""
+        return {"version": __version__, **self.health().to_json()}
+
+    def health(self) -> Health:
+        """How all is now."""
+        now_ns, flight = self._clock.now_ns(), self._flights.current
+        odometry = self._odometry
+        sources = [self._feed.health] + ([self._link.health] if self._link is not None else [])
+        return Health(
+            t_ns=now_ns,
+            uptime_s=(now_ns - self._began_ns) * 1e-9,
+            sources=tuple(sources),
+            stages=self._stages(now_ns),
+            tracker=self._tracker(),
+            quality=odometry.quality if odometry is not None else -1,
+            scale=self._scale,
+            pose_latency_p95_ms=self._pose.health(now_ns).latency_p95_ms,
+            feedback=self._sender.health() if self._sender is not None else FeedbackHealth(),
+            flight=flight.folder.name if flight is not None and flight.folder is not None else "",
+            load=self.load,
+            degradation=self._governor.level.number,
+            degraded=self._governor.degraded,
+            loop_delay_p99_ms=self._loop_delay.percentile_ms(99, now_ns),
+            n_warnings=dict(self._journal.n_warnings),
+        )
+
+    def _tracker(self) -> str:
+        flight = self._flights.current
+        if flight is None:
+            there = self._feed.health.state in ("running", "frozen", "silent", "ended")
+            return "waiting for arming" if there else "waiting for the camera"
+        if self._odometry is None:
+            return "starting"
+        return IN_WORDS[self._odometry.state]
+
+    def _stages(self, now_ns: int) -> tuple[StageHealth, ...]:
+        flight = self._flights.current
+        if flight is None:
+            return ()
+        out = []
+        for kind, stage in flight.stages.items():
+            meter = {"localisation": self._pose, "depth": self._depth}.get(kind)
+            measured = meter.health(now_ns) if meter is not None else StageHealth(kind)
+            said = stage.progress
+            out.append(
+                replace(
+                    measured,
+                    alive=stage.alive,
+                    n=said.n_done if said is not None else 0,
+                    n_dropped=stage.n_dropped,
+                    n_restarted=flight.n_restarted.get(kind, 0),
+                    detail=said.device if said is not None else "starting",
+                )
+            )
+        return tuple(out)

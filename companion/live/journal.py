@@ -1,0 +1,47 @@
+"""Lines for the journal: on standard error, with a priority where systemd reads them."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections import Counter
+from collections.abc import Mapping
+
+from companion.messages import Warned
+
+ERROR, WARNING, INFO = 3, 4, 6
+MAX_SAME_IN_A_ROW = 5
+EVERY = 100
+"""A thing that is warned of again and again is told of each so many times only."""
+
+
+class Journal:
+    """Where the daemon says what happens; may be used from any thread."""
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        self._with_priority = "JOURNAL_STREAM" in environment
+        self._lock = threading.Lock()
+        self.n_warnings: Counter[str] = Counter()
+
+    def say(self, text: str, priority: int = INFO) -> None:
+        """One line."""
+        prefix = f"<{priority}>" if self._with_priority else "companion: "
+        line = " ".join(text.split())
+        with self._lock:
+            try:
+                print(prefix + line, file=sys.stderr, flush=True)
+            except OSError:
+                pass  # nobody listens any more, which must not end a flight
+
+    def warn(self, warning: Warned) -> bool:
+        """Count a warning, and tell of it unless it comes too often; whether it was told."""
+        with self._lock:
+            self.n_warnings[warning.what] += 1
+            n = self.n_warnings[warning.what]
+        told = n <= MAX_SAME_IN_A_ROW or n % EVERY == 0
+        if told:
+            often = f" (for the {n}th time)" if n > MAX_SAME_IN_A_ROW else ""
+            detail = f": {warning.detail}" if warning.detail else ""
+            self.say(f"warning: {warning.what}{detail}{often}", WARNING)
+        return told

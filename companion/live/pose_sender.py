@@ -1,0 +1,106 @@
+"""Poses to the autopilot: each frame's at once, predicted ones in between, and what was measured.
+
+Everything here runs in the event loop. What a pose must be to be sent `companion.feedback` decides.
+"""
+
+from __future__ import annotations
+
+import asyncio
+
+from drivers.autopilot_link import AutopilotLink
+
+from companion.clock import FlightClock
+from companion.config import FeedbackConfig
+from companion.feedback import PoseGate, PoseToSend
+from companion.health import FeedbackHealth, LatencyMeter, RateMeter
+from companion.messages import AttitudeSample, Odometry
+from drivers.pose_messages import odometry_message, vision_messages
+
+TICK_S = 0.005
+IDLE_TICK_S = 0.05
+INFO, WARNING = 6, 4
+
+
+class PoseSender:
+    """Odometry of the newest flight in; ODOMETRY or VISION_POSITION_ESTIMATE out."""
+
+    def __init__(self, config: FeedbackConfig, link: AutopilotLink, clock: FlightClock) -> None:
+        self._config, self._link, self._clock = config, link, clock
+        self._gate = PoseGate(config)
+        self._rate, self._latency = RateMeter(), LatencyMeter()
+        self._n_sent = 0
+        self._told: str | None = None
+
+    def restart(self) -> None:
+        """Localisation begins anew."""
+        self._gate.restart()
+
+    def reconfigure(self, config: FeedbackConfig) -> None:
+        """Take over other limits; belief must then hold anew."""
+        n_resets = self._gate.n_resets
+        self._config, self._gate = config, PoseGate(config, n_resets)
+
+    def take_attitude(self, sample: AttitudeSample) -> None:
+        """Take the autopilot's attitude."""
+        self._gate.take_attitude(sample)
+
+    def take(self, odometry: Odometry) -> None:
+        """Take the odometry of a frame, and send it if it may be sent."""
+        self._send(self._gate.take(odometry, self._clock.now_ns()))
+        self._tell()
+
+    async def run(self) -> None:
+        """Send predicted poses when they are due, and say when poses cease."""
+        while True:
+            await asyncio.sleep(TICK_S if self._gate.sending else IDLE_TICK_S)
+            self._send(self._gate.due(self._clock.now_ns()))
+            self._tell()
+
+    def health(self) -> FeedbackHealth:
+        """As it stands now."""
+        now_ns = self._clock.now_ns()
+        p95_ms = self._latency.percentile_ms(95, now_ns)
+        return FeedbackHealth(
+            mode=self._config.mode,
+            sending=self._gate.sending,
+            why_not=self._gate.why_not,
+            rate_hz=self._rate.hz(now_ns),
+            latency_p50_ms=self._latency.percentile_ms(50, now_ns),
+            latency_p95_ms=p95_ms,
+            n_sent=self._n_sent,
+            n_resets=self._gate.n_resets,
+        )
+
+    def _send(self, pose: PoseToSend | None) -> None:
+        if pose is None or not self._link.alive:
+            return
+        if self._config.mode == "odometry":
+            self._link.send(odometry_message(pose))
+        else:
+            for message in vision_messages(pose):
+                self._link.send(message)
+        now_ns = self._clock.now_ns()
+        self._n_sent += 1
+        self._rate.add(now_ns)
+        if not pose.predicted:
+            self._latency.add(now_ns, (now_ns - pose.t_ns) * 1e-6)
+
+    def _tell(self) -> None:
+        """The pilot hears when poses begin and cease."""
+        state = "" if self._gate.sending else self._gate.why_not
+        if self._gate.sending and self._told != "":
+            self._link.say(INFO, "Companion: vision pose on")
+        elif not self._gate.sending and self._told == "":
+            self._link.say(WARNING, f"Companion: vision pose off: {state}")
+        else:
+            return
+        self._told = state
+
+
+def make_pose_sender(
+    config: FeedbackConfig, link: AutopilotLink | None, clock: FlightClock
+) -> PoseSender | None:
+    """What sends poses; None where none are to be sent."""
+    if link is None or config.mode == "off":
+        return None
+    return PoseSender(config, link, clock)
