@@ -13,7 +13,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from drivers.autopilot_link import AutopilotLink
-from drivers.loop_delay import measure_loop_delay
+from companion.live.loop_delay import measure_loop_delay
 
 from companion.camera import Camera
 from companion.clock import FlightClock

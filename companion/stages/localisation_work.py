@@ -1,0 +1,33 @@
+"""Where the camera is, as a process: always with the latest frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from companion.localisation import LocalisationStage
+from companion.messages import Message
+from companion.stages.protocol import Finish, SetShare, Setup
+from companion.stages.work import Work
+
+
+class _Localisation(Work):
+    latest_only = True
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__()
+        self._stage = LocalisationStage(setup.config, setup.camera, self.times, beside=True)
+
+    def step(self, message: Any) -> Iterable[Message]:
+        if isinstance(message, SetShare):
+            self._stage.set_effort(message.share)
+            return []
+        return self._stage.step(message)
+
+    def finish(self, finish: Finish) -> Iterable[Message]:
+        return self._stage.finish(adjust=not finish.hurry)
+
+
+def work(setup: Setup) -> Work:
+    """The stage that a setup asks for."""
+    return _Localisation(setup)

@@ -1,0 +1,47 @@
+"""What is left of a flight, as a process: its recording, and its results when it is over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import ExitStack
+from typing import Any
+
+from companion.errors import StageError
+from companion.messages import Message
+from companion.output.flight_result import FlightResult
+from companion.output.write import write_results
+from companion.stages.protocol import Finish, Setup
+from companion.stages.work import Work
+from companion.viewer import FileViewer
+
+
+class _Recorder(Work):
+    def __init__(self, setup: Setup) -> None:
+        super().__init__()
+        if setup.folder is None:
+            raise StageError("a recorder needs a folder")
+        self._folder, self._voxel_m = setup.folder, setup.config.cloud.voxel_m
+        self._result = FlightResult()
+        self._open = ExitStack()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._recording = self._open.enter_context(
+            FileViewer(setup.config.viewer, setup.camera, self._folder / "flight.rrd")
+        )
+
+    def step(self, message: Any) -> Iterable[Message]:
+        self._result.take(message)
+        self._recording.take(message)
+        return []
+
+    def finish(self, finish: Finish) -> Iterable[Message]:
+        self._open.close()
+        if finish.facts is not None:
+            write_results(
+                self._folder, self._result, finish.facts, self._voxel_m, page=not finish.hurry
+            )
+        return []
+
+
+def work(setup: Setup) -> Work:
+    """The stage that a setup asks for."""
+    return _Recorder(setup)
