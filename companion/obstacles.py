@@ -70,18 +70,21 @@ def obstacles_around(
     max_cm = round(reach.max_m * 100)
     min_cm = round(reach.min_m * 100)
     distances_cm = np.full(N_SECTORS, UNKNOWN_CM, np.uint16)
-    seen_through = _seen_through(points, eyes, distance_m, reach)
-    distances_cm[np.bincount(sector[seen_through], minlength=N_SECTORS) >= MIN_POINTS] = max_cm + 1
+    far = distance_m > reach.max_m
+    through = _seen_through(points[far], eyes[far], reach)
+    distances_cm[np.bincount(sector[far][through], minlength=N_SECTORS) >= MIN_POINTS] = max_cm + 1
 
     down_m = points[:, 2]
     hit = (down_m >= -reach.above_m) & (down_m <= reach.below_m)
     hit &= (distance_m >= reach.min_m) & (distance_m <= reach.max_m)
-    for index in np.unique(sector[hit]):
-        inside = distance_m[hit & (sector == index)]
-        if len(inside) >= MIN_POINTS:
-            # Not the very nearest, which may be an error.
-            nearest_m = np.partition(inside, MIN_POINTS - 1)[MIN_POINTS - 1]
-            distances_cm[index] = np.clip(int(nearest_m * 100), min_cm, max_cm)
+    hit_m, hit_sector = distance_m[hit], sector[hit]
+    order = np.lexsort((hit_m, hit_sector))
+    hit_m, hit_sector = hit_m[order], hit_sector[order]
+    found, first, n = np.unique(hit_sector, return_index=True, return_counts=True)
+    # Not the very nearest of a sector, which may be an error.
+    enough = n >= MIN_POINTS
+    nearest_m = hit_m[first[enough] + MIN_POINTS - 1]
+    distances_cm[found[enough]] = np.clip((nearest_m * 100).astype(np.int64), min_cm, max_cm)
     return Obstacles(t_ns, distances_cm, min_cm, max_cm)
 
 
@@ -93,10 +96,8 @@ def _sector(points: Array, world_from_body: Pose) -> NDArray[np.int64]:
     return index % N_SECTORS
 
 
-def _seen_through(
-    points: Array, eyes: Array, distance_m: Array, reach: Reach
-) -> NDArray[np.bool_]:
-    """Which points lie beyond reach at the end of a line of sight through the vehicle's height.
+def _seen_through(points: Array, eyes: Array, reach: Reach) -> NDArray[np.bool_]:
+    """Which of these points beyond reach end a line of sight that keeps to the vehicle's height.
 
     The line begins at the eye and passes near to the vehicle, which is at the origin.
     """
@@ -109,7 +110,6 @@ def _seen_through(
     end_down_m = closest[:, 2] + direction[:, 2] / np.maximum(level, 1e-9) * reach.max_m
     through: NDArray[np.bool_] = (
         (np.linalg.norm(closest, axis=1) <= NEAR_SIGHT_M)
-        & (distance_m > reach.max_m)
         & (closest[:, 2] >= -reach.above_m)
         & (closest[:, 2] <= reach.below_m)
         & (end_down_m >= -reach.above_m)
@@ -122,7 +122,7 @@ class RecentCloud:
     """The newest chunks of the cloud, thinned; what is older than `max_age_s` no longer counts."""
 
     def __init__(
-        self, max_age_s: float = 15.0, max_chunks: int = 12, max_points: int = 4000
+        self, max_age_s: float = 15.0, max_chunks: int = 12, max_points: int = 2000
     ) -> None:
         self._max_age_ns = round(max_age_s * 1e9)
         self._max_chunks = max_chunks

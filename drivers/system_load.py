@@ -43,7 +43,7 @@ class SystemLoad:
         self.read({})
 
     def read(self, processes: Mapping[str, int]) -> ComputerLoad:
-        """The load now, and that of our processes, given by name and process id."""
+        """The load now, and that of our processes, by name and process id; 0 is this one."""
         shares = self._core_shares()
         memory = psutil.virtual_memory()
         used, total, free = _disk(self._folder)
@@ -82,7 +82,8 @@ class SystemLoad:
 
     def _loads(self, processes: Mapping[str, int]) -> Iterator[ProcessLoad]:
         before, self._processes = self._processes, {}
-        for name, pid in processes.items():
+        for name, given in processes.items():
+            pid = given or os.getpid()
             try:
                 process = psutil.Process(pid)
                 times, memory = process.cpu_times(), process.memory_info()
