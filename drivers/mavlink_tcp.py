@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 import time
 
@@ -79,7 +80,8 @@ class TcpWire(TcpConnection):
             raise SourceError(f"{self.name}: no answer") from error
         except OSError as error:
             opened.close()
-            raise SourceError(f"{self.name}: {error.strerror or error}") from error
+            reason = os.strerror(error.errno) if error.errno else str(error)
+            raise SourceError(f"{self.name}: {reason}") from error
         except asyncio.CancelledError:
             opened.close()
             raise

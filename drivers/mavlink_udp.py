@@ -50,6 +50,8 @@ class UdpWire(Wire):
     link over, and an autopilot that comes back from another port is found again.
     """
 
+    reads_at_once = 16
+
     def __init__(
         self,
         endpoint: Endpoint,

@@ -65,7 +65,7 @@ def _serial(key: str, url: str, rest: str) -> Endpoint:
 
 
 def _network(key: str, url: str, kind: str, rest: str) -> Endpoint:
-    host, colon, port = rest.rpartition(":")
+    host, _, port = rest.rpartition(":")
     host = host.removeprefix("//")
     if host.startswith("[") and host.endswith("]"):
         host = host[1:-1]
@@ -75,6 +75,6 @@ def _network(key: str, url: str, kind: str, rest: str) -> Endpoint:
         raise ConfigError(
             f'{key}: "{url}" must be {kind}:HOST:PORT with a port from 1 to 65535'
         )
-    if not host and not (colon and kind in ("udpin", "tcpin")):
+    if not host and kind not in ("udpin", "tcpin"):
         raise ConfigError(f'{key}: "{url}" says no host: {kind}:HOST:{port}')
     return Endpoint(kind=kind, host=host or LOOPBACK, port=int(port))

@@ -45,6 +45,7 @@ class Wire(ABC):
     """
 
     read_size = 65536
+    reads_at_once = 1
 
     def __init__(
         self, name: str, bytes_per_s: float, queue: PacketQueue, read_limit: RateLimit | None = None
@@ -152,25 +153,34 @@ class Wire(ABC):
         return 0.0
 
     def _readable(self, end: WireEnd) -> None:
-        try:
-            data, monotonic_ns = self._read()
-        except (BlockingIOError, InterruptedError):
-            return
-        except EOFError:
-            self.lose("closed by the other side")
-            return
-        except OSError as error:
-            self.lose(error.strerror or str(error))
-            return
+        for _ in range(self.reads_at_once):
+            try:
+                data, monotonic_ns = self._read()
+            except (BlockingIOError, InterruptedError):
+                return
+            except EOFError:
+                self.lose("closed by the other side")
+                return
+            except OSError as error:
+                self.lose(error.strerror or str(error))
+                return
+            must_pause = self._has_too_much(data, monotonic_ns, end)
+            self._deliver(end, data, monotonic_ns)
+            if must_pause or not self.connected:
+                return
+
+    def _has_too_much(self, data: bytes, monotonic_ns: int, end: WireEnd) -> bool:
         limit = self._read_limit
-        if limit is not None:
-            limit.refill(monotonic_ns)
-            limit.take(max(64, len(data)))  # many small pieces are work too
-            if limit.left < 0:
-                loop = asyncio.get_running_loop()
-                loop.remove_reader(self._fd)
-                self._paused = loop.call_later(limit.wait_s(limit.burst / 2), self._resume, end)
-        self._deliver(end, data, monotonic_ns)
+        if limit is None:
+            return False
+        limit.refill(monotonic_ns)
+        limit.take(max(64, len(data)))  # many small pieces are work too
+        if limit.left >= 0:
+            return False
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._fd)
+        self._paused = loop.call_later(limit.wait_s(limit.burst / 2), self._resume, end)
+        return True
 
     def _resume(self, end: WireEnd) -> None:
         self._paused = None
