@@ -28,7 +28,7 @@ WARNING = 2
 
 
 def check_library() -> None:
-    """ConfigError unless this MAVSDK can be kept quiet, for which only its C interface has a name."""
+    """ConfigError unless this MAVSDK can be kept quiet; only its C interface has a name for how."""
     try:
         intercept = library.mavsdk_subscribe_outgoing_messages_json
     except AttributeError:
