@@ -6,6 +6,7 @@ pose, the tracker's keyframes tell where the map lies in the world.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -75,8 +76,11 @@ class LocalisationStage:
         """What the tracker knows."""
         return self._tracker.state
 
-    def step(self, message: Message) -> list[Message]:
-        """Take one message; messages come in order of time."""
+    def step(self, message: Message) -> Iterable[Message]:
+        """Take one message; messages come in order of time.
+
+        What a frame gives is worked out as it is asked for, the pose first: take all of it.
+        """
         if isinstance(message, Frame):
             return self._frame(message)
         if isinstance(message, AttitudeSample):
@@ -111,7 +115,7 @@ class LocalisationStage:
         attitude = self._attitude.at(t_ns)
         return None if attitude is None else attitude @ mount.rotation
 
-    def _frame(self, frame: Frame) -> list[Message]:
+    def _frame(self, frame: Frame) -> Iterator[Message]:
         self._t_ns = frame.t_ns
         attitude = self._ned_from_camera(frame.t_ns)
         predicted = self._motion.predict(frame.t_ns, attitude)
@@ -119,23 +123,22 @@ class LocalisationStage:
         tracked = self._tracker.step(frame, Prior(predicted, attitude))
         if len(self._tracker.segments) != n_segments or self.state is TrackState.INITIALISING:
             self._motion.reset()
-        out: list[Message] = []
         for message in tracked:
             if isinstance(message, Track) and message.map_from_camera is not None:
                 if message.seq == frame.seq:
                     self._motion.correct(frame.t_ns, message.map_from_camera, attitude)
-                    out.append(self._odometry_of(message))
+                    yield self._odometry_of(message)
                 placed = self._main_from_newest.apply_to_pose(message.map_from_camera)
-                out.append(replace(message, map_from_camera=placed))
+                yield replace(message, map_from_camera=placed)
             else:
                 if isinstance(message, Track):
-                    out.append(self._odometry_of(message))
-                out.append(message)
+                    yield self._odometry_of(message)
+                yield message
         if any(isinstance(m, KeyframeAdded) for m in tracked):
             with self._times("georeference"), self._tracker.turn.tracking():
-                out.append(self._map_update(final=False))
-        out += self._judge_attitude(frame.t_ns)
-        return out
+                update = self._map_update(final=False)
+            yield update
+        yield from self._judge_attitude(frame.t_ns)
 
     def _odometry_of(self, track: Track) -> Odometry:
         """A track of the newest segment, in that segment's own frame, as an autopilot wants it."""

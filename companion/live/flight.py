@@ -37,7 +37,7 @@ from companion.stages.protocol import Finish, SetShare, Setup
 from companion.stages.stage_process import StageProcess
 from companion.viewer import LiveViewer
 
-NICE = {"localisation": 0, "depth": 10, "recorder": 10}
+NICE = {"localisation": 0, "recorder": 10, "depth": 20}
 """The pose comes first; the others take what is left over."""
 PATIENCE_S = {"localisation": 120.0, "depth": 60.0, "recorder": 180.0}
 HURRIED_S = {"localisation": 0.7, "depth": 0.2, "recorder": 1.6}

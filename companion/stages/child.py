@@ -24,6 +24,10 @@ from companion.stages.protocol import Finish, Finished, Progress, Setup  # noqa:
 from companion.stages.work import module_of  # noqa: E402
 
 REPORT_EVERY_S = 1.0
+LOWEST_NICE = 19
+"""What is nicer still runs only where nothing else wants the processor."""
+SWITCH_S = 5e-4
+"""What works beside the tracker gives it the interpreter so soon."""
 
 
 def main() -> int:
@@ -31,7 +35,10 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the daemon says when
     kind, nice, pipe_fd, ring_fd = sys.argv[1], *map(int, sys.argv[2:5])
-    os.nice(nice)
+    os.nice(min(nice, LOWEST_NICE))
+    if nice > LOWEST_NICE:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    sys.setswitchinterval(SWITCH_S)
     pipe: Connection[Any, Any] = Connection(pipe_fd)
     module = module_of(kind)  # which takes a second, and may be long before there is a flight
     try:
