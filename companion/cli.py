@@ -9,7 +9,8 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from companion import __version__
@@ -24,27 +25,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     with StopSignals() as signals:
         try:
-            if arguments.command == "check-config":
-                _check_config(arguments)
-            else:
-                _replay(arguments, signals)
-                signals.take()
+            return COMMANDS[arguments.command](arguments, signals)
         except KeyboardInterrupt:
             print("companion: stopped", file=sys.stderr)
             return signals.exit_status
         except CompanionError as error:
             print(f"companion: error: {error}", file=sys.stderr)
             return 2 if isinstance(error, InputError) else 1
-    return 0
 
 
-def _replay(arguments: argparse.Namespace, signals: StopSignals) -> None:
+# Libraries are loaded late: those behind a command take a second, and --help needs none of them.
+
+
+def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.live.daemon import run
+
+    return run(lambda: load_config(arguments.config, arguments.set))
+
+
+def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     config = load_config(arguments.config, arguments.set)
     if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
         raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
     if arguments.out.exists() and not arguments.out.is_dir():
         raise InputError(f"{arguments.out}: is a file; --out wants a folder")
-    # Late, since the libraries behind it take a second to load, and --help needs none of them.
     from companion.replay import replay
 
     replay(
@@ -58,10 +62,72 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> None:
         progress=signals.between_frames(progress_on(sys.stderr)),
     )
     print(f"report: {arguments.out / 'report.html'}")
+    signals.take()
+    return 0
 
 
-def _check_config(arguments: argparse.Namespace) -> None:
+def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.status import show_status
+    from drivers.status_socket import found_socket_path
+
+    setting = load_config(arguments.config, arguments.set).daemon.socket
+    show_status(
+        found_socket_path(setting), sys.stdout, as_json=arguments.json, watch=arguments.watch,
+        stop=threading.Event(),
+    )  # fmt: skip
+    return 0
+
+
+def _devices(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.devices import devices
+
+    print(devices(arguments.json))
+    return 0
+
+
+def _doctor(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.doctor import doctor
+
+    config = load_config(arguments.config, arguments.set)
+    return doctor(config, write=arguments.write, yes=arguments.yes, as_json=arguments.json)
+
+
+def _calibrate(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.calibrate import calibrate, print_board
+    from drivers.camera_source import camera_source
+
+    if arguments.print_board is not None:
+        paper = print_board(arguments.board, arguments.print_board)
+        print(f"{arguments.print_board}: print it on {paper}, at 100 %")
+        return 0
+    if arguments.live == (arguments.source is not None):
+        raise InputError("wanted a video, a folder of images, or --live, and one of them only")
+    if arguments.name is None:
+        raise InputError("--name is missing: a name for the camera, as in --name front")
+    config = load_config(arguments.config, arguments.set)
+    source = camera_source(config.camera) if arguments.live else arguments.source
+    report = calibrate(
+        source, arguments.board, arguments.name, arguments.out, arguments.model,
+        signals.between_frames(progress_on(sys.stderr)),
+    )  # fmt: skip
+    print(report)
+    return 0
+
+
+def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
     print(to_toml(load_config(arguments.config, arguments.set)), end="")
+    return 0
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {
+    "run": _run,
+    "replay": _replay,
+    "status": _status,
+    "devices": _devices,
+    "calibrate": _calibrate,
+    "doctor": _doctor,
+    "check-config": _check_config,
+}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -80,6 +146,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    commands.add_parser(
+        "run", parents=[configuration], help="fly: camera, autopilot, map and pose, until stopped",
+        description="The daemon on the drone. SIGTERM ends it, SIGHUP has it read its "
+        "configuration again.",
+    )  # fmt: skip
 
     replay = commands.add_parser(
         "replay", parents=[configuration], help="turn a logged flight into a metric map",
@@ -106,6 +178,56 @@ def _parser() -> argparse.ArgumentParser:
         "--paced", action="store_true",
         help="in the flight's own time, dropping what a live run would drop",
     )  # fmt: skip
+
+    as_json = argparse.ArgumentParser(add_help=False)
+    as_json.add_argument("--json", action="store_true", help="as JSON, for programs")
+
+    status = commands.add_parser(
+        "status", parents=[configuration, as_json], help="ask the running daemon how it is"
+    )
+    status.add_argument("--watch", action="store_true", help="again every second, until Ctrl-C")
+
+    commands.add_parser(
+        "devices", parents=[as_json], help="list cameras, serial ports and OpenCL devices"
+    )
+
+    calibrate = commands.add_parser(
+        "calibrate", parents=[configuration], help="calibrate a camera by a board held before it",
+        description="Find a camera's focal length, centre and distortion from views of a board; "
+        "writes OUT/NAME.toml, for camera.calibration, and a picture beside it.",
+    )  # fmt: skip
+    calibrate.add_argument(
+        "source", type=Path, nargs="?", metavar="VIDEO|FOLDER", help="views of the board"
+    )
+    calibrate.add_argument(
+        "--live", action="store_true", help="take the views from the configured camera, now"
+    )
+    calibrate.add_argument(
+        "--board", default="charuco:7x5:0.04:0.03:DICT_5X5_100", metavar="BOARD",
+        help="charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY or chessboard:9x6:SQUARE_M, whose "
+        "numbers are those of inner corners (default: %(default)s)",
+    )  # fmt: skip
+    calibrate.add_argument("--name", help="what to call the camera")
+    calibrate.add_argument(
+        "--out", type=Path, default=Path("config/cameras"), metavar="DIR",
+        help="where to write (default: %(default)s)",
+    )  # fmt: skip
+    calibrate.add_argument(
+        "--model", default="auto", choices=("auto", "radtan", "equidistant"),
+        help="of distortion (default: whichever fits views best that it was not fitted to)",
+    )  # fmt: skip
+    calibrate.add_argument(
+        "--print-board", type=Path, metavar="FILE", help="only write the board, .pdf or .png"
+    )
+
+    doctor = commands.add_parser(
+        "doctor", parents=[configuration, as_json],
+        help="find the autopilot's parameters that keep it from using the pose",
+        description="Read the autopilot's parameters over the configured link and name each that "
+        "stands in the way. Exit status 1 where there is one.",
+    )  # fmt: skip
+    doctor.add_argument("--write", action="store_true", help="set them, after asking")
+    doctor.add_argument("--yes", action="store_true", help="do not ask")
 
     commands.add_parser(
         "check-config", parents=[configuration], help="print the configuration that would be used",
