@@ -77,7 +77,7 @@ class TelemetryCollector:
 
     def add(self, remote_ns: int, segment: int, content: Telemetry | GeodeticFix) -> None:
         """Take a sample, unless numbers in it are not finite."""
-        if not _finite(content):
+        if not is_finite(content):
             self.count("telemetry with values that are no numbers left out")
             return
         self._stamps.append((remote_ns, segment))
@@ -137,7 +137,7 @@ def kind_of(sample: Telemetry) -> str:
     return type(sample).__name__.removesuffix("Sample").lower()
 
 
-def _finite(content: Telemetry | GeodeticFix) -> bool:
+def is_finite(content: Telemetry | GeodeticFix) -> bool:
     # written out, since this runs for every sample of a flight
     if isinstance(content, AttitudeSample):
         return bool(np.isfinite(content.ned_from_body).all())

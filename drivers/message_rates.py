@@ -1,0 +1,139 @@
+"""How often the autopilot is asked to send what, what really comes, and when to ask again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.config import LinkConfig
+
+CHECK_NS = 3_000_000_000
+"""So long a rate is counted before it is judged."""
+SHORT = 0.5
+"""A rate of less than this share of what was asked for falls short."""
+FIRST_AGAIN_NS, MOST_AGAIN_NS = 3_000_000_000, 60_000_000_000
+"""Between asking and asking again, doubling."""
+GPS_HZ, TIME_HZ = 5.0, 1.0
+"""More than receivers give, and often enough to tell GPS time from boot time."""
+NEVER_NS = 2**62
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A quantity: messages that state it, best first, and how often it is wanted."""
+
+    ids: tuple[int, ...]
+    rate_hz: float
+    always: bool = True
+    """Whether there is always something to send; a position or a range may not be known."""
+
+
+def wanted(config: LinkConfig) -> list[Wanted]:
+    """What the samples of a flight are made of."""
+    # both firmwares have all of these; ArduPilot's older versions lack the first of some
+    rates = [
+        Wanted(
+            (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_ATTITUDE),
+            config.attitude_hz,
+        ),
+        Wanted(
+            (
+                mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+                mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+                mavlink.MAVLINK_MSG_ID_RAW_IMU,
+            ),
+            config.imu_hz,
+        ),
+        Wanted((mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,), config.position_hz, always=False),
+        Wanted((mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,), config.position_hz, always=False),
+        Wanted(
+            (mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,), min(config.position_hz, GPS_HZ), always=False
+        ),
+        Wanted((mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,), config.height_hz),
+        Wanted((mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,), config.height_hz, always=False),
+        Wanted((mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,), TIME_HZ),
+    ]
+    return [each for each in rates if each.rate_hz > 0]
+
+
+@dataclass(slots=True)
+class _Stream:
+    want: Wanted
+    choice: int = 0
+    due_ns: int = 0
+    again_ns: int = FIRST_AGAIN_NS
+    begun_ns: int | None = None
+    """When counting began; None while it has not been asked for."""
+    n: int = 0
+
+    @property
+    def message_id(self) -> int:
+        return self.want.ids[self.choice]
+
+
+class MessageRates:
+    """The state of every quantity; asks no clock and sends nothing itself."""
+
+    def __init__(self, wants: Sequence[Wanted]) -> None:
+        self._streams = [_Stream(want) for want in wants]
+        self.n_asked = 0
+        self.missing: list[int] = []
+        """Messages that this autopilot has said it does not have."""
+
+    def restart(self) -> None:
+        """Ask for everything anew: the autopilot has forgotten."""
+        self._streams = [_Stream(stream.want) for stream in self._streams]
+        self.missing = []
+
+    def came(self, message_id: int) -> None:
+        """Count a message."""
+        for stream in self._streams:
+            if message_id == stream.message_id:
+                stream.n += 1
+
+    def due(self, now_ns: int) -> tuple[int, float] | None:
+        """A message that is to be asked for now, and its rate; `asked` is to follow."""
+        for stream in self._streams:
+            if stream.begun_ns is not None and now_ns - stream.begun_ns >= CHECK_NS:
+                self._judge(stream, now_ns)
+            if now_ns >= stream.due_ns:
+                return stream.message_id, stream.want.rate_hz
+        return None
+
+    def asked(self, message_id: int, refused: bool, now_ns: int) -> None:
+        """It was asked for, and refused for good or not."""
+        self.n_asked += 1
+        for stream in self._streams:
+            if stream.message_id != message_id:
+                continue
+            stream.begun_ns, stream.n = now_ns, 0
+            stream.due_ns = NEVER_NS  # until it is judged
+            if refused:
+                self._refused(stream, now_ns)
+
+    def skip(self, now_ns: int) -> None:
+        """What came or did not come until now says nothing: the autopilot was silent."""
+        for stream in self._streams:
+            if stream.begun_ns is not None:
+                stream.begun_ns, stream.n = now_ns, 0
+
+    def _judge(self, stream: _Stream, now_ns: int) -> None:
+        assert stream.begun_ns is not None
+        rate_hz = stream.n / ((now_ns - stream.begun_ns) * 1e-9)
+        stream.begun_ns, stream.n = now_ns, 0
+        if rate_hz >= SHORT * stream.want.rate_hz or stream.message_id in self.missing:
+            stream.again_ns, stream.due_ns = FIRST_AGAIN_NS, NEVER_NS
+        elif stream.due_ns == NEVER_NS:
+            if not stream.want.always:
+                stream.again_ns = max(stream.again_ns, 3 * FIRST_AGAIN_NS)
+            stream.due_ns = now_ns + stream.again_ns - FIRST_AGAIN_NS
+            stream.again_ns = min(2 * stream.again_ns, MOST_AGAIN_NS)
+
+    def _refused(self, stream: _Stream, now_ns: int) -> None:
+        if stream.message_id not in self.missing:
+            self.missing.append(stream.message_id)
+        if stream.choice + 1 < len(stream.want.ids):
+            stream.choice += 1
+            stream.due_ns, stream.begun_ns = now_ns, None
