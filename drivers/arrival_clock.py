@@ -5,6 +5,8 @@ from __future__ import annotations
 MAX_DRIFT = 200e-6
 """Two clocks of computers do not run apart faster than this."""
 MAX_LATE_NS = 1_000_000_000
+SETTLED_FALL_NS, SETTLED_AFTER = 5_000_000, 5
+"""So many arrivals that are not much earlier than was known show that no backlog comes any more."""
 STEPPED_AFTER_NS = 3_000_000_000
 """What is later than that for so long is not late: the sender's stamps were set back."""
 
@@ -20,12 +22,21 @@ class ArrivalClock:
         self._offset_ns: float | None = None
         self._last_ns = 0
         self._late_since_ns: int | None = None
+        self._n_steady = 0
+
+    @property
+    def settled(self) -> bool:
+        """Whether times may be believed: what waited for us before we came arrives all at once."""
+        return self._n_steady >= SETTLED_AFTER
 
     def monotonic_ns(self, sent_ns: int, arrived_ns: int) -> int:
         """Our time of what the sender stamped `sent_ns`; never later than it arrived."""
         offset_ns = float(arrived_ns - sent_ns)
         if self._offset_ns is None or self._stepped_back(offset_ns, arrived_ns):
-            self._offset_ns = offset_ns
+            self._offset_ns, self._n_steady = offset_ns, 0
+        if not self.settled:
+            fallen = self._offset_ns - offset_ns > SETTLED_FALL_NS
+            self._n_steady = 0 if fallen else self._n_steady + 1
         risen_ns = self._offset_ns + MAX_DRIFT * max(0, arrived_ns - self._last_ns)
         self._offset_ns = min(offset_ns, risen_ns)
         self._last_ns = arrived_ns

@@ -30,6 +30,8 @@ RETRY_S = 0.5
 """Between two attempts to open a camera that is not there."""
 READ_S = 0.1
 """A read waits for so long at most, so that stopping does not."""
+STOP_S = 2.0
+"""A thread that has not ended by then never will."""
 FROZEN_S = 1.0
 """Pictures that have been the same for so long come from a frozen camera."""
 MIN_CONTRAST = 12
@@ -101,10 +103,10 @@ class CameraFeed:
         self._thread.start()
 
     def stop(self) -> None:
-        """Close the camera and end; a driver that hangs is left behind after two seconds."""
+        """Close the camera and end; a driver that hangs is left behind."""
         self._stop.set()
         if self._thread.ident is not None:
-            self._thread.join(2.0)
+            self._thread.join(STOP_S)
 
     def _run(self) -> None:
         n_opened = 0
@@ -135,7 +137,8 @@ class CameraFeed:
         except Exception as error:  # a driver's bug must not end the flight
             self._set("missing", MISSING, f"{self._source.name}: {type(error).__name__}: {error}")
             return False
-        self._meter.detail = self._source.name
+        if self._meter.state == "opening":  # else what was amiss may still be
+            self._meter.detail = self._source.name
         return True
 
     def _close(self) -> None:

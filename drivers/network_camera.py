@@ -92,13 +92,15 @@ class _Receiver:
 
     def __init__(self, config: CameraConfig, name: str) -> None:
         self.opened = threading.Event()
-        self.error: SourceError | None = None
+        self.error: SourceError | ConfigError | None = None
         self._config = config
         self._name = name
         self._ended = threading.Event()
         self._changed = threading.Condition()
         self._newest: _Newest | None = None
         self._n_dropped = 0
+        self._heard_s = 0.0
+        """When the last packet came; RTSP reports a time that ran out as damaged data."""
         self.thread = threading.Thread(target=self._run, name="network camera", daemon=True)
 
     def take(self, timeout_s: float) -> _Newest | None:
@@ -119,7 +121,8 @@ class _Receiver:
         self.thread.join(0.3)
 
     def _run(self) -> None:
-        error: SourceError = EndOfPictures(f"{self._name}: closed")
+        error: SourceError | ConfigError = EndOfPictures(f"{self._name}: closed")
+        self._heard_s = time.monotonic()
         try:
             with av.open(
                 self._config.url, options=_options(self._config), timeout=(OPEN_S, READ_S)
@@ -127,14 +130,20 @@ class _Receiver:
                 if not container.streams.video:
                     raise SourceError(f"{self._name}: there is no video in it")
                 stream = container.streams.video[0]
+                self._heard_s = time.monotonic()
                 self.opened.set()
                 self._decode(container, stream)
             error = SourceError(f"{self._name}: the sender has ended the stream")
         except SourceError as raised:
             error = raised
+        except av.error.ProtocolNotFoundError:
+            error = ConfigError(f"camera.url: {self._name}: not a protocol that FFmpeg knows")
         except av.error.FFmpegError as raised:
             # its own text holds the whole address, password and all
-            error = SourceError(f"{self._name}: {_reason(raised)}")
+            limit_s = READ_S if self.opened.is_set() else OPEN_S
+            silent = time.monotonic() - self._heard_s >= 0.9 * limit_s
+            reason = "nothing came in time" if silent else _reason(raised)
+            error = SourceError(f"{self._name}: {reason}")
         except Exception as raised:
             error = SourceError(f"{self._name}: {type(raised).__name__} in the decoder")
         finally:
@@ -151,6 +160,7 @@ class _Receiver:
         clock, last_ns = ArrivalClock(), 0
         for packet in container.demux(stream):
             arrived_ns = time.monotonic_ns()
+            self._heard_s = arrived_ns * 1e-9
             if self._ended.is_set():
                 return
             try:
@@ -163,7 +173,9 @@ class _Receiver:
                 if frame.pts is not None and frame.time_base is not None:
                     sent_ns = round(frame.pts * frame.time_base * 1_000_000_000)
                     t_ns = clock.monotonic_ns(sent_ns, arrived_ns)
-                # what was sent before we came arrives all at once, older than it seems
+                    if not clock.settled:
+                        self._count_dropped()
+                        continue
                 if frame.is_corrupt or t_ns <= last_ns:
                     self._count_dropped()
                     continue
@@ -196,7 +208,7 @@ def without_secrets(url: str) -> str:
 
 def _options(config: CameraConfig) -> dict[str, str]:
     options = {"fflags": "nobuffer", "flags": "low_delay", "probesize": "500000",
-               "analyzeduration": "500000"}  # fmt: skip
+               "analyzeduration": "500000", "fpsprobesize": "0"}  # fmt: skip
     if urlsplit(config.url).scheme in ("rtsp", "rtsps"):
         options["rtsp_transport"] = config.transport
         options["max_delay"] = str(MAX_WAIT_FOR_ORDER_US)
@@ -215,8 +227,6 @@ def _arrays(frame: av.VideoFrame) -> tuple[Bytes, Bytes]:
 
 
 def _reason(error: Any) -> str:
-    if isinstance(error, av.error.ExitError | TimeoutError):
-        return "nothing came in time"
     if isinstance(error, av.error.HTTPUnauthorizedError | av.error.HTTPForbiddenError):
         return "user or password is wrong"
     return str(error.strerror or type(error).__name__).lower()
