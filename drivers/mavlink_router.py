@@ -31,6 +31,7 @@ BURST_S, LEAST_BURST = 0.05, 600
 LOOP_NS = 1_000_000_000
 AUTOPILOT_NS = 5_000_000_000
 AUTOPILOT = 1
+TIMESYNC = 111
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +47,8 @@ class ClientCounts:
     """Packets of its own that the link had no room for."""
     n_bad_bytes: int
     n_refused: int
-    """Packets that came back in a circle, spoke in the autopilot's name or ours, or lacked the
-    signature."""
+    """Packets that came back in a circle, spoke in the autopilot's name or ours, told it another
+    time than ours, or lacked the signature."""
 
 
 class RouterClient:
@@ -164,8 +165,10 @@ class Router:
 
     def from_client(self, client: RouterClient, packet: Packet, monotonic_ns: int) -> None:
         """Pass on what a client sent."""
-        if self._goes_in_circles(client, packet, monotonic_ns) or not self._accepts(
-            packet, monotonic_ns
+        if (
+            self._goes_in_circles(client, packet, monotonic_ns)
+            or _answers_timesync(packet)
+            or not self._accepts(packet, monotonic_ns)
         ):
             client.n_refused += 1
             return
@@ -251,3 +254,11 @@ class Router:
     @staticmethod
     def _read_limit() -> RateLimit:
         return RateLimit(CLIENT_BYTES_PER_S, CLIENT_BURST)
+
+
+def _answers_timesync(packet: Packet) -> bool:
+    """Whether an autopilot would set its idea of our clock by this.
+
+    It asks all at once and takes any answer for ours, whose time is in the poses that it gets.
+    """
+    return packet.known and packet.message_id == TIMESYNC and any(packet.payload[:8])

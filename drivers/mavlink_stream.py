@@ -54,16 +54,20 @@ class Packet(NamedTuple):
         return self.raw[0] == V2 and bool(self.raw[2] & SIGNED)
 
     @property
+    def payload(self) -> bytes:
+        """What the header and the checksum enclose; MAVLink 2 leaves out zeros at its end."""
+        begin = 10 if self.raw[0] == V2 else 6
+        return self.raw[begin : begin + self.raw[1]]
+
+    @property
     def target(self) -> tuple[int, int] | None:
         """System and component it is meant for, 0 for any; None where the message names none."""
         places = _target_places(self.message_id) if self.known else None
         if places is None:
             return None
-        begin = 10 if self.raw[0] == V2 else 6
-        end = begin + self.raw[1]  # MAVLink 2 leaves out zeros at the end
+        payload = self.payload
         system, component = (
-            0 if place is None or begin + place >= end else self.raw[begin + place]
-            for place in places
+            0 if place is None or place >= len(payload) else payload[place] for place in places
         )
         return system, component
 

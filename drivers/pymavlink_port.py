@@ -20,6 +20,7 @@ from drivers.mavlink_wire import Wire, run_together
 
 FIRST_SYSTEM = 1
 """What ArduPilot and PX4 are numbered unless somebody changed it."""
+MANY_REFUSED = 10
 
 
 class PymavlinkPort:
@@ -47,6 +48,8 @@ class PymavlinkPort:
         self.n_unsigned = 0
         """Packets of the link refused for want of a valid signature."""
         self._n_unpacked = 0
+        self._n_refused = 0
+        """Of `n_unsigned`, those since one was good."""
         self._clock = clock
         self._stream = MavlinkStream()
         self._reader = mavlink.MAVLink(None)
@@ -68,11 +71,15 @@ class PymavlinkPort:
     @property
     def trouble(self) -> str:
         """What is wrong with the wire or the router's places, for people; "" when nothing is."""
-        return "; ".join(text for text in (self._wire.trouble, self.router.trouble) if text)
+        keyless = ""
+        if self._n_refused > MANY_REFUSED:
+            keyless = f"{self.name}: what comes is not signed with the key of link.signing_key_file"
+        troubles = self._wire.trouble, keyless, self.router.trouble
+        return "; ".join(trouble for trouble in troubles if trouble)
 
     @property
     def n_dropped(self) -> int:
-        """Messages that could not be sent: no wire, no room, or a field out of its range."""
+        """Messages not sent: no wire, no room, or a field out of its range; clients' ones too."""
         return self._wire.n_dropped + self._n_unpacked
 
     @property
@@ -127,8 +134,10 @@ class PymavlinkPort:
             for packet in packets:
                 self._follow(packet)
                 if self._is_signed(packet, monotonic_ns):
+                    self._n_refused = 0
                     self._deliver(packet, monotonic_ns)
                 else:
+                    self._n_refused += 1
                     self.n_unsigned += 1
         finally:
             self.router.from_link(packets, monotonic_ns)

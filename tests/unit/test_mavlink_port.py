@@ -261,8 +261,8 @@ def test_an_autopilot_without_the_key_is_not_listened_to(
                 await until(lambda: port.connected)
                 port.send(heartbeat())
                 if autopilots_key is None:
-                    await until(lambda: port.n_unsigned > 5)
-                    assert port.n_bad == port.n_unsigned
+                    await until(lambda: "not signed with the key" in port.trouble)
+                    assert port.n_bad == port.n_unsigned > 10
                 else:
                     autopilot_bad = lambda: autopilot.n_bad > 0  # noqa: E731
                     await until(autopilot_bad)

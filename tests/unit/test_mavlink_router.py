@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import ConfigError
 from drivers.mavlink_stream import MavlinkStream, Packet
@@ -189,6 +190,20 @@ def test_packets_do_not_go_in_circles() -> None:
     asyncio.run(play())
 
 
+def test_clients_may_ask_the_autopilot_the_time_but_not_tell_it_theirs() -> None:
+    async def play() -> None:
+        async with flown() as scene:
+            client, speaker = await scene.tcp_client(), Speaker(255, 190)
+            question = mavlink.MAVLink_timesync_message(0, 12345)
+            for v1 in (False, True):
+                client.send(speaker.pack(mavlink.MAVLink_timesync_message(7, 12345), v1=v1))
+                client.send(speaker.pack(question, v1=v1))
+            await until(lambda: counts(scene, "n_refused") == 2)
+            await until(lambda: len(scene.autopilot.hear()) == 2)
+
+    asyncio.run(play())
+
+
 def test_a_client_that_repeats_itself_is_heard() -> None:
     async def play() -> None:
         async with flown() as scene:
@@ -226,7 +241,7 @@ def test_garbage_never_reaches_the_autopilot_and_ends_the_connection() -> None:
     asyncio.run(play())
 
 
-async def steady(scene: Scene, other: Side, seconds: float = 0.6) -> list[float]:
+async def steady(scene: Scene, other: Side, seconds: float = 0.5) -> list[float]:
     """Latencies of 100 messages a second to and from the autopilot, in s, while things happen."""
     speaker, latencies = Speaker(1, 1), []
     n_before = len(scene.heard.of("ATTITUDE"))
