@@ -12,9 +12,6 @@ import signal
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from drivers.autopilot_link import AutopilotLink
-from companion.live.loop_delay import measure_loop_delay
-
 from companion.camera import Camera
 from companion.clock import FlightClock
 from companion.config import Config
@@ -25,6 +22,7 @@ from companion.live.flight_facts import facts_of
 from companion.live.flights import Flights
 from companion.live.health_watch import HealthWatch
 from companion.live.journal import ERROR, INFO, WARNING, Journal
+from companion.live.loop_delay import measure_loop_delay
 from companion.live.missing import Missing
 from companion.live.pose_sender import make_pose_sender
 from companion.live.reload import reloaded
@@ -40,11 +38,13 @@ from companion.messages import (
     Track,
     Warned,
 )
+from drivers.autopilot_link import AutopilotLink
 from drivers.calibration import live_camera
 from drivers.camera_feed import CameraFeed
 from drivers.camera_source import camera_source
 from drivers.link_port import link_port
 from drivers.metrics import Metrics
+from drivers.origin_keeper import OriginKeeper
 from drivers.service_manager import ServiceManager
 from drivers.status_socket import StatusSocket, own_socket_path
 
@@ -115,12 +115,14 @@ class Daemon:
         ]
         if self._link is not None:
             work.append(self._link.run())
-        if self._sender is not None:
+        if self._link is not None and self._sender is not None:
             work.append(self._sender.run())
+            if config.feedback.set_origin:
+                work.append(OriginKeeper(config.feedback, self._link, self._journal.say).run())
         if self._reports is not None:
             work.append(self._reports.run())
         tasks = [loop.create_task(each) for each in work]
-        stopped = loop.create_task(self._stop.wait())
+        stopped: asyncio.Task[Any] = loop.create_task(self._stop.wait())
         try:
             await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
             for task in tasks:
@@ -128,6 +130,7 @@ class Daemon:
                     raise task.exception() or AssertionError
         finally:
             self._service.stopping()
+            tasks[0].cancel()  # what is watched is being taken apart
             feed_closed = loop.run_in_executor(None, self._feed.stop)
             await self._flights.close(END_S)
             for task in (stopped, *tasks):

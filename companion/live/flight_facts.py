@@ -6,13 +6,12 @@ import shlex
 import sys
 from collections.abc import Mapping
 
-from drivers.autopilot_link import AutopilotLink
-
 from companion.config import Config
 from companion.config_file import dump
 from companion.live.flight import LiveFlight
 from companion.output.flight_result import RunFacts
 from companion.output.surroundings import peak_memory_mb, versions
+from drivers.autopilot_link import AutopilotLink
 
 
 def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> RunFacts:

@@ -10,8 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from drivers.autopilot_link import AutopilotLink
-
 from companion import __version__
 from companion.clock import FlightClock
 from companion.config import Config
@@ -29,12 +27,15 @@ from companion.live.flights import Flights
 from companion.live.journal import Journal
 from companion.live.pose_sender import PoseSender
 from companion.messages import MapUpdate, Odometry, PointChunk, Track, TrackState, Warned
+from drivers.autopilot_link import AutopilotLink
 from drivers.camera_feed import CameraFeed
 from drivers.system_load import SystemLoad
 
 GOVERN_NS = 1_000_000_000
 STUCK_NS = 3_000_000_000
 """Frames come but no track does: the pose loop hangs."""
+SETTLE_NS = 3_000_000_000
+"""Beginning a map takes long, and tells nothing of what comes after."""
 STUCK = "localisation hangs and is ended"
 IN_WORDS = {
     TrackState.INITIALISING: "initialising",
@@ -66,6 +67,7 @@ class HealthWatch:
         self._load_reader = SystemLoad(Path(config.daemon.flights))
         self.load = ComputerLoad()
         self._governed_ns = 0
+        self._settled_ns = 0
         self._n_dropped = 0
         self._last_frame_ns = 0
         self._odometry: Odometry | None = None
@@ -98,6 +100,8 @@ class HealthWatch:
     def take_odometry(self, odometry: Odometry) -> None:
         """The odometry of a frame."""
         now_ns = self._clock.now_ns()
+        if odometry.state is not TrackState.TRACKING:
+            self._settled_ns = now_ns + SETTLE_NS
         self._odometry, self._odometry_ns = odometry, now_ns
         self._pose.done(now_ns, odometry.t_ns)
         self._recent.add(now_ns, (now_ns - odometry.t_ns) * 1e-6)
@@ -144,7 +148,7 @@ class HealthWatch:
 
     def _step_governor(self) -> None:
         flight, now_ns = self._flights.current, self._clock.now_ns()
-        if flight is None or not flight.ready:
+        if flight is None or not flight.ready or now_ns < self._settled_ns:
             return
         if not self._governed_ns:  # the levels of the flight before hold for this one
             self._governed_ns = now_ns

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import asyncio
 
-from drivers.autopilot_link import AutopilotLink
-
 from companion.clock import FlightClock
 from companion.config import FeedbackConfig
 from companion.feedback import PoseGate, PoseToSend
 from companion.health import FeedbackHealth, LatencyMeter, RateMeter
 from companion.messages import AttitudeSample, Odometry
+from drivers.autopilot_link import AutopilotLink
 from drivers.pose_messages import odometry_message, vision_messages
 
 TICK_S = 0.005

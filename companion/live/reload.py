@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from companion.config import Config
 from companion.config_file import dump
@@ -24,7 +25,7 @@ def reloaded(running: Config, read: Config) -> tuple[Config, list[str]]:
         if value != old[section][key]
         and (section in FIXED_SECTIONS or f"{section}.{key}" in FIXED_KEYS)
     ]
-    kept = {}
+    kept: dict[str, Any] = {}
     for name in cannot:
         section, key = name.split(".")
         part = kept.get(section, getattr(read, section))

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
-from drivers.autopilot_link import AutopilotLink
-
 from companion.camera import Camera
 from companion.clock import FlightClock
 from companion.geometry import Pose
 from companion.live.health_watch import HealthWatch
 from companion.messages import MapUpdate, PointChunk, Track, TrackState
 from companion.obstacles import RecentCloud, obstacles_around
+from drivers.autopilot_link import AutopilotLink
 from drivers.computer_status import computer_status
 from drivers.obstacle_distance import obstacle_distance
 
