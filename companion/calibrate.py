@@ -44,7 +44,9 @@ LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
 """A lens is fitted to the views of a live camera from so many on, and again after so many more."""
 READ_S = 0.25
 """A live camera is waited for so long before Ctrl-C is looked for."""
-N_UNFOUND_KEPT = 24
+MIN_FOUND = 0.05
+"""Of the pictures must show the board, else it is asked whether they show another."""
+N_UNFOUND_KEPT = 12
 """Pictures without the board that are kept, to tell what else is on them."""
 
 
@@ -79,6 +81,7 @@ class CalibrationReport:
             f"  {len(made.views)} views{left_out}; the board was found in {self.n_found} of "
             f"{self.n_pictures} pictures, {self.n_blurred} of them blurred; "
             f"{made.coverage.share:.0%} of the picture covered\n"
+            f"  the board is flat to {made.sag_m * 1000:.1f} mm\n"
             f"calibration: {self.toml}\n"
             f"picture: {self.picture}"
         )
@@ -253,10 +256,11 @@ def _judged(gathered: _Gathered, called: str, model: str) -> Calibration:
     """The calibration, when it may be used."""
     refused = f"{called}: not calibrated: "
     n, found = gathered.n_searched, gathered.n_found
-    if not found:
+    if found < MIN_FOUND * n:  # perhaps by chance, on a board that is another one
         instead = gathered.chart.explain(gathered.unfound)
         raise InputError(
-            f"{refused}--board {gathered.chart.name} is in none of {n} pictures"
+            f"{refused}--board {gathered.chart.name} was found in {found or 'none'} of {n} "
+            "pictures"
             + (f"; {instead}" if instead else ": is it in view, lit, and the board that was given?")
         )
     views = choose(gathered.views, MAX_VIEWS)

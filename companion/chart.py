@@ -30,7 +30,7 @@ MIN_CORNERS = 8
 """Fewer say too little of where the board is."""
 SEARCH_WIDTH_PX = 1600
 """Larger pictures are searched for a chessboard at this width, then refined at their own."""
-MAX_TRIED = 8
+MAX_TRIED = 4
 """In so many pictures other boards are looked for, when the one asked for was not found."""
 
 
@@ -135,7 +135,7 @@ class CharucoChart:
         tried = _spread(greys, MAX_TRIED)
         seen = _markers_seen(tried, self._dictionary)
         if not seen:
-            return _other_dictionary(tried, self._dictionary) or _chessboard_seen(tried)
+            return _other_dictionary(tried, self._dictionary) or _chessboard_seen(tried, self)
         for other in self._variants():
             if any(other.find(grey) is not None for grey in tried):
                 return f"what is to be seen is --board {other.name}"
@@ -147,7 +147,7 @@ class CharucoChart:
             )
         return (
             f"markers of {self._dictionary} are to be seen, but too few of them ({len(seen)} of "
-            f"{n_markers}), or not where this board has them"
+            f"{n_markers}), blurred, or not where this board has them"
         )
 
     def black_m(self) -> Array:
@@ -216,7 +216,7 @@ class ChessboardChart:
     def explain(self, greys: Sequence[Bytes]) -> str | None:
         """What is to be seen instead of the board, as far as it can be told."""
         tried = _spread(greys, MAX_TRIED)
-        return _other_dictionary(tried, None) or _chessboard_seen(tried)
+        return _other_dictionary(tried, None) or _chessboard_seen(tried, None)
 
     def black_m(self) -> Array:
         """What is black on it."""
@@ -351,19 +351,31 @@ def _markers_seen(greys: Sequence[Bytes], dictionary: str) -> set[int]:
 
 
 def _other_dictionary(greys: Sequence[Bytes], known: str | None) -> str | None:
-    counts = {
-        name: len(_markers_seen(greys, name)) for name in _dictionaries() if name != known
-    }
-    best = max(counts, key=lambda name: counts[name])  # of equals the first, which is the smallest
-    if counts[best] < 4:
-        return None
-    return f"markers of {best} are to be seen ({counts[best]} of them)"
+    """A dictionary of which some picture shows enough not to be chance."""
+    families: dict[str, list[str]] = {}
+    for name in _dictionaries():
+        stem, _, count = name.rpartition("_")
+        # those of one stem are the beginnings of their largest
+        families.setdefault(stem if count.isdigit() else name, []).append(name)
+    for grey in greys:
+        seen = {family[-1]: _markers_seen([grey], family[-1]) for family in families.values()}
+        best = max(seen, key=lambda name: len(seen[name]))
+        if len(seen[best]) < 4:
+            continue
+        family = next(family for family in families.values() if family[-1] == best)
+        name = next(n for n in family if len(_dictionary(n).bytesList) > max(seen[best]))
+        if name != known:
+            return f"markers of {name} are to be seen, {len(seen[best])} of them in one picture"
+    return None
 
 
-def _chessboard_seen(greys: Sequence[Bytes]) -> str | None:
+def _chessboard_seen(greys: Sequence[Bytes], own: CharucoChart | None) -> str | None:
     for grey in greys:
         found, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
-        if found and meta is not None:
-            rows, columns = sorted(np.asarray(meta).shape[:2])
+        if not found or meta is None:
+            continue
+        rows, columns = sorted(np.asarray(meta).shape[:2])
+        if own is None or rows > min(own.rows, own.columns) or columns > max(own.rows, own.columns):
             return f"a chessboard of {columns}x{rows} inner corners is to be seen"
+        return "squares are to be seen, but no markers: bring the board nearer, and focus the lens"
     return None

@@ -54,7 +54,7 @@ class Calibration:
     holdout_px: float
     """Root mean square error in views that the lens was not fitted to."""
     sigmas: Array
-    """Standard deviations of fx fy cx cy k…"""
+    """Standard deviations of the lens's parameters, fx fy cx cy k…"""
     tried_px: dict[str, float]
     """Held-out error of each model that was tried."""
     coverage: Coverage
@@ -68,6 +68,19 @@ class Calibration:
     def rms_px(self) -> float:
         """Root mean square error in the views that it was fitted to."""
         return self.lens.rms_px
+
+    @property
+    def sag_m(self) -> float:
+        """How far the board is from flat."""
+        return self.lens.sag_m(self._corners_m())
+
+    @property
+    def sag(self) -> float:
+        """The same as a share of the board's longer side."""
+        return self.sag_m / float(np.ptp(self._corners_m()[:, :2], axis=0).max())
+
+    def _corners_m(self) -> Array:
+        return np.concatenate([view.sighting.board_m for view in self.views])
 
     @property
     def views_px(self) -> list[float]:

@@ -1,8 +1,12 @@
 """A lens and the board's poses that explain where corners were seen: least squares, robust at will.
 
-Both lens models go through the same solver (Levenberg-Marquardt over the lens, the poses eliminated
-view by view), so that their errors and standard deviations can be compared. OpenCV's own fisheye
-solver gives no deviations and stops on views near the edge.
+The board need not be flat: how it is bowed is solved for with the lens. A sag of half a
+hundredth of its width, as of paper on cardboard, would else move the focal length by one hundredth
+without showing in the residuals.
+
+Both lens models go through the same solver (Levenberg-Marquardt, the poses eliminated view by
+view), so that their errors and standard deviations can be compared. OpenCV's own fisheye solver
+gives no deviations and stops on views near the edge.
 """
 
 from __future__ import annotations
@@ -14,11 +18,14 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.calibration.views import View
 from companion.camera import Camera, Distortion
 from companion.geometry import Array
 
+N_BOW = 3
+"""Of the board's depth a x^2 + b x y + c y^2."""
 N_COEFFICIENTS = {Distortion.RADTAN: 5, Distortion.EQUIDISTANT: 4}
 FIRST_FOV_DEG = {
     Distortion.RADTAN: (35, 60, 85, 110),
@@ -27,7 +34,7 @@ FIRST_FOV_DEG = {
 """Horizontal fields of view that a fit is begun with; the one that comes furthest is kept."""
 FIRST_VIEWS = 12
 """Views with which that is found out."""
-MAX_STEPS = 60
+MAX_STEPS = 30
 CONVERGED = 1e-8
 """Relative fall of the cost under which a fit is at its end."""
 MIRRORED = 25.0
@@ -40,11 +47,19 @@ class LensModel:
 
     distortion: Distortion
     n_free: int
+    bowed: bool = True
+    """Whether the board may be."""
 
     @property
-    def free(self) -> slice:
-        """Which of fx fy cx cy k… are solved for."""
-        return slice(0, 4 + self.n_free)
+    def n_lens(self) -> int:
+        """How many parameters fx fy cx cy k… there are; those of the board follow."""
+        return 4 + N_COEFFICIENTS[self.distortion]
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Which of the parameters are solved for."""
+        bow = self.n_lens + np.arange(N_BOW if self.bowed else 0)
+        return np.concatenate([np.arange(4 + self.n_free), bow])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +70,7 @@ class LensFit:
     width: int
     height: int
     parameters: Array
-    """fx fy cx cy k…"""
+    """fx fy cx cy k…, then a b c of the board's depth a x^2 + b x y + c y^2, in metres"""
     poses: tuple[Array, ...]
     """camera_from_board of each view: rotation vector and translation, (6,)."""
     residuals_px: tuple[Array, ...]
@@ -67,10 +82,14 @@ class LensFit:
     @property
     def camera(self) -> Camera:
         """The lens as the rest of the program has it."""
-        fx, fy, cx, cy, *coefficients = (float(value) for value in self.parameters)
-        return Camera(
-            self.width, self.height, fx, fy, cx, cy, self.model.distortion, tuple(coefficients)
-        )
+        return _camera(self.model, self.parameters, self.width, self.height)
+
+    def sag_m(self, board_m: Array) -> float:
+        """How far the board's sides stand before or behind its middle, given its corners (N, 3)."""
+        half = np.ptp(board_m[:, :2], axis=0) / 2
+        a, b, c = self.parameters[-N_BOW:]
+        depths = [a * x * x + b * x * y + c * y * y for x in (0, half[0]) for y in (0, half[1])]
+        return float(max(np.abs(depths)))
 
     @property
     def rms_px(self) -> float:
@@ -96,12 +115,12 @@ def first_lens(views: Sequence[View], model: LensModel, huber_px: float) -> Lens
     """
     width, height = views[0].width, views[0].height
     at = np.unique(np.linspace(0, len(views) - 1, min(FIRST_VIEWS, len(views))).round().astype(int))
-    rough = LensModel(model.distortion, min(2, model.n_free))
+    rough = LensModel(model.distortion, min(2, model.n_free), bowed=False)
     best: LensFit | None = None
     for fov_deg in FIRST_FOV_DEG[model.distortion]:
         half = math.radians(fov_deg) / 2
         focal = width / 2 / (math.tan(half) if model.distortion is Distortion.RADTAN else half)
-        guess = np.zeros(4 + N_COEFFICIENTS[model.distortion])
+        guess = np.zeros(model.n_lens + N_BOW)
         guess[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
         some = [views[i] for i in at if _first_pose(views[i], rough, guess) is not None]
         if len(some) < max(3, len(at) // 2):
@@ -122,7 +141,9 @@ def fit_lens(
     if start.model.distortion is not model.distortion:
         raise ValueError("a lens of another kind is no beginning")
     parameters = start.parameters.copy()
-    parameters[4 + model.n_free :] = 0
+    kept = np.ones(len(parameters), np.bool_)
+    kept[model.free] = False
+    parameters[kept] = 0
     known = dict(zip(start.numbers, start.poses, strict=True))
     return _solved(views, model, parameters, huber_px, MAX_STEPS, known)
 
@@ -136,8 +157,9 @@ def residuals_of(lens: LensFit, view: View) -> Array:
 
 
 def standard_deviations(lens: LensFit, views: Sequence[View]) -> Array:
-    """Of fx fy cx cy k…, from the residuals and what the lens does to the corners; 0 where kept."""
-    free, n_free = lens.model.free, lens.model.free.stop
+    """Of the lens's parameters, from the residuals and what each does to the corners; 0 if kept."""
+    free = lens.model.free
+    n_free = len(free)
     schur = np.zeros((n_free, n_free))
     for view, pose in zip(views, lens.poses, strict=True):
         _, by_lens, by_pose = _projected(view, lens.model, lens.parameters, pose)
@@ -211,8 +233,9 @@ Block = tuple[Array, Array, Array, Array, Array]
 
 
 def _block(
-    view: View, model: LensModel, parameters: Array, pose: Array, free: slice, huber_px: float
-) -> Block:
+    view: View, model: LensModel, parameters: Array, pose: Array, free: NDArray[np.int64],
+    huber_px: float,
+) -> Block:  # fmt: skip
     """Normal equations of one view: lens, lens by pose, pose, and both right-hand sides."""
     pixels, by_lens, by_pose = _projected(view, model, parameters, pose)
     residual = view.sighting.image_px - pixels
@@ -268,24 +291,26 @@ def _all_residuals(
 
 
 def _residuals(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
-    pixels, _, _ = _projected(view, model, parameters, pose)
+    pixels, _, _ = _imaged(view, model, parameters, pose)
     out: Array = view.sighting.image_px - pixels
     return out
 
 
-def _projected(
+def _imaged(
     view: View, model: LensModel, parameters: Array, pose: Array
 ) -> tuple[Array, Array, Array]:
-    """Corners (N, 2) of a view, and their derivatives (2 N, …) by the lens and by the pose."""
+    """Corners (N, 2) of a view; derivatives (2 N, …) by the lens alone and by the pose."""
     fx, fy, cx, cy = parameters[:4]
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    board_m = np.ascontiguousarray(view.sighting.board_m)
+    board_m = view.sighting.board_m.copy()
+    board_m[:, 2] = _bows(board_m) @ parameters[-N_BOW:]
+    lens = parameters[4 : model.n_lens]
     if model.distortion is Distortion.RADTAN:
-        pixels, by = cv2.projectPoints(board_m, pose[:3], pose[3:], matrix, parameters[4:])
+        pixels, by = cv2.projectPoints(board_m, pose[:3], pose[3:], matrix, lens)
         by_pose, by_lens = by[:, :6], by[:, 6:15]
     else:
         pixels, by = cv2.fisheye.projectPoints(
-            board_m[:, None], pose[:3], pose[3:], matrix, parameters[4:]
+            board_m[:, None], pose[:3], pose[3:], matrix, lens
         )
         by_lens, by_pose = by[:, :8], by[:, 8:14]
     return (
@@ -294,12 +319,32 @@ def _projected(
     )  # fmt: skip
 
 
+def _projected(
+    view: View, model: LensModel, parameters: Array, pose: Array
+) -> tuple[Array, Array, Array]:
+    """Corners (N, 2) of a view; derivatives (2 N, …) by all parameters and by the pose."""
+    pixels, by_lens, by_pose = _imaged(view, model, parameters, pose)
+    # a corner that moves along the board's normal is one that the board's shift moves along it
+    by_depth = by_pose[:, 3:] @ cv2.Rodrigues(pose[:3])[0][:, 2]
+    by_bow = by_depth[:, None] * np.repeat(_bows(view.sighting.board_m), 2, axis=0)
+    return pixels, np.concatenate([by_lens, by_bow], 1), by_pose
+
+
+def _bows(board_m: Array) -> Array:
+    x, y = board_m[:, 0], board_m[:, 1]
+    out = np.empty((len(board_m), N_BOW))
+    out[:, 0], out[:, 1], out[:, 2] = x * x, x * y, y * y
+    return out
+
+
+def _camera(model: LensModel, parameters: Array, width: int, height: int) -> Camera:
+    fx, fy, cx, cy, *coefficients = (float(value) for value in parameters[: model.n_lens])
+    return Camera(width, height, fx, fy, cx, cy, model.distortion, tuple(coefficients))
+
+
 def _first_pose(view: View, model: LensModel, parameters: Array) -> Array | None:
     """The board's pose under a known lens; of the two that a flat board allows, the better one."""
-    fx, fy, cx, cy, *coefficients = (float(value) for value in parameters)
-    camera = Camera(
-        view.width, view.height, fx, fy, cx, cy, model.distortion, tuple(coefficients)
-    )
+    camera = _camera(model, parameters, view.width, view.height)
     normalised = camera.normalise(view.sighting.image_px)
     usable = np.isfinite(normalised).all(1)
     if usable.sum() < 6:
@@ -350,7 +395,7 @@ def _pose_cost(view: View, model: LensModel, parameters: Array, pose: Array) -> 
 def _refined_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
     damping = 1e-3
     for _ in range(20):
-        pixels, _, by = _projected(view, model, parameters, pose)
+        pixels, _, by = _imaged(view, model, parameters, pose)
         residual = (view.sighting.image_px - pixels).reshape(-1)
         cost = float(residual @ residual)
         normal = by.T @ by

@@ -13,6 +13,8 @@ from companion.geometry import Array
 MIN_VIEWS = 12
 MAX_REJECTED = 0.25
 """Of the views chosen."""
+MAX_SAG = 0.01
+"""Of the board's longer side; less than this the fit allows for."""
 MIN_TILT = 0.3
 """Sine of the angle between the board and the picture: about 17 degrees."""
 MIN_TILTED = 4
@@ -48,8 +50,13 @@ def faults(calibration: Calibration) -> list[str]:
             f"views left out of the fit are {calibration.holdout_px:.2f} px off (at most "
             f"{MAX_HOLDOUT * limit_px:.2f}): take more views, all over the picture"
         )
-    out += few(n) + bare(calibration.coverage) + frontal(calibration.lens.tilts())
-    out += _uncertain(calibration)
+    if calibration.sag > MAX_SAG:
+        out.append(
+            f"the board is bowed by {calibration.sag_m * 1000:.1f} mm (at most "
+            f"{MAX_SAG * calibration.sag_m / calibration.sag * 1000:.1f}): mount it flat"
+        )
+    out += few(n) + bare(calibration.coverage)
+    out += frontal(calibration.lens.tilts()) or _uncertain(calibration)
     if folds(camera):
         out.append(
             "the lens model folds over within the picture: cover its corners with the board, or "
@@ -67,9 +74,10 @@ def few(n_views: int) -> list[str]:
     """Too few views."""
     if n_views >= MIN_VIEWS:
         return []
+    number = f"{n_views} views" if n_views != 1 else "1 view"
     return [
-        f"{n_views} views of the board that differ from each other (at least {MIN_VIEWS}): "
-        "show it in more places, near and far, tilted"
+        f"only {number} of the board unlike the others (at least {MIN_VIEWS}): show it "
+        "in more places, near and far, tilted"
     ]
 
 
@@ -93,8 +101,9 @@ def frontal(tilts: Array) -> list[str]:
     """Too few views tilted, or all about one axis; `tilts` as `LensFit.tilts` has them."""
     n_tilted = int((np.linalg.norm(tilts, axis=1) >= MIN_TILT).sum())
     if n_tilted < MIN_TILTED:
+        squarely = f"all but {n_tilted}" if n_tilted else "all"
         return [
-            f"the board faced the camera squarely in all but {n_tilted} views (at least "
+            f"the board faced the camera squarely in {squarely} views (at least "
             f"{MIN_TILTED} tilted), so that the focal length is not determined: tilt it by 20 to "
             "45 degrees"
         ]
@@ -133,8 +142,9 @@ def _uncertain(calibration: Calibration) -> list[str]:
     out = []
     focal = max(calibration.sigmas[0] / camera.fx, calibration.sigmas[1] / camera.fy)
     if focal > MAX_SIGMA_FOCAL:
+        by = f"{focal:.1%}" if focal < 0.3 else "a third or more"
         out.append(
-            f"the focal length is uncertain by {focal:.1%} (at most {MAX_SIGMA_FOCAL:.1%}): tilt "
+            f"the focal length is uncertain by {by} (at most {MAX_SIGMA_FOCAL:.1%}): tilt "
             "the board more, and bring it nearer"
         )
     centre = float(max(calibration.sigmas[2:4])) / camera.width

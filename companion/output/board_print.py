@@ -42,7 +42,9 @@ def board_page(chart: Chart, form: str) -> tuple[bytes, str]:
         # one outline, so that no hair lines show between rectangles that touch
         codes = [Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY] * len(corners)
         outline = Outline(corners.reshape(-1, 2), codes)
-        axes.add_patch(PathPatch(outline, facecolor="black", edgecolor="none", linewidth=0))
+        black = PathPatch(outline, facecolor="black", edgecolor="none", linewidth=0)
+        black.set_snap(False)  # whole dots would make squares of different sizes
+        axes.add_patch(black)
         points = min(8.0, 0.55 * below_mm / INCH_MM * 72)
         axes.text(
             across_mm / 2, down_mm + below_mm * 0.6,

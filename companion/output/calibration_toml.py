@@ -38,6 +38,7 @@ def calibration_toml(calibration: Calibration, name: str, board: str, source: st
         "n_corners_rejected": calibration.n_corners_rejected,
         "coverage": round(calibration.coverage.share, 3),
         **{f"sigma_{key}": round(float(sigma), 4) for key, sigma in sigmas},
+        "board_sag_mm": round(calibration.sag_m * 1000, 2),
         "board": board,
         "source": source,
     }
@@ -45,7 +46,8 @@ def calibration_toml(calibration: Calibration, name: str, board: str, source: st
         "# Lens of a camera, written by `companion calibrate`; pixel centres are at integers.\n"
         f"{_lines(lens)}\n"
         "# Errors and standard deviations in pixels; holdout_px is in views left out of the fit,\n"
-        "# coverage the share of the picture in which the board was.\n"
+        "# coverage the share of the picture in which the board was, board_sag_mm how far from flat\n"
+        "# it is, which was allowed for.\n"
         f"[quality]\n{_lines(quality)}"
     )
     return text.encode("utf-8")

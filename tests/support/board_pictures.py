@@ -32,6 +32,8 @@ class Placing:
     tilt_right_deg: float = 0.0
     tilt_down_deg: float = 0.0
     turn_deg: float = 0.0
+    parallel: bool = False
+    """To the picture, whatever the tilts; else these are from where it faces the camera."""
 
 
 def placings(n: int, *, tilt_deg: float = 35.0, width: float = 0.5, seed: int = 1) -> list[Placing]:
@@ -70,7 +72,8 @@ class BoardPictures:
     ) -> Bytes:  # fmt: skip
         """The board there; None for the scene without it.
 
-        `blur_px` is motion to the right; `bend` bows the board by so many of its widths.
+        `blur_px` is motion to the right; `bend` bows the board: its sides are behind its middle by
+        so many of its widths.
         """
         picture = self._background
         if placing is not None:
@@ -81,7 +84,7 @@ class BoardPictures:
         if blur_px > 1:
             n = round(blur_px)
             small = cv2.filter2D(small, -1, np.full((1, n), 1 / n, np.float32))
-        noisy = small + self._rng.normal(0, noise, small.shape)
+        noisy = small + noise * self._rng.standard_normal(small.shape, np.float32)
         return np.asarray(np.clip(noisy, 0, 255), np.uint8)
 
     def pictures(self, places: Sequence[Placing]) -> list[Bytes]:
@@ -89,31 +92,45 @@ class BoardPictures:
         return [self.picture(placing) for placing in places]
 
     def _with_board(self, placing: Placing, bend: float) -> Array:
-        rotation, shift = self._pose(placing)
-        # texture from ray: the plane's homography, undone
-        plane = np.stack([rotation[:, 0], rotation[:, 1], shift], 1)
-        back = np.linalg.inv(plane)
-        x, y = self._rays[..., 0], self._rays[..., 1]
-        w = back[2, 0] * x + back[2, 1] * y + back[2, 2]
-        at = np.where(w > 1e-6, w, np.nan)
-        across = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / at
-        down = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / at
-        if bend:  # as a sheet that was rolled: what lies beside its middle is out of place
-            away = across / self._size_m[0] - 0.5
-            across = across + bend * 4 * self._size_m[0] * away * np.abs(away)
-            down = down + bend * 2 * self._size_m[0] * away**2
+        rotation, shift = self.pose(placing)
+        part = self._part_with(rotation, shift)
+        # the ray in the board's frame, where it begins at -shift and the sheet is z = depth
+        x, y = self._rays[part][..., 0], self._rays[part][..., 1]
+        begin = -rotation.T @ shift
+        ray = [rotation[0, i] * x + rotation[1, i] * y + rotation[2, i] for i in range(3)]
+        ray[2] = np.where(ray[2] > 1e-2, ray[2], np.nan)
+        depth: Array | float = 0.0
+        across = down = x
+        for _ in range(5 if bend else 1):
+            along = (depth - begin[2]) / ray[2]
+            across, down = begin[0] + along * ray[0], begin[1] + along * ray[1]
+            away = np.clip(across / self._size_m[0] - 0.5, -1, 1)
+            depth = bend * 4 * self._size_m[0] * away**2
         scale = PX_PER_SQUARE / self._square_m
-        u, v = across * scale - 0.5, down * scale - 0.5
+        u, v = (np.clip(at * scale - 0.5, -99, 1e4) for at in (across, down))
         board = cv2.remap(
             self._texture, np.nan_to_num(u, nan=-9).astype(np.float32),
             np.nan_to_num(v, nan=-9).astype(np.float32), cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0,
         )  # fmt: skip
         height, width = self._texture.shape
         inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
-        return np.where(inside, board, self._background)
+        picture = self._background.copy()
+        picture[part][inside] = board[inside]
+        return picture
 
-    def _pose(self, placing: Placing) -> tuple[Array, Array]:
+    def _part_with(self, rotation: Array, shift: Array) -> tuple[slice, slice]:
+        """The samples among which the board is, generously."""
+        along = np.linspace(-0.1, 1.1, 25)
+        edge = np.array([[a, b, 0] for a in along for b in along]) * [*self._size_m, 0]
+        pixels = self.camera.project(edge @ rotation.T + shift)
+        if not np.isfinite(pixels).all():
+            return slice(None), slice(None)
+        low = np.maximum(2 * pixels.min(0) - 20, 0).astype(int)
+        high = np.maximum(2 * pixels.max(0) + 20, 1).astype(int)
+        return slice(low[1], high[1]), slice(low[0], high[0])
+
+    def pose(self, placing: Placing) -> tuple[Array, Array]:
+        """Rotation and shift, camera from board; the board begins with its white margin."""
         camera = self.camera
         middle = np.array([placing.u * camera.width, placing.v * camera.height])
         half = 0.5 * placing.width * min(camera.width, 1.4 * camera.height)
@@ -128,6 +145,8 @@ class BoardPictures:
         right /= np.linalg.norm(right)
         facing = np.stack([right, np.cross(forward, right), forward], 1)
         tilts = np.radians([-placing.tilt_down_deg, placing.tilt_right_deg, placing.turn_deg])
+        if placing.parallel:
+            facing, tilts[:2] = np.eye(3), 0.0
         rotation: Array = facing @ rotation_from_vector(tilts)
         shift: Array = forward * distance - rotation @ np.append(self._size_m / 2, 0)
         return rotation, shift
