@@ -264,13 +264,13 @@ PX4_RULES = (
 )  # fmt: skip
 
 RULES = {ARDUPILOT: ARDUPILOT_RULES, PX4: PX4_RULES}
-ALSO_READ = {
-    ARDUPILOT: (
-        "INS_POS1_X", "INS_POS1_Y", "INS_POS1_Z",
-        *(f"SERIAL{n}_BAUD" for n in range(1, 9)), *(f"SERIAL{n}_PROTOCOL" for n in range(1, 9)),
-    ),
+COMPARED = {
+    ARDUPILOT: ("INS_POS1_X", "INS_POS1_Y", "INS_POS1_Z"),
+    PX4: ("EKF2_IMU_POS_X", "EKF2_IMU_POS_Y", "EKF2_IMU_POS_Z"),
+}
+OF_LINES = {
+    ARDUPILOT: tuple(f"SERIAL{n}_{what}" for n in range(1, 9) for what in ("BAUD", "PROTOCOL")),
     PX4: (
-        "EKF2_IMU_POS_X", "EKF2_IMU_POS_Y", "EKF2_IMU_POS_Z",
         *(f"MAV_{n}_{what}" for n in range(3) for what in ("CONFIG", "RATE")),
         "SER_TEL1_BAUD", "SER_TEL2_BAUD", "SER_TEL3_BAUD", "SER_TEL4_BAUD",
     ),
@@ -281,9 +281,10 @@ EITHER_OF = (("EKF2_EV_CTRL", "EKF2_AID_MASK"),)
 """One of each pair there must be: older firmware has the second."""
 
 
-def names_to_read(firmware: str) -> list[str]:
-    """All parameters that advice for a firmware looks at."""
-    return [rule.name for rule in RULES[firmware]] + list(ALSO_READ[firmware])
+def names_to_read(firmware: str, line: bool = False) -> list[str]:
+    """The parameters that advice for a firmware looks at; those of its serial ports as well."""
+    names = [rule.name for rule in RULES[firmware]] + list(COMPARED[firmware])
+    return names + list(OF_LINES[firmware]) if line else names
 
 
 def advise(

@@ -156,7 +156,7 @@ def test_rate_that_px4_keeps_to() -> None:
 
 def test_names_fit_a_parameter() -> None:
     for firmware in FIRMWARES:
-        names = names_to_read(firmware)
+        names = names_to_read(firmware, line=True)
         assert len(set(names)) == len(names)
         assert all(re.fullmatch(r"[A-Z][A-Z0-9_]{2,15}", name) for name in names)
         assert all(rule.why and rule.why[-1] not in ". " for rule in RULES[firmware])
