@@ -65,7 +65,7 @@ def test_a_flight_comes_in_the_time_it_was_taken(tmp_path: Path) -> None:
     pictures = []
     for _ in after_ms:
         pictures += taken(camera, 1)
-        assert 0 <= time.monotonic_ns() - pictures[-1].monotonic_ns < 25 * MS
+        assert 0 <= time.monotonic_ns() - pictures[-1].monotonic_ns < 100 * MS
     assert [int(p.grey[0, 0]) for p in pictures] == [0, 1, 2, 3, 4]
     begun_ns = pictures[0].monotonic_ns
     assert [(p.monotonic_ns - begun_ns) // MS for p in pictures] == after_ms
@@ -203,8 +203,10 @@ def test_gstreamer_gives_stamped_pictures(needs_gstreamer: None, form: str, widt
     now_ns = time.monotonic_ns()
     camera.close()
     assert {p.grey.shape for p in pictures} == {(48, width)}
-    assert np.diff([p.monotonic_ns for p in pictures]) == pytest.approx(20 * MS, abs=10 * MS)
-    assert 0 <= now_ns - pictures[-1].monotonic_ns < 100 * MS
+    steps = np.diff([p.monotonic_ns for p in pictures])
+    assert np.all(np.abs(steps - np.round(steps / (20 * MS)) * 20 * MS) < MS)
+    assert np.all(steps > 10 * MS)
+    assert 0 <= now_ns - pictures[-1].monotonic_ns < 400 * MS
     assert pictures[-1].grey.max() > 200  # the ball
     assert not np.array_equal(pictures[0].grey, pictures[-1].grey)
     if form != "GRAY8":
