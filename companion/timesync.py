@@ -21,10 +21,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.clocksync import REBOOT_NS
 from companion.geometry import Array
 from companion.messages import ClockReport
 
+REBOOT_NS = 1_000_000_000
+"""A step back of autopilot time by more than this is a reboot; less is a message overtaken."""
 STEP_NS = 250_000_000
 """An error that large is put right at once, a smaller one smoothly."""
 SLEW_S, MAX_SLEW = 0.2, 0.5

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.messages import GeoOrigin, PositionSample, PositionSource, Telemetry, Warned
@@ -27,6 +28,8 @@ NAME_AGAIN_NS = 10_000_000_000
 CHOOSE_NS = 1_000_000_000
 """Which of several messages is the more frequent is looked at so often."""
 ABOUT = 1.25
+"""Messages that come at rates within this ratio are about as frequent."""
+MOST_AWAY_M = 1e6
 
 OUT_OF_ORDER, WILD, LATE = "telemetry out of order", "telemetry stamped wildly", "telemetry late"
 AHEAD, UNUSABLE = "telemetry from the future", "telemetry that is not usable"
@@ -60,12 +63,13 @@ class LiveSamples:
         """Take any message of the autopilot."""
         kind = message.get_msgId()
         if kind == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
-            self._take_origin(message)
+            self._take_origin(message, receive_ns)
             return
         if kind not in SAMPLE_OF and kind != mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
             return
         try:
-            self._take(kind, message, receive_ns)
+            with np.errstate(all="ignore"):  # what comes of infinities is looked at afterwards
+                self._take(kind, message, receive_ns)
         except (ArithmeticError, ValueError) as error:  # numbers that make no sense together
             self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: {error}")
 
@@ -91,18 +95,18 @@ class LiveSamples:
         if self._wild:
             self._name(WILD, receive_ns, self._wild)
             self._wild = ""
-        if not all(choice.takes(kind, receive_ns) for choice in self._choices):
-            return
         sample = SAMPLE_OF[kind](message) if kind in SAMPLE_OF else None
-        if sample is not None:
+        if sample is None:
+            return
+        if not is_finite(sample) or not _on_earth(sample):
+            self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
+            return
+        if all(choice.takes(kind, receive_ns) for choice in self._choices):
             self._pass_on(sample, remote_ns, receive_ns, message.get_type())
 
     def _pass_on(
         self, content: Telemetry | GeodeticFix, remote_ns: int, receive_ns: int, name: str
     ) -> None:
-        if not is_finite(content):
-            self._drop(UNUSABLE, receive_ns, f"{name}: values that are no numbers")
-            return
         t_ns = self._clock.host_ns(remote_ns)
         if t_ns is None:
             self.n_dropped["telemetry before the clock was known"] += 1
@@ -131,13 +135,12 @@ class LiveSamples:
             return self.places.local(content, remote_ns)
         return content
 
-    def _take_origin(self, message: Any) -> None:
-        if message.latitude or message.longitude:
-            self.places.told(
-                GeoOrigin(
-                    message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3
-                )
-            )
+    def _take_origin(self, message: Any, receive_ns: int) -> None:
+        latitude_deg, longitude_deg = message.latitude * 1e-7, message.longitude * 1e-7
+        if not _is_place(latitude_deg, longitude_deg):
+            self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
+        elif message.latitude or message.longitude:  # both 0 is what is not set
+            self.places.told(GeoOrigin(latitude_deg, longitude_deg, message.altitude * 1e-3))
 
     def _begin(self) -> None:
         """Another clock runs: the autopilot has begun anew."""
@@ -190,6 +193,18 @@ class _Choice:
             most = max(self._before.values())
             # of those about as frequent always the same
             self._chosen = next(kind for kind in present if ABOUT * self._before[kind] >= most)
+
+
+def _on_earth(content: Telemetry | GeodeticFix) -> bool:
+    if isinstance(content, GeodeticFix):
+        return _is_place(content.latitude_deg, content.longitude_deg)
+    if isinstance(content, PositionSample):
+        return bool(np.abs(content.position_ned_m).max() < MOST_AWAY_M)
+    return True
+
+
+def _is_place(latitude_deg: float, longitude_deg: float) -> bool:
+    return abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180
 
 
 def _quantity(content: Telemetry | GeodeticFix) -> str:

@@ -153,6 +153,7 @@ class FakeAutopilot:
         self._vision: Received | None = None
         self._due_ns: dict[str, int] = {}
         self._last_stamp_s: dict[str, float] = {}
+        self._spoken_to = False
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._latest_out_ns = self._latest_in_ns = 0
@@ -357,6 +358,9 @@ class FakeAutopilot:
 
     def _take(self, now_ns: int) -> None:
         for data in self._wire.receive():
+            if not self._spoken_to:
+                self._spoken_to = True
+                self._due_ns["HEARTBEAT"] = 0  # on UDP nobody has heard the one before
             before = self._codec.total_receive_errors
             try:
                 messages = self._codec.parse_buffer(bytearray(data)) or []

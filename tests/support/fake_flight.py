@@ -11,11 +11,12 @@ from typing import Any, Protocol
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.clocksync import BootSegments, estimate_clock
+from companion.clocksync import BootSegments
 from companion.geometry import Array, Pose, quaternion_from_rotation, vector_from_rotation
 from companion.messages import GeoOrigin
 from drivers.geodesy import origin_of
 from drivers.mavlink_samples import boot_ns
+from drivers.telemetry_tlog import read_tlog
 from drivers.tlog_records import TlogRecords
 
 HERE = GeoOrigin(47.397742, 8.545594, 489.0)
@@ -164,44 +165,32 @@ class RecordedFlight:
     def __init__(self, path: Path) -> None:
         if path.is_dir():
             path = next(iter(sorted(path.glob("*.tlog"))))
+        content = read_tlog(path)
+        if content.host_ns is None:
+            raise ValueError(f"{path}: no telemetry of an autopilot")
+        self.origin = content.collected.finish(content.host_ns, content.clock).origin or HERE
         log = TlogRecords(path.read_bytes())
-        found: list[tuple[int, int, int, Any]] = []
-        one_way, exchanges = [], []
+        found: list[tuple[int, int, Any]] = []
         segments, unix_minus_boot_ns = BootSegments(), None
-        self.origin = HERE
         for record in log:
             if record.component != mavlink.MAV_COMP_ID_AUTOPILOT1:
                 continue
             message = log.decode(record)
             if message is None:
                 continue
-            kind, receive_ns = message.get_type(), record.unix_us * 1000
-            if kind == "TIMESYNC":
-                if message.tc1 and 0 <= receive_ns - message.ts1 < 10**9:
-                    segment = segments.segment_of(message.tc1)
-                    exchanges.append((message.ts1, message.tc1, receive_ns, segment))
-                continue
-            if kind == "HOME_POSITION":
-                self.origin = GeoOrigin(
-                    message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3
-                )
+            if message.get_type() == "SYSTEM_TIME" and message.time_unix_usec:
+                unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
             remote_ns = boot_ns(message, unix_minus_boot_ns)
-            if kind not in MEASURED or remote_ns is None:
-                continue
-            segment = segments.segment_of(remote_ns)
-            one_way.append((remote_ns, receive_ns, segment))
-            found.append((remote_ns, segment, len(found), message))
-        clock = estimate_clock(exchanges, one_way)
-        if clock is None:
-            raise ValueError(f"{path}: no telemetry of an autopilot")
-        hosts = clock.host_ns(
+            if message.get_type() in MEASURED and remote_ns is not None:
+                found.append((remote_ns, segments.segment_of(remote_ns), message))
+        hosts = content.host_ns(
             np.array([each[0] for each in found]), np.array([each[1] for each in found])
         )
         self.begin_unix_ns = int(hosts.min())
         self.duration_s = float(hosts.max() - hosts.min()) * 1e-9
         self._times: dict[str, list[float]] = {}
         self._messages: dict[str, list[Any]] = {}
-        for host_ns, (_, _, _, message) in sorted(
+        for host_ns, (_, _, message) in sorted(
             zip(hosts.tolist(), found, strict=True), key=lambda each: each[0]
         ):
             kind = message.get_type()
