@@ -23,7 +23,10 @@ AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAVLINK_2 = 0xFD
 WINDOW = 10
 """Requests under way at once; ArduPilot queues no more than 20, of everybody's."""
-ANSWER_S = 0.4
+ANSWER_S, LEAST_ANSWER_S = 0.5, 0.15
+SLACK = 4
+"""What is not there is not answered for: it is waited for as long as the slowest answer, so many
+times over."""
 TRIES = 3
 QUIET_S = 1.0
 """A list that has paused for so long has ended, or has lost its end."""
@@ -74,6 +77,7 @@ class Parameters:
         self._listed: dict[int, str] = {}
         self._n_listed: int | None = None
         self._came = asyncio.Event()
+        self._slowest_s: float | None = None
         self._ends = (
             link.listen(mavlink.MAVLINK_MSG_ID_PARAM_VALUE, self._take_value),
             link.listen(mavlink.MAVLINK_MSG_ID_PARAM_ERROR, self._take_error),
@@ -95,7 +99,7 @@ class Parameters:
                 part = missing[at : at + WINDOW]
                 for name in part:
                     self._request(name=name)
-                await self._until(partial(self._all_settled, part), ANSWER_S)
+                await self._until(partial(self._all_settled, part))
         if wanted and not self._answered and not self._unknown:
             raise SourceError("the autopilot does not answer for its parameters")
         return {name: self.known[name] for name in wanted if name in self._answered}
@@ -114,7 +118,7 @@ class Parameters:
                 part = missing[at : at + WINDOW]
                 for index in part:
                     self._request(index=index)
-                await self._until(partial(self._all_listed, part), ANSWER_S)
+                await self._until(partial(self._all_listed, part))
         if self._n_listed is None:
             raise SourceError("the autopilot does not answer for its parameters")
         if not self._complete():
@@ -134,7 +138,7 @@ class Parameters:
                     self._system, AUTOPILOT, name.encode(), self._encoded(value, kind), kind
                 )
             )
-            await self._until(lambda: name in self._answered, ANSWER_S)
+            await self._until(lambda: name in self._answered)
             if name in self._answered:
                 break
         now = (await self.read([name])).get(name)
@@ -169,17 +173,28 @@ class Parameters:
         )
 
     async def _until(
-        self, true: Callable[[], bool], patience_s: float, most_s: float = MOST_ANSWERS_S
+        self,
+        true: Callable[[], bool],
+        patience_s: float | None = None,
+        most_s: float = MOST_ANSWERS_S,
     ) -> None:
         """Wait for something to come true, while each message comes in time; others' come too."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + most_s
-        while not true() and (left_s := end_s - loop.time()) > 0:
+        while not true() and (begin_s := loop.time()) < end_s:
             self._came.clear()
+            wait_s = min(patience_s or self._patience_s, end_s - begin_s)
             try:
-                await asyncio.wait_for(self._came.wait(), min(patience_s, left_s))
+                await asyncio.wait_for(self._came.wait(), wait_s)
             except asyncio.TimeoutError:
                 return
+            self._slowest_s = max(self._slowest_s or 0.0, loop.time() - begin_s)
+
+    @property
+    def _patience_s(self) -> float:
+        if self._slowest_s is None:
+            return ANSWER_S
+        return min(ANSWER_S, max(LEAST_ANSWER_S, SLACK * self._slowest_s))
 
     def _settled(self, name: str) -> bool:
         return name in self._answered or name in self._unknown
