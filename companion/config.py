@@ -125,7 +125,7 @@ class LinkConfig:
     """Of pressure and rangefinder."""
     timesync_hz: Annotated[float, Range(0.1, 50)] = 10.0
     silent_after_s: Annotated[float, Range(0.2, 60)] = 3.0
-    """Without a heartbeat for so long the autopilot counts as gone."""
+    """Having said nothing for so long the autopilot counts as gone."""
     signing_key_file: str = ""
     """A file with 64 hexadecimal digits; "" for unsigned MAVLink."""
 

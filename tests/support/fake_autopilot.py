@@ -581,14 +581,15 @@ class FakeAutopilot:
                 after = lambda: self.send(message)  # noqa: E731
         elif command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
             result = ACCEPTED
-            after = lambda: self.arm(values[0] == 1)  # noqa: E731
+            self.arm(values[0] == 1)
         elif command == mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and values[0] == 1:
             result = DENIED if self.armed else ACCEPTED
             after = None if self.armed else self.reboot
         elif command == DO_SET_GLOBAL_ORIGIN and self.knows_do_set_origin:
             # its latitude and longitude have their digits in a COMMAND_INT only
             result = ACCEPTED if got.kind == "COMMAND_INT" else DENIED
-            after = (lambda: self._take_origin(*values[4:])) if result == ACCEPTED else None
+            if result == ACCEPTED:
+                self._take_origin(*values[4:])
         self.send(
             mavlink.MAVLink_command_ack_message(
                 command, result, 0, 0, got.system, got.component

@@ -380,6 +380,37 @@ def test_commands_on_a_wire_that_loses_a_third() -> None:
     run(test())
 
 
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_without_gps_positions_are_those_that_the_autopilot_was_given(firmware: str) -> None:
+    """The pretended autopilot's side of it: what follows from this is not the link's to decide."""
+
+    def odometry(t_ns: int) -> Any:
+        unknown = [float("nan")] * 21
+        return mavlink.MAVLink_odometry_message(
+            t_ns // 1000, 20, 12, 3.0, -4.0, -5.0, [1.0, 0.0, 0.0, 0.0], 0, 0, 0, 0, 0, 0,
+            unknown, unknown, 0, 3, 90,
+        )  # fmt: skip
+
+    async def test() -> None:
+        with FakeAutopilot(firmware, flight=circle(), gps=False) as autopilot:
+            async with linked(autopilot) as heard:
+                await heard.until(lambda: heard.kinds()["height"] > 5)
+                assert "local position" not in heard.kinds() and "GPS" not in heard.kinds()
+                assert heard.link.samples.gps_fix_type == 1
+                heard.link.send(
+                    mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 489000)
+                )
+                heard.link.send(odometry(heard.clock.now_ns()))
+                await heard.until(lambda: heard.kinds()["local position"] > 2)
+                local = [each for each in heard.samples if kind_of(each) == "local position"]
+                assert isinstance(local[-1], PositionSample)
+                assert local[-1].position_ned_m == pytest.approx([3, -4, -5])
+                assert heard.link.origin is not None
+                assert heard.link.origin.latitude_deg == pytest.approx(47.397742)
+
+    run(test())
+
+
 def test_long_texts_reach_the_autopilot_whole() -> None:
     async def test() -> None:
         with FakeAutopilot("px4", flight=circle()) as autopilot:
