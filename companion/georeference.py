@@ -10,6 +10,7 @@ the path does.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,8 @@ SIGMA_VELOCITY_M_S = 0.15
 VELOCITY_TAU_S = 1.0
 SIGMA_TILT_RAD = np.radians(0.5)
 SIGMA_YAW_RAD = np.radians(6.0)
+SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.01, 0.05
+"""No rangefinder and no barometer tells the scale better than this."""
 MAX_PLACES = 400
 
 
@@ -67,8 +70,9 @@ class _Series:
     times: list[int] = field(default_factory=list)
     values: list[Array] = field(default_factory=list)
 
-    def add(self, t_ns: int, value: Array) -> None:
-        if np.isfinite(value).all() and (not self.times or t_ns - self.times[-1] >= MIN_SPACING_NS):
+    def add(self, t_ns: int, value: Array, horizontal_only: bool = False) -> None:
+        known = value[..., :2] if horizontal_only else value
+        if np.isfinite(known).all() and (not self.times or t_ns - self.times[-1] >= MIN_SPACING_NS):
             self.times.append(t_ns)
             self.values.append(value)
 
@@ -84,6 +88,15 @@ class _Series:
 
     def __len__(self) -> int:
         return len(self.times)
+
+
+class _Scale(NamedTuple):
+    """Metres per map unit, its relative standard deviation, and what told it."""
+
+    scale: float
+    sigma: float
+    method: str
+    n: int
 
 
 class Georeferencer:
@@ -119,13 +132,14 @@ class Georeferencer:
             self._range.add(sample.t_ns, np.array([sample.distance_m]))
 
     def _integrate(self, series: _Series, t_ns: int, velocity: Array) -> None:
-        # rows: velocity, and the way travelled so far by it
+        # rows: velocity, and the way travelled so far by it; a GPS may not tell the vertical part
         if not series.times:
-            series.add(t_ns, np.stack([velocity, np.zeros(3)]))
+            series.add(t_ns, np.stack([velocity, 0.0 * velocity]), horizontal_only=True)
             return
         previous, way = series.values[-1]
         dt = (t_ns - series.times[-1]) * 1e-9
-        series.add(t_ns, np.stack([velocity, way + 0.5 * (previous + velocity) * dt]))
+        travelled = way + 0.5 * (previous + velocity) * dt
+        series.add(t_ns, np.stack([velocity, travelled]), horizontal_only=True)
 
     def solve(self, places: list[Place]) -> Georeference | None:
         """Where the map lies; None until it is known well enough."""
@@ -140,7 +154,8 @@ class Georeferencer:
                     return found
         if level is None:
             return None
-        return self._from_range(places, level) or self._from_height(places, level)
+        by_range = self._from_scale(places, level, self._range_scale(places))
+        return by_range or self._from_scale(places, level, self._height_scale(places, level))
 
     def _from_positions(
         self, places: list[Place], level: Array | None, source: PositionSource
@@ -159,15 +174,22 @@ class Georeferencer:
         extent = target - target.mean(0)
         if float(np.linalg.norm(extent, axis=1).max()) < 0.5 * self._config.min_travel_m:
             return None
-        solution = _fit(t_ns[ok] * 1e-9, mapped, target, way[ok], level)
+        scales = [self._range_scale(places)]
+        if level is not None:
+            scales.append(self._height_scale(places, level))
+        prior = min((s for s in scales if s is not None), key=lambda s: s.sigma, default=None)
+        solution = _fit(t_ns[ok] * 1e-9, mapped, target, way[ok], level, prior)
         if solution is None:
             return None
         similarity, covariance, residual = solution
         sigma_scale, sigma_yaw = float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[3, 3]))
         if sigma_scale > self._config.max_sigma_scale:
             return None
-        with_velocity = np.isfinite(way[ok]).all(1).sum() > 4
-        method = source.value + (" and velocity" if with_velocity else "")
+        with_velocity = np.isfinite(way[ok, :2]).all(1).sum() > 4
+        method = " and ".join(
+            [source.value, *(["velocity"] if with_velocity else []),
+             *([prior.method] if prior is not None else [])]
+        )  # fmt: skip
         return Georeference(similarity, sigma_scale, sigma_yaw, method, int(ok.sum()), residual)
 
     def _lever_ned(self, places: list[Place]) -> Array:
@@ -180,8 +202,8 @@ class Georeferencer:
             for p in places
         ])  # fmt: skip
 
-    def _from_range(self, places: list[Place], level: Array) -> Georeference | None:
-        """Scale from the rangefinder against the map's ground; no positions, so no origin."""
+    def _range_scale(self, places: list[Place]) -> _Scale | None:
+        """Scale from the rangefinder against the map's ground."""
         if len(self._range) < 4:
             return None
         distance, ok = self._range.at(np.array([p.t_ns for p in places]))
@@ -194,13 +216,11 @@ class Georeferencer:
             return None
         scale = float(np.median(ratios))
         spread = 1.4826 * float(np.median(np.abs(ratios - scale))) / scale
-        sigma = max(spread / np.sqrt(len(ratios)), 0.01)
-        if sigma > self._config.max_sigma_scale:
-            return None
-        return self._without_origin(places, level, scale, sigma, "rangefinder", len(ratios))
+        sigma = max(spread / np.sqrt(len(ratios)), SIGMA_RANGE_SCALE)
+        return _Scale(scale, sigma, "rangefinder", len(ratios))
 
-    def _from_height(self, places: list[Place], level: Array) -> Georeference | None:
-        """Scale from changes of barometric height; no positions, so no origin."""
+    def _height_scale(self, places: list[Place], level: Array) -> _Scale | None:
+        """Scale from changes of barometric height."""
         if len(self._height) < 4:
             return None
         t_ns = np.array([p.t_ns for p in places])
@@ -214,12 +234,19 @@ class Georeferencer:
         scale = float((a * b).sum() / max(float((a * a).sum()), 1e-12))
         if scale <= 0:
             return None
-        sigma = 0.5 / np.sqrt(max(float((b * b).sum()), 1e-9)) + float(
-            np.std(b - scale * a) / np.sqrt(max(float((b * b).sum()), 1e-9))
-        )
-        if sigma > self._config.max_sigma_scale:
+        size_m = float(np.sqrt(max(float((b * b).sum()), 1e-9)))
+        sigma = max((0.5 + float(np.std(b - scale * a))) / size_m, SIGMA_HEIGHT_SCALE)
+        return _Scale(scale, sigma, "barometric height", int(ok.sum()))
+
+    def _from_scale(
+        self, places: list[Place], level: Array, found: _Scale | None
+    ) -> Georeference | None:
+        """Scale alone: no positions, so no origin."""
+        if found is None or found.sigma > self._config.max_sigma_scale:
             return None
-        return self._without_origin(places, level, scale, sigma, "barometric height", int(ok.sum()))
+        return self._without_origin(
+            places, level, found.scale, found.sigma, found.method, found.n
+        )  # fmt: skip
 
     def _without_origin(
         self, places: list[Place], level: Array, scale: float, sigma: float, method: str, n: int
@@ -269,9 +296,13 @@ def _drift_root(t_s: Array) -> Array:
 
 
 def _fit(
-    t_s: Array, mapped: Array, target: Array, way: Array, level: Array | None
+    t_s: Array, mapped: Array, target: Array, way: Array, level: Array | None,
+    scale: _Scale | None,
 ) -> tuple[Similarity, Array, float] | None:
-    """Generalised least squares over (log scale, turn (3), origin (3)); covariance (7, 7)."""
+    """Generalised least squares over (log scale, turn (3), origin (3)); covariance (7, 7).
+
+    `scale` is what others say of it.
+    """
     guess = _start(mapped, target, level)
     if not np.isfinite(guess.scale) or guess.scale <= 0:
         return None
@@ -281,7 +312,7 @@ def _fit(
         else np.full(3, 1e-3)
     )
     keep = np.ones(len(t_s), bool)
-    steps = np.isfinite(way[1:] - way[:-1]).all(1)
+    steps = np.isfinite(way[1:, :2] - way[:-1, :2]).all(1)
     dt = np.diff(t_s)
     information, chi2, n_rows, root = np.eye(7), 0.0, 1, np.eye(len(t_s))
     for iteration in range(12):
@@ -311,6 +342,8 @@ def _fit(
         if use.any():
             j = (jac[1:] - jac[:-1])[use]
             r = ((way[1:] - way[:-1]) - (turned[1:] - turned[:-1]))[use]
+            told = np.isfinite(r)
+            j, r = j * told[..., None], np.where(told, r, 0.0)
             sigma_m = SIGMA_VELOCITY_M_S * np.sqrt(dt[use] * np.maximum(dt[use], VELOCITY_TAU_S))
             weight = 1.0 / sigma_m
             length = np.linalg.norm(r, axis=1) * weight
@@ -319,7 +352,10 @@ def _fit(
             information += np.einsum("nij,nik->jk", j, j)
             gradient += np.einsum("nij,ni->j", j, r)
             chi2 += float((r * r).sum())
-            n_rows += r.size
+            n_rows += int(told.sum())
+        if scale is not None:
+            information[0, 0] += scale.sigma**-2
+            gradient[0] += np.log(scale.scale / guess.scale) / scale.sigma**2
         if level is not None:
             turn = vector_from_rotation(guess.rotation @ level.T)
             information[1:4, 1:4] += np.diag(prior**2)

@@ -41,6 +41,7 @@ class SmoothOdometry:
         self._odometry_from_world = Pose.identity()
         self._last: tuple[int, Pose, Pose] | None = None
         """time, `map_from_camera`, `odometry_from_body` of the last frame that was believed"""
+        self._anchored = False
         self._velocity = np.zeros(3)
         self._n_doubted = 0
         self._way: deque[tuple[int, Array]] = deque()
@@ -114,6 +115,7 @@ class SmoothOdometry:
             if not georeference.has_origin:  # go on from the place last known
                 offset = self._last[2].translation - self._raw(georeference, pose).translation
         self._odometry_from_world = Pose(np.eye(3), offset)
+        self._anchored = georeference.has_origin
         self._segment, self._georeference = segment, georeference
         self._last = None
         self._way.clear()
@@ -128,8 +130,12 @@ class SmoothOdometry:
         self._georeference = georeference
 
     def _work_in(self, raw: Pose, t_ns: int) -> None:
-        """Move towards the pose that the map has, where its place in the world is known."""
-        if self._last is None or self._georeference is None or not self._georeference.has_origin:
+        """Move towards the pose that the map has, where it began with a place in the world.
+
+        A map that began without one goes on as it began: the way to a place found out later may be
+        long, and an autopilot would fly it.
+        """
+        if self._last is None or not self._anchored:
             return
         dt_s = min((t_ns - self._last[0]) * 1e-9, 1.0)
         here = self._odometry_from_world @ raw
