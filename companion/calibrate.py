@@ -16,6 +16,7 @@ import numpy as np
 from companion.calibration.determine import MODELS, Calibration, determine
 from companion.calibration.verdict import advice, faults, few
 from companion.calibration.views import (
+    Coverage,
     LitArea,
     View,
     choose,
@@ -38,8 +39,8 @@ MAX_SEARCHED = 400
 MAX_VIEWS = 40
 """Views that a lens is fitted to; more of them make it slower and hardly better."""
 MAX_LIVE_VIEWS = 80
-LIVE_NOVELTY = 0.06
-"""Views of a live camera are kept when they are this unlike those before."""
+LIVE_NOVELTY, LIVE_GAIN = 0.05, 0.005
+"""Views of a live camera are kept when they are so unlike those before, or cover so much more."""
 LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
 """A lens is fitted to the views of a live camera from so many on, and again after so many more."""
 READ_S = 0.25
@@ -100,6 +101,8 @@ def calibrate(
         raise InputError(f"--model {model}: wanted auto, {' or '.join(MODELS)}")
     if not name or name != Path(name).name or name.startswith("."):
         raise InputError(f"--name {name}: wanted a name for a file, without folders")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; --out wants a folder")
     gathered = _Gathered(chart)
     if isinstance(source, Path):
         called = source.name
@@ -148,7 +151,7 @@ class _Gathered:
     n_small: int = 0
     unfound: list[Bytes] = field(default_factory=list)
 
-    def look(self, number: int, grey: Bytes, least_novelty: float) -> str:
+    def look(self, number: int, grey: Bytes, *, only_new: bool) -> str:
         """Look for the board in a picture; "" when it gave a view, else why it gave none."""
         height, width = grey.shape
         if self.n_searched and self.size != (width, height):
@@ -171,10 +174,21 @@ class _Gathered:
         if view.small:
             self.n_small += 1
             return "bring the board nearer"
-        if least_novelty and novelty(view, self.views) < least_novelty:
+        if only_new and not self._is_new(view):
             return "move the board"
         self.views.append(view)
         return ""
+
+    def covered(self) -> Coverage:
+        """Where the board was."""
+        return coverage(self.views, self.lit.mask(*self.size))
+
+    def _is_new(self, view: View) -> bool:
+        if novelty(view, self.views) >= LIVE_NOVELTY:
+            return True
+        lit = self.lit.mask(*self.size)
+        before, after = coverage(self.views, lit), coverage([*self.views, view], lit)
+        return after.share >= before.share + LIVE_GAIN
 
     def _keep_unfound(self, grey: Bytes) -> None:
         if len(self.unfound) < N_UNFOUND_KEPT:
@@ -195,7 +209,7 @@ def _search(frames: FrameSource, gathered: _Gathered, progress: Progress) -> Non
     try:
         stretch = math.ceil(frames.n_frames / MAX_SEARCHED)
         for number, grey, done in _sharpest(frames, stretch):
-            gathered.look(number, grey, 0.0)
+            gathered.look(number, grey, only_new=False)
             progress.update(done, "looking for the board", len(gathered.views))
     finally:
         progress.finish()
@@ -229,9 +243,9 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
             if picture is None:
                 progress.update(number, "no picture comes", len(gathered.views))
                 continue
-            amiss = gathered.look(number, picture.grey, LIVE_NOVELTY)
+            amiss = gathered.look(number, picture.grey, only_new=True)
             number += 1
-            covered = coverage(gathered.views, gathered.lit.mask(*gathered.size))
+            covered = gathered.covered()
             wanted = advice(gathered.views, covered, made)
             n_new = len(gathered.views) - n_fitted
             if n_new >= (LIVE_FIT_EVERY if wanted else 1) and len(gathered.views) >= LEAST_FITTED:

@@ -135,7 +135,7 @@ class CharucoChart:
         tried = _spread(greys, MAX_TRIED)
         seen = _markers_seen(tried, self._dictionary)
         if not seen:
-            return _other_dictionary(tried, self._dictionary) or _chessboard_seen(tried, self)
+            return _other_dictionary(tried) or _chessboard_seen(tried, self)
         for other in self._variants():
             if any(other.find(grey) is not None for grey in tried):
                 return f"what is to be seen is --board {other.name}"
@@ -216,7 +216,7 @@ class ChessboardChart:
     def explain(self, greys: Sequence[Bytes]) -> str | None:
         """What is to be seen instead of the board, as far as it can be told."""
         tried = _spread(greys, MAX_TRIED)
-        return _other_dictionary(tried, None) or _chessboard_seen(tried, None)
+        return _other_dictionary(tried) or _chessboard_seen(tried, None)
 
     def black_m(self) -> Array:
         """What is black on it."""
@@ -350,22 +350,18 @@ def _markers_seen(greys: Sequence[Bytes], dictionary: str) -> set[int]:
     return seen
 
 
-def _other_dictionary(greys: Sequence[Bytes], known: str | None) -> str | None:
+def _other_dictionary(greys: Sequence[Bytes]) -> str | None:
     """A dictionary of which some picture shows enough not to be chance."""
-    families: dict[str, list[str]] = {}
+    families: dict[str, str] = {}
     for name in _dictionaries():
         stem, _, count = name.rpartition("_")
-        # those of one stem are the beginnings of their largest
-        families.setdefault(stem if count.isdigit() else name, []).append(name)
+        # the smallest of those that share their first markers, which are what boards are made of
+        families.setdefault(stem if count.isdigit() else name, name)
     for grey in greys:
-        seen = {family[-1]: _markers_seen([grey], family[-1]) for family in families.values()}
-        best = max(seen, key=lambda name: len(seen[name]))
-        if len(seen[best]) < 4:
-            continue
-        family = next(family for family in families.values() if family[-1] == best)
-        name = next(n for n in family if len(_dictionary(n).bytesList) > max(seen[best]))
-        if name != known:
-            return f"markers of {name} are to be seen, {len(seen[best])} of them in one picture"
+        counts = {name: len(_markers_seen([grey], name)) for name in families.values()}
+        best = max(counts, key=lambda name: counts[name])
+        if counts[best] >= 4:
+            return f"markers of {best} are to be seen, {counts[best]} of them in one picture"
     return None
 
 

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 
-from companion.camera import Camera
+from companion.camera import Camera, Distortion
 from companion.chart import ChessboardChart, parse_chart
 from companion.geometry import Array, rotation_from_vector
 from companion.messages import Bytes
 
+RADTAN = Camera(
+    640, 480, 520.0, 505.0, 331.0, 228.0, Distortion.RADTAN, (-0.28, 0.09, 0.0012, -0.0008, -0.012)
+)
+FISHEYE = Camera(
+    640, 480, 260.0, 252.0, 309.0, 251.0, Distortion.EQUIDISTANT, (-0.012, 0.006, -0.003, 0.0006)
+)
 CHARUCO = "charuco:7x5:0.04:0.03:DICT_5X5_100"
 CHESSBOARD = "chessboard:9x6:0.025"
 MARGIN = 0.4
@@ -158,6 +165,16 @@ class BoardPictures:
         return np.where(np.isfinite(self._rays[..., 0]), scene, 0.0).astype(np.float32)
 
 
+@cache
+def well_shown(camera: Camera, board: str = CHARUCO, bend: float = 0.0) -> tuple[Bytes, ...]:
+    """Pictures that a calibration can be made of."""
+    pictures = BoardPictures(camera, board)
+    # a chessboard must be in view as a whole
+    n, width = (19, 0.5) if board == CHARUCO else (24, 0.42)
+    return tuple(pictures.picture(p, bend=bend) for p in placings(n, width=width))
+
+
+@cache
 def _rays(camera: Camera) -> Array:
     """Ray of each sample, (2 H, 2 W, 2): exact at every fourth, straight between."""
     across, down = (np.arange(n // 2 + 2) * 2.0 for n in (camera.width, camera.height))
@@ -168,6 +185,7 @@ def _rays(camera: Camera) -> Array:
     return np.asarray(between, np.float64)
 
 
+@cache
 def _texture(board: str) -> tuple[Array, float]:
     """Drawn by other means than the program's own, as far as there are any."""
     chart = parse_chart(board)

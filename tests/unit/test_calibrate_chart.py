@@ -9,16 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.camera import Camera, Distortion
 from companion.chart import parse_chart
 from companion.errors import InputError
 from companion.messages import Bytes
 from companion.output.board_print import board_page
-from tests.support.board_pictures import CHARUCO, CHESSBOARD, BoardPictures, Placing
-
-CAMERA = Camera(
-    640, 480, 520.0, 505.0, 331.0, 228.0, Distortion.RADTAN, (-0.2, 0.05, 0.001, -0.001, 0.0)
-)
+from tests.support.board_pictures import CHARUCO, CHESSBOARD, RADTAN, BoardPictures, Placing
 
 
 @pytest.mark.parametrize(
@@ -45,7 +40,7 @@ def test_board_that_is_none(text: str, named: str) -> None:
 
 @pytest.mark.parametrize("board", [CHARUCO, CHESSBOARD])
 def test_corners_are_where_they_are(board: str) -> None:
-    pictures = BoardPictures(CAMERA, board)
+    pictures = BoardPictures(RADTAN, board)
     placing = Placing(0.45, 0.55, 0.6, 20, -15, 10)
     sighting = parse_chart(board).find(pictures.picture(placing))
     assert sighting is not None
@@ -54,7 +49,7 @@ def test_corners_are_where_they_are(board: str) -> None:
     # a board half a turn round is the same chessboard; each corner must be at one of these
     margin = 0.4 * chart.square_m
     rotation, shift = pictures.pose(placing)
-    true = CAMERA.project((sighting.board_m + [margin, margin, 0]) @ rotation.T + shift)
+    true = RADTAN.project((sighting.board_m + [margin, margin, 0]) @ rotation.T + shift)
     away = np.minimum(
         np.linalg.norm(true - sighting.image_px, axis=1),
         np.linalg.norm(true[::-1] - sighting.image_px, axis=1),
@@ -63,7 +58,7 @@ def test_corners_are_where_they_are(board: str) -> None:
 
 
 def test_part_of_a_charuco_board_is_enough() -> None:
-    picture = BoardPictures(CAMERA).picture(Placing(0.1, 0.4, 0.7))
+    picture = BoardPictures(RADTAN).picture(Placing(0.1, 0.4, 0.7))
     sighting = parse_chart(CHARUCO).find(picture)
     assert sighting is not None
     assert 8 <= len(sighting.ids) < 24
@@ -77,11 +72,10 @@ def test_part_of_a_charuco_board_is_enough() -> None:
         (CHARUCO, "charuco:5x7:0.04:0.03:DICT_5X5_100", f"--board {CHARUCO}"),
         (CHARUCO, "charuco:6x4:0.04:0.03:DICT_5X5_100", "up to number 16"),
         (CHESSBOARD, "chessboard:8x6:0.025", "9x6"),
-        (CHESSBOARD, CHARUCO, "9x6"),
     ],
 )
 def test_another_board_is_named(shown: str, given: str, said: str) -> None:
-    picture = BoardPictures(CAMERA, shown).picture(Placing(0.5, 0.5, 0.6, 10, 10))
+    picture = BoardPictures(RADTAN, shown).picture(Placing(0.5, 0.5, 0.6, 10, 10))
     chart = parse_chart(given)
     assert chart.find(picture) is None
     explained = chart.explain([picture])
@@ -89,7 +83,7 @@ def test_another_board_is_named(shown: str, given: str, said: str) -> None:
 
 
 def test_nothing_is_not_explained() -> None:
-    empty = BoardPictures(CAMERA).picture(None)
+    empty = BoardPictures(RADTAN).picture(None)
     for board in (CHARUCO, CHESSBOARD):
         assert parse_chart(board).find(empty) is None
         assert parse_chart(board).explain([empty]) is None
@@ -97,8 +91,7 @@ def test_nothing_is_not_explained() -> None:
 
 @pytest.mark.parametrize(
     "board",
-    [CHARUCO, "charuco:6x8:0.02:0.014:DICT_APRILTAG_36H11", "charuco:5x6:0.03:0.02:DICT_4X4_50"
-     ":legacy", CHESSBOARD],
+    [CHARUCO, "charuco:5x6:0.03:0.02:DICT_APRILTAG_36H11:legacy", CHESSBOARD],
 )  # fmt: skip
 def test_printed_board_is_found_and_to_scale(board: str) -> None:
     page, paper = board_page(parse_chart(board), "png")

@@ -12,33 +12,25 @@ import pytest
 from companion.calibration.determine import Calibration, determine, folds
 from companion.calibration.verdict import MIN_TILT, advice, bare, faults, few, frontal
 from companion.calibration.views import Coverage, LitArea, View, choose, coverage, novelty
-from companion.camera import Camera, Distortion
+from companion.camera import Camera
 from companion.chart import parse_chart
 from companion.geometry import Array
-from companion.messages import Bytes
-from tests.support.board_pictures import CHARUCO, CHESSBOARD, BoardPictures, Placing, placings
-
-RADTAN = Camera(
-    640, 480, 520.0, 505.0, 331.0, 228.0, Distortion.RADTAN, (-0.28, 0.09, 0.0012, -0.0008, -0.012)
+from tests.support.board_pictures import (
+    CHARUCO,
+    CHESSBOARD,
+    FISHEYE,
+    RADTAN,
+    BoardPictures,
+    Placing,
+    well_shown,
 )
-FISHEYE = Camera(
-    640, 480, 260.0, 252.0, 309.0, 251.0, Distortion.EQUIDISTANT, (-0.012, 0.006, -0.003, 0.0006)
-)
-
-
-@cache
-def shown(camera: Camera, board: str, bend: float = 0.0) -> tuple[Bytes, ...]:
-    pictures = BoardPictures(camera, board)
-    # a chessboard must be in view as a whole
-    n, width = (19, 0.5) if board == CHARUCO else (24, 0.42)
-    return tuple(pictures.picture(p, bend=bend) for p in placings(n, width=width))
 
 
 @cache
 def found(camera: Camera, board: str, bend: float = 0.0) -> tuple[tuple[View, ...], LitArea]:
     lit, views = LitArea(), []
     chart = parse_chart(board)
-    for number, grey in enumerate(shown(camera, board, bend)):
+    for number, grey in enumerate(well_shown(camera, board, bend)):
         lit.see(grey)
         sighting = chart.find(grey)
         if sighting is not None:
@@ -102,12 +94,15 @@ def test_bowed_board_does_not_move_the_focal_length() -> None:
     away = np.abs(lens_of(made.camera) - lens_of(RADTAN))
     assert (away[:2] < 0.003 * lens_of(RADTAN)[:2]).all(), away
     assert 0.002 < made.sag < 0.008
-    assert not faults(made)
 
 
 def test_board_that_is_bowed_too_far() -> None:
-    made = calibrated(RADTAN, model="radtan", bend=0.03)
-    assert any("bowed" in fault for fault in faults(made))
+    made = calibrated(RADTAN, model="radtan", bend=0.006)
+    assert not faults(made)
+    lens = made.lens
+    bent = np.concatenate([lens.parameters[:-3], 4 * lens.parameters[-3:]])
+    further = dataclasses.replace(made, lens=dataclasses.replace(lens, parameters=bent))
+    assert [fault for fault in faults(further) if "bowed" in fault]
 
 
 def test_radtan_does_not_do_for_a_fisheye() -> None:
