@@ -440,8 +440,8 @@ class FakeAutopilot:
             at_s = flight_s
         stamp_ns = now_ns
         if 0 < flight_s < self.flight.duration_s:
-            if self._last_stamp_s.get(kind) == at_s:
-                return None  # nothing new was measured
+            if self._last_stamp_s.get(kind) == at_s or at_s > flight_s:
+                return None  # nothing new was measured, or nothing yet
             self._last_stamp_s[kind] = at_s
             stamp_ns = now_ns - round((flight_s - at_s) * 1e9)
         boot_ns = max(0, self.boot_ns(stamp_ns))
