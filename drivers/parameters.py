@@ -23,7 +23,7 @@ AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAVLINK_2 = 0xFD
 WINDOW = 10
 """Requests under way at once; ArduPilot queues no more than 20, of everybody's."""
-ANSWER_S, LEAST_ANSWER_S = 0.5, 0.15
+ANSWER_S, LEAST_ANSWER_S = 0.5, 0.1
 SLACK = 4
 """What is not there is not answered for: it is waited for as long as the slowest answer, so many
 times over."""
