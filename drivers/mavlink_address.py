@@ -44,10 +44,9 @@ async def _ask(host: str, port: int) -> Address:
             pass  # the loop has ended meanwhile: nobody asks any more
 
     threading.Thread(target=look_up, name="resolver", daemon=True).start()
-    try:
-        found = await asyncio.wait_for(answer, RESOLVE_S)
-    except asyncio.TimeoutError:
-        found = "no answer from the name server"
+    # not wait_for: up to Python 3.11 it swallows a cancellation that comes with the answer
+    await asyncio.wait({answer}, timeout=RESOLVE_S)
+    found = answer.result() if answer.done() else "no answer from the name server"
     if isinstance(found, str):
         raise SourceError(f"{host}: the name cannot be resolved: {found}")
     return found

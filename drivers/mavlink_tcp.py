@@ -72,12 +72,11 @@ class TcpWire(TcpConnection):
         try:
             opened.setblocking(False)
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-            connecting = asyncio.get_running_loop().sock_connect(opened, address)
-            await asyncio.wait_for(connecting, CONNECT_S)
+            await self._connect(opened, address)
             return self.take(opened)
-        except asyncio.TimeoutError as error:
+        except SourceError:
             opened.close()
-            raise SourceError(f"{self.name}: no answer") from error
+            raise
         except OSError as error:
             opened.close()
             reason = os.strerror(error.errno) if error.errno else str(error)
@@ -85,3 +84,16 @@ class TcpWire(TcpConnection):
         except asyncio.CancelledError:
             opened.close()
             raise
+
+    async def _connect(self, opened: socket.socket, address: tuple[str, int]) -> None:
+        loop = asyncio.get_running_loop()
+        connecting = asyncio.ensure_future(loop.sock_connect(opened, address))
+        try:
+            # not wait_for: up to Python 3.11 it swallows a cancellation that comes with the answer
+            await asyncio.wait({connecting}, timeout=CONNECT_S)
+            if not connecting.done():
+                raise SourceError(f"{self.name}: no answer")
+            connecting.result()
+        finally:
+            if connecting.cancel():
+                await asyncio.wait({connecting})

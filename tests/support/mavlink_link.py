@@ -109,6 +109,10 @@ class Ear:
 @contextlib.asynccontextmanager
 async def running(work: Coroutine[Any, Any, None]) -> AsyncIterator[asyncio.Task[None]]:
     """Something that runs until the end of the block; what fails in it fails the test."""
+    loop = asyncio.get_running_loop()
+    failures: list[object] = []
+    if loop.get_exception_handler() is None:
+        loop.set_exception_handler(lambda _, what: failures.append(what))
     task = asyncio.ensure_future(work)
     await asyncio.sleep(0)
     try:
@@ -117,6 +121,7 @@ async def running(work: Coroutine[Any, Any, None]) -> AsyncIterator[asyncio.Task
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
+        assert failures == []
 
 
 class Heard:

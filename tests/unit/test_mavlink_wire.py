@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import socket
 import time
@@ -11,12 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from drivers import mavlink_tcp
 from drivers.mavlink_queue import PacketQueue
 from drivers.mavlink_serial import SerialWire
 from drivers.mavlink_tcp import TcpWire
 from drivers.mavlink_transport import link_wire
 from drivers.mavlink_udp import PEER_SILENT_NS, KernelStamps, UdpWire
 from drivers.mavlink_url import Endpoint, link_endpoint
+from drivers.mavlink_wire import STALLED_NS
 from tests.support.fake_wire import PtyWire, free_port
 from tests.support.mavlink_link import Ear, Speaker, running, until
 
@@ -229,6 +232,70 @@ def test_a_tcp_peer_that_never_reads_costs_the_oldest_and_no_time() -> None:
                         await asyncio.sleep(0)
                     assert ear.stream.n_bad_bytes == 0
                     assert len(ear.packets) + wire.n_dropped == n_sent
+
+    asyncio.run(scene())
+
+
+def test_a_wire_ends_whenever_it_is_cancelled() -> None:
+    """A cancellation that came as the connection did was once swallowed."""
+
+    async def scene() -> None:
+        with socket.create_server((HOST, 0), backlog=100) as server:
+            endpoint = Endpoint("tcp", HOST, server.getsockname()[1])
+            for n_turns in range(30):
+                wire = TcpWire(endpoint, PacketQueue(64_000))
+                task = asyncio.ensure_future(wire.run(Ear()))
+                for _ in range(n_turns):
+                    await asyncio.sleep(0)
+                task.cancel()
+                await asyncio.wait({task}, timeout=1)
+                assert task.cancelled()
+                assert not wire.connected
+
+    asyncio.run(scene())
+
+
+def test_a_tcp_peer_that_answers_no_call_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mavlink_tcp, "CONNECT_S", 0.05)
+
+    async def scene() -> None:
+        with socket.create_server((HOST, 0), backlog=0) as server, contextlib.ExitStack() as ends:
+            for _ in range(3):  # until its backlog is full
+                queued = ends.enter_context(socket.socket())
+                queued.setblocking(False)
+                with contextlib.suppress(BlockingIOError):
+                    queued.connect(server.getsockname())
+            wire = TcpWire(Endpoint("tcp", HOST, server.getsockname()[1]), PacketQueue(64_000))
+            async with running(wire.run(Ear())):
+                await until(lambda: "no answer" in wire.trouble)
+
+    asyncio.run(scene())
+
+
+def test_a_tcp_peer_that_reads_nothing_for_long_is_given_up() -> None:
+    async def scene() -> None:
+        with socket.create_server((HOST, 0)) as server:
+            server.setblocking(False)
+            endpoint = Endpoint("tcp", HOST, server.getsockname()[1])
+            wire = TcpWire(endpoint, PacketQueue(64_000))
+            async with running(wire.run(Ear())):
+                client, _ = await asyncio.get_running_loop().sock_accept(server)
+                with client:
+                    await until(lambda: wire.connected)
+                    while not wire.queue:
+                        wire.write(bytes(10_000))
+                    wire.write(b"not so soon")
+                    assert wire.connected
+                    wire._progress_ns -= STALLED_NS
+                    wire.write(b"now")
+                    assert not wire.connected
+                    assert "nothing was taken for 30 s" in await ended(wire)
+                    again, _ = await asyncio.get_running_loop().sock_accept(server)
+                    again.close()
+
+    async def ended(wire: TcpWire) -> str:
+        await until(lambda: wire.trouble != "")
+        return wire.trouble
 
     asyncio.run(scene())
 
