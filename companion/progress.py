@@ -50,7 +50,9 @@ class TerminalProgress:
             RemainingColumn(),
             console=Console(file=stream),
         )
-        self._task = self._bar.add_task("", start=False, visible=False, state="", points=0)
+        self._task = self._bar.add_task(
+            "", start=False, visible=False, total=None, state="", points=0
+        )
 
     def start(self, total_frames: int) -> None:
         """Show the bar."""
