@@ -25,6 +25,8 @@ READ_S = 2.0
 """Without a packet for so long the connection counts as lost."""
 MAX_WAIT_FOR_ORDER_US = 100_000
 """UDP packets that overtake each other are put in order within this time."""
+NO_STAMPS = 0x80
+"""AVFMT_NOTIMESTAMPS: the stream has none (JPEG over HTTP), and FFmpeg makes them up."""
 BRIGHTNESS_FIRST = frozenset({"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "nv12", "gray"})
 """Pixel formats whose first plane is the grey picture."""
 
@@ -158,6 +160,7 @@ class _Receiver:
         stream.thread_type = "SLICE"  # threads by frame would hold back a picture each
         stream.codec_context.flags |= av.codec.context.Flags.low_delay
         clock, last_ns = ArrivalClock(), 0
+        stamped = not container.format.flags & NO_STAMPS
         for packet in container.demux(stream):
             arrived_ns = time.monotonic_ns()
             self._heard_s = arrived_ns * 1e-9
@@ -170,7 +173,7 @@ class _Receiver:
                 continue
             for frame in frames:
                 t_ns = arrived_ns
-                if frame.pts is not None and frame.time_base is not None:
+                if stamped and frame.pts is not None and frame.time_base is not None:
                     sent_ns = round(frame.pts * frame.time_base * 1_000_000_000)
                     t_ns = clock.monotonic_ns(sent_ns, arrived_ns)
                     if not clock.settled:

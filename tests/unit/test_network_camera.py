@@ -22,6 +22,7 @@ from drivers.camera_feed import CameraFeed
 from drivers.camera_source import Picture
 from drivers.network_camera import NetworkCamera, without_secrets
 from tests.support import rtsp_server as server
+from tests.support.http_camera import HttpCamera
 
 PASSWORD = "s3cret"
 
@@ -237,3 +238,16 @@ def test_files_are_for_another_source(url: str) -> None:
 def test_no_such_protocol() -> None:
     with pytest.raises(ConfigError, match=r"camera\.url: nonsense://cam/: not a protocol"):
         NetworkCamera(CameraConfig(source="network", url="nonsense://u:p@cam/")).open()
+
+
+def test_pictures_without_stamps_are_stamped_as_they_come() -> None:
+    """JPEG over HTTP has none, and FFmpeg would make some up for 25 pictures a second."""
+    with HttpCamera() as sender:
+        network = NetworkCamera(CameraConfig(source="network", url=sender.url))
+        network.open()
+        pictures = [network.read(1.0) for _ in range(15)]
+        network.close()
+        sent_ns = sender.sent_ns
+    newest = pictures[-1]
+    assert newest is not None
+    assert (sent_ns - newest.monotonic_ns) * 1e-9 < 0.2
