@@ -7,6 +7,13 @@ import pickle
 import signal
 import sys
 
+# The daemon says when to end: not Ctrl-C, which is for its own group of processes, nor systemd. No
+# session of its own, though: the scheduler would share the processor between sessions first, and
+# priorities would not count between stages (sched(7), autogroup).
+os.setpgid(0, 0)
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, signal.SIG_IGN)
+
 # before numpy loads, as in companion.__main__
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
@@ -32,8 +39,6 @@ SWITCH_S = 5e-4
 
 def main() -> int:
     """Serve one stage until told to finish, or until the daemon is gone."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # the daemon says when
     kind, nice, pipe_fd, ring_fd = sys.argv[1], *map(int, sys.argv[2:5])
     os.nice(min(nice, LOWEST_NICE))
     if nice > LOWEST_NICE:

@@ -6,7 +6,6 @@ frames through shared memory. Nothing here makes the caller wait but `wait`.
 
 from __future__ import annotations
 
-import os
 import pickle
 import signal
 import socket
@@ -48,11 +47,10 @@ class StageProcess:
         self._asked_to_end = False
         self._outbox: LatestWins[Any] = LatestWins(lambda message: isinstance(message, FrameInRing))
         ours, theirs = socket.socketpair()
-        # a session of its own: Ctrl-C is for the daemon, which tells its stages what to do
         self._child = subprocess.Popen(
             [sys.executable, "-m", CHILD, kind, str(nice), str(theirs.fileno()), str(ring.fd)],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-            pass_fds=(theirs.fileno(), ring.fd), start_new_session=True,
+            pass_fds=(theirs.fileno(), ring.fd),
         )  # fmt: skip
         theirs.close()
         self._pipe = Connection(ours.detach())
@@ -101,7 +99,7 @@ class StageProcess:
         self._asked_to_end = True
         self._outbox.close()
         if self._child.poll() is None:
-            os.killpg(self._child.pid, signal.SIGKILL)
+            self._child.kill()
         self._child.wait()
         for thread in (self._reader, self._writer):
             if thread is not threading.current_thread():
