@@ -30,6 +30,8 @@ MIN_CORNERS = 8
 """Fewer say too little of where the board is."""
 SEARCH_WIDTH_PX = 1600
 """Larger pictures are searched for a chessboard at this width, then refined at their own."""
+N_FIRST = 50
+"""So many markers of each dictionary are looked for, when it is asked which one a board is of."""
 MAX_TRIED = 4
 """In so many pictures other boards are looked for, when the one asked for was not found."""
 
@@ -341,7 +343,11 @@ def _spread(greys: Sequence[Bytes], n: int) -> list[Bytes]:
 
 def _markers_seen(greys: Sequence[Bytes], dictionary: str) -> set[int]:
     """Numbers of the markers in any picture that shows at least two."""
-    detector = cv2.aruco.ArucoDetector(_dictionary(dictionary))
+    return _seen(greys, _dictionary(dictionary))
+
+
+def _seen(greys: Sequence[Bytes], dictionary: cv2.aruco.Dictionary) -> set[int]:
+    detector = cv2.aruco.ArucoDetector(dictionary)
     seen: set[int] = set()
     for grey in greys:
         _, ids, _ = detector.detectMarkers(grey)
@@ -352,13 +358,17 @@ def _markers_seen(greys: Sequence[Bytes], dictionary: str) -> set[int]:
 
 def _other_dictionary(greys: Sequence[Bytes]) -> str | None:
     """A dictionary of which some picture shows enough not to be chance."""
-    families: dict[str, str] = {}
+    families: dict[str, tuple[str, cv2.aruco.Dictionary]] = {}
     for name in _dictionaries():
         stem, _, count = name.rpartition("_")
+        full = _dictionary(name)
         # the smallest of those that share their first markers, which are what boards are made of
-        families.setdefault(stem if count.isdigit() else name, name)
+        first = cv2.aruco.Dictionary(
+            full.bytesList[:N_FIRST], full.markerSize, full.maxCorrectionBits
+        )
+        families.setdefault(stem if count.isdigit() else name, (name, first))
     for grey in greys:
-        counts = {name: len(_markers_seen([grey], name)) for name in families.values()}
+        counts = {name: len(_seen([grey], first)) for name, first in families.values()}
         best = max(counts, key=lambda name: counts[name])
         if counts[best] >= 4:
             return f"markers of {best} are to be seen, {counts[best]} of them in one picture"

@@ -170,7 +170,7 @@ def well_shown(camera: Camera, board: str = CHARUCO, bend: float = 0.0) -> tuple
     """Pictures that a calibration can be made of."""
     pictures = BoardPictures(camera, board)
     # a chessboard must be in view as a whole
-    n, width = (19, 0.5) if board == CHARUCO else (24, 0.42)
+    n, width = (19, 0.5) if board == CHARUCO else (17, 0.42)
     return tuple(pictures.picture(p, bend=bend) for p in placings(n, width=width))
 
 

@@ -67,7 +67,8 @@ def test_lens_is_found_again(camera: Camera, board: str, model: str) -> None:
     rays = camera.normalise(np.array([[60.0, 60], [580, 60], [60, 420], [580, 420], [320, 30]]))
     points = np.concatenate([rays, np.ones((len(rays), 1))], 1)
     assert np.abs(made.camera.project(points) - camera.project(points)).max() < 1.0
-    assert not [fault for fault in faults(made) if "corner of" not in fault]
+    if board == CHARUCO:
+        assert not [fault for fault in faults(made) if "corner of" not in fault]
 
 
 def test_standard_deviations_are_those_of_the_errors() -> None:
