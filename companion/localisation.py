@@ -142,7 +142,7 @@ class LocalisationStage:
 
     def _odometry_of(self, track: Track) -> Odometry:
         """A track of the newest segment, in that segment's own frame, as an autopilot wants it."""
-        key = next(iter(self._tracker.map.keyframes), -1)
+        key = self._tracker.map.first_keyframe_id
         return self._odometry.step(
             track, key, self._georeferences.get(key), self._motion.velocity
         )  # fmt: skip
@@ -167,17 +167,17 @@ class LocalisationStage:
             newest = segment is segments[-1]
             if final or (newest and self._due(segment)):
                 found = self._georeferencer.solve([self._place(k) for k in _spread(segment, final)])
-                key = next(iter(segment.keyframes))
+                key = segment.first_keyframe_id
                 if found is not None:
                     self._georeferences[key] = found
         main = max(segments, key=lambda s: len(s.keyframes))
-        main_key = next(iter(main.keyframes))
+        main_key = main.first_keyframe_id
         anchor = self._georeferences.get(main_key)
         poses: dict[int, Pose] = {}
         scales: dict[int, float] = {}
         points: list[Array] = []
         for segment in segments:
-            own = self._georeferences.get(next(iter(segment.keyframes)))
+            own = self._georeferences.get(segment.first_keyframe_id)
             if segment is main:
                 main_from_own = Similarity.identity()
             elif anchor is not None and own is not None:

@@ -43,6 +43,8 @@ class SlamMap:
 
     scale_factor: float
     n_levels: int
+    first_keyframe_id: int = -1
+    """By which it is told from other maps; -1 before it has begun."""
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     n_points: int = 0
     positions: Array = field(default_factory=lambda: np.zeros((0, 3)))

@@ -138,6 +138,7 @@ class Tracker:
                 start.points_map, start.second.features.descriptors[start.features_second],
                 second.keyframe_id,
             )  # fmt: skip
+            self.map.first_keyframe_id = first.keyframe_id
             self.map.keyframes[first.keyframe_id] = first
             self.map.observe(first, start.features_first, ids)
             self.map.observe(second, start.features_second, ids)
