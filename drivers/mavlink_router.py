@@ -111,7 +111,7 @@ class Router:
         self._accepts = accepts
         self._queue_bytes = config.queue_kb * 1000
         self._clients: list[RouterClient] = []
-        self._doors: list[TcpDoor] = []
+        self._doors: list[TcpDoor[RouterClient]] = []
         self._autopilots: dict[int, int] = {}
         self._recent: dict[bytes, tuple[RouterClient | None, int]] = {}
         self._budget = RateLimit(1.0, 1.0)

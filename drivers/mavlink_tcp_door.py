@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from companion.errors import SourceError
 from drivers.mavlink_address import resolve
@@ -25,7 +25,10 @@ class Guest(WireEnd, Protocol):
     n_received: int
 
 
-class TcpDoor:
+AnyGuest = TypeVar("AnyGuest", bound=Guest)
+
+
+class TcpDoor(Generic[AnyGuest]):
     """Listens at an endpoint; `admit` gives a connection its wire and end, `leave` takes them back.
 
     When all places are taken, the oldest connection that has never sent a packet makes room for a
@@ -35,8 +38,8 @@ class TcpDoor:
     def __init__(
         self,
         endpoint: Endpoint,
-        admit: Callable[[str], tuple[TcpConnection, Guest]],
-        leave: Callable[[Guest], None],
+        admit: Callable[[str], tuple[TcpConnection, AnyGuest]],
+        leave: Callable[[AnyGuest], None],
     ) -> None:
         self.name = str(endpoint)
         self.trouble = ""
@@ -46,7 +49,7 @@ class TcpDoor:
         self._endpoint = endpoint
         self._admit = admit
         self._leave = leave
-        self._guests: dict[asyncio.Task[None], tuple[TcpConnection, Guest]] = {}
+        self._guests: dict[asyncio.Task[None], tuple[TcpConnection, AnyGuest]] = {}
 
     async def run(self) -> None:
         """Let clients in until cancelled."""
