@@ -166,7 +166,7 @@ class BoardPictures:
 
 
 @cache
-def well_shown(camera: Camera, board: str = CHARUCO, bend: float = 0.0) -> tuple[Bytes, ...]:
+def well_shown(camera: Camera, board: str, bend: float) -> tuple[Bytes, ...]:
     """Pictures that a calibration can be made of."""
     pictures = BoardPictures(camera, board)
     # a chessboard must be in view as a whole

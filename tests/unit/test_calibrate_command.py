@@ -108,7 +108,7 @@ class BoardBeforeCamera:
 
 def test_video_becomes_a_calibration_that_is_read_back(tmp_path: Path) -> None:
     empty = BoardPictures(RADTAN).picture(None)
-    frames = [frame for grey in well_shown(RADTAN) for frame in (grey, empty)]
+    frames = [frame for grey in well_shown(RADTAN, CHARUCO, 0.0) for frame in (grey, empty)]
     video = video_of(frames, tmp_path / "board.mp4")
     out = tmp_path / "cameras"
     run = companion(video, "--name", "front", "--out", out)
@@ -130,7 +130,7 @@ def test_video_becomes_a_calibration_that_is_read_back(tmp_path: Path) -> None:
 
 
 def test_refusal_is_one_line_and_keeps_what_was_there(tmp_path: Path) -> None:
-    source = folder_of(well_shown(RADTAN)[:6], tmp_path / "views")
+    source = folder_of(well_shown(RADTAN, CHARUCO, 0.0)[:6], tmp_path / "views")
     good = tmp_path / "cameras" / "front.toml"
     good.parent.mkdir()
     good.write_text("fx = 1\n")
@@ -169,14 +169,14 @@ def far_away() -> list[Bytes]:
 @pytest.mark.parametrize(
     ("shown", "board", "said"),
     [
-        (lambda: [well_shown(RADTAN)[0]] * 5, CHARUCO, "only 1 view of the board"),
+        (lambda: [well_shown(RADTAN, CHARUCO, 0.0)[0]] * 5, CHARUCO, "only 1 view of the board"),
         (lambda: changed(u=0.3), CHARUCO, "never in the upper right and lower right corner"),
         (lambda: changed(parallel=True), CHARUCO, "faced the camera squarely"),
         (blurred, CHARUCO, "blurred in 8 of the 8 pictures"),
         (far_away, "chessboard:9x6:0.025", "too small in"),
         (lambda: [BoardPictures(RADTAN).picture(None)] * 2, CHARUCO, "is it in view, lit"),
         (
-            lambda: well_shown(RADTAN)[:3],
+            lambda: well_shown(RADTAN, CHARUCO, 0.0)[:3],
             "charuco:5x7:0.04:0.03:DICT_5X5_100",
             "what is to be seen is --board charuco:7x5",
         ),
@@ -217,7 +217,7 @@ def test_out_that_is_a_file(tmp_path: Path) -> None:
 
 def test_live_camera_until_there_are_enough_views(tmp_path: Path) -> None:
     # the end of the board's round first: what is lacking must be told, and then be there
-    camera = BoardBeforeCamera(well_shown(RADTAN), goes_on=True)
+    camera = BoardBeforeCamera(well_shown(RADTAN, CHARUCO, 0.0), goes_on=True)
     progress = Ended(60)
     report = calibrate(camera, CHARUCO, "front", tmp_path, "radtan", progress)
     assert camera.opened and camera.closed
@@ -229,7 +229,7 @@ def test_live_camera_until_there_are_enough_views(tmp_path: Path) -> None:
 
 
 def test_live_camera_stopped_before_there_is_enough(tmp_path: Path) -> None:
-    camera = BoardBeforeCamera(well_shown(RADTAN))
+    camera = BoardBeforeCamera(well_shown(RADTAN, CHARUCO, 0.0))
     with pytest.raises(InputError, match="only 5 views"):
         calibrate(camera, CHARUCO, "front", tmp_path / "out", "radtan", Ended(6))
     assert camera.closed
@@ -237,15 +237,15 @@ def test_live_camera_stopped_before_there_is_enough(tmp_path: Path) -> None:
 
 
 def test_live_camera_at_its_end(tmp_path: Path) -> None:
-    camera = BoardBeforeCamera(well_shown(RADTAN)[:1])
+    camera = BoardBeforeCamera(well_shown(RADTAN, CHARUCO, 0.0)[:1])
     with pytest.raises(InputError, match="only 1 view"):
         calibrate(camera, CHARUCO, "front", tmp_path / "out", "radtan", NoProgress())
     assert camera.closed
 
 
 def test_live_camera_that_changes_its_size(tmp_path: Path) -> None:
-    shown = [well_shown(RADTAN)[0], well_shown(RADTAN)[1], well_shown(RADTAN)[2][:240]]
-    camera = BoardBeforeCamera(shown)
+    first, second, third, *_ = well_shown(RADTAN, CHARUCO, 0.0)
+    camera = BoardBeforeCamera([first, second, third[:240]])
     with pytest.raises(InputError, match="640 x 240, those before were 640 x 480"):
         calibrate(camera, CHARUCO, "front", tmp_path / "out", "radtan", NoProgress())
     assert camera.closed

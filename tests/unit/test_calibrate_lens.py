@@ -27,7 +27,7 @@ from tests.support.board_pictures import (
 
 
 @cache
-def found(camera: Camera, board: str, bend: float = 0.0) -> tuple[tuple[View, ...], LitArea]:
+def found(camera: Camera, board: str, bend: float) -> tuple[tuple[View, ...], LitArea]:
     lit, views = LitArea(), []
     chart = parse_chart(board)
     for number, grey in enumerate(well_shown(camera, board, bend)):
@@ -39,9 +39,7 @@ def found(camera: Camera, board: str, bend: float = 0.0) -> tuple[tuple[View, ..
 
 
 @cache
-def calibrated(
-    camera: Camera, board: str = CHARUCO, model: str = "auto", bend: float = 0.0
-) -> Calibration:
+def calibrated(camera: Camera, board: str, model: str, bend: float = 0.0) -> Calibration:
     views, lit = found(camera, board, bend)
     made = determine(choose(views, 40), lit.mask(camera.width, camera.height), model)
     assert made is not None
@@ -72,14 +70,14 @@ def test_lens_is_found_again(camera: Camera, board: str, model: str) -> None:
 
 
 def test_standard_deviations_are_those_of_the_errors() -> None:
-    made = calibrated(RADTAN)
+    made = calibrated(RADTAN, CHARUCO, "auto")
     away = np.abs(lens_of(made.camera) - lens_of(RADTAN)) / made.sigmas[:4]
     assert (away < 4).all(), away
     assert (made.sigmas[:4] < 1.0).all() and (made.sigmas[:4] > 0.05).all()
 
 
 def test_same_as_opencv_where_the_board_is_flat() -> None:
-    made = calibrated(RADTAN)
+    made = calibrated(RADTAN, CHARUCO, "auto")
     _, matrix, *_ = cv2.calibrateCamera(
         [view.sighting.board_m.astype(np.float32) for view in made.views],
         [view.sighting.image_px.astype(np.float32) for view in made.views],
@@ -91,14 +89,14 @@ def test_same_as_opencv_where_the_board_is_flat() -> None:
 
 
 def test_bowed_board_does_not_move_the_focal_length() -> None:
-    made = calibrated(RADTAN, model="radtan", bend=0.006)
+    made = calibrated(RADTAN, CHARUCO, "radtan", 0.006)
     away = np.abs(lens_of(made.camera) - lens_of(RADTAN))
     assert (away[:2] < 0.003 * lens_of(RADTAN)[:2]).all(), away
     assert 0.002 < made.sag < 0.008
 
 
 def test_board_that_is_bowed_too_far() -> None:
-    made = calibrated(RADTAN, model="radtan", bend=0.006)
+    made = calibrated(RADTAN, CHARUCO, "radtan", 0.006)
     assert not faults(made)
     lens = made.lens
     bent = np.concatenate([lens.parameters[:-3], 4 * lens.parameters[-3:]])
@@ -107,12 +105,12 @@ def test_board_that_is_bowed_too_far() -> None:
 
 
 def test_radtan_does_not_do_for_a_fisheye() -> None:
-    made = calibrated(FISHEYE, model="radtan")
+    made = calibrated(FISHEYE, CHARUCO, "radtan")
     assert any("error" in fault for fault in faults(made))
 
 
 def test_views_that_fit_no_lens_are_left_out() -> None:
-    views = list(found(RADTAN, CHARUCO)[0])
+    views = list(found(RADTAN, CHARUCO, 0.0)[0])
     rng = np.random.default_rng(3)
     for at in (4, 11):  # as a picture in which the board moved while its rows were read
         sighting = views[at].sighting
@@ -140,7 +138,7 @@ def test_lens_that_folds_over_is_known() -> None:
 
 
 def test_same_view_twice_is_one() -> None:
-    views = found(RADTAN, CHARUCO)[0]
+    views = found(RADTAN, CHARUCO, 0.0)[0]
     assert novelty(views[3], views[:3]) > 0.03
     assert novelty(views[3], views[:4]) == 0.0
     assert len(choose([views[0]] * 9, 40)) == 1
@@ -192,9 +190,9 @@ def test_what_is_lacking_is_said() -> None:
 
 
 def test_advice_ends_when_nothing_is_lacking() -> None:
-    views, lit = found(RADTAN, CHARUCO)
+    views, lit = found(RADTAN, CHARUCO, 0.0)
     covered = coverage(views, lit.mask(640, 480))
     assert advice(views[:2], coverage(views[:2], covered.lit), None)
     assert "corner" in advice(views[:5], coverage(views[:5], covered.lit), None)
     assert "more views" in advice(views, covered, None)
-    assert advice(views, covered, calibrated(RADTAN)) == ""
+    assert advice(views, covered, calibrated(RADTAN, CHARUCO, "auto")) == ""
