@@ -7,6 +7,7 @@ import struct
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,19 @@ from companion.config import LinkConfig, RouterConfig
 from companion.errors import ConfigError
 from drivers.mavlink_samples import SAMPLE_OF
 from drivers.mavsdk_port import MavsdkPort
+from drivers.pymavlink_port import PymavlinkPort
 from tests.support.fake_autopilot import FakeAutopilot
 from tests.support.fake_flight import circle
+from tests.support.fake_wire import free_port
+from tests.support.faults import read_tlog
 
 CLOCK = FlightClock()
+SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 Heard = list[tuple[Any, int]]
 
 
 @asynccontextmanager
-async def running(port: MavsdkPort) -> AsyncIterator[Heard]:
+async def running(port: PymavlinkPort) -> AsyncIterator[Heard]:
     heard: Heard = []
     task = asyncio.ensure_future(port.run(lambda message, t_ns: heard.append((message, t_ns))))
     try:
@@ -166,7 +171,7 @@ def test_stamp_is_that_of_arrival() -> None:
     asyncio.run(fly())
 
 
-def test_samples_are_those_of_the_recorded_flight() -> None:
+def test_rates_of_100_and_200_hz() -> None:
     async def fly() -> None:
         with FakeAutopilot("ardupilot", "udpin:127.0.0.1:0", circle()) as autopilot:
             autopilot.rates_hz.update(ATTITUDE_QUATERNION=100, RAW_IMU=200)
@@ -180,13 +185,36 @@ def test_samples_are_those_of_the_recorded_flight() -> None:
                 passed_s = time.monotonic() - begun_s
                 new = kinds(heard)[begin:]
                 sent = autopilot.rates_hz
-            assert new.count("ATTITUDE_QUATERNION") >= 0.85 * passed_s * sent["ATTITUDE_QUATERNION"]
-            assert new.count("RAW_IMU") >= 0.85 * passed_s * sent["RAW_IMU"]
+            # a busy machine keeps the pretended autopilot from its rates; nothing may be lost
+            assert new.count("ATTITUDE_QUATERNION") >= 0.5 * passed_s * sent["ATTITUDE_QUATERNION"]
+            assert new.count("RAW_IMU") >= 0.5 * passed_s * sent["RAW_IMU"]
             sample = next(m for m, _ in heard if m.get_type() == "RAW_IMU")
             assert SAMPLE_OF[sample.get_msgId()](sample) is not None
             assert port.n_bad == port.n_lost == 0
 
     asyncio.run(fly())
+
+
+def test_both_backends_give_the_same_of_a_recorded_flight() -> None:
+    packets = [each.packet for each in islice(read_tlog(SAMPLE / "telemetry.tlog"), 600)]
+
+    async def heard_by(kind: type[PymavlinkPort]) -> list[str]:
+        place = free_port()
+        config = LinkConfig(url=f"udpin:127.0.0.1:{place}")
+        port = kind(config, RouterConfig(), CLOCK)
+        async with running(port) as heard:
+            await until(lambda: port.connected)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+                for number, packet in enumerate(packets):
+                    out.sendto(packet, ("127.0.0.1", place))
+                    if number % 50 == 49:
+                        await until(lambda sent=number + 1: len(heard) == sent)  # type: ignore[misc]
+            return [f"{m.get_header().seq} {m.get_srcSystem()} {m}" for m, _ in heard]
+
+    async def compare() -> None:
+        assert await heard_by(MavsdkPort) == await heard_by(PymavlinkPort)
+
+    asyncio.run(compare())
 
 
 def test_rubbish_is_passed_over() -> None:
