@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import json
 import math
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -28,6 +29,7 @@ _KINDS = {
     bool: "true or false", int: "a whole number", float: "a number", str: "a string",
     tuple: "a list of strings",
 }  # fmt: skip
+_PASSWORD = re.compile(r"(://[^:/@\s]*):[^@/\s]+@")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -62,8 +64,21 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
 
 
 def dump(config: Config) -> dict[str, dict[str, Any]]:
-    """Every section and key with its value, for a report."""
+    """Every section and key with its value."""
     return dataclasses.asdict(config)
+
+
+def shown(config: Config) -> dict[str, dict[str, Any]]:
+    """The same, without the passwords of URLs."""
+    return {
+        section: {k: without_passwords(v) if isinstance(v, str) else v for k, v in values.items()}
+        for section, values in dump(config).items()
+    }
+
+
+def without_passwords(text: str) -> str:
+    """A text, with the passwords of URLs in it made unreadable."""
+    return _PASSWORD.sub(r"\1:***@", text)
 
 
 def to_toml(config: Config) -> str:

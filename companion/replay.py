@@ -10,7 +10,7 @@ from pathlib import Path
 
 from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
-from companion.config_file import dump
+from companion.config_file import shown, without_passwords
 from companion.depth.opencl import ComputeDevice, open_device
 from companion.depth.stage import DepthStage
 from companion.errors import FlightError
@@ -84,7 +84,8 @@ def replay(
                 stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
                 origin=log.origin if _has_origin(result) else None,
                 device=device.name if device else "none (depth.enabled = false)",
-                config=dump(config), versions=versions(), command=shlex.join(sys.argv),
+                config=shown(config), versions=versions(),
+                command=without_passwords(shlex.join(sys.argv)),
                 peak_memory_mb=peak_memory_mb(), camera=flight.camera,
                 n_frames_total=flight.n_frames_between(start_ns, stop_ns),
                 completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),

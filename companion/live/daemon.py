@@ -50,6 +50,8 @@ from drivers.status_socket import StatusSocket, own_socket_path
 
 WATCH_S = 0.2
 READY_AFTER_S = 5.0
+FAULT, BAD_INPUT = 1, 2
+"""Exit statuses."""
 END_S = 2.6
 """A stop takes little longer, whatever hangs."""
 
@@ -204,7 +206,7 @@ class Daemon:
         try:
             self._camera, remarks = live_camera(self._config.camera, self._config.mount, *size)
         except CompanionError as error:
-            self._give_up(str(error))
+            self._give_up(str(error), BAD_INPUT)
             return
         for remark in remarks:
             self._journal.say(remark, WARNING)
@@ -262,7 +264,7 @@ class Daemon:
                 self._journal.say(line)
                 self._service.status(line)
             if self._feed.fault is not None:
-                self._give_up(str(self._feed.fault))
+                self._give_up(str(self._feed.fault), BAD_INPUT)
             gone = self._missing.step(health, now_s, self._armed)
             if gone:
                 self._give_up(gone)
@@ -287,10 +289,10 @@ class Daemon:
             self._journal.say(f"configuration read again{text}", WARNING if cannot else INFO)
         self._service.ready()
 
-    def _give_up(self, why: str) -> None:
+    def _give_up(self, why: str, status: int = FAULT) -> None:
         if self._status == 0:
             self._journal.say(f"error: {why}", ERROR)
-        self._status = 1
+            self._status = status
         self._stop.set()
 
     def _tell_pilot(self, what: str) -> None:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping
 
 from companion.config import Config
-from companion.config_file import dump
+from companion.config_file import shown, without_passwords
 from companion.live.flight import LiveFlight
 from companion.output.flight_result import RunFacts
 from companion.output.surroundings import peak_memory_mb, versions
@@ -29,9 +29,9 @@ def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> 
         clock=link.clock_filter.report() if link is not None else None,
         origin=link.origin if link is not None and flight.has_origin else None,
         device=device,
-        config=dump(config),
+        config=shown(config),
         versions=versions(),
-        command=shlex.join(sys.argv),
+        command=without_passwords(shlex.join(sys.argv)),
         peak_memory_mb=peak_memory_mb(),
         camera=flight.camera,
         n_frames_total=flight.n_frames,

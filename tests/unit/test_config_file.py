@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from companion.config import Config
-from companion.config_file import dump, load_config, to_toml
+from companion.config_file import dump, load_config, shown, to_toml, without_passwords
 from companion.errors import ConfigError
 
 DESCRIBED = Path(__file__).parents[2] / "config" / "companion.toml"
@@ -152,3 +152,12 @@ def test_described_file_says_something_before_the_first_key_of_each_section() ->
 
 def test_defaults_are_themselves_allowed(tmp_path: Path) -> None:
     assert load_config(write(tmp_path, to_toml(Config()))) == Config()
+
+
+def test_passwords_are_not_shown() -> None:
+    config = load_config(None, ["camera.url=rtsp://pilot:s3cret@10.0.0.2:554/main"])
+    assert shown(config)["camera"]["url"] == "rtsp://pilot:***@10.0.0.2:554/main"
+    assert "s3cret" in to_toml(config)  # which is read back
+    assert without_passwords("run --set camera.url=rtsp://a:b@c/") == (
+        "run --set camera.url=rtsp://a:***@c/"
+    )
