@@ -52,6 +52,7 @@ WATCH_S = 0.2
 READY_AFTER_S = 5.0
 FAULT, BAD_INPUT = 1, 2
 """Exit statuses."""
+SPARE_AGAIN_S = 1.0
 END_S = 2.6
 """A stop takes little longer, whatever hangs."""
 
@@ -185,6 +186,7 @@ class Daemon:
             current(self._on_mapped),
             self._on_warned,
             lambda: self._soon(self._localisation_died, flight),
+            lambda why: self._soon(self._unusable, why),
         )
 
     def _on_odometry(self, odometry: Odometry) -> None:
@@ -242,6 +244,14 @@ class Daemon:
         if self._flights.current is flight:
             self._flights.end()
             self._begin_if_due()
+        elif self._flights.is_spare(flight):
+            self._flights.discard_spare()
+            self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+
+    def _unusable(self, why: str) -> None:
+        """On the ground somebody is there to read it; in the air the pose goes on without."""
+        if not self._armed:
+            self._give_up(why, BAD_INPUT)
 
     # -- watching -------------------------------------------------------------------------------
 

@@ -8,8 +8,6 @@ own state: depth and recorder begin again within the flight, localisation ends i
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -43,6 +41,8 @@ PATIENCE_S = {"localisation": 120.0, "depth": 60.0, "recorder": 180.0}
 HURRIED_S = {"localisation": 0.7, "depth": 0.2, "recorder": 1.6}
 RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
+LONGEST_WAIT_S = 30.0
+"""Between two starts of a stage that dies again and again."""
 NO_VIEWER = "the viewer cannot be shown"
 NOT_FINISHED = "a stage did not give its last results in time"
 
@@ -55,6 +55,8 @@ class Listener:
     mapped: Callable[[Track | MapUpdate | PointChunk], None]
     warned: Callable[[Warned], None]
     localisation_died: Callable[[], None]
+    unusable: Callable[[str], None]
+    """A stage has never come up, since what the user gave cannot be used."""
 
 
 class LiveFlight:
@@ -75,7 +77,7 @@ class LiveFlight:
         self.n_restarted = {"depth": 0, "recorder": 0}
         self._ring = FrameRing(camera.width, camera.height)
         self._lock = threading.Lock()
-        self._over = False
+        self._over = threading.Event()
         self._hurry_s: float | None = None
         self.n_frames = 0
         self._viewer: LiveViewer | None = None
@@ -83,6 +85,8 @@ class LiveFlight:
         self._last_map: MapUpdate | None = None
         kinds = ["localisation", "recorder"] + (["depth"] if config.depth.enabled else [])
         self.stages = {kind: self._start(kind) for kind in kinds}
+        for kind in kinds:
+            self._set_up(kind)
 
     @property
     def ready(self) -> bool:
@@ -92,14 +96,13 @@ class LiveFlight:
     def begin(self, folder: Path) -> None:
         """The flight begins, and leaves its results there."""
         self.folder, self._began_s = folder, monotonic_s()
-        for kind in self.stages:
-            self._set_up(kind)
+        self._set_up("recorder")
         if self._config.daemon.viewer != "none":
             threading.Thread(target=self._open_viewer, name="viewer", daemon=True).start()
 
     def frame(self, frame: Frame) -> None:
         """Take a frame of the camera's size."""
-        if self.folder is None or self._over:
+        if self.folder is None or self._over.is_set():
             return
         self.n_frames += 1
         place = self._ring.put(frame)
@@ -109,7 +112,7 @@ class LiveFlight:
 
     def take(self, message: Telemetry | Warned) -> None:
         """Take telemetry, or a warning for the log."""
-        if self.folder is None or self._over:
+        if self.folder is None or self._over.is_set():
             return
         if not isinstance(message, Warned):
             self.stages["localisation"].offer(message)
@@ -135,7 +138,7 @@ class LiveFlight:
 
     def kill_localisation(self) -> None:
         """End a localisation that hangs."""
-        os.kill(self.stages["localisation"].pid, signal.SIGKILL)
+        self.stages["localisation"].interrupt()
 
     def hurry(self) -> None:
         """Whatever `finish` is at, it has little time left."""
@@ -144,7 +147,7 @@ class LiveFlight:
     def finish(self, facts: Callable[[LiveFlight], RunFacts]) -> None:
         """Give all results and end; after `hurry` within three seconds. Waits for it."""
         with self._lock:
-            self._over = True
+            self._over.set()
         if self.folder is not None:
             for kind in ("localisation", "depth"):
                 if kind in self.stages:
@@ -171,7 +174,8 @@ class LiveFlight:
             ):
                 break
         if stage.finished is None:
-            self._warn(NOT_FINISHED, kind)
+            why = f": {stage.failed.why}" if stage.failed is not None else ""
+            self._warn(NOT_FINISHED, kind + why)
 
     def _start(self, kind: str) -> StageProcess:
         def ended(why: str) -> None:
@@ -181,8 +185,11 @@ class LiveFlight:
 
     def _set_up(self, kind: str) -> None:
         folder = self.folder
-        if kind == "recorder" and folder is not None and self.n_restarted[kind]:
-            folder = folder / f"part-{self.n_restarted[kind] + 1}"
+        if kind == "recorder":
+            if folder is None:
+                return  # what it records is yet to begin
+            if self.n_restarted[kind]:
+                folder = folder / f"part-{self.n_restarted[kind] + 1}"
         self.stages[kind].begin(Setup(self._config, self.camera, folder))
 
     def _ended(self, kind: str, why: str) -> None:
@@ -190,21 +197,27 @@ class LiveFlight:
         if not why:
             return
         with self._lock:
-            if self._over:
+            if self._over.is_set():
                 return
             if kind == "localisation":
-                self._over = True
-            else:
-                self.n_restarted[kind] += 1
-                gone, self.stages[kind] = self.stages[kind], self._start(kind)
-                gone.kill()
-                if self.folder is not None:
-                    self._set_up(kind)
+                self._over.set()
         if kind == "localisation":
             self._warn(LOCALISATION_DIED, why)
             self._listener.localisation_died()
             return
         self._warn(RESTARTED, f"{kind}: {why}")
+        gone, n_before = self.stages[kind], self.n_restarted[kind]
+        if gone.failed is not None and gone.failed.by_input and not n_before + bool(gone.progress):
+            self._listener.unusable(why)
+        if n_before and self._over.wait(min(2.0 ** (n_before - 1), LONGEST_WAIT_S)):
+            return
+        with self._lock:
+            if self._over.is_set():
+                return
+            self.n_restarted[kind] += 1
+            self.stages[kind] = self._start(kind)
+            gone.kill()
+            self._set_up(kind)
         if self._last_map is not None:
             self.stages[kind].offer(self._last_map)
 
@@ -240,7 +253,7 @@ class LiveFlight:
             return
         viewer.__enter__()
         with self._lock:
-            if not self._over:
+            if not self._over.is_set():
                 self._viewer = viewer
                 return
         viewer.__exit__(None, None, None)

@@ -57,6 +57,10 @@ class Flights:
         self._ending[flight] = thread
         thread.start()
 
+    def is_spare(self, flight: LiveFlight) -> bool:
+        """Whether this is the one that waits for its beginning."""
+        return self._spare is flight
+
     def discard_spare(self) -> None:
         """The next flight is to be prepared anew."""
         spare, self._spare = self._spare, None

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from companion import __version__
-from companion.clock import FlightClock
+from companion.clock import FlightClock, monotonic_s
 from companion.config import Config
 from companion.governor import Governor, Pressure
 from companion.health import (
@@ -34,6 +34,10 @@ from drivers.system_load import SystemLoad
 GOVERN_NS = 1_000_000_000
 STUCK_NS = 3_000_000_000
 """Frames come but no track does: the pose loop hangs."""
+START_S = 30.0
+"""A localisation that is not ready by then never will be."""
+NO_SIGN_S = 10.0
+"""A stage from which nothing is heard for so long, while frames come, is not well."""
 SETTLE_NS = 3_000_000_000
 """Beginning a map takes long, and tells nothing of what comes after."""
 STUCK = "localisation hangs and is ended"
@@ -70,6 +74,7 @@ class HealthWatch:
         self._settled_ns = 0
         self._n_dropped = 0
         self._last_frame_ns = 0
+        self._frames_since_s = 0.0
         self._odometry: Odometry | None = None
         self._odometry_ns = 0
         self._scale = ""
@@ -95,7 +100,10 @@ class HealthWatch:
 
     def frame_came(self) -> None:
         """A frame; from the camera's thread."""
-        self._last_frame_ns = self._clock.now_ns()
+        now_ns = self._clock.now_ns()
+        if now_ns - self._last_frame_ns > GOVERN_NS:
+            self._frames_since_s = monotonic_s()
+        self._last_frame_ns = now_ns
 
     def take_odometry(self, odometry: Odometry) -> None:
         """The odometry of a frame."""
@@ -123,9 +131,10 @@ class HealthWatch:
     def pose_loop_alive(self) -> bool:
         """False while frames come to a pose loop that gives nothing."""
         flight, now_ns = self._flights.current, self._clock.now_ns()
-        if flight is None or not flight.ready or now_ns - self._last_frame_ns > GOVERN_NS:
+        frames_come = now_ns - self._last_frame_ns < GOVERN_NS
+        if flight is None or not flight.ready or not frames_come:
             self._odometry_ns = max(self._odometry_ns, now_ns - STUCK_NS // 2)
-            return True
+            return flight is None or flight.ready or flight.duration_s < START_S
         return now_ns - self._odometry_ns < STUCK_NS
 
     def kill_stuck(self) -> None:
@@ -218,18 +227,23 @@ class HealthWatch:
         if flight is None:
             return ()
         out = []
+        now_s = monotonic_s()
+        frames_come = now_ns - self._last_frame_ns < GOVERN_NS
         for kind, stage in flight.stages.items():
             meter = {"localisation": self._pose, "depth": self._depth}.get(kind)
             measured = meter.health(now_ns) if meter is not None else StageHealth(kind)
             said = stage.progress
+            detail = said.device if said is not None else "starting"
+            no_sign_s = now_s - max(stage.heard_s, self._frames_since_s)
+            hangs = frames_come and said is not None and no_sign_s > NO_SIGN_S
             out.append(
                 replace(
                     measured,
-                    alive=stage.alive,
+                    alive=stage.alive and not hangs,
                     n=said.n_done if said is not None else 0,
                     n_dropped=stage.n_dropped,
                     n_restarted=flight.n_restarted.get(kind, 0),
-                    detail=said.device if said is not None else "starting",
+                    detail=f"no sign of it for {no_sign_s:.0f} s" if hangs else detail,
                 )
             )
         return tuple(out)

@@ -24,11 +24,12 @@ from multiprocessing.connection import Connection  # noqa: E402
 from typing import Any  # noqa: E402
 
 from companion.clock import monotonic_s  # noqa: E402
+from companion.errors import CompanionError, InputError  # noqa: E402
 from companion.latest import LatestWins  # noqa: E402
 from companion.messages import Frame  # noqa: E402
 from companion.stages.frame_ring import FrameInRing, FrameRing  # noqa: E402
-from companion.stages.protocol import Finish, Finished, Progress, Setup  # noqa: E402
-from companion.stages.work import module_of  # noqa: E402
+from companion.stages.protocol import Failed, Finish, Finished, Progress, Setup  # noqa: E402
+from companion.stages.work import WorkModule, module_of  # noqa: E402
 
 REPORT_EVERY_S = 1.0
 LOWEST_NICE = 19
@@ -50,8 +51,23 @@ def main() -> int:
         setup: Setup = pipe.recv()
     except EOFError:
         return 0
-    ring = FrameRing(setup.camera.width, setup.camera.height, ring_fd)
     send = _sender(pipe)
+    try:
+        _serve(pipe, send, module, setup, ring_fd)
+    except (CompanionError, OSError) as error:  # no device, no room on the disk: no bug of ours
+        send(Failed(str(error), isinstance(error, InputError)))
+        return 1
+    return 0
+
+
+def _serve(
+    pipe: Connection[Any, Any],
+    send: Callable[[Any], None],
+    module: WorkModule,
+    setup: Setup,
+    ring_fd: int,
+) -> None:
+    ring = FrameRing(setup.camera.width, setup.camera.height, ring_fd)
     work = module.work(setup)
     send(Progress(device=work.device))
     inbox: LatestWins[Any] = LatestWins(work.may_skip)
@@ -97,7 +113,6 @@ def main() -> int:
             n_dropped = inbox.n_dropped + n_overwritten
             send(Progress(n_done, n_dropped, work.times.summary(), work.device))
     send(Finished(work.times.summary(), work.device))
-    return 0
 
 
 def _sender(pipe: Connection[Any, Any]) -> Callable[[Any], None]:

@@ -49,6 +49,14 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
+class Failed:
+    """The stage cannot do its work and ends: why, and whether what the user gave is to blame."""
+
+    why: str
+    by_input: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Finished:
     """All results are given."""
 

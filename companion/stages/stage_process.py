@@ -16,9 +16,10 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
+from companion.clock import monotonic_s
 from companion.latest import LatestWins
 from companion.stages.frame_ring import FrameInRing, FrameRing
-from companion.stages.protocol import Finish, Finished, Progress, Setup
+from companion.stages.protocol import Failed, Finish, Finished, Progress, Setup
 
 CHILD = "companion.stages.child"
 
@@ -43,6 +44,9 @@ class StageProcess:
         self.progress: Progress | None = None
         """None until the stage is ready."""
         self.finished: Finished | None = None
+        self.failed: Failed | None = None
+        self.heard_s = monotonic_s()
+        """When it last gave a sign of its work."""
         self._deliver, self._ended = deliver, ended
         self._asked_to_end = False
         self._outbox: LatestWins[Any] = LatestWins(lambda message: isinstance(message, FrameInRing))
@@ -94,6 +98,10 @@ class StageProcess:
         self._reader.join(seconds)
         return not self._reader.is_alive()
 
+    def interrupt(self) -> None:
+        """End it as if it had died by itself: `ended` hears of it."""
+        self._child.kill()
+
     def kill(self) -> None:
         """End it now."""
         self._asked_to_end = True
@@ -119,6 +127,9 @@ class StageProcess:
                 message = self._pipe.recv()
                 if isinstance(message, Progress):
                     self.progress = message
+                    self.heard_s = monotonic_s()
+                elif isinstance(message, Failed):
+                    self.failed = message
                 elif isinstance(message, Finished):
                     self.finished = message
                 else:
@@ -127,7 +138,8 @@ class StageProcess:
             pass
         self._outbox.close()
         status = self._child.wait()
-        self._ended("" if self._asked_to_end else _in_words(status))
+        why = self.failed.why if self.failed is not None else _in_words(status)
+        self._ended("" if self._asked_to_end else why)
 
 
 def _in_words(status: int) -> str:

@@ -152,7 +152,7 @@ def test_odometry_comes_at_thirty_hertz(flown: Flown) -> None:
 
 def test_odometry_is_true(flown: Flown) -> None:
     poses, truth = flown.poses, TrueFlight(SAMPLE)
-    t_s = poses.stamp_us * 1e-6 - flown.begins_unix_s + truth.begin_s
+    t_s = np.float64(truth.begin_s - flown.begins_unix_s) + poses.stamp_us * np.float64(1e-6)
     error_m = np.linalg.norm(poses.place - truth.place(t_s), axis=1)
     true_turn = truth.rotations(t_s)
     cosine = (np.einsum("nij,nij->n", poses.rotations, true_turn) - 1) / 2

@@ -135,14 +135,14 @@ class Daemon:
         """Whether it has not ended."""
         return self._running.poll() is None
 
-    def signal(self, number: signal.Signals) -> None:
+    def send(self, number: signal.Signals) -> None:
         """Send it a signal."""
         self._running.send_signal(number)
 
     def stop(self, timeout_s: float = 10.0) -> float:
         """SIGTERM; how many seconds it took to end. AssertionError unless it ends well."""
         began_s = time.monotonic()
-        self.signal(signal.SIGTERM)
+        self.send(signal.SIGTERM)
         status = self._running.wait(timeout_s)
         took_s = time.monotonic() - began_s
         assert status == 0, status
@@ -162,7 +162,7 @@ class Daemon:
             if kind in self._command_of(child)
         ]
         assert found, f"there is no process of {kind}"
-        return max(found)[1]
+        return int(max(found)[1])
 
     def signal_stage(self, kind: str, number: signal.Signals) -> int:
         """Send a stage's process a signal; the time of it."""

@@ -85,7 +85,7 @@ class HttpCamera:
         c, mount = self._optics, BODY_FROM_CAMERA.matrix().tolist()
         content = {
             "width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
-            "body_from_camera": mount,
+            "distortion_model": "none", "body_from_camera": mount,
         }  # fmt: skip
         path.write_text(json.dumps(content))
         return path
