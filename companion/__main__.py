@@ -7,7 +7,9 @@ import sys
 
 # Before numpy loads: its matrices here are small, and threads of its own would take the cores
 # from the stages that run side by side, and let sums come out in another order.
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+for variable in (
+    "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM",
+):  # fmt: skip
     os.environ.setdefault(variable, "1")
 
 from companion.cli import main  # noqa: E402

@@ -16,6 +16,8 @@ from companion.geometry import Array, Pose
 
 MAX_OFF_AXIS_RAD = np.radians(80.0)
 """Beyond this angle from the optical axis a pixel has no usable normalised coordinates."""
+EXACT = 1e-12
+"""In normalised coordinates."""
 
 
 class Distortion(Enum):
@@ -108,8 +110,12 @@ class Camera:
         n = d.copy()
         for _ in range(8):  # Newton on the 2-D model: converges also where plain iteration does not
             error = self.distort(n) - d
-            jacobian = self._distortion_jacobian(n)
-            n = n - np.linalg.solve(jacobian, error[..., None])[..., 0]
+            if np.abs(error).max(initial=0.0, where=np.isfinite(error)) < EXACT:
+                break
+            j = self._distortion_jacobian(n)
+            (a, b), (c, e) = (j[..., 0, 0], j[..., 0, 1]), (j[..., 1, 0], j[..., 1, 1])
+            x, y = error[..., 0], error[..., 1]
+            n = n - np.stack([e * x - b * y, a * y - c * x], -1) / (a * e - b * c)[..., None]
         return np.where(np.abs(self.distort(n) - d).max(-1, keepdims=True) < 1e-6, n, np.nan)
 
     def pixel_from_normalised_jacobian(self, normalised: Array) -> Array:
@@ -136,6 +142,16 @@ class Camera:
     def _distortion_jacobian(self, n: Array) -> Array:
         if self.distortion is Distortion.NONE:
             return np.broadcast_to(np.eye(2), (*n.shape[:-1], 2, 2))
+        if self.distortion is Distortion.RADTAN:
+            x, y = n[..., 0], n[..., 1]
+            k1, k2, p1, p2, k3 = self.coefficients
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+            cross = slope * x * y + 2 * (p1 * x + p2 * y)
+            dx_dx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+            dy_dy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+            return np.stack([np.stack([dx_dx, cross], -1), np.stack([cross, dy_dy], -1)], -2)
         step = 1e-6
         dx = (self.distort(n + [step, 0]) - self.distort(n - [step, 0])) / (2 * step)
         dy = (self.distort(n + [0, step]) - self.distort(n - [0, step])) / (2 * step)

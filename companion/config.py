@@ -208,9 +208,11 @@ class FeaturesConfig:
     n_levels: Annotated[int, Range(1, 16)] = 8
     scale_factor: Annotated[float, Range(1.05, 2)] = 1.2
     fast_threshold: Annotated[int, Range(1, 255)] = 12
-    """Contrast that a corner has at least, in grey levels, where the scene is rich."""
+    """Contrast that a corner has at least to begin with, in grey levels; it follows the scene."""
     min_fast_threshold: Annotated[int, Range(1, 255)] = 4
     """The same where the scene is dull."""
+    max_fast_threshold: Annotated[int, Range(1, 255)] = 60
+    """The same where the scene is so rich that looking at all corners would take too long."""
     cell_px: Annotated[int, Range(8, 512)] = 32
     """Features are spread over cells of this size."""
 

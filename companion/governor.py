@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 MAX_POSE_LATENCY_MS = 60.0
 """From exposure to pose, 95th percentile."""
-EASY_LATENCY_SHARE = 0.7
+EASY_LATENCY_SHARE = 0.75
+NEARLY_LATE_SHARE = 0.9
 SEVERE_LATENCY_SHARE = 2.0
 FULL_CPU_SHARE = 0.97
 """A full processor is no harm by itself (the dense map takes what is left over), but makes a pose
@@ -142,7 +143,7 @@ class Governor:
             return f"since {pressure.pose_dropped_hz:.0f} frames/s go without a pose", SETTLE_S
         if (
             latency_ms is not None
-            and latency_ms > EASY_LATENCY_SHARE * limit_ms
+            and latency_ms > NEARLY_LATE_SHARE * limit_ms
             and pressure.cpu_share is not None
             and pressure.cpu_share > FULL_CPU_SHARE
         ):

@@ -159,11 +159,12 @@ class HealthWatch:
         flight, now_ns = self._flights.current, self._clock.now_ns()
         if flight is None or not flight.ready or now_ns < self._settled_ns:
             return
-        if not self._governed_ns:  # the levels of the flight before hold for this one
-            self._governed_ns = now_ns
-            self._apply()
         n_dropped = flight.stages["localisation"].n_dropped
-        dropped_hz = (n_dropped - self._n_dropped) * 1e9 / max(now_ns - self._governed_ns, 10**8)
+        if not self._governed_ns:  # the levels of the flight before hold for this one
+            self._governed_ns, self._n_dropped = now_ns, n_dropped
+            self._apply()
+            return
+        dropped_hz = (n_dropped - self._n_dropped) * 1e9 / (now_ns - self._governed_ns)
         self._n_dropped, self._governed_ns = n_dropped, now_ns
         changed = self._governor.step(now_ns, Pressure(
             cpu_share=self.load.cpu_share,

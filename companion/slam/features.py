@@ -97,7 +97,7 @@ class FeatureExtractor:
                 break
             self._threshold = max(config.min_fast_threshold, int(self._threshold * 0.7))
         if len(keypoints) > 3 * self._n_wanted:
-            self._threshold = min(config.fast_threshold, self._threshold + 1)
+            self._threshold = min(config.max_fast_threshold, self._threshold + 1)
         return keypoints
 
     def _spread(self, keypoints: list[cv2.KeyPoint]) -> list[int]:
