@@ -37,6 +37,7 @@ POOR = "quality too low"
 TILTED = "tilt differs from the autopilot's"
 LATE = "poses come too late"
 SILENT = "no frames"
+BEGUN_ANEW = "localisation begins anew"
 PROVING = "belief must hold first"
 
 
@@ -81,6 +82,8 @@ class PoseGate:
 
     def restart(self) -> None:
         """Localisation begins anew: nothing ties its poses to those before."""
+        if self.sending:
+            self._stop(BEGUN_ANEW)
         self._resets_before += self._resets + 1
         self._resets = 0
         self._good, self._believed_since_ns = None, None

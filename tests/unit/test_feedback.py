@@ -160,6 +160,8 @@ def test_discontinuities_are_counted_across_restarts() -> None:
     flight.run(0.5, reset_counter=1)
     assert flight.sent[-1][1].reset_counter == 1
     flight.gate.restart()
+    assert not flight.gate.sending
+    assert not flight.run(0.9), "belief must hold anew"
     flight.run(2)
     assert flight.sent[-1][1].reset_counter == 2
 
