@@ -7,15 +7,17 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-from linuxpy.video import device as v4l2
 
 from companion.errors import ConfigError, SourceError
+from drivers import v4l2_ioctl as v4l2
+from drivers.v4l2_node import CaptureNode, SizeRange
 
 DEV = Path("/dev")
-CAPTURE = v4l2.BufferType.VIDEO_CAPTURE
 MAX_SIZES_NAMED = 24
+NUMBERS = (
+    v4l2.CTRL_TYPE_INTEGER, v4l2.CTRL_TYPE_BOOLEAN, v4l2.CTRL_TYPE_MENU,
+    v4l2.CTRL_TYPE_INTEGER_MENU,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,19 +87,15 @@ def stable_path(path: str) -> str:
     return ""
 
 
-def sizes_of(fd: int, codes: Iterable[str]) -> str:
+def sizes_of(node: CaptureNode, codes: Iterable[str]) -> str:
     """The sizes that a camera has in any of these codes, in words."""
-    sizes: dict[str, None] = {}
-    for code in codes:
-        for size in v4l2.iter_read_frame_sizes(fd, v4l2.raw.v4l2_fourcc(*code)):
-            info = size.info
-            if size.type == v4l2.FrameSizeType.DISCRETE:
-                sizes[f"{info.width} x {info.height}"] = None
-            else:
-                sizes[
-                    f"{info.min_width} x {info.min_height} to {info.max_width} x {info.max_height}"
-                ] = None
+    sizes = dict.fromkeys(_in_words(size) for code in codes for size in node.sizes(code))
     return ", ".join(list(sizes)[:MAX_SIZES_NAMED]) or "it does not say which"
+
+
+def _in_words(size: SizeRange) -> str:
+    least = f"{size.least[0]} x {size.least[1]}"
+    return least if size.least == size.most else f"{least} to {size.most[0]} x {size.most[1]}"
 
 
 def _nodes() -> list[str]:
@@ -111,79 +109,44 @@ def _look_at(path: str) -> CameraDevice | None:
     except OSError as error:
         return CameraDevice(path, stable_path(path), problem=error.strerror or str(error))
     try:
-        caps = v4l2.read_capabilities(fd)
-        able = caps.device_caps or caps.capabilities
-        wanted = v4l2.Capability.VIDEO_CAPTURE | v4l2.Capability.STREAMING
-        if able & wanted != wanted:
+        node = CaptureNode(fd)
+        if not node.gives_pictures:
             return None
         return CameraDevice(
-            path, stable_path(path), _text(caps.card), _text(caps.driver), _text(caps.bus_info),
-            tuple(_formats(fd)), tuple(_controls(fd)),
+            path, stable_path(path), node.name, node.driver, node.bus,
+            tuple(_formats(node)), tuple(_controls(node)),
         )  # fmt: skip
-    except (OSError, ValueError, ArithmeticError) as error:
-        # linuxpy raises the last two over what a driver states wrongly
-        return CameraDevice(path, stable_path(path), problem=str(error))
+    except OSError as error:
+        return CameraDevice(path, stable_path(path), problem=error.strerror or str(error))
     finally:
         os.close(fd)
 
 
-def _formats(fd: int) -> Iterable[CameraFormat]:
-    for each in v4l2.iter_read_formats(fd, CAPTURE):
-        number = int(each.pixel_format)
-        code = v4l2.human_pixel_format(number)
-        sizes = []
-        for size in v4l2.iter_read_frame_sizes(fd, number):
-            info = size.info
-            if size.type == v4l2.FrameSizeType.DISCRETE:
-                sizes.append((info.width, info.height))
-            else:  # any between; the ends say enough
-                sizes += [(info.min_width, info.min_height), (info.max_width, info.max_height)]
+def _formats(node: CaptureNode) -> Iterable[CameraFormat]:
+    for code in node.codes():
+        # of a range the ends say enough
+        ends = [end for each in node.sizes(code) for end in (each.least, each.most)]
+        sizes = list(dict.fromkeys(ends))
         if not sizes:
-            pix = v4l2.get_raw_format(fd, CAPTURE).fmt.pix
-            sizes.append((pix.width, pix.height))
+            now = node.format()
+            sizes.append((now.width, now.height))
         for width, height in sizes:
-            rates = {
-                round(float(rate.max_fps), 3)
-                for rate in v4l2.iter_read_frame_intervals(fd, number, width, height)
-            }
-            yield CameraFormat(code, width, height, tuple(sorted(rates - {0.0}, reverse=True)))
+            yield CameraFormat(code, width, height, tuple(node.rates_hz(code, width, height)))
 
 
-def _controls(fd: int) -> Iterable[CameraControl]:
-    numbers = {
-        v4l2.ControlType.INTEGER, v4l2.ControlType.BOOLEAN, v4l2.ControlType.MENU,
-        v4l2.ControlType.INTEGER_MENU,
-    }  # fmt: skip
-    for control in v4l2.iter_read_controls(fd):
-        if control.type not in numbers or control.flags & v4l2.ControlFlag.DISABLED:
+def _controls(node: CaptureNode) -> Iterable[CameraControl]:
+    for control in node.controls():
+        if control.type not in NUMBERS or control.flags & v4l2.CTRL_FLAG_DISABLED:
             continue
+        choices = node.menu(control) if control.type == v4l2.CTRL_TYPE_MENU else {}
         yield CameraControl(
-            _text(control.name), _value(fd, control), control.minimum, control.maximum,
-            control.step, control.default_value, _choices(fd, control),
+            control.name.decode("utf-8", "replace").strip(), _value(node, control.id),
+            control.minimum, control.maximum, control.step, control.default_value, choices,
         )  # fmt: skip
 
 
-def _value(fd: int, control: Any) -> int | None:
+def _value(node: CaptureNode, number: int) -> int | None:
     try:
-        return int(v4l2.get_control(fd, control.id))
+        return node.control(number)
     except OSError:  # write-only, or inactive while another is automatic
         return None
-
-
-def _choices(fd: int, control: Any) -> dict[int, str]:
-    if control.type != v4l2.ControlType.MENU:
-        return {}
-    out = {}
-    for index in range(control.minimum, control.maximum + 1):
-        entry = v4l2.raw.v4l2_querymenu()
-        entry.id, entry.index = control.id, index
-        try:
-            v4l2.ioctl(fd, v4l2.IOC.QUERYMENU, entry)
-        except OSError:  # menus have holes
-            continue
-        out[index] = _text(entry.name)
-    return out
-
-
-def _text(raw: bytes) -> str:
-    return raw.split(b"\0")[0].decode("utf-8", "replace").strip()

@@ -1,8 +1,4 @@
-"""USB and other cameras of Video4Linux, by linuxpy: stamped by the driver, not when they are read.
-
-linuxpy serves as codec of the ioctls; its own streaming classes hide the flags of a buffer, which
-tell what its stamp means.
-"""
+"""USB and other cameras of Video4Linux: stamped by the driver, not when they are read."""
 
 from __future__ import annotations
 
@@ -12,18 +8,16 @@ import os
 import select
 import time
 from dataclasses import dataclass
-from typing import Any
-
-from linuxpy.video import device as v4l2
 
 from companion.config import CameraConfig
 from companion.errors import ConfigError, SourceError
+from drivers import v4l2_ioctl as v4l2
 from drivers.camera_devices import find_camera, sizes_of, stable_path
 from drivers.camera_source import Picture
 from drivers.pixel_formats import CODES, to_grey_and_rgb
 from drivers.v4l2_controls import apply_controls
+from drivers.v4l2_node import CaptureNode, FilledBuffer, PictureFormat
 
-CAPTURE = v4l2.BufferType.VIDEO_CAPTURE
 N_BUFFERS = 4
 MAX_AGE_NS = 2_000_000_000
 """A stamp further than this from now is not of the clock that the driver says."""
@@ -34,10 +28,8 @@ GONE = (errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EIO, errno.EPIPE, errno.E
 @dataclass(slots=True)
 class _Stream:
     fd: int
-    code: str
-    width: int
-    height: int
-    stride: int
+    node: CaptureNode
+    format: PictureFormat
     buffers: list[mmap.mmap]
     exposure_ns: int
     sequence: int | None = None
@@ -67,13 +59,11 @@ class V4l2Camera:
         try:
             fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            raise SourceError(_cannot_open(path, error)) from error
+            raise SourceError(f"{path}: {_cannot_open(error)}") from error
         try:
             self._stream = self._begin(path, fd)
         except OSError as error:
-            raise SourceError(
-                f"{path}: the camera cannot be started: {error.strerror or error}"
-            ) from error
+            raise SourceError(f"{path}: {_cannot_start(error)}") from error
         finally:
             if self._stream is None:
                 os.close(fd)
@@ -94,7 +84,7 @@ class V4l2Camera:
                 buffer = self._newest(stream, max(0.0, left_s))
                 if buffer is not None:
                     picture = self._picture(stream, buffer)
-                    _enqueue(stream.fd, buffer.index)
+                    stream.node.enqueue(buffer.index)
                     if picture is not None:
                         return picture
                     self.n_dropped += 1
@@ -111,32 +101,36 @@ class V4l2Camera:
         for buffer in stream.buffers:
             buffer.close()
         try:
-            v4l2.stream_off(stream.fd, CAPTURE)
+            stream.node.stop()
         except OSError:
             pass  # unplugged: it has stopped by itself
         os.close(stream.fd)
 
     def _begin(self, path: str, fd: int) -> _Stream:
-        config = self._config
-        code, width, height, stride = self._set_format(path, fd)
-        self._set_rate(path, fd)
-        exposure_ns, remarks = apply_controls(path, fd, config)
+        node = CaptureNode(fd)
+        if not node.gives_pictures:
+            raise ConfigError(f"{path}: this node of {node.name} gives no pictures; name another")
+        form = self._set_format(path, node)
+        self._set_rate(path, node)
+        exposure_ns, remarks = apply_controls(path, node, self._config)
         self.remarks += remarks
-        made = v4l2.request_buffers(fd, CAPTURE, v4l2.Memory.MMAP, N_BUFFERS)
-        buffers: list[mmap.mmap] = []
-        for index in range(made.count):
-            buffer = v4l2.query_buffer(fd, CAPTURE, v4l2.Memory.MMAP, index)
-            buffers.append(mmap.mmap(fd, buffer.length, offset=buffer.m.offset))
-            _enqueue(fd, index)
-        v4l2.stream_on(fd, CAPTURE)
-        return _Stream(fd, code, width, height, stride, buffers, exposure_ns)
+        buffers = node.make_buffers(N_BUFFERS)
+        try:
+            for index in range(len(buffers)):
+                node.enqueue(index)
+            node.start()
+        except OSError:
+            for buffer in buffers:  # a mapping keeps the device busy
+                buffer.close()
+            raise
+        return _Stream(fd, node, form, buffers, exposure_ns)
 
-    def _set_format(self, path: str, fd: int) -> tuple[str, int, int, int]:
+    def _set_format(self, path: str, node: CaptureNode) -> PictureFormat:
         config = self._config
-        offered = [v4l2.human_pixel_format(f) for f in _pixel_formats(fd)]
+        offered = node.codes()
         wanted = config.pixel_format.upper()
         if wanted == "AUTO":
-            codes = _by_preference(fd, offered, config)
+            codes = _by_preference(node, offered, config)
         elif wanted in offered and wanted in CODES:
             codes = [wanted]
         else:
@@ -150,27 +144,27 @@ class V4l2Camera:
                 + ", ".join(CODES)
             )
         for code in codes:
-            pix = v4l2.set_format(fd, CAPTURE, config.width, config.height, code).fmt.pix
-            given = v4l2.human_pixel_format(pix.pixelformat)
-            if (pix.width, pix.height, given) == (config.width, config.height, code):
-                return code, pix.width, pix.height, 0 if code == "MJPG" else pix.bytesperline
+            given = node.set_format(code, config.width, config.height)
+            same = (given.code, given.width, given.height) == (code, config.width, config.height)
+            if same and given.n_planes == 1:
+                return given
         raise ConfigError(
             f"{path}: no pictures of {config.width} x {config.height} as {' or '.join(codes)}; "
-            f"set camera.width and camera.height to one of: {sizes_of(fd, codes)}"
+            f"set camera.width and camera.height to one of: {sizes_of(node, codes)}"
         )
 
-    def _set_rate(self, path: str, fd: int) -> None:
+    def _set_rate(self, path: str, node: CaptureNode) -> None:
         wanted = self._config.rate_hz
         try:
-            v4l2.set_fps(fd, CAPTURE, wanted)
-            given = float(v4l2.get_fps(fd, CAPTURE))
-        except (OSError, ZeroDivisionError):
+            given = node.set_rate(wanted)
+        except OSError:
+            given = 0.0
+        if not given:
             self.remarks.append(f"{path}: its rate cannot be set, {wanted:g}/s was asked")
-            return
-        if abs(given - wanted) > (1 - MAX_RATE_SHORTFALL) * wanted:
+        elif abs(given - wanted) > (1 - MAX_RATE_SHORTFALL) * wanted:
             self.remarks.append(f"{path}: it gives {given:g} pictures/s, {wanted:g} were asked")
 
-    def _newest(self, stream: _Stream, timeout_s: float) -> Any | None:
+    def _newest(self, stream: _Stream, timeout_s: float) -> FilledBuffer | None:
         poll = select.poll()
         poll.register(stream.fd, select.POLLIN)
         ready = poll.poll(timeout_s * 1e3)
@@ -178,28 +172,28 @@ class V4l2Camera:
             return None
         newest = None
         while True:
-            try:
-                buffer = v4l2.dequeue_buffer(stream.fd, CAPTURE, v4l2.Memory.MMAP)
-            except BlockingIOError:
+            buffer = stream.node.dequeue()
+            if buffer is None:
                 if newest is None and ready[0][1] & (select.POLLERR | select.POLLHUP):
-                    raise OSError(errno.ENODEV, "no longer there") from None
+                    raise OSError(errno.ENODEV, "no longer there")
                 return newest
             if newest is not None:
-                _enqueue(stream.fd, newest.index)
+                stream.node.enqueue(newest.index)
                 self.n_dropped += 1
             newest = buffer
             if stream.sequence is not None:  # gaps are what the driver itself had to drop
                 self.n_dropped += max(0, buffer.sequence - stream.sequence - 1)
             stream.sequence = buffer.sequence
 
-    def _picture(self, stream: _Stream, buffer: Any) -> Picture | None:
+    def _picture(self, stream: _Stream, buffer: FilledBuffer) -> Picture | None:
         now_ns = time.monotonic_ns()
-        if buffer.flags & v4l2.BufferFlag.ERROR or not buffer.bytesused:
+        if buffer.flags & v4l2.BUF_FLAG_ERROR or buffer.end <= buffer.start:
             return None
+        form = stream.format
         view = memoryview(stream.buffers[buffer.index])
         try:
             arrays = to_grey_and_rgb(
-                stream.code, view[: buffer.bytesused], stream.width, stream.height, stream.stride
+                form.code, view[buffer.start : buffer.end], form.width, form.height, form.stride
             )
         finally:
             view.release()
@@ -207,10 +201,10 @@ class V4l2Camera:
             return None
         return Picture(self._mid_exposure_ns(stream, buffer, now_ns), *arrays)
 
-    def _mid_exposure_ns(self, stream: _Stream, buffer: Any, now_ns: int) -> int:
-        kind = buffer.flags & v4l2.BufferFlag.TIMESTAMP_MASK
-        stamp_ns = buffer.timestamp.secs * 1_000_000_000 + buffer.timestamp.usecs * 1_000
-        stated = kind == v4l2.BufferFlag.TIMESTAMP_MONOTONIC
+    def _mid_exposure_ns(self, stream: _Stream, buffer: FilledBuffer, now_ns: int) -> int:
+        kind = buffer.flags & v4l2.BUF_FLAG_TIMESTAMP_MASK
+        stamp_ns = buffer.stamp_ns
+        stated = kind == v4l2.BUF_FLAG_TIMESTAMP_MONOTONIC
         if not stated or abs(now_ns - stamp_ns) > MAX_AGE_NS:
             if not stream.stamped_by_us:
                 stream.stamped_by_us = True
@@ -219,42 +213,38 @@ class V4l2Camera:
                     f"{self.name}: the driver's stamps are {why}; pictures are stamped when read"
                 )
             stamp_ns = now_ns
-            source = v4l2.BufferFlag.TSTAMP_SRC_EOF
+            source = v4l2.BUF_FLAG_TSTAMP_SRC_EOF
         else:
-            source = buffer.flags & v4l2.BufferFlag.TSTAMP_SRC_MASK
+            source = buffer.flags & v4l2.BUF_FLAG_TSTAMP_SRC_MASK
         half_ns = stream.exposure_ns // 2
-        starts = source == v4l2.BufferFlag.TSTAMP_SRC_SOE
-        return int(stamp_ns + half_ns if starts else stamp_ns - half_ns)
+        starts = source == v4l2.BUF_FLAG_TSTAMP_SRC_SOE
+        return stamp_ns + half_ns if starts else stamp_ns - half_ns
 
 
-def _enqueue(fd: int, index: int) -> None:
-    v4l2.enqueue_buffer(fd, CAPTURE, v4l2.Memory.MMAP, 0, index)
-
-
-def _pixel_formats(fd: int) -> list[int]:
-    return [int(each.pixel_format) for each in v4l2.iter_read_formats(fd, CAPTURE)]
-
-
-def _by_preference(fd: int, offered: list[str], config: CameraConfig) -> list[str]:
+def _by_preference(node: CaptureNode, offered: list[str], config: CameraConfig) -> list[str]:
     """Codes that can be read, those first that are fast enough at this size, then as in CODES."""
     known = [code for code in CODES if code in offered]
 
     def too_slow(code: str) -> bool:
-        number = v4l2.raw.v4l2_fourcc(*code)
-        rates = [
-            float(each.max_fps)
-            for each in v4l2.iter_read_frame_intervals(fd, number, config.width, config.height)
-        ]
+        rates = node.rates_hz(code, config.width, config.height)
         return max(rates, default=0.0) < MAX_RATE_SHORTFALL * config.rate_hz
 
     return sorted(known, key=too_slow)
 
 
-def _cannot_open(path: str, error: OSError) -> str:
+def _cannot_open(error: OSError) -> str:
     if error.errno == errno.EACCES:
-        return f"{path}: may not be opened: add the user to the group video"
+        return "may not be opened: add the user to the group video"
     if error.errno == errno.EBUSY:
-        return f"{path}: another program uses the camera"
+        return "another program uses the camera"
     if error.errno in GONE:
-        return f"{path}: there is no such camera now"
-    return f"{path}: cannot be opened: {error.strerror}"
+        return "there is no such camera now"
+    return f"cannot be opened: {error.strerror}"
+
+
+def _cannot_start(error: OSError) -> str:
+    if error.errno == errno.EBUSY:
+        return "another program uses the camera"
+    if error.errno == errno.ENOTTY:
+        return "it is no camera"
+    return f"the camera cannot be started: {error.strerror or error}"

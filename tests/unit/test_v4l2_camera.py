@@ -14,11 +14,12 @@ from companion.devices import devices
 from companion.errors import ConfigError, SourceError
 from companion.messages import Frame, Warned
 from drivers import camera_feed
+from drivers import v4l2_ioctl as v4l2
 from drivers.camera_devices import cameras
 from drivers.camera_feed import CameraFeed
 from drivers.camera_source import Picture
 from drivers.v4l2_camera import V4l2Camera
-from tests.support.fake_v4l2 import ID, MONOTONIC_EOF, FakeV4l2, install
+from tests.support.fake_v4l2 import MONOTONIC_EOF, FakeV4l2, install
 
 
 @pytest.fixture
@@ -97,8 +98,9 @@ def test_stamps_that_cannot_be_used_are_replaced_and_told(
 def test_controls_are_set_and_automatics_put_off(webcam: FakeV4l2, camera: V4l2Camera) -> None:
     camera.open()
     assert webcam.values == {
-        ID.EXPOSURE_AUTO: 1, ID.EXPOSURE_ABSOLUTE: 50, ID.EXPOSURE_AUTO_PRIORITY: 0, ID.GAIN: 99,
-        ID.FOCUS_AUTO: 0, ID.FOCUS_ABSOLUTE: 20,
+        v4l2.CID_EXPOSURE_AUTO: 1, v4l2.CID_EXPOSURE_ABSOLUTE: 50,
+        v4l2.CID_EXPOSURE_AUTO_PRIORITY: 0, v4l2.CID_GAIN: 99, v4l2.CID_FOCUS_AUTO: 0,
+        v4l2.CID_FOCUS_ABSOLUTE: 20,
     }  # fmt: skip
     assert camera.remarks == [
         f"{webcam.stable_path}: camera.focus is 20 in its steps, 23 was asked"
@@ -106,11 +108,11 @@ def test_controls_are_set_and_automatics_put_off(webcam: FakeV4l2, camera: V4l2C
 
 
 def test_what_is_left_to_the_camera_is_not_touched(webcam: FakeV4l2, camera: V4l2Camera) -> None:
-    webcam.values[ID.GAIN] = 77
+    webcam.values[v4l2.CID_GAIN] = 77
     camera.open()
-    assert webcam.values[ID.GAIN] == 77
-    assert webcam.values[ID.EXPOSURE_AUTO] == 3
-    assert webcam.values[ID.FOCUS_AUTO] == 1
+    assert webcam.values[v4l2.CID_GAIN] == 77
+    assert webcam.values[v4l2.CID_EXPOSURE_AUTO] == 3
+    assert webcam.values[v4l2.CID_FOCUS_AUTO] == 1
 
 
 @pytest.mark.parametrize(
@@ -132,7 +134,7 @@ def test_what_the_camera_cannot_do(
 
 
 def test_a_camera_without_the_control(webcam: FakeV4l2) -> None:
-    del webcam.controls[int(ID.FOCUS_ABSOLUTE)]
+    del webcam.controls[v4l2.CID_FOCUS_ABSOLUTE]
     with pytest.raises(ConfigError, match=r"no such control: leave camera\.focus"):
         V4l2Camera(CameraConfig(focus=3)).open()
 
