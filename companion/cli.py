@@ -108,10 +108,32 @@ def _calibrate(arguments: argparse.Namespace, signals: StopSignals) -> int:
     source = camera_source(config.camera) if arguments.live else arguments.source
     report = calibrate(
         source, arguments.board, arguments.name, arguments.out, arguments.model,
-        signals.between_frames(progress_on(sys.stderr)),
+        signals.between_frames(progress_on(sys.stderr, "views")),
     )  # fmt: skip
     print(report)
+    if not arguments.live:
+        signals.take()
     return 0
+
+
+def _bench_slam(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.bench_slam import bench_slam
+    from companion.output.slam_bench import as_json, table
+
+    rows = bench_slam(
+        arguments.flights, load_config(arguments.config, arguments.set), arguments.out,
+        faults=arguments.faults, above_m=arguments.above,
+        progress=signals.between_frames(progress_on(sys.stderr)),
+    )  # fmt: skip
+    print(as_json(rows) if arguments.json else table(rows))
+    return 0
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {"slam": _bench_slam}
+
+
+def _bench(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    return BENCHES[arguments.bench](arguments, signals)
 
 
 def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -126,6 +148,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {
     "devices": _devices,
     "calibrate": _calibrate,
     "doctor": _doctor,
+    "bench": _bench,
     "check-config": _check_config,
 }
 
@@ -228,6 +251,23 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     doctor.add_argument("--write", action="store_true", help="set them, after asking")
     doctor.add_argument("--yes", action="store_true", help="do not ask")
+
+    bench = commands.add_parser("bench", help="measure how good the results are, against truth")
+    benches = bench.add_subparsers(dest="bench", required=True, metavar="WHAT")
+
+    slam = benches.add_parser(
+        "slam", parents=[configuration, as_json], help="errors of the camera's path",
+        description="Track recorded flights that have truth/world_from_camera.tum, dense mapping "
+        "left off; lengths are in metres, times in milliseconds.",
+    )  # fmt: skip
+    slam.add_argument("flights", type=Path, nargs="+", metavar="FLIGHT")
+    slam.add_argument("--faults", action="store_true", help="each flight under each known fault")
+    slam.add_argument(
+        "--above", type=float, metavar="M", help="count only frames truly higher than this"
+    )
+    slam.add_argument(
+        "--out", type=Path, metavar="DIR", help="write slam.json and pictures of the paths there"
+    )
 
     commands.add_parser(
         "check-config", parents=[configuration], help="print the configuration that would be used",

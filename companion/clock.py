@@ -42,6 +42,7 @@ class StageTimes:
 
     def __init__(self) -> None:
         self._ms: defaultdict[str, list[float]] = defaultdict(list)
+        self._total_ms: defaultdict[str, float] = defaultdict(float)
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
@@ -50,11 +51,16 @@ class StageTimes:
         try:
             yield
         finally:
-            self._ms[name].append((time.perf_counter() - start) * 1e3)
+            self.add(name, (time.perf_counter() - start) * 1e3)
 
     def add(self, name: str, ms: float) -> None:
         """Record a duration that was measured elsewhere (an OpenCL event)."""
         self._ms[name].append(ms)
+        self._total_ms[name] += ms
+
+    def total_ms(self, name: str) -> float:
+        """All of it so far under one name."""
+        return self._total_ms[name]
 
     def summary(self) -> dict[str, dict[str, float]]:
         """Per name: n, p50_ms, p95_ms, total_s."""

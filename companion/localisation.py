@@ -76,6 +76,22 @@ class LocalisationStage:
         """What the tracker knows."""
         return self._tracker.state
 
+    @property
+    def n_segments(self) -> int:
+        """Maps that stand for themselves."""
+        return len(self._segments())
+
+    @property
+    def n_loops(self) -> int:
+        """Places that were known again and tied together."""
+        return 0
+
+    @property
+    def camera_from_body(self) -> Pose:
+        """Where the body is from the camera; the identity where that is not known."""
+        mount = self._camera.body_from_camera
+        return mount.inverse() if mount is not None else Pose.identity()
+
     def step(self, message: Message) -> Iterable[Message]:
         """Take one message; messages come in order of time.
 
