@@ -273,6 +273,8 @@ class Warned:
     t_ns: int
     what: str
     detail: str = ""
+    good: bool = False
+    """Good news: something has come, or has come back."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

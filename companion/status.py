@@ -92,7 +92,8 @@ def _feedback(feedback: Mapping[str, Any]) -> str:
         return why + (f" ({detail})" if detail else "")
     return (
         f"{feedback['mode']}, {_number(feedback.get('rate_hz'), '/s')},"
-        f" {_number(feedback.get('latency_p95_ms'), ' ms')} after exposure (p95),"
+        f" {_number(feedback.get('latency_p50_ms'), ' ms')} after exposure"
+        f" ({_number(feedback.get('latency_p95_ms'), ' ms')} p95),"
         f" {feedback.get('n_resets', 0)} resets"
     )
 

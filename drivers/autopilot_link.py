@@ -28,6 +28,7 @@ from drivers.mavlink_wire import run_together
 from drivers.message_rates import MessageRates, wanted
 from drivers.status_text import StatusTexts
 from drivers.vehicle import Vehicle, is_autopilot, vehicle_of
+from drivers.within import within
 
 FIRST_SYSTEM = 1
 """Whose component we say we are until the vehicle is heard: on UDP it may answer only then."""
@@ -195,7 +196,7 @@ class AutopilotLink:
             if result in REFUSALS and not came.done():
                 return None
             with contextlib.suppress(asyncio.TimeoutError):
-                return await asyncio.wait_for(came, timeout_s)
+                return await within(came, timeout_s)
             return None
         finally:
             end()
@@ -240,12 +241,13 @@ class AutopilotLink:
     def _found(self, vehicle: Vehicle, now_ns: int) -> None:
         self.vehicle = vehicle
         self.port.identity = (vehicle.system_id, self._config.component_id)
-        self._warn(Warned(now_ns, "autopilot found", f"{vehicle} on {self.port.name}"))
+        self._warn(Warned(now_ns, "autopilot found", f"{vehicle} on {self.port.name}", good=True))
 
     def _heard(self, now_ns: int) -> None:
         if not self.alive and self._heard_ns:
             silent_s = (now_ns - self._heard_ns) * 1e-9
-            self._warn(Warned(now_ns, "autopilot heard again", f"after {silent_s:.1f} s"))
+            detail = f"after {silent_s:.1f} s"
+            self._warn(Warned(now_ns, "autopilot heard again", detail, good=True))
             self._meter.n_reopened += 1
             self._wanted.restart()
         self.alive = True

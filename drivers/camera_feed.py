@@ -238,7 +238,8 @@ class CameraFeed:
         before, self._meter.state = self._meter.state, "running"
         self._meter.detail = self._source.name
         if self._seq:
-            self._warn(Warned(self._clock.now_ns(), BACK, f"{self._source.name}: it was {before}"))
+            detail = f"{self._source.name}: it was {before}"
+            self._warn(Warned(self._clock.now_ns(), BACK, detail, good=True))
         self._warned_s.clear()
 
     def _set(self, state: SourceState, what: str, detail: str) -> None:

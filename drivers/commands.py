@@ -8,6 +8,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drivers.within import within
+
 NO_ANSWER = -1
 """In the place of a MAV_RESULT: it did not answer, however often it was asked."""
 TRIES = 3
@@ -54,7 +56,7 @@ class Commands:
             wait_s = timeout_s
             while True:
                 try:
-                    result = await asyncio.wait_for(answers.get(), wait_s)
+                    result = await within(answers.get(), wait_s)
                 except asyncio.TimeoutError:
                     break
                 if result != mavlink.MAV_RESULT_IN_PROGRESS:

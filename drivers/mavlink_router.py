@@ -175,7 +175,9 @@ class Router:
         target = packet.target
         if target is not None:
             system, component = self._identity()
-            if target[0] in (0, system) and target[1] in (0, component):
+            # the autopilot is on the wire: what calls itself that here is not to be believed
+            meant = target[0] in (0, system) and target[1] in (0, component)
+            if meant and packet.component != AUTOPILOT:
                 self._deliver(packet, monotonic_ns)
                 if target == (system, component):
                     return

@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.errors import SourceError
 from drivers.mavlink_port import OnMessage
 from drivers.vehicle import Firmware, Vehicle
+from drivers.within import within
 
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAVLINK_2 = 0xFD
@@ -185,7 +186,7 @@ class Parameters:
             self._came.clear()
             wait_s = min(patience_s or self._patience_s, end_s - begin_s)
             try:
-                await asyncio.wait_for(self._came.wait(), wait_s)
+                await within(self._came.wait(), wait_s)
             except asyncio.TimeoutError:
                 return
             self._slowest_s = max(self._slowest_s or 0.0, loop.time() - begin_s)

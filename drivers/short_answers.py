@@ -10,6 +10,8 @@ import asyncio
 import socket
 from collections.abc import Awaitable, Callable
 
+from drivers.within import within
+
 MAX_CLIENTS = 8
 MAX_REQUEST = 8192
 TIMEOUT_S = 2.0
@@ -66,7 +68,7 @@ class ShortAnswers:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            await asyncio.wait_for(self._reply(reader, writer), TIMEOUT_S)
+            await within(self._reply(reader, writer), TIMEOUT_S)
             self.n_answered += 1
         except (OSError, EOFError, asyncio.TimeoutError):
             self.n_refused += 1

@@ -138,6 +138,7 @@ def kind_of(sample: Telemetry) -> str:
 
 
 def is_finite(content: Telemetry | GeodeticFix) -> bool:
+    """Whether all its numbers are."""
     # written out, since this runs for every sample of a flight
     if isinstance(content, AttitudeSample):
         return bool(np.isfinite(content.ned_from_body).all())

@@ -43,5 +43,6 @@ class Journal:
         if told:
             often = f" (for the {n}th time)" if n > MAX_SAME_IN_A_ROW else ""
             detail = f": {warning.detail}" if warning.detail else ""
-            self.say(f"warning: {warning.what}{detail}{often}", WARNING)
+            kind, priority = ("", INFO) if warning.good else ("warning: ", WARNING)
+            self.say(f"{kind}{warning.what}{detail}{often}", priority)
         return told

@@ -46,8 +46,8 @@ def calibration_toml(calibration: Calibration, name: str, board: str, source: st
         "# Lens of a camera, written by `companion calibrate`; pixel centres are at integers.\n"
         f"{_lines(lens)}\n"
         "# Errors and standard deviations in pixels; holdout_px is in views left out of the fit,\n"
-        "# coverage the share of the picture in which the board was, board_sag_mm how far from flat\n"
-        "# it is, which was allowed for.\n"
+        "# coverage the share of the picture in which the board was, board_sag_mm how far from\n"
+        "# flat it is, which was allowed for.\n"
         f"[quality]\n{_lines(quality)}"
     )
     return text.encode("utf-8")

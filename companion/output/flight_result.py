@@ -135,7 +135,7 @@ class FlightResult:
             path = self._positions.setdefault(message.source, [])
             if not path or message.t_ns - path[-1][0] >= POSITION_STEP_NS:
                 path.append((message.t_ns, message.position_ned_m))
-        elif isinstance(message, Warned):
+        elif isinstance(message, Warned) and not message.good:
             warnings = self.warnings.get(message.what)
             if warnings is None:
                 self.warnings[message.what] = WarningCount(1, message.t_ns, message.detail)

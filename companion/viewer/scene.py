@@ -119,7 +119,8 @@ class Scene:
             self._autopilot(message)
         elif isinstance(message, Warned):
             text = f"{message.what}: {message.detail}" if message.detail else message.what
-            self._rec.log("log", rr.TextLog(text, level=rr.TextLogLevel.WARN))
+            level = rr.TextLogLevel.INFO if message.good else rr.TextLogLevel.WARN
+            self._rec.log("log", rr.TextLog(text, level=level))
 
     def _encoded(self, rgb: Bytes) -> rr.EncodedImage:
         small = rgb

@@ -35,8 +35,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def opened(folder: Path, **camera: float) -> Flight:
-    return open_flight(folder, CameraConfig(**camera))
+AS_FOUND = CameraConfig()
+
+
+def opened(folder: Path, camera: CameraConfig = AS_FOUND) -> Flight:
+    return open_flight(folder, camera)
 
 
 def frames(flight: Flight, *part: int) -> list[Frame]:
@@ -178,12 +181,12 @@ def test_no_list_of_times(folder: Path) -> None:
 
 def test_no_calibration(folder: Path) -> None:
     (folder / "camera.json").unlink()
-    flight = opened(folder, assumed_hfov_deg=60)
+    flight = opened(folder, CameraConfig(assumed_hfov_deg=60))
     assert flight.camera.assumed
     assert flight.camera.body_from_camera is None
     assert whats(flight.warnings) == ["no camera.json: the camera is assumed"]
     with pytest.raises(FlightError, match="assumed_hfov_deg"):
-        opened(folder, assumed_hfov_deg=0)
+        opened(folder, CameraConfig(assumed_hfov_deg=0))
 
 
 def test_numbered_images(tmp_path: Path) -> None:
