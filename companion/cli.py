@@ -132,6 +132,22 @@ def _bench_slam(arguments: argparse.Namespace, signals: StopSignals) -> int:
 BENCHES: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {"slam": _bench_slam}
 
 
+def _depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.depth_command import Wanted, reconstruct
+
+    sets = list(arguments.set)
+    if arguments.device is not None:
+        sets.append(f"opencl.device={arguments.device}")
+    wanted = Wanted(arguments.reference, arguments.frames, *arguments.range)
+    maps = reconstruct(
+        arguments.dataset, arguments.out, load_config(arguments.config, sets), wanted,
+        signals.between_frames(progress_on(sys.stderr)),
+    )  # fmt: skip
+    print(f"{len(maps)} depth maps and cloud.ply: {arguments.out}")
+    signals.take()
+    return 0
+
+
 def _bench(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return BENCHES[arguments.bench](arguments, signals)
 
@@ -148,6 +164,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {
     "devices": _devices,
     "calibrate": _calibrate,
     "doctor": _doctor,
+    "depth": _depth,
     "bench": _bench,
     "check-config": _check_config,
 }
@@ -252,6 +269,30 @@ def _parser() -> argparse.ArgumentParser:
     doctor.add_argument("--write", action="store_true", help="set them, after asking")
     doctor.add_argument("--yes", action="store_true", help="do not ask")
 
+    depth = commands.add_parser(
+        "depth", parents=[configuration], help="dense depth from images with known poses",
+        description="Reconstruct the depth of reference frames. DATASET is a folder in the layout "
+        "of REMODE's test set or of TUM RGB-D, with poses.txt and K.txt, or a flight with "
+        "trajectory.tum.",
+    )  # fmt: skip
+    depth.add_argument("dataset", type=Path, metavar="DATASET")
+    depth.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the results"
+    )
+    depth.add_argument(
+        "--reference", type=int, metavar="N",
+        help="only this frame, from all others (default: a new one as the view moves on)",
+    )  # fmt: skip
+    depth.add_argument(
+        "--frames", type=_frames, default=(None, None), metavar="A:B",
+        help="use frames from A up to, not including, B",
+    )  # fmt: skip
+    depth.add_argument(
+        "--range", type=_depths, required=True, metavar="NEAR:FAR",
+        help="least and greatest depth that there can be, metres",
+    )  # fmt: skip
+    depth.add_argument("--device", metavar="NAME", help="the same as --set opencl.device=NAME")
+
     bench = commands.add_parser("bench", help="measure how good the results are, against truth")
     benches = bench.add_subparsers(dest="bench", required=True, metavar="WHAT")
 
@@ -281,6 +322,28 @@ def _seconds(text: str) -> float:
     if not (math.isfinite(value) and value >= 0):
         raise argparse.ArgumentTypeError(f"wanted seconds since the first frame, given is {text}")
     return value
+
+
+def _frames(text: str) -> tuple[int | None, int | None]:
+    first, colon, beyond = text.partition(":")
+    try:
+        out = (int(first) if first else None, int(beyond) if beyond else None)
+    except ValueError:
+        colon = ""
+    if not colon or (None not in out and out[1] <= out[0]):  # type: ignore[operator]
+        raise argparse.ArgumentTypeError(f"wanted FIRST:BEYOND, given is {text}")
+    return out
+
+
+def _depths(text: str) -> tuple[float, float]:
+    near, _, far = text.partition(":")
+    try:
+        out = float(near), float(far)
+    except ValueError:
+        out = 0.0, 0.0
+    if not (0 < out[0] < out[1] < math.inf):
+        raise argparse.ArgumentTypeError(f"wanted NEAR:FAR in metres, given is {text}")
+    return out
 
 
 def _viewer(text: str) -> str:

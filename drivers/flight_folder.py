@@ -57,6 +57,16 @@ class Flight:
         return len(self._numbers)
 
     @property
+    def numbers(self) -> tuple[int, ...]:
+        """Index in frames.csv of each of these frames."""
+        return tuple(self._numbers)
+
+    @property
+    def times_ns(self) -> tuple[int, ...]:
+        """Time of each of these frames."""
+        return tuple(self._times_ns)
+
+    @property
     def start_ns(self) -> int:
         """Time of the first frame."""
         return self._times_ns[0]

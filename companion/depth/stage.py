@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.camera import Camera
 from companion.clock import Timer
@@ -20,6 +18,7 @@ from companion.config import CloudConfig, DepthConfig
 from companion.depth.engine import DepthEngine, Intrinsics
 from companion.depth.fusion import Fusion
 from companion.depth.opencl import ComputeDevice
+from companion.depth.undistortion import undistortion
 from companion.geometry import Pose, Similarity
 from companion.messages import (
     Bytes,
@@ -32,7 +31,6 @@ from companion.messages import (
 )
 
 MAX_HELD = 100
-MAX_HFOV_RAD = np.radians(110.0)
 FIRST_BASELINE = 0.01
 """Share of the median depth: the first frame has a short search, which is hardly ambiguous."""
 
@@ -57,7 +55,7 @@ class DepthStage:
     ) -> None:
         self._config = config
         self._fusion = Fusion(cloud)
-        self._maps = _undistortion(camera)
+        self._maps = undistortion(camera)
         fx, fy, cx, cy = self._maps[2]
         self._engine = DepthEngine(
             device, camera.width, camera.height, Intrinsics(fx, fy, cx, cy), config
@@ -220,24 +218,3 @@ class DepthStage:
         oldest = first_needed - max(2 * span, 10)
         for seq in [s for s in self._held if s < oldest]:
             del self._held[seq]
-
-
-def _undistortion(
-    camera: Camera,
-) -> tuple[NDArray[Any], NDArray[Any], tuple[float, float, float, float]]:
-    """Remap tables to an ideal pinhole image of the same size, and its fx, fy, cx, cy.
-
-    The focal length is kept, unless the field of view would be too wide for a plane.
-    """
-    fx, fy = camera.fx, camera.fy
-    widest = 0.5 * camera.width / np.tan(0.5 * MAX_HFOV_RAD)
-    if camera.distortion.value == "equidistant" and fx < widest:
-        fx, fy = widest, widest * camera.fy / camera.fx
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    n = np.stack([(u - camera.cx) / fx, (v - camera.cy) / fy], -1).reshape(-1, 2)
-    d = camera.distort(n)
-    shape = (camera.height, camera.width)
-    map_u = (d[:, 0] * camera.fx + camera.cx).reshape(shape).astype(np.float32)
-    map_v = (d[:, 1] * camera.fy + camera.cy).reshape(shape).astype(np.float32)
-    a, b = cv2.convertMaps(map_u, map_v, cv2.CV_16SC2)
-    return np.asarray(a), np.asarray(b), (fx, fy, camera.cx, camera.cy)

@@ -1,0 +1,225 @@
+"""`companion depth`: depth of reference frames from images with known poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from companion.clock import StageTimes
+from companion.config import Config
+from companion.depth.engine import DepthEngine, Intrinsics
+from companion.depth.fusion import Fusion
+from companion.depth.opencl import ComputeDevice, open_device
+from companion.depth.undistortion import undistortion
+from companion.errors import FlightError
+from companion.geometry import Array, Pose
+from companion.messages import Bytes, DepthMap, MapUpdate, PointChunk
+from companion.output.depth_files import write_cloud, write_depth, write_log
+from companion.progress import Progress
+from drivers.posed_images import PosedImages
+from drivers.posed_layouts import open_posed_images
+
+MAX_TURN_RAD = np.radians(35.0)
+MAX_FRAMES = 400
+"""Images around one reference that are taken at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What of a data set is wanted: one reference or all, frames A to B, depths in metres."""
+
+    reference: int | None
+    frames: tuple[int | None, int | None]
+    near_m: float
+    far_m: float
+
+
+class Reconstruction:
+    """The engine on one data set; keeps undistorted images as long as they may be needed."""
+
+    def __init__(self, images: PosedImages, config: Config, device: ComputeDevice) -> None:
+        self.images = images
+        self._map_u, self._map_v, k = undistortion(images.camera)
+        self.intrinsics = Intrinsics(*k)
+        camera = images.camera
+        self.times = StageTimes()
+        self.engine = DepthEngine(
+            device, camera.width, camera.height, self.intrinsics, config.depth
+        )
+        self._kept: dict[int, Bytes] = {}
+
+    def picture(self, position: int) -> Bytes:
+        """The undistorted RGB image at a position."""
+        if position not in self._kept:
+            for at, rgb in self.images.pictures([position]):
+                self.keep(at, rgb)
+        return self._kept[position]
+
+    def load(self, positions: list[int]) -> None:
+        """Have these images at hand, and no others."""
+        self._kept = {p: self._kept[p] for p in positions if p in self._kept}
+        missing = [p for p in positions if p not in self._kept]
+        for at, rgb in self.images.pictures(missing):
+            self.keep(at, rgb)
+
+    def keep(self, position: int, rgb: Bytes) -> None:
+        """Undistort an image and keep it."""
+        out = cv2.remap(rgb, self._map_u, self._map_v, cv2.INTER_LINEAR)
+        self._kept[position] = np.asarray(out, np.uint8)
+
+    def grey(self, position: int) -> Bytes:
+        """The undistorted grey image at a position."""
+        return np.asarray(cv2.cvtColor(self.picture(position), cv2.COLOR_RGB2GRAY), np.uint8)
+
+    def pose(self, position: int) -> Pose:
+        """Pose world_from_camera; only of positions that have one."""
+        pose = self.images.poses[position]
+        assert pose is not None
+        return pose
+
+    def depth_map(
+        self, reference: int, others: list[int], near_m: float, far_m: float
+    ) -> tuple[DepthMap, list[dict[str, float]]]:
+        """Depth of one reference from other images in this order, and what each update took."""
+        with self.times("begin"):
+            self.engine.begin(self.grey(reference), near_m, far_m)
+        log = []
+        for position in others:
+            grey = self.grey(position)
+            current_from_reference = self.pose(position).inverse() @ self.pose(reference)
+            before = self.times.total_ms("update")
+            with self.times("update"):
+                n_worked = self.engine.update(grey, current_from_reference)
+            log.append(
+                {
+                    "frame": self.images.numbers[position],
+                    "ms": round(self.times.total_ms("update") - before, 3),
+                    "pixels_worked_on": n_worked,
+                }
+            )
+        with self.times("finish"):
+            out = self.engine.finish(
+                self.images.numbers[reference], self.images.numbers[reference],
+                self.picture(reference),
+            )  # fmt: skip
+        return out, log
+
+
+def reconstruct(
+    path: Path, out: Path, config: Config, wanted: Wanted, progress: Progress
+) -> list[DepthMap]:
+    """Write depth of the wanted references, their cloud and depth.json into the folder `out`."""
+    images = open_posed_images(path)
+    device = open_device(config.opencl)
+    work = Reconstruction(images, config, device)
+    positions = _positions(images, wanted.frames)
+    references = _references(images, positions, wanted, config)
+    out.mkdir(parents=True, exist_ok=True)
+    fusion = Fusion(config.cloud)
+    chunks: list[PointChunk] = []
+    done: list[DepthMap] = []
+    log = []
+    numbers = images.numbers
+    places = {numbers[p]: pose for p in positions if (pose := images.poses[p]) is not None}
+    update = MapUpdate(0, 0, places, np.zeros((0, 3)), None)
+    progress.start(len(references))
+    try:
+        for n, reference in enumerate(references, 1):
+            others = _others(images, positions, reference, wanted, config)
+            work.load([reference, *others])
+            depth_map, frames = work.depth_map(reference, others, wanted.near_m, wanted.far_m)
+            write_depth(out, depth_map)
+            done.append(depth_map)
+            log.append({"reference": numbers[reference], "frames": frames})
+            if len(references) > 1:
+                chunks += fusion.add(depth_map, update)
+            progress.update(n, f"frame {numbers[reference]}", sum(len(c.rgb) for c in chunks))
+    finally:
+        progress.finish()
+    chunks += fusion.flush(update) if len(references) > 1 else _alone(done[0])
+    write_cloud(out, chunks, places)
+    write_log(
+        out, device=device.name, layout=images.layout, maps=done, frames=log,
+        stages=work.times.summary(),
+    )  # fmt: skip
+    return done
+
+
+def _positions(images: PosedImages, frames: tuple[int | None, int | None]) -> list[int]:
+    first = 0 if frames[0] is None else frames[0]
+    beyond = max(images.numbers) + 1 if frames[1] is None else frames[1]
+    out = [
+        i
+        for i, number in enumerate(images.numbers)
+        if first <= number < beyond and images.poses[i] is not None
+    ]
+    if len(out) < 2:
+        raise FlightError(f"{images.path}: --frames names fewer than two images with a pose")
+    return out
+
+
+def _references(
+    images: PosedImages, positions: list[int], wanted: Wanted, config: Config
+) -> list[int]:
+    if wanted.reference is not None:
+        if wanted.reference not in images.numbers:
+            raise FlightError(f"{images.path}: there is no frame {wanted.reference}")
+        position = images.numbers.index(wanted.reference)
+        if images.poses[position] is None:
+            raise FlightError(f"{images.path}: frame {wanted.reference} has no pose")
+        return [position]
+    depth = _middle_m(wanted)
+    half_view = float(np.arctan(0.5 * images.camera.width / images.camera.fx))
+    out = [positions[0]]
+    for position in positions[1:]:
+        relative = _relative(images, out[-1], position)
+        step = float(np.linalg.norm(relative.translation)) / depth
+        turn = float(np.arccos(np.clip(relative.rotation[2, 2], -1, 1)))
+        if step > config.depth.reference_step or turn > 0.35 * half_view:
+            out.append(position)
+    return out
+
+
+def _others(
+    images: PosedImages, positions: list[int], reference: int, wanted: Wanted, config: Config
+) -> list[int]:
+    """Images that see what the reference sees, the nearest in time first."""
+    if wanted.reference is not None:
+        return sorted((p for p in positions if p != reference), key=lambda p: abs(p - reference))
+    out = []
+    reach = config.depth.max_baseline * _middle_m(wanted)
+    for position in positions:
+        relative = _relative(images, reference, position)
+        turn = np.arccos(np.clip(relative.rotation[2, 2], -1, 1))
+        near = float(np.linalg.norm(relative.translation)) <= reach
+        if position != reference and near and turn < MAX_TURN_RAD:
+            out.append(position)
+    return sorted(out, key=lambda p: (abs(p - reference), p))[:MAX_FRAMES]
+
+
+def _relative(images: PosedImages, a: int, b: int) -> Pose:
+    first, second = images.poses[a], images.poses[b]
+    assert first is not None and second is not None
+    return first.inverse() @ second
+
+
+def _middle_m(wanted: Wanted) -> float:
+    return float(np.sqrt(wanted.near_m * wanted.far_m))
+
+
+def _alone(depth_map: DepthMap) -> list[PointChunk]:
+    """All points of the only reference: no other can agree or disagree."""
+    rows, columns = np.nonzero(depth_map.depth > 0)
+    fx, fy, cx, cy = depth_map.intrinsics
+    z: Array = depth_map.depth[rows, columns].astype(np.float64)
+    points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
+    return [
+        PointChunk(
+            depth_map.keyframe_id, depth_map.t_ns, points.astype(np.float32),
+            np.ascontiguousarray(depth_map.rgb[rows, columns]),
+            depth_map.inlier_ratio[rows, columns],
+        )
+    ]  # fmt: skip
