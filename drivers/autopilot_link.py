@@ -27,6 +27,7 @@ from drivers.mavlink_samples import SAMPLE_OF
 from drivers.mavlink_wire import run_together
 from drivers.message_rates import MessageRates, wanted
 from drivers.status_text import StatusTexts
+from drivers.timesync_message import TimesyncMessage, timesync_target
 from drivers.vehicle import Vehicle, is_autopilot, vehicle_of
 from drivers.within import within
 
@@ -261,9 +262,13 @@ class AutopilotLink:
             self._deliver(ArmedSample(receive_ns, self._armed))
 
     def _take_timesync(self, message: Any, receive_ns: int) -> None:
+        targets = zip(timesync_target(message), self.port.identity, strict=True)
+        if any(target not in (0, ours) for target, ours in targets):
+            return
         if message.tc1 == 0:  # the autopilot asks, and states its own time in doing so
             middle_ns = receive_ns + (self._clock.now_ns() - receive_ns) // 2
-            self.send(mavlink.MAVLink_timesync_message(middle_ns, message.ts1))
+            asker = message.get_srcSystem(), message.get_srcComponent()
+            self.send(TimesyncMessage(middle_ns, message.ts1, asker))
             if message.ts1 > 0:
                 self.clock_filter.one_way(message.ts1, receive_ns)
         elif message.ts1 in self._questions:  # answers to others are none of ours
@@ -307,7 +312,7 @@ class AutopilotLink:
                     del self._questions[next(iter(self._questions))]
                 now_ns = self._clock.now_ns()
                 self._questions[now_ns] = None
-                self.send(mavlink.MAVLink_timesync_message(0, now_ns))
+                self.send(TimesyncMessage(0, now_ns, (self.vehicle.system_id, AUTOPILOT)))
             await asyncio.sleep(1 / self._config.timesync_hz)
 
     async def _watch(self) -> None:

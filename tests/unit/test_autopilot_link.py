@@ -35,6 +35,7 @@ from drivers.pymavlink_port import PymavlinkPort
 from drivers.status_text import StatusTexts
 from drivers.telemetry_log import GeodeticFix, kind_of
 from drivers.telemetry_tlog import read_tlog
+from drivers.timesync_message import TimesyncMessage, timesync_target
 from drivers.vehicle import vehicle_of
 from tests.support.fake_autopilot import FakeAutopilot
 from tests.support.fake_flight import HERE, RecordedFlight, circle, hover
@@ -508,6 +509,29 @@ def test_the_autopilots_questions_are_answered_with_the_flights_time() -> None:
             [answer] = [message for message in port.of("TIMESYNC") if message.tc1]
             assert answer.ts1 == 123_456_789_000
             assert now_ns <= answer.tc1 <= heard.clock.now_ns()
+
+    run(test())
+
+
+def test_timesync_names_whom_it_is_for() -> None:
+    async def test() -> None:
+        async with spoken() as (_heard, port, talk):
+            [question, *_] = asked_clock(port)
+            assert timesync_target(question) == (1, 1)
+
+            def answers(message: Any) -> list[Any]:
+                port.sent.clear()
+                talk.say(message, 0.01)
+                return [each for each in port.of("TIMESYNC") if each.tc1]
+
+            assert not answers(TimesyncMessage(0, 7 * SECOND, (1, 191)))
+            [answer] = answers(TimesyncMessage(0, 8 * SECOND, (1, 197)))
+            assert timesync_target(answer) == (1, 1)
+            # one who does not know the extension reads it as ever
+            [read] = mavlink.MAVLink(None).parse_buffer(answer.get_msgbuf())
+            assert (read.tc1, read.ts1) == (answer.tc1, 8 * SECOND)
+            [to_all] = answers(mavlink.MAVLink_timesync_message(0, 9 * SECOND))
+            assert to_all.ts1 == 9 * SECOND
 
     run(test())
 
