@@ -1,0 +1,1 @@
+"""The recording of a flight: an MCAP file that survives whatever ends its writer."""

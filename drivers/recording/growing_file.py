@@ -1,0 +1,51 @@
+"""A file that grows by whole pieces, and that nobody takes for finished while it grows."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+
+class GrowingFile:
+    """A new file; OSError where it cannot be made, or is there already.
+
+    Its lock goes with the process, however that ends: see `is_growing`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._size = 0
+
+    def append(self, data: bytes) -> None:
+        """Put all of it at the end; OSError, and none of it stays, where there is no room."""
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._fd, rest) :]
+        except OSError:
+            os.ftruncate(self._fd, self._size)
+            os.lseek(self._fd, self._size, os.SEEK_SET)
+            raise
+        self._size += len(data)
+
+    def sync(self) -> None:
+        """Wait until the disk has it."""
+        os.fdatasync(self._fd)
+
+    def close(self) -> None:
+        """Close it; can be called twice."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+
+def is_growing(fd: int) -> bool:
+    """Whether somebody else still writes to the file that is open as `fd`."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    fcntl.flock(fd, fcntl.LOCK_UN)
+    return False

@@ -1,0 +1,61 @@
+"""Gives a recording that was cut short the end that it lacks, where it lies."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from drivers.recording.growing_file import is_growing
+from drivers.recording.mcap_scan import McapFile, Scan
+from drivers.recording.mcap_writer import ending, note_record
+
+NOTE = "repaired"
+"""Metadata that a repair leaves: how many bytes were cut off."""
+
+
+def repair(path: Path, found: Scan) -> bool:
+    """Cut a file where its data end, and write the index; whether that could be done.
+
+    Not where it is still being written, may not be written, or there is no room. `found` is what a
+    scan of it found. Whatever ends this half way leaves a file that can be repaired again.
+    """
+    try:
+        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        if is_growing(fd):
+            return False
+        note, index = note_record(NOTE, {"cut_bytes": str(n_cut_bytes(found))}, found.good_end)
+        found.contents.metadata.append(index)
+        tail = note + ending(found.contents, found.good_end + len(note))
+        os.ftruncate(fd, found.good_end)
+        os.pwrite(fd, tail, found.good_end)
+        os.fsync(fd)
+    except OSError:
+        return False
+    finally:
+        os.close(fd)
+    return True
+
+
+def n_cut_bytes(found: Scan) -> int:
+    """Bytes that an earlier repair has cut off, or that are to be cut off."""
+    noted = found.metadata.get(NOTE, {}).get("cut_bytes", "0")
+    return found.n_cut_bytes + (int(noted) if noted.isdigit() else 0)
+
+
+def opened(path: Path) -> tuple[McapFile, Scan]:
+    """A file whose chunks have all been looked at, repaired if need be and possible.
+
+    FlightError where it is no MCAP file.
+    """
+    file = McapFile(path)
+    found = file.scan()
+    if not found.whole and repair(path, found):
+        file.close()
+        file = McapFile(path)
+        again = file.scan()
+        again.n_lost_bytes, again.n_lost_places = found.n_lost_bytes, found.n_lost_places
+        return file, again
+    return file, found
