@@ -139,7 +139,7 @@ class Daemon:
         """Send it a signal."""
         self._running.send_signal(number)
 
-    def stop(self, timeout_s: float = 10.0) -> float:
+    def stop(self, timeout_s: float = 30.0) -> float:
         """SIGTERM; how many seconds it took to end. AssertionError unless it ends well."""
         began_s = time.monotonic()
         self.send(signal.SIGTERM)

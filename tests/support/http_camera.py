@@ -11,6 +11,7 @@ goes round faster than the pattern camera's own so that scale is found sooner.
     stalled       True: the connection stays, and nothing comes
     frozen        True: the same picture again and again
     size          (width, height) of what it sends
+    covered       True: it is dark, but for the sensor's noise
     lost          the share of pictures that never leave it
     sent_ns       CLOCK_MONOTONIC of the last picture that a client was sent
 """
@@ -36,6 +37,8 @@ from drivers.pattern_camera import BODY_FROM_CAMERA, PatternScene, pattern_optic
 
 RATE_HZ = 15.0
 FASTER = 2.0
+LEAD_NS, MOST_LATE_NS = 50_000_000, 20_000_000
+"""A picture that could not be sent at the time that it shows is left out."""
 BOUNDARY = b"picture"
 HEAD = (
     b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=" + BOUNDARY + b"\r\n"
@@ -52,13 +55,14 @@ class HttpCamera:
     """See above. One client at a time; `on` may be set before it is started."""
 
     def __init__(self, width: int = 320, height: int = 240, on: bool = True) -> None:
-        self.size = width, height
-        self.on, self.stalled, self.frozen, self.lost = on, False, False, 0.0
+        self._full_size = width, height
+        self.heal()
+        self.on = on
         self.sent_ns = 0
         self._optics = pattern_optics(CameraConfig(width=width, height=height))
         self._scene = PatternScene()
         self._last: Bytes | None = None
-        self._random = random.Random(1)
+        self._random, self._noise = random.Random(1), np.random.default_rng(1)
         self._stop = threading.Event()
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
@@ -79,6 +83,11 @@ class HttpCamera:
         self._thread.join()
         if self.fault is not None:
             raise self.fault
+
+    def heal(self) -> None:
+        """Be there, and do as a camera should."""
+        self.size, self.on, self.lost = self._full_size, True, 0.0
+        self.stalled = self.frozen = self.covered = False
 
     def write_calibration(self, path: Path) -> Path:
         """As the daemon is given it."""
@@ -121,24 +130,29 @@ class HttpCamera:
                         continue  # it has gone
 
     def _film(self, client: socket.socket) -> None:
-        due_ns = time.monotonic_ns()
+        due_ns = time.monotonic_ns() + LEAD_NS
         while self.on and not self._stop.is_set():
             due_ns = max(due_ns + round(1e9 / RATE_HZ), time.monotonic_ns())
+            # drawn beforehand for the time at which it is sent: whoever gets it takes that for its
+            picture = self._picture(due_ns)
             self._stop.wait((due_ns - time.monotonic_ns()) * 1e-9)
             if self.stalled or self._random.random() < self.lost:
                 continue
-            picture = self._picture()
+            if time.monotonic_ns() - due_ns > MOST_LATE_NS:
+                continue
             head = b"--" + BOUNDARY + b"\r\nContent-Type: image/jpeg\r\nContent-Length: "
             data = head + str(len(picture)).encode() + b"\r\n\r\n" + picture + b"\r\n"
-            if self.on and not self.stalled:  # which may have changed meanwhile
+            if self.on:  # which may have changed meanwhile
                 client.sendall(data)
                 self.sent_ns = time.monotonic_ns()
 
-    def _picture(self) -> bytes:
+    def _picture(self, monotonic_ns: int) -> bytes:
         if self._last is None or not self.frozen:
-            pose = world_from_body(time.monotonic_ns()) @ BODY_FROM_CAMERA
+            pose = world_from_body(monotonic_ns) @ BODY_FROM_CAMERA
             self._last = self._scene.picture(self._optics, pose)[1]
         seen = self._last
+        if self.covered:
+            seen = np.asarray(self._noise.integers(0, 8, seen.shape), np.uint8)
         if seen.shape[1::-1] != self.size:
             seen = np.asarray(cv2.resize(seen, self.size), np.uint8)
         done, data = cv2.imencode(".jpg", seen[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
