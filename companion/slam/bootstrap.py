@@ -10,6 +10,7 @@ import numpy as np
 from companion.camera import Camera
 from companion.config import TrackingConfig
 from companion.geometry import Array, Pose
+from companion.messages import Frame
 from companion.slam.features import Features, Ints
 from companion.slam.initializer import MIN_POINTS, initialise
 from companion.slam.matching import match_descriptors
@@ -40,13 +41,13 @@ class Bootstrap:
         self.pending: deque[View] = deque(maxlen=MAX_PENDING)
         self._reference: View | None = None
 
-    def step(
-        self, seq: int, t_ns: int, features: Features, ned_from_camera: Array | None
-    ) -> Start | None:
+    def step(self, frame: Frame, features: Features, ned_from_camera: Array | None) -> Start | None:
         """Take a frame; a Start when a map can begin with it."""
+        seq = frame.seq
         view = View(
-            seq, t_ns, features, ned_from_camera, Pose.identity(), np.full(len(features), -1)
-        )
+            seq, frame.t_ns, features, ned_from_camera, frame.grey, Pose.identity(),
+            np.full(len(features), -1),
+        )  # fmt: skip
         self.pending.append(view)
         reference = self._reference
         if reference is None:

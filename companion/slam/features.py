@@ -69,6 +69,9 @@ class FeatureExtractor:
         pixels = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
         octaves = np.array([k.octave for k in keypoints], np.int64)
         angles = np.array([k.angle for k in keypoints], np.float32)
+        # levels are shrunk about the image's corner, not about the centre of its first pixel
+        half = 0.5 * (self._config.scale_factor**octaves - 1.0)
+        pixels += half[:, None].astype(np.float32)
         normalised = self._camera.normalise(pixels)
         seen = np.isfinite(normalised).all(1)
         pixels, octaves, angles = pixels[seen], octaves[seen], angles[seen]

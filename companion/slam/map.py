@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from companion.geometry import Array, Pose
-from companion.messages import Bytes
+from companion.messages import Bytes, Floats
 from companion.slam.features import Bools, Features, Ints
+from companion.slam.patches import STORED, Patches, cut, level_of
 
 
 @dataclass(slots=True, eq=False)
@@ -25,10 +26,13 @@ class Keyframe:
     camera_from_map: Pose
     features: Features
     point_ids: Ints
-    body_attitude: Array | None = None
-    """rotation ned_from_body (3, 3) by the autopilot at that time"""
-    n_tracked_at_creation: int = 0
-    parent_id: int | None = None
+    normalised: Array
+    whitening: Array
+    """(N, 2), (N, 2, 2) as those of the features, finer where a point's patch was found"""
+    refined_for: Ints
+    """(N,) the point with whose patch each feature was refined, -1 where it was not"""
+    grey: Bytes | None = None
+    """the image, while it may be looked at again"""
 
     @property
     def centre(self) -> Array:
@@ -59,6 +63,13 @@ class SlamMap:
     n_observers: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     born: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """keyframe id at which the point was made"""
+    first_seen: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """keyframe id of the view that the patch is from"""
+    first_unproject: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    """derivative of that view's normalised coordinates by its pixels"""
+    patch_grey: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
+    patch_centre: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    patch_level: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def _reserve(self, n: int) -> None:
         size = len(self.alive)
@@ -67,25 +78,44 @@ class SlamMap:
         new = max(4096, 2 * size, n)
         for name in (
             "positions", "alive", "descriptors", "normals", "base_distance",
-            "n_visible", "n_found", "n_observers", "born",
+            "n_visible", "n_found", "n_observers", "born", "first_seen", "first_unproject",
+            "patch_grey", "patch_centre", "patch_level",
         ):  # fmt: skip
             old = getattr(self, name)
             grown = np.zeros((new, *old.shape[1:]), old.dtype)
             grown[:size] = old
             setattr(self, name, grown)
 
-    def add_points(self, positions: Array, descriptors: Bytes, keyframe_id: int) -> Ints:
-        """Add points (M, 3) and return their ids; observations are added apart."""
+    def add_points(
+        self, positions: Array, keyframe: Keyframe, features: Ints, levels: list[Floats]
+    ) -> Ints:
+        """Add points (M, 3), shown by `features` of a keyframe, whose image `levels` are.
+
+        Returns their ids; observations are added apart.
+        """
+        seen = keyframe.features
         ids = np.arange(self.n_points, self.n_points + len(positions))
         self._reserve(self.n_points + len(positions))
         self.positions[ids] = positions
-        self.descriptors[ids] = descriptors
+        self.descriptors[ids] = seen.descriptors[features]
         self.alive[ids] = True
         self.n_visible[ids] = 1
         self.n_found[ids] = 1
-        self.born[ids] = keyframe_id
+        self.born[ids] = self.first_seen[ids] = keyframe.keyframe_id
+        whitening, sigma = seen.whitening[features], seen.sigma_px[features]
+        self.first_unproject[ids] = np.linalg.inv(whitening * sigma[:, None, None])
+        patches = cut(
+            levels, seen.pixels[features].astype(np.float64),
+            level_of(seen.octaves[features], self.scale_factor),
+        )  # fmt: skip
+        self.patch_grey[ids], self.patch_centre[ids] = patches.grey, patches.centre
+        self.patch_level[ids] = patches.level
         self.n_points += len(positions)
         return ids
+
+    def patches_of(self, points: Ints) -> Patches:
+        """The patches of some points."""
+        return Patches(self.patch_grey[points], self.patch_centre[points], self.patch_level[points])
 
     def observe(self, keyframe: Keyframe, features: Ints, points: Ints) -> None:
         """Let `keyframe` see `points` with `features`; a feature's earlier point is let go."""

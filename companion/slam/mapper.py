@@ -6,16 +6,21 @@ import numpy as np
 
 from companion.camera import Camera
 from companion.config import MappingConfig
+from companion.messages import Floats
 from companion.slam.bundle import Bundle, adjust
 from companion.slam.features import Bools, Ints
 from companion.slam.local_map import Projector
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.matching import match_epipolar
+from companion.slam.patches import image_levels
+from companion.slam.refinement import refine_features
 from companion.slam.triangulation import consistent, triangulate
 from companion.slam.worker import MapTurn
 
 MIN_PARALLAX_RAD = np.radians(0.8)
 N_NEIGHBOURS = 8
+IMAGES_KEPT = 100
+"""Images of older keyframes are let go; what they show is then only as fine as its corners are."""
 
 
 class Mapper:
@@ -33,6 +38,8 @@ class Mapper:
         """Take a keyframe, whose tracked points are set, into the map."""
         slam_map = self._map
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
+        for old in list(slam_map.keyframes.values())[-IMAGES_KEPT - 2 : -IMAGES_KEPT]:
+            old.grey = None
         _, points = slam_map.seen_by(keyframe)
         neighbours = [
             slam_map.keyframes[k]
@@ -40,12 +47,34 @@ class Mapper:
             if k != keyframe.keyframe_id
         ][:N_NEIGHBOURS]
         slam_map.refresh(points, [*reversed(neighbours), keyframe])
-        created = self._triangulate(keyframe, neighbours)
+        assert keyframe.grey is not None
+        created = self._triangulate(keyframe, neighbours, image_levels(keyframe.grey))
         self._extend(keyframe, neighbours, created)
+        self._refine([keyframe, *neighbours])
         self.adjust_locally(keyframe)
         self._cull(keyframe)
 
-    def _triangulate(self, keyframe: Keyframe, neighbours: list[Keyframe]) -> Ints:
+    def _refine(self, keyframes: list[Keyframe]) -> None:
+        """Make positions finer that were not yet, by the points' patches."""
+        slam_map = self._map
+        for k in keyframes:
+            features, points = slam_map.seen_by(k)
+            new = (k.refined_for[features] != points) & (
+                slam_map.first_seen[points] != k.keyframe_id
+            )
+            features, points = features[new], points[new]
+            if k.grey is None or len(points) == 0:
+                continue
+            self._turn.give_way()
+            finer, white, _ = refine_features(
+                slam_map, k.camera_from_map, k.features, features, points, image_levels(k.grey)
+            )
+            k.normalised[features], k.whitening[features] = finer, white
+            k.refined_for[features] = points
+
+    def _triangulate(
+        self, keyframe: Keyframe, neighbours: list[Keyframe], levels: list[Floats]
+    ) -> Ints:
         created = []
         slam_map = self._map
         for other in neighbours:
@@ -86,9 +115,8 @@ class Mapper:
             if len(ia) == 0:
                 continue
             ids = slam_map.add_points(
-                keyframe.camera_from_map.inverse().apply(points),
-                fa.descriptors[ia], keyframe.keyframe_id,
-            )  # fmt: skip
+                keyframe.camera_from_map.inverse().apply(points), keyframe, ia, levels
+            )
             slam_map.observe(keyframe, ia, ids)
             slam_map.observe(other, ib, ids)
             slam_map.refresh(ids, [other, keyframe])
@@ -212,8 +240,8 @@ class Mapper:
         bundle = Bundle(
             [k.camera_from_map for k in cameras], len(variable), slam_map.positions[points],
             cam, index,
-            np.concatenate([k.features.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
-            np.concatenate([k.features.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
+            np.concatenate([k.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
+            np.concatenate([k.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
         )  # fmt: skip
         result = adjust(bundle, iterations or self._config.iterations, self._turn.give_way)
         for i, k in enumerate(variable):

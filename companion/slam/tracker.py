@@ -21,7 +21,9 @@ from companion.slam.features import FeatureExtractor, Features, Ints
 from companion.slam.local_map import Projector, local_points
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.mapper import Mapper
+from companion.slam.patches import image_levels
 from companion.slam.pose_refinement import refine_pose
+from companion.slam.refinement import refine_features
 from companion.slam.relocalizer import Relocalizer
 from companion.slam.view import View
 from companion.slam.worker import AtOnce, Beside, MappingWorker, MapTurn
@@ -107,7 +109,7 @@ class Tracker:
         if self.state is TrackState.INITIALISING:
             return self._initialise(frame, features, prior)
         view = View(
-            frame.seq, frame.t_ns, features, prior.ned_from_camera,
+            frame.seq, frame.t_ns, features, prior.ned_from_camera, frame.grey,
             Pose.identity(), np.full(len(features), -1),
         )  # fmt: skip
         with self._times("tracking"):
@@ -127,17 +129,17 @@ class Tracker:
         self, frame: Frame, features: Features, prior: Prior
     ) -> list[Track | KeyframeAdded]:
         with self._times("initialising"):
-            start = self._bootstrap.step(frame.seq, frame.t_ns, features, prior.ned_from_camera)
+            start = self._bootstrap.step(frame, features, prior.ned_from_camera)
         if start is None or not self._given_up(frame.t_ns):
             return [Track(frame.seq, frame.t_ns, self.state)]
         self._begin_segment()
         with self._times("mapping"):
             first = self._keyframe(start.first)
             second = self._keyframe(start.second)
+            assert second.grey is not None
             ids = self.map.add_points(
-                start.points_map, start.second.features.descriptors[start.features_second],
-                second.keyframe_id,
-            )  # fmt: skip
+                start.points_map, second, start.features_second, image_levels(second.grey)
+            )
             self.map.first_keyframe_id = first.keyframe_id
             self.map.keyframes[first.keyframe_id] = first
             self.map.observe(first, start.features_first, ids)
@@ -210,7 +212,28 @@ class Tracker:
         self._refresh_local(view)
         if not self._match(view, view.camera_from_map, self._local, 5.0, count=True):
             return False
+        self._refine(view)
         return _believable(view, prior)
+
+    def _refine(self, view: View) -> None:
+        """Lay the points' patches over the image, and take the pose from where they fit."""
+        features = view.features
+        normalised, whitening = features.normalised.copy(), features.whitening.copy()
+        refined_for = np.full(len(features), -1)
+        index = np.flatnonzero(view.point_ids >= 0)
+        points = view.point_ids[index]
+        finer, white, _ = refine_features(
+            self.map, view.camera_from_map, features, index, points, image_levels(view.grey)
+        )
+        normalised[index], whitening[index] = finer, white
+        refined_for[index] = points
+        view.normalised, view.whitening, view.refined_for = normalised, whitening, refined_for
+        pose, inlier, information = refine_pose(
+            view.camera_from_map, self.map.positions[points], finer, white, rounds=2
+        )
+        if inlier.sum() >= max(self._config.min_inliers, 0.5 * len(points)):
+            view.camera_from_map, view.information = pose, information
+            view.point_ids[index[~inlier]] = -1
 
     def _match(
         self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False
@@ -293,7 +316,6 @@ class Tracker:
         keyframe = self._keyframe(view)
         features = np.flatnonzero(view.point_ids >= 0)
         self.map.observe(keyframe, features, view.point_ids[features])
-        keyframe.n_tracked_at_creation = len(features)
         self._reference = keyframe
         mapper, slam_map = self.mapper, self.map
 
@@ -310,7 +332,11 @@ class Tracker:
     def _keyframe(self, view: View) -> Keyframe:
         keyframe = Keyframe(
             self._next_keyframe_id, view.seq, view.t_ns, view.camera_from_map, view.features,
-            np.full(len(view.features), -1), view.ned_from_camera,
+            np.full(len(view.features), -1),
+            view.features.normalised.copy() if view.normalised is None else view.normalised,
+            view.features.whitening.copy() if view.whitening is None else view.whitening,
+            np.full(len(view.features), -1) if view.refined_for is None else view.refined_for,
+            view.grey,
         )  # fmt: skip
         self._next_keyframe_id += 1
         return keyframe

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.geometry import Array, Pose
+from companion.messages import Bytes
 from companion.slam.features import Features, Ints
 
 
@@ -18,9 +19,14 @@ class View:
     t_ns: int
     features: Features
     ned_from_camera: Array | None
+    grey: Bytes
     camera_from_map: Pose
     point_ids: Ints
     n_matches: int = 0
+    normalised: Array | None = None
+    whitening: Array | None = None
+    refined_for: Ints | None = None
+    """as of a keyframe, once the frame was tracked"""
     information: Array | None = None
     """(6, 6) of the pose: rotation, translation in the camera frame"""
 

@@ -1,0 +1,65 @@
+"""Positions of features that show map points, made finer by the points' own patches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.geometry import Array, Pose
+from companion.messages import Floats
+from companion.slam.features import Bools, Features, Ints
+from companion.slam.map import SlamMap
+from companion.slam.patches import align
+
+SIGMA_PX = 0.35
+"""Expected error of an aligned patch at full size; it grows with the level as the pixels do."""
+MAX_MOVE_SIGMAS = 2.0
+
+
+def refine_features(
+    slam_map: SlamMap,
+    camera_from_map: Pose,
+    features: Features,
+    index: Ints,
+    points: Ints,
+    levels: list[Floats],
+) -> tuple[Array, Array, Bools]:
+    """Finer positions of features `index` (M,), which show `points` (M,) of the map.
+
+    Returns their `normalised` (M, 2) and `whitening` (M, 2, 2) as in Features, unchanged where the
+    patch was not found for sure, and where it was (M,).
+    """
+    sigma = features.sigma_px[index]
+    normalised, whitening = features.normalised[index], features.whitening[index]
+    jacobian = whitening * sigma[:, None, None]
+    warp = _warps(slam_map, camera_from_map, points, jacobian)
+    pixels = features.pixels[index].astype(np.float64)
+    found, sure = align(slam_map.patches_of(points), warp, levels, pixels, MAX_MOVE_SIGMAS * sigma)
+    moved = np.linalg.solve(jacobian[sure], (found - pixels)[sure][..., None])[..., 0]
+    normalised, whitening = normalised.copy(), whitening.copy()
+    normalised[sure] += moved
+    size = 2.0 ** slam_map.patch_level[points[sure]]
+    whitening[sure] = jacobian[sure] / (SIGMA_PX * size)[:, None, None]
+    return normalised, whitening, sure
+
+
+def _warps(slam_map: SlamMap, camera_from_map: Pose, points: Ints, jacobian: Array) -> Array:
+    """How full-size pixels of each point's first view move in this one (M, 2, 2)."""
+    first_ids, which = np.unique(slam_map.first_seen[points], return_inverse=True)
+    out = np.full((len(points), 2, 2), np.nan)
+    for k, first_id in enumerate(first_ids.tolist()):
+        first = slam_map.keyframes.get(first_id)
+        if first is None:
+            continue
+        here = np.flatnonzero(which == k)
+        ids = points[here]
+        depth = first.camera_from_map.apply(slam_map.positions[ids])[:, 2]
+        turn = camera_from_map.rotation @ first.camera_from_map.rotation.T
+        seen = camera_from_map.apply(slam_map.positions[ids])
+        z = np.where(np.abs(seen[:, 2]) < 1e-9, 1e-9, seen[:, 2])
+        # of a plane through the point, facing the first view
+        shift = slam_map.first_unproject[ids] * depth[:, None, None]
+        in_camera = np.matmul(turn[:, :2], shift)
+        n = seen[:, :2] / z[:, None]
+        projected = (in_camera[:, :2] - n[:, :, None] * in_camera[:, 2:]) / z[:, None, None]
+        out[here] = np.matmul(jacobian[here], projected)
+    return out
