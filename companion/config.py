@@ -191,6 +191,29 @@ class DaemonConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class RecorderConfig:
+    """The recording of a live flight."""
+
+    enabled: bool = True
+    codec: Annotated[str, OneOf(("mjpeg", "h264", "png", "raw"))] = "mjpeg"
+    """Of pictures; png and raw lose nothing."""
+    jpeg_quality: Annotated[int, Range(30, 100)] = 90
+    h264_encoder: str = "auto"
+    """FFmpeg's name of an encoder; "auto" takes one in hardware, else libx264."""
+    h264_kbit_s: Annotated[int, Range(100, 100000)] = 6000
+    flush_s: Annotated[float, Range(0.1, 10)] = 0.5
+    """What is older than twice this is on the disk, whatever happens."""
+    buffer_mb: Annotated[int, Range(4, 4096)] = 64
+    """What waits for a slow disk at most; what comes then is dropped, pictures first."""
+    point_cloud: bool = False
+    """Record the dense points too, which a replay makes anew."""
+    least_free_mb: Annotated[int, Range(0, 1000000)] = 1000
+    """With less room than this on the disk the recording makes some, or ends."""
+    when_full: Annotated[str, OneOf(("prune", "stop"))] = "prune"
+    """Delete the oldest flights, or stop recording."""
+
+
+@dataclass(frozen=True, slots=True)
 class TelemetryConfig:
     """How the autopilot's log is put on the flight's clock."""
 
@@ -280,18 +303,14 @@ class DepthConfig:
     """Longest baseline used, as a share of the median depth."""
     lag_keyframes: Annotated[int, Range(1, 20)] = 2
     """A keyframe waits for so many later ones, whose frames and adjusted poses it uses."""
-    min_zncc: Annotated[float, Range(0, 1)] = 0.65
-    """Least correlation of a match."""
-    peak_margin: Annotated[float, Range(0, 1)] = 0.05
-    """A second peak this near to the best makes a match ambiguous."""
+    min_zncc: Annotated[float, Range(0, 1)] = 0.6
+    """Least correlation of an image that is said to fit."""
     noise_grey: Annotated[float, Range(0, 50)] = 1.5
     """Patches whose grey levels vary less than this are blank."""
-    pose_error_px: Annotated[float, Range(0.01, 2)] = 0.15
-    """Error of a match that comes from the poses, whatever the texture."""
-    converged_sigma: Annotated[float, Range(0.0001, 0.1)] = 0.006
+    converged_sigma: Annotated[float, Range(0.0001, 0.1)] = 0.01
     """Relative standard deviation at which a pixel has converged."""
-    min_inlier_ratio: Annotated[float, Range(0, 1)] = 0.6
-    """Share of good measurements that a converged pixel has at least."""
+    min_inlier_ratio: Annotated[float, Range(0, 1)] = 0.35
+    """Share of images that fit, which a converged pixel has at least; some may not see it."""
     regularise_iterations: Annotated[int, Range(0, 1000)] = 60
     regularise_weight: Annotated[float, Range(0.001, 1000)] = 20.0
     """Weight of the measurements against smoothness."""
@@ -328,6 +347,7 @@ class Config:
     router: RouterConfig = field(default_factory=RouterConfig)
     feedback: FeedbackConfig = field(default_factory=FeedbackConfig)
     daemon: DaemonConfig = field(default_factory=DaemonConfig)
+    recorder: RecorderConfig = field(default_factory=RecorderConfig)
     telemetry: TelemetryConfig = field(default_factory=TelemetryConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
