@@ -26,7 +26,7 @@ from companion.output.surroundings import peak_memory_mb
 from companion.pipeline import in_order_of_time
 from companion.progress import Progress
 from companion.trajectory_error import Path, PathErrors, path_errors
-from drivers.flight_folder import open_flight
+from drivers.open_flight import open_flight
 
 LEAD_NS = 10_000_000_000
 FRAME_PARTS = ("features", "tracking", "initialising")

@@ -199,7 +199,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     replay.add_argument(
         "flight", type=Path, metavar="FLIGHT",
-        help="folder of the flight: video or images, frames.csv, camera.json, telemetry log",
+        help="a flight: folder with video or images, a video, or a data set (EuRoC, KITTI, TUM RGB-D …)",
     )  # fmt: skip
     replay.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder for the results"

@@ -24,7 +24,8 @@ from companion.paced import PacedFeed
 from companion.pipeline import Pipeline, Sink, in_order_of_time
 from companion.progress import Progress
 from companion.viewer import FileViewer, LiveViewer
-from drivers.flight_folder import ENDS_EARLY, Flight, open_flight
+from drivers.flight import ENDS_EARLY, Flight
+from drivers.open_flight import open_flight
 from drivers.telemetry_log import TelemetryLog
 
 LEAD_NS = 10_000_000_000

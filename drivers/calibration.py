@@ -16,6 +16,7 @@ from companion.camera import Camera, Distortion
 from companion.config import CameraConfig, MountConfig
 from companion.errors import ConfigError, FlightError
 from companion.geometry import Array, Pose, quaternion_from_euler, rotation_from_quaternion
+from drivers.text_table import numbers_of, read_rows
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -61,8 +62,19 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
     model = _model(path, content)
     return Camera(
         width, height, fx, fy, cx, cy, model, _coefficients(path, content, model),
-        _body_from_camera(path, content.get("body_from_camera")),
+        body_from_camera_of(path, content.get("body_from_camera")),
     )  # fmt: skip
+
+
+def read_matrix(path: Path, width: int, height: int) -> Camera:
+    """The camera of an intrinsic matrix as text, three rows of three; FlightError if it is none."""
+    matrix = np.array([numbers_of(path, words[:3]) for words in read_rows(path, 3)])
+    if matrix.shape != (3, 3) or min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise FlightError(f"{path}: wanted an intrinsic matrix, three rows of three numbers")
+    fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if not (0 < cx < width and 0 < cy < height):
+        raise FlightError(f"{path}: cx, cy = {cx:g}, {cy:g} lie outside of the picture")
+    return Camera(width, height, fx, fy, cx, cy)
 
 
 def assumed_camera(width: int, height: int, hfov_deg: float) -> Camera:
@@ -188,7 +200,8 @@ def _coefficients(path: Path, content: Mapping[str, Any], model: Distortion) -> 
     return tuple(_number(path, {f"D[{i}]": value}, f"D[{i}]") for i, value in enumerate(given))
 
 
-def _body_from_camera(path: Path, given: Any) -> Pose | None:
+def body_from_camera_of(path: Path, given: Any) -> Pose | None:
+    """The transform that a 4 x 4 matrix is, None for None; FlightError where it is none."""
     if given is None:
         return None
     try:

@@ -211,7 +211,10 @@ class ImageFolder:
 
 def _load(path: Path) -> Bytes | None:
     # OpenCV turns pictures by EXIF unless told not to; calibrations are of the sensor as it is
-    data = np.fromfile(path, np.uint8)
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError:  # a file that a list names need not be there: its number stays a hole
+        return None
     if not data.size:
         return None
     bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from companion.camera import Camera, Distortion
-from companion.config import CameraConfig
+from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
 from companion.geometry import Array, Pose, interpolate_rotation, rotation_from_quaternion
 from companion.messages import Bytes, Floats, Frame
 from drivers.calibration import read_calibration
-from drivers.flight_folder import open_flight
+from drivers.flight_folder import open_flight_folder
 from drivers.frame_source import IMAGE_SUFFIXES
 from drivers.posed_images import PosedImages, pictures_of, read_depth, read_rgb
 
@@ -131,7 +131,7 @@ def _posed_video(path: Path) -> PosedImages:
 
 
 def _flight(path: Path) -> PosedImages:
-    flight = open_flight(path, CameraConfig())
+    flight = open_flight_folder(path, CameraConfig(), TelemetryConfig())
     pose_s, known = _tum_poses(path / "trajectory.tum")
     times_ns = flight.times_ns
     numbers = flight.numbers

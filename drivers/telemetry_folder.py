@@ -1,9 +1,9 @@
-"""Which log a flight folder has, and whether it is of the same flight as the pictures."""
+"""Which log a flight has, and whether it is of the same flight as the pictures."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from companion.errors import FlightError
 from companion.messages import Warned
 from drivers.telemetry_dataflash import read_dataflash
 from drivers.telemetry_gpmf import read_gpmf
-from drivers.telemetry_log import HostTimes, LogContent, TelemetryLog
+from drivers.telemetry_log import HostTimes, LogContent, Pictures, TelemetryLog, no_telemetry
 from drivers.telemetry_tlog import read_tlog
 from drivers.telemetry_ulog import read_ulog
 
@@ -26,38 +26,36 @@ READERS: dict[str, Callable[[Path], LogContent]] = {
 Times = NDArray[np.int64]
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Pictures:
-    """When the pictures of a flight were taken, and their file with its times by its own clock."""
-
-    path: Path
-    start_ns: int
-    stop_ns: int
-    host_from_file_ns: Callable[[Times], Times]
+def logs_in(folder: Path) -> list[Path]:
+    """The telemetry logs of a folder."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS)
 
 
-def read_telemetry(folder: Path, pictures: Pictures, config: TelemetryConfig) -> TelemetryLog:
-    """The log in a folder or in its video, on the flight's clock.
+def logs_beside(video: Path) -> list[Path]:
+    """The telemetry logs that have a video's name."""
+    return [path for path in logs_in(video.parent) if path.stem == video.stem]
+
+
+def read_telemetry(
+    paths: Sequence[Path], pictures: Pictures, config: TelemetryConfig
+) -> TelemetryLog:
+    """What these logs say, or without any the video itself, on the flight's clock.
 
     Of several logs the one that has most of the pictures' time. FlightError where there are logs
     and none is of that time.
     """
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS)
     found = []
     for path in paths:
         try:
             content = READERS[path.suffix.lower()](path)
         except OSError as error:
             raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
-        found.append((path, _aligned(content, pictures, config)))
+        found.append((path, aligned(content, pictures, config)))
     if not paths:
         inside = read_gpmf(pictures.path, pictures.host_from_file_ns)
         if inside is None:
-            missing = Warned(
-                pictures.start_ns, "no telemetry", "neither scale nor level will be known"
-            )
-            return TelemetryLog("", (), warnings=(missing,))
-        found.append((pictures.path, _aligned(inside, pictures, config)))
+            return no_telemetry(pictures)
+        found.append((pictures.path, aligned(inside, pictures, config)))
     usable = [(path, log) for path, log in found if _overlap_ns(log, pictures) > 0]
     if usable:
         path, log = max(usable, key=lambda each: _overlap_ns(each[1], pictures))
@@ -76,7 +74,8 @@ def read_telemetry(folder: Path, pictures: Pictures, config: TelemetryConfig) ->
     return dataclasses.replace(log, warnings=(*log.warnings, empty))
 
 
-def _aligned(content: LogContent, pictures: Pictures, config: TelemetryConfig) -> TelemetryLog:
+def aligned(content: LogContent, pictures: Pictures, config: TelemetryConfig) -> TelemetryLog:
+    """What a reader found, on the flight's clock, with what is configured of that applied."""
     shift_ns = round(config.offset_s * 1e9)
     host_ns = content.host_ns
     # a reader that knows the autopilot's clock only cannot say when
@@ -93,7 +92,7 @@ def _aligned(content: LogContent, pictures: Pictures, config: TelemetryConfig) -
         what = "telemetry has no absolute time and is taken to begin with the video"
         warnings.append(Warned(pictures.start_ns, what, content.collected.source))
         to_start_ns = pictures.start_ns - int(content.collected.stamps()[0].min())
-        host_ns = _shifted(_unchanged, to_start_ns)
+        host_ns = _shifted(unchanged, to_start_ns)
     clock = content.clock
     if clock is not None and shift_ns:
         clock = dataclasses.replace(clock, offset_s=clock.offset_s + config.offset_s)
@@ -101,7 +100,7 @@ def _aligned(content: LogContent, pictures: Pictures, config: TelemetryConfig) -
         dataclasses.replace(sample, t_ns=sample.t_ns + shift_ns) for sample in content.on_host_clock
     ]
     return content.collected.finish(
-        _shifted(host_ns or _unchanged, shift_ns), clock, warnings, armed
+        _shifted(host_ns or unchanged, shift_ns), clock, warnings, armed
     )
 
 
@@ -113,7 +112,8 @@ def _shifted(host_ns: HostTimes, shift_ns: int) -> HostTimes:
     return times
 
 
-def _unchanged(remote_ns: Times, segment: Times) -> Times:
+def unchanged(remote_ns: Times, segment: Times) -> Times:
+    """Times of a log that is on the flight's clock already."""
     return remote_ns
 
 

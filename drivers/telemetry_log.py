@@ -10,6 +10,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,16 @@ MAX_PAIRS = 200
 HostTimes = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]
 
 
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """When the pictures of a flight were taken, and their file with its times by its own clock."""
+
+    path: Path
+    start_ns: int
+    stop_ns: int
+    host_from_file_ns: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryLog:
     """All samples of a flight, sorted by time on the flight's clock.
@@ -49,6 +60,12 @@ class TelemetryLog:
     origin: GeoOrigin | None = None
     warnings: tuple[Warned, ...] = ()
     rates_hz: Mapping[str, float] = field(default_factory=dict)
+
+
+def no_telemetry(pictures: Pictures) -> TelemetryLog:
+    """The log of a flight that has none."""
+    missing = Warned(pictures.start_ns, "no telemetry", "neither scale nor level will be known")
+    return TelemetryLog("", (), warnings=(missing,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

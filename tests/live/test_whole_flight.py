@@ -17,7 +17,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig
-from drivers.flight_folder import open_flight
+from drivers.open_flight import open_flight
 from tests.support.command import Run, refused
 from tests.support.daemon import Daemon
 from tests.support.fake_autopilot import FakeAutopilot, Received

@@ -11,7 +11,8 @@ import pytest
 from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
 from companion.messages import Frame, Warned
-from drivers.flight_folder import Flight, open_flight
+from drivers.flight import Flight
+from drivers.open_flight import open_flight
 from tests.support.logs import (
     START_NS,
     Tlog,
@@ -215,8 +216,11 @@ def test_no_flight(tmp_path: Path) -> None:
     (tmp_path / "camera.mp4").write_bytes(b"no video")
     with pytest.raises(FlightError, match=r"camera\.mp4"):
         opened(tmp_path)
-    with pytest.raises(FlightError, match="not a folder"):
+    with pytest.raises(FlightError, match=r"camera\.mp4"):
         opened(tmp_path / "camera.mp4")
+    (tmp_path / "note.txt").write_text("no flight")
+    with pytest.raises(FlightError, match="not a folder, and no file that holds a flight"):
+        opened(tmp_path / "note.txt")
 
 
 def test_two_videos(folder: Path) -> None:

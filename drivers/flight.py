@@ -1,0 +1,146 @@
+"""A recorded flight, whatever it was recorded in: frames in order of time, and what was logged."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.camera import Camera
+from companion.geometry import Pose
+from companion.messages import Frame, Warned
+from drivers.ahead import Ahead
+from drivers.frame_source import FrameSource
+from drivers.telemetry_log import Pictures, TelemetryLog
+
+FRAMES_AHEAD = 4
+ENDS_EARLY = "the video ends early"
+"""What a flight with fewer frames than its list of times warns of."""
+
+
+class TruePose(NamedTuple):
+    """Where a frame truly was taken: `world_from_camera` in metres, in a world of the format's."""
+
+    t_ns: int
+    world_from_camera: Pose
+
+
+class Flight:
+    """A flight that can be read; `open_flight` makes one."""
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        source: FrameSource,
+        numbers: list[int],
+        times_ns: list[int],
+        warnings: Sequence[Warned],
+        read_log: Callable[[Pictures], TelemetryLog],
+        read_truth: Callable[[], Sequence[TruePose]] = tuple,
+    ) -> None:
+        self.path = path
+        self.camera = camera
+        self.warnings = tuple(warnings)
+        """What was found amiss on opening."""
+        self.source = source
+        """Where its pictures lie."""
+        self._numbers = numbers
+        self._times_ns = times_ns
+        self._read_log = read_log
+        self._read_truth = read_truth
+        self._telemetry: TelemetryLog | None = None
+
+    @property
+    def n_frames(self) -> int:
+        """Frames that have a time and a picture."""
+        return len(self._numbers)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Number of each of these frames in its source."""
+        return tuple(self._numbers)
+
+    @property
+    def times_ns(self) -> tuple[int, ...]:
+        """Time of each of these frames."""
+        return tuple(self._times_ns)
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first frame."""
+        return self._times_ns[0]
+
+    @property
+    def stop_ns(self) -> int:
+        """One nanosecond after the last frame."""
+        return self._times_ns[-1] + 1
+
+    def n_frames_between(self, start_ns: int | None = None, stop_ns: int | None = None) -> int:
+        """How many frames `frames` has to decode between these times."""
+        first, beyond = self._part(start_ns, stop_ns)
+        return beyond - first
+
+    def frames(
+        self, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[Frame | Warned]:
+        """Frames with start_ns <= t_ns < stop_ns, decoded a few ahead in another thread.
+
+        `seq` is the number in the source. A picture that cannot be decoded comes as a Warned.
+        """
+        first, beyond = self._part(start_ns, stop_ns)
+        ahead = Ahead(self._decode(first, beyond), FRAMES_AHEAD)
+        try:
+            yield from ahead
+        finally:
+            ahead.close()
+
+    def telemetry(self) -> TelemetryLog:
+        """Everything that the autopilot logged, on the flight's clock; read once, then kept.
+
+        FlightError where none of it is of the time of the frames.
+        """
+        if self._telemetry is None:
+            pictures = Pictures(
+                self.source.path, self.start_ns, self.stop_ns, self._host_from_file_ns
+            )
+            self._telemetry = self._read_log(pictures)
+        return self._telemetry
+
+    def truth(self) -> Sequence[TruePose]:
+        """Where its frames truly were, where the format tells; for scoring only."""
+        return self._read_truth()
+
+    def _host_from_file_ns(self, file_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Times on the flight's clock of times by the video's own, beyond its ends at its rate."""
+        own_ns = np.array(self.source.own_times_ns(), np.int64)[self._numbers]
+        inside = np.clip(file_ns, own_ns[0], own_ns[-1])
+        after_ns = np.interp(inside - own_ns[0], own_ns - own_ns[0], self._since_start())
+        out: NDArray[np.int64] = self.start_ns + after_ns.astype(np.int64) + (file_ns - inside)
+        return out
+
+    def _since_start(self) -> NDArray[np.int64]:
+        return np.array(self._times_ns, np.int64) - self.start_ns
+
+    def _part(self, start_ns: int | None, stop_ns: int | None) -> tuple[int, int]:
+        first = 0 if start_ns is None else bisect_left(self._times_ns, start_ns)
+        beyond = self.n_frames if stop_ns is None else bisect_left(self._times_ns, stop_ns)
+        return first, max(first, beyond)
+
+    def _decode(self, first: int, beyond: int) -> Iterator[Frame | Warned]:
+        if first == beyond:
+            return
+        wanted = dict(zip(self._numbers[first:beyond], self._times_ns[first:beyond], strict=True))
+        for number, rgb in self.source.pictures(self._numbers[first], self._numbers[beyond - 1]):
+            if number not in wanted:
+                continue
+            if rgb is None:
+                yield Warned(wanted[number], "a picture could not be decoded", f"number {number}")
+                continue
+            grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+            yield Frame(number, wanted[number], grey, rgb)

@@ -1,0 +1,68 @@
+"""The one door to recorded flights: what is given is recognised by what it is, not by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from companion.config import CameraConfig, TelemetryConfig
+from companion.errors import FlightError
+from drivers.euroc import is_euroc, open_euroc
+from drivers.flight import Flight
+from drivers.flight_folder import has_pictures, is_flight_folder, open_flight_folder
+from drivers.kitti import is_kitti, open_kitti
+from drivers.posed_flight import is_posed_folder, open_posed_flight
+from drivers.tum_rgbd import is_tum_rgbd, open_tum_rgbd
+from drivers.video_flight import is_video, open_video
+
+
+class Format(NamedTuple):
+    """A format of recorded flights; `recognises` looks at a file or a folder that exists."""
+
+    name: str
+    recognises: Callable[[Path], bool]
+    open: Callable[[Path, CameraConfig, TelemetryConfig], Flight]
+
+
+FILES = (Format("video", is_video, open_video),)
+FOLDERS = (
+    Format("flight folder", is_flight_folder, open_flight_folder),
+    Format("EuRoC (ASL)", is_euroc, open_euroc),
+    Format("KITTI odometry", is_kitti, open_kitti),
+    Format("TUM RGB-D", is_tum_rgbd, open_tum_rgbd),
+    Format("images with poses", is_posed_folder, open_posed_flight),
+    Format("video or images", has_pictures, open_flight_folder),
+)
+"""In the order in which they are tried."""
+
+
+def open_flight(
+    path: Path, config: CameraConfig, telemetry: TelemetryConfig | None = None
+) -> Flight:
+    """Open a flight of any known format and check all of it but the telemetry.
+
+    FlightError where it is amiss, or of no known format.
+    """
+    return format_of(path).open(path, config, telemetry or TelemetryConfig())
+
+
+def format_of(path: Path) -> Format:
+    """The format of what lies there; FlightError where it is none."""
+    if not path.exists():
+        raise FlightError(f"{path}: there is no such file or folder")
+    try:
+        known = next((f for f in (FOLDERS if path.is_dir() else FILES) if f.recognises(path)), None)
+    except OSError as error:
+        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
+    if known is not None:
+        return known
+    if path.is_dir():
+        names = ", ".join(f.name for f in FOLDERS)
+        raise FlightError(
+            f"{path}: no video and no images, so not a flight; a folder can be: {names}"
+        )
+    names = ", ".join(f.name for f in FILES)
+    raise FlightError(
+        f"{path}: not a folder, and no file that holds a flight; a file can be: {names}"
+    )
