@@ -199,7 +199,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     replay.add_argument(
         "flight", type=Path, metavar="FLIGHT",
-        help="a flight: folder with video or images, a video, or a data set (EuRoC, KITTI, TUM RGB-D …)",
+        help="a folder with video or images, a video, or a data set (EuRoC, KITTI, TUM RGB-D)",
     )  # fmt: skip
     replay.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder for the results"
