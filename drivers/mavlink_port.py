@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from drivers.mavlink_router import ClientCounts
+
 OnMessage = Callable[[Any, int], None]
 """Takes a message as pymavlink has it, and the flight's time at which it came, ns."""
 
@@ -41,6 +43,9 @@ class MavlinkPort(Protocol):
     @property
     def n_bad(self) -> int:
         """Times that something came which was refused: damaged, or not signed as it should be."""
+
+    def clients(self) -> list[ClientCounts]:
+        """How those do who share the link."""
 
     async def run(self, on_message: OnMessage) -> None:
         """Receive for ever, reconnecting as needed; ends when it is cancelled."""

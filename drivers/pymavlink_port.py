@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.clock import FlightClock
 from companion.config import LinkConfig, RouterConfig
 from drivers.mavlink_port import OnMessage
-from drivers.mavlink_router import Router
+from drivers.mavlink_router import ClientCounts, Router
 from drivers.mavlink_signing import MavlinkSigning, read_key
 from drivers.mavlink_stream import MavlinkStream, Packet, decode
 from drivers.mavlink_transport import link_wire
@@ -91,6 +91,10 @@ class PymavlinkPort:
     def n_bad_bytes(self) -> int:
         """Bytes that belonged to no packet."""
         return self._stream.n_bad_bytes
+
+    def clients(self) -> list[ClientCounts]:
+        """How those do who share the link."""
+        return self.router.counts()
 
     async def run(self, on_message: OnMessage) -> None:
         """Receive, and serve the router's clients, until cancelled."""

@@ -22,6 +22,7 @@ from companion.live.flight_facts import facts_of
 from companion.live.flights import Flights
 from companion.live.health_watch import HealthWatch
 from companion.live.journal import ERROR, INFO, WARNING, Journal
+from companion.live.link_watch import LinkWatch
 from companion.live.loop_delay import measure_loop_delay
 from companion.live.missing import Missing
 from companion.live.pose_sender import make_pose_sender
@@ -76,8 +77,10 @@ class Daemon:
             camera_source(config.camera), clock, config.camera, self._on_frame, self._on_warned
         )
         self._link: AutopilotLink | None = None
+        self._link_watch: LinkWatch | None = None
         if config.link.url:
             port = link_port(config.link, config.router, clock)
+            self._link_watch = LinkWatch(port, self._on_warned)
             self._link = AutopilotLink(
                 config.link, port, clock, self._on_telemetry, self._on_warned
             )
@@ -260,6 +263,8 @@ class Daemon:
         is_ready = False
         while True:
             await asyncio.sleep(WATCH_S)
+            if self._link_watch is not None:
+                self._link_watch.step(self._clock.now_ns())
             health = self._watch.health()
             now_s = (self._clock.now_ns() - began_ns) * 1e-9
             if not is_ready and (self._watch.pipeline_up or now_s > READY_AFTER_S):

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.support.daemon import Daemon
+from tests.support.daemon import PROGRAM, Daemon
 from tests.support.fake_autopilot import FakeAutopilot
 from tests.support.fake_flight import MadeUpFlight
 from tests.support.http_camera import HttpCamera, world_from_body
@@ -54,6 +54,7 @@ class Flying:
         url: str = "udpin:127.0.0.1:0",
         camera_on: bool = True,
         start: bool = True,
+        program: tuple[str, ...] = PROGRAM,
     ) -> None:
         self.camera = HttpCamera(on=camera_on)
         self.strain = Strain()
@@ -66,6 +67,7 @@ class Flying:
             folder, "camera.source=network", f"camera.url={self.camera.url}",
             f"camera.calibration={calibration}", f"link.url={self.autopilot.url}",
             "feedback.mode=odometry", "depth.enabled=false", *settings,
+            program=program,
         )  # fmt: skip
         self._start = start
         self._open = ExitStack()

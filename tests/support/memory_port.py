@@ -8,6 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drivers.mavlink_port import OnMessage
+from drivers.mavlink_router import ClientCounts
 
 
 class MemoryPort:
@@ -25,6 +26,9 @@ class MemoryPort:
     async def run(self, on_message: OnMessage) -> None:
         self._on_message = on_message
         await asyncio.Event().wait()
+
+    def clients(self) -> list[ClientCounts]:
+        return []
 
     def send(self, message: Any) -> None:
         message.pack(self._codec)  # fails where a field is out of its range

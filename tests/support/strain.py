@@ -13,7 +13,7 @@ import time
 from types import TracebackType
 
 TICK_S = 0.02
-ROUNDS = 4
+ROUNDS = 2
 
 
 class Strain:
