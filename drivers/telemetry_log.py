@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.geodesy import ned_from_geodetic, origin_of
 from companion.geometry import Array
 from companion.messages import (
     ArmedSample,
@@ -28,7 +29,6 @@ from companion.messages import (
     Telemetry,
     Warned,
 )
-from drivers.geodesy import ned_from_geodetic, origin_of
 
 PAIR_NS = 100_000_000
 """Local and global positions so near in time tell where the local origin lies."""

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from companion.geodesy import geodetic_from_ned, ned_from_geodetic, origin_of
 from companion.messages import GeoOrigin
-from drivers.geodesy import ned_from_geodetic, origin_of
 
 HOME = GeoOrigin(-35.363262, 149.165237, 584.09)
 
@@ -30,3 +30,12 @@ def test_origin_of_a_place_known_twice() -> None:
     found = origin_of(latitude, longitude, altitude, position)
     away = ned_from_geodetic(found.latitude_deg, found.longitude_deg, found.altitude_m, HOME)
     assert np.abs(away).max() < 0.1
+
+
+def test_there_and_back() -> None:
+    """An asymmetric place, kilometres away, returns to micrometres."""
+    places = np.array([[-35.3, 149.1, 700.0], [-35.4, 149.3, -20.0]])
+    ned = np.stack([ned_from_geodetic(lat, lon, alt, HOME) for lat, lon, alt in places])
+    back = geodetic_from_ned(ned, HOME)
+    np.testing.assert_allclose(back[:, :2], places[:, :2], atol=1e-11)
+    np.testing.assert_allclose(back[:, 2], places[:, 2], atol=1e-6)

@@ -23,6 +23,32 @@ def ned_from_geodetic(
     return ned
 
 
+def geodetic_from_ned(points_ned_m: Array, origin: GeoOrigin) -> Array:
+    """Latitude, longitude (degrees) and altitude (m) (N, 3) of places (N, 3) about `origin`.
+
+    The exact inverse of `ned_from_geodetic`, to micrometres (Bowring 1976, repeated).
+    """
+    turn = _ned_from_ecef(origin.latitude_deg, origin.longitude_deg)
+    zero = _ecef(origin.latitude_deg, origin.longitude_deg, origin.altitude_m)
+    x, y, z = (np.asarray(points_ned_m, np.float64) @ turn + zero).T
+    across = np.hypot(x, y)
+    semi_minor_m = SEMI_MAJOR_M * (1 - FLATTENING)
+    second = ECCENTRICITY_2 / (1 - ECCENTRICITY_2)
+    reduced = np.arctan2(z, across * (1 - FLATTENING))
+    latitude = np.zeros_like(reduced)
+    for _ in range(3):
+        latitude = np.arctan2(
+            z + second * semi_minor_m * np.sin(reduced) ** 3,
+            across - ECCENTRICITY_2 * SEMI_MAJOR_M * np.cos(reduced) ** 3,
+        )
+        reduced = np.arctan2((1 - FLATTENING) * np.sin(latitude), np.cos(latitude))
+    sine, cosine = np.sin(latitude), np.cos(latitude)
+    radius_m = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * sine**2)
+    # of both forms the one that is not divided by next to nothing at the poles or the equator
+    altitude = across * cosine + z * sine - radius_m * (1 - ECCENTRICITY_2 * sine**2)
+    return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], 1)
+
+
 def origin_of(
     latitude_deg: float, longitude_deg: float, altitude_m: float, position_ned_m: Array
 ) -> GeoOrigin:
