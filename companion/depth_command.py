@@ -10,13 +10,14 @@ import numpy as np
 
 from companion.clock import StageTimes
 from companion.config import Config
-from companion.depth.engine import DepthEngine, Intrinsics
+from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion
 from companion.depth.opencl import ComputeDevice, open_device
 from companion.depth.undistortion import undistortion
+from companion.depth.views import Intrinsics
 from companion.errors import FlightError
 from companion.geometry import Array, Pose
-from companion.messages import Bytes, DepthMap, MapUpdate, PointChunk
+from companion.messages import Bytes, DepthMap, MapUpdate, PixelState, PointChunk
 from companion.output.depth_files import write_cloud, write_depth, write_log
 from companion.progress import Progress
 from drivers.posed_images import PosedImages
@@ -212,7 +213,7 @@ def _middle_m(wanted: Wanted) -> float:
 
 def _alone(depth_map: DepthMap) -> list[PointChunk]:
     """All points of the only reference: no other can agree or disagree."""
-    rows, columns = np.nonzero(depth_map.depth > 0)
+    rows, columns = np.nonzero(depth_map.state == PixelState.CONVERGED.value)
     fx, fy, cx, cy = depth_map.intrinsics
     z: Array = depth_map.depth[rows, columns].astype(np.float64)
     points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from companion.config import CloudConfig
 from companion.geometry import Array, Similarity
-from companion.messages import DepthMap, Floats, MapUpdate, PointChunk
+from companion.messages import DepthMap, Floats, MapUpdate, PixelState, PointChunk
 from companion.voxel import thin_by_voxel
 
 Mask = NDArray[np.bool_]
@@ -49,12 +49,13 @@ class Fusion:
         place = update.place_of(keyframe_id)
         if place is None:
             return None
-        rows, columns = np.nonzero(depth_map.depth > 0)
+        measured = _measured(depth_map)
+        rows, columns = np.nonzero(measured)
         if len(rows) == 0:
             return None
-        ahead = _smooth(depth_map.depth)[rows, columns]
+        ahead = _smooth(measured)[rows, columns]
         rows, columns = rows[ahead], columns[ahead]
-        z = depth_map.depth[rows, columns].astype(np.float64)
+        z = measured[rows, columns].astype(np.float64)
         fx, fy, cx, cy = depth_map.intrinsics
         points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
         agreeing = np.zeros(len(points), np.int64)
@@ -94,9 +95,13 @@ class Fusion:
         v = np.rint(fy * p[:, 1] / z + cy)
         inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
         seen = np.zeros(len(points))
-        seen[inside] = other.depth[v[inside].astype(int), u[inside].astype(int)]
+        seen[inside] = _measured(other)[v[inside].astype(int), u[inside].astype(int)]
         agrees: Mask = (seen > 0) & (np.abs(seen - z) < self._config.agreement * z)
         return agrees
+
+
+def _measured(depth_map: DepthMap) -> Floats:
+    return np.where(depth_map.state == PixelState.CONVERGED.value, depth_map.depth, np.float32(0))
 
 
 def _smooth(depth: Floats) -> Mask:

@@ -50,6 +50,10 @@ class ComputeDevice:
         """Copy a contiguous array to a buffer and wait."""
         return cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
 
+    def copy(self, to: cl.Buffer, source: cl.Buffer, offset: int, n_bytes: int) -> None:
+        """Copy the first bytes of a buffer into another, from an offset on."""
+        cl.enqueue_copy(self.queue, to, source, dst_offset=offset, byte_count=n_bytes)
+
     def read(self, array: NDArray[Any], buffer: cl.Buffer) -> None:
         """Copy a buffer to a contiguous array and wait."""
         cl.enqueue_copy(self.queue, array, buffer, is_blocking=True)

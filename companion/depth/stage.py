@@ -15,10 +15,11 @@ import numpy as np
 from companion.camera import Camera
 from companion.clock import Timer
 from companion.config import CloudConfig, DepthConfig
-from companion.depth.engine import DepthEngine, Intrinsics
+from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion
 from companion.depth.opencl import ComputeDevice
 from companion.depth.undistortion import undistortion
+from companion.depth.views import Intrinsics
 from companion.geometry import Pose, Similarity
 from companion.messages import (
     Bytes,
@@ -58,7 +59,7 @@ class DepthStage:
         self._maps = undistortion(camera)
         fx, fy, cx, cy = self._maps[2]
         self._engine = DepthEngine(
-            device, camera.width, camera.height, Intrinsics(fx, fy, cx, cy), config
+            device, camera.width, camera.height, Intrinsics(fx, fy, cx, cy), config, eager=False
         )
         self._times = times
         self._held: OrderedDict[int, _Held] = OrderedDict()

@@ -1,15 +1,100 @@
-"""The depth filter's update and regulariser in plain numpy: slow, and easy to check by eye."""
+"""The dense engine's kernels in plain numpy: slow, and easy to check by eye."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from companion.config import DepthConfig
-from companion.depth.engine import MAX_STEPS, RADIUS, Intrinsics
-from companion.geometry import Array, Pose
+from companion.geometry import Array
 
-OFFSETS = np.arange(-RADIUS, RADIUS + 1, dtype=np.float64)
-AREA = (2 * RADIUS + 1) ** 2
+UNRELATED = 12
+
+
+def census(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """A word for each pixel: bit n is whether the n-th of its 24 neighbours is brighter."""
+    height, width = image.shape
+    padded = np.pad(image, 2, mode="edge")
+    out = np.zeros(image.shape, np.uint32)
+    n = 0
+    for j in range(5):
+        for i in range(5):
+            if (j, i) != (2, 2):
+                brighter = padded[j : j + height, i : i + width] > image
+                out |= brighter.astype(np.uint32) << np.uint32(n)
+                n += 1
+    return out
+
+
+def project(projection: Array, x: float, y: float, rho: Array) -> tuple[Array, Array, Array]:
+    """Where a pixel of the reference is seen at inverse depths, and the third component there."""
+    rows = projection.reshape(3, 4)
+    q = rows[:, :3] @ np.array([x, y, 1.0])
+    points = q[:, None] + rows[:, 3:] * rho
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return points[0] / points[2], points[1] / points[2], points[2]
+
+
+def costs(
+    words_r: NDArray[np.uint32], words: list[NDArray[np.uint32]], projections: Array,
+    n_dropped: int, rhos: Array, stride: int,
+) -> NDArray[np.uint8]:  # fmt: skip
+    """Cost (grid height, grid width, planes) when all planes are looked at."""
+    height, width = words_r.shape
+    out = np.zeros((-(-height // stride), -(-width // stride), len(rhos)), np.uint8)
+    for gy, gx in np.ndindex(out.shape[:2]):
+        word = words_r[gy * stride, gx * stride]
+        bits = np.full((len(words), len(rhos)), UNRELATED)
+        for k, projection in enumerate(projections):
+            u, v, z = project(projection, gx * stride, gy * stride, rhos)
+            with np.errstate(invalid="ignore"):
+                iu, iv = np.floor(u + 0.5), np.floor(v + 0.5)
+                seen = (z > 1e-6) & (iu >= 0) & (iv >= 0) & (iu < width) & (iv < height)
+            for p in np.flatnonzero(seen):
+                other = int(words[k][int(iv[p]), int(iu[p])])
+                bits[k, p] = bin(other ^ int(word)).count("1")
+        out[gy, gx] = np.sort(bits, axis=0)[: len(words) - n_dropped].sum(0)
+    return out
+
+
+def aggregate(
+    cost: NDArray[np.uint8], grey: NDArray[np.uint8], dx: int, dy: int, small: int, large: int,
+    soft: int,
+) -> Array:  # fmt: skip
+    """The path costs (H, W, planes) of one direction; `grey` (H, W) is on the grid."""
+    height, width, _ = cost.shape
+    out = np.zeros(cost.shape)
+    for start in range(width if dy else height):
+        x = start if dy else (0 if dx > 0 else width - 1)
+        y = start if not dy else (0 if dy > 0 else height - 1)
+        last: tuple[int, int] | None = None
+        for _ in range(height if dy else width):
+            now = cost[y, x].astype(float)
+            if last is not None:
+                path = out[last]
+                edge = abs(int(grey[y, x]) - int(grey[last]))
+                jump = path.min() + max(small, large * soft // (soft + edge))
+                side = np.minimum(np.r_[np.inf, path[:-1]], np.r_[path[1:], np.inf]) + small
+                now = now + np.minimum(np.minimum(path, side), jump) - path.min()
+            out[y, x] = now
+            last = (y, x)
+            x, y = x + dx, y + dy
+            if dy and not 0 <= x < width:
+                x, last = x % width, None
+    return out
+
+
+def winner(total: Array, rho0: float, step: float) -> tuple[Array, Array]:
+    """Inverse depth and margin of sums (N, planes)."""
+    rho, margin = np.zeros(len(total)), np.zeros(len(total))
+    planes = np.arange(total.shape[1])
+    for i, s in enumerate(total):
+        at = int(s.argmin())
+        shift = 0.0
+        if 0 < at < len(s) - 1 and s[at - 1] + s[at + 1] > 2 * s[at]:
+            shift = 0.5 * (s[at - 1] - s[at + 1]) / (s[at - 1] + s[at + 1] - 2 * s[at])
+        rho[i] = rho0 + step * (at + shift)
+        margin[i] = (s[np.abs(planes - at) > 2].min() - s[at]) / (s[at] + 1)
+    return rho, margin
 
 
 def sample(image: Array, x: Array, y: Array) -> Array:
@@ -22,116 +107,45 @@ def sample(image: Array, x: Array, y: Array) -> Array:
     return out
 
 
-def correlate(image: Array, template: Array, x: float, y: float) -> float:
-    """ZNCC of a normalised template with the patch around (x, y); -1 outside."""
+def follow(image: Array, projection: Array, rho: Array, stride: int) -> tuple[Array, Array]:
+    """Value (nan where unseen) and change along the epipolar line of each grid pixel (H, W)."""
     height, width = image.shape
-    left, top = int(x) - RADIUS, int(y) - RADIUS
-    side = 2 * RADIUS + 1
-    if not (x >= RADIUS and y >= RADIUS and left + side + 1 < width and top + side + 2 < height):
-        return -1.0
-    dx, dy = np.meshgrid(OFFSETS, OFFSETS)
-    patch = sample(image, np.asarray(x + dx), np.asarray(y + dy))
-    patch = patch - patch.mean()
-    energy = float((patch * patch).sum())
-    return float((patch * template).sum() / np.sqrt(energy)) if energy > 1.0 else -1.0
+    m = projection.reshape(3, 4)
+    gy, gx = np.indices(rho.shape).astype(float) * stride
+    q = np.stack([gx, gy, np.ones(rho.shape)], -1) @ m[:, :3].T + rho[..., None] * m[:, 3]
+    u, v = q[..., 0] / q[..., 2], q[..., 1] / q[..., 2]
+    along = np.stack([m[0, 3] - u * m[2, 3], m[1, 3] - v * m[2, 3]], -1) / q[..., 2:]
+    half = 0.5 * along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    seen = (q[..., 2] > 1e-6) & (u >= 1) & (v >= 1) & (u < width - 2) & (v < height - 2)
+    value, change = np.full(rho.shape, np.nan), np.zeros(rho.shape)
+    su, sv, e = u[seen], v[seen], half[seen]
+    before = sample(image, su - e[:, 0], sv - e[:, 1])
+    behind = sample(image, su + e[:, 0], sv + e[:, 1])
+    value[seen], change[seen] = 0.5 * (before + behind), behind - before
+    return value, change
 
 
-def update_pixel(
-    reference: Array, current: Array, u: int, v: int, state: Array, pose: Pose,
-    camera: Intrinsics, rho: tuple[float, float], config: DepthConfig,
-) -> tuple[Array, int]:  # fmt: skip
-    """One pixel's state (mu, sigma^2, a, b) and label after `current` (current_from_reference)."""
-    mu, sigma2, a, b = state
-    height, width = reference.shape
-    reach = 2.5 * np.sqrt(sigma2)
-    ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
-    q0, t = pose.rotation @ ray, pose.translation
-
-    def place(r: float) -> Array:
-        out: Array = q0 + r * t
-        return out
-
-    def pixel(q: Array) -> Array:
-        return np.array([camera.fx * q[0] / q[2] + camera.cx, camera.fy * q[1] / q[2] + camera.cy])
-
-    low, high, middle = place(max(mu - reach, rho[0])), place(min(mu + reach, rho[1])), place(mu)
-    if min(low[2], high[2], middle[2]) < 0.1:
-        return state, 0
-    begin, end = pixel(low), pixel(high)
-    length = float(np.linalg.norm(end - begin))
-    if length <= 0.02:
-        return state, 0
-    direction = (end - begin) / length
-    # the derivative of the current pixel by the reference pixel, at depth 1 / mu
-    affine = np.empty((2, 2))
-    for k, (axis, focal) in enumerate(((0, camera.fx), (1, camera.fy))):
-        d = pose.rotation[:, axis] / focal
-        affine[0, k] = camera.fx * (d[0] - middle[0] / middle[2] * d[2]) / middle[2]
-        affine[1, k] = camera.fy * (d[1] - middle[1] / middle[2] * d[2]) / middle[2]
-    if not 0.2 < np.linalg.det(affine) < 5.0:
-        return state, 0
-    back = np.linalg.inv(affine)
-    dx, dy = np.meshgrid(OFFSETS, OFFSETS)
-    x = np.clip(u + dx * back[0, 0] + dy * back[0, 1], 0, width - 1.01)
-    y = np.clip(v + dx * back[1, 0] + dy * back[1, 1], 0, height - 1.01)
-    template = sample(reference, x, y)
-    template = template - template.mean()
-    energy = float((template * template).sum())
-    if energy < AREA * config.noise_grey**2:
-        return state, 3
-    template = template / np.sqrt(energy)
-    steps = max(int(np.ceil(np.float32(length + 2.0))), 4)
-    if steps > MAX_STEPS:
-        return state, 0
-    step = (length + 2.0) / steps
-    places = [begin - direction + direction * (k * step) for k in range(steps + 1)]
-    scores = np.array([correlate(current, template, *p) for p in places])
-    if (scores > -1.0).sum() < 3:
-        return state, 0
-    at = int(scores.argmax())
-    best = float(scores[at])
-    if best < config.min_zncc:
-        b = b + 0.5
-        return np.array([mu, sigma2, a, b]), 2 if a / (a + b) < 0.2 else 0
-    far = np.abs(np.arange(steps + 1) - at) > 3
-    if far.any() and scores[far].max() > best - config.peak_margin:
-        return state, 0
-    if at in (0, steps) or min(scores[at - 1], scores[at + 1]) <= -1.0:
-        return state, 0
-    bend = scores[at - 1] - 2 * best + scores[at + 1]
-    if bend / step**2 > -1e-4:
-        return state, 0
-    shift = np.clip(0.5 * (scores[at - 1] - scores[at + 1]) / bend, -0.5, 0.5)
-    found = places[0] + direction * ((at + shift) * step)
-    variance = 2 * (1 - min(best, 1.0)) / (AREA * -bend / step**2) + config.pose_error_px**2
-    if variance > 1.0:
-        return state, 0
-    n = np.array([(found[0] - camera.cx) / camera.fx, (found[1] - camera.cy) / camera.fy])
-    k = 0 if abs(direction[0]) > abs(direction[1]) else 1
-    measured = (n[k] * q0[2] - q0[k]) / (t[k] - n[k] * t[2])
-    q = place(measured)
-    if not (0.5 * rho[0] < measured < 1.5 * rho[1] and q[2] > 0.1):
-        return state, 0
-    slope = np.array([camera.fx, camera.fy]) * (t[:2] * q[2] - q[:2] * t[2]) / q[2] ** 2
-    tau2 = variance / float(slope @ slope)
-    return fuse(state, measured, tau2, rho), -1
-
-
-def fuse(state: Array, measured: float, tau2: float, rho: tuple[float, float]) -> Array:
-    """Gaussian x Beta update (Vogiatzis & Hernandez 2011)."""
-    mu, sigma2, a, b = state
-    s2 = 1.0 / (1.0 / sigma2 + 1.0 / tau2)
-    m = s2 * (mu / sigma2 + measured / tau2)
-    spread = sigma2 + tau2
-    normal = np.exp(-0.5 * (measured - mu) ** 2 / spread) / np.sqrt(2 * np.pi * spread)
-    c1, c2 = a / (a + b) * normal, b / (a + b) / (rho[1] - rho[0])
-    c1, c2 = c1 / (c1 + c2), c2 / (c1 + c2)
-    f = c1 * (a + 1) / (a + b + 1) + c2 * a / (a + b + 1)
-    e = (c1 * (a + 1) * (a + 2) + c2 * a * (a + 1)) / ((a + b + 1) * (a + b + 2))
-    new_mu = c1 * m + c2 * mu
-    new_sigma2 = c1 * (s2 + m * m) + c2 * (sigma2 + mu * mu) - new_mu**2
-    new_a = (e - f) / (f - e / f)
-    return np.array([new_mu, new_sigma2, new_a, new_a * (1 - f) / f])
+def verify(
+    reference: Array, value: Array, change: Array, least: float, noise: float, furthest_px: float
+) -> tuple[Array, Array]:
+    """Whether one image fits (H, W), and whether it does not, by least squares over 5 x 5."""
+    good, bad = np.zeros(reference.shape), np.zeros(reference.shape)
+    for y in range(2, reference.shape[0] - 2):
+        for x in range(2, reference.shape[1] - 2):
+            window = slice(y - 2, y + 3), slice(x - 2, x + 3)
+            t = reference[window].ravel()
+            w, d = value[window].ravel(), change[window].ravel()
+            t = t - t.mean()
+            energy = float(t @ t)
+            if np.isnan(w).any() or energy <= 25 * noise**2:
+                continue
+            design = np.stack([w - w.mean(), d - d.mean()], 1)
+            (gain, slope), *_ = np.linalg.lstsq(design, t, rcond=None)
+            explained = float(t @ (design @ [gain, slope]))
+            fits = explained > least**2 * energy and 0.25 < gain < 4.0
+            fits = fits and abs(slope / gain) < furthest_px
+            good[y, x], bad[y, x] = fits, not fits
+    return good, bad
 
 
 def regularise(

@@ -1,0 +1,280 @@
+/* A sweep of planes of equal depth through several images: census costs (Zabih & Woodfill 1994),
+ * the worst views left out at each plane, semi-global aggregation (Hirschmueller 2008).
+ *
+ * Images are uchar, row-major. Census words have 24 bits of a 5 x 5 window. A grid pixel (x, y) is
+ * image pixel stride * (x, y). Costs are uchar, sums ushort, both [y][x][plane]. Plane k lies at
+ * inverse depth rho0 + k * step.
+ *
+ * Vectors are read through pointers and compared with ?: because some compilers make calls, and slow
+ * ones, of vloadn, min and max.
+ */
+
+#if !defined(PLANES)
+#error "PLANES must be defined, a multiple of 16, at most 256"
+#endif
+#define BLOCK 8
+#define BLOCKS (PLANES / BLOCK)
+#define LANES (PLANES / 16)
+/* Of 24 bits: what two patches that have nothing in common differ by. */
+#define UNRELATED 12
+
+typedef uchar8 uchar8_anywhere __attribute__((aligned(1)));
+typedef uint8 uint8_anywhere __attribute__((aligned(4)));
+
+static int inside(int value, int high)
+{
+    return value < 0 ? 0 : value > high ? high : value;
+}
+
+/* Grid: (width + 7) / 8 x height; a work-item does 8 pixels. Beyond the border the image repeats. */
+__kernel void census(__global const uchar *image, const int width, const int height,
+                     __global uint *out)
+{
+    const int x0 = 8 * get_global_id(0), y = get_global_id(1);
+    if (x0 >= width || y >= height)
+        return;
+    if (x0 >= 2 && x0 + 10 <= width && y >= 2 && y + 2 < height) {
+        __global const uchar *at = image + y * width + x0;
+        const uchar8 centre = *(__global const uchar8_anywhere *)at;
+        uchar8 part[3] = {0, 0, 0};
+#pragma unroll
+        for (int n = 0; n < 24; ++n) {
+            const int m = n < 12 ? n : n + 1;
+            const uchar8 other = *(__global const uchar8_anywhere *)(at + (m / 5 - 2) * width + m % 5 - 2);
+            part[n / 8] |= as_uchar8(other > centre) & (uchar8)(1 << n % 8);
+        }
+        *(__global uint8_anywhere *)(out + y * width + x0) = convert_uint8(part[0])
+                                                             | convert_uint8(part[1]) << 8
+                                                             | convert_uint8(part[2]) << 16;
+        return;
+    }
+    for (int x = x0; x < x0 + 8 && x < width; ++x) {
+        const uchar centre = image[y * width + x];
+        uint word = 0;
+        for (int n = 0; n < 24; ++n) {
+            const int m = n < 12 ? n : n + 1;
+            const int v = inside(y + m / 5 - 2, height - 1), u = inside(x + m % 5 - 2, width - 1);
+            word |= (uint)(image[v * width + u] > centre) << n;
+        }
+        out[y * width + x] = word;
+    }
+}
+
+/* Differing bits between a word and the words at the projections of 8 planes; outside: UNRELATED. */
+static uchar8 differing(__global const uint *words, uint word, float8 rho, float3 base, float3 shift,
+                        int width, int height)
+{
+    const float8 z = base.z + rho * shift.z;
+    const float8 scale = 1.0f / z;
+    const float8 x = (base.x + rho * shift.x) * scale + 0.5f, y = (base.y + rho * shift.y) * scale + 0.5f;
+    const int8 seen = (z > 1e-6f) & (x >= 0.0f) & (x < (float)width) & (y >= 0.0f) & (y < (float)height);
+    /* what is not seen may not even fit an int */
+    const float8 safe_x = seen ? x : 0.0f, safe_y = seen ? y : 0.0f;
+    const int8 at = convert_int8(safe_y) * width + convert_int8(safe_x);
+    uint8 bits = (uint8)(words[at.s0], words[at.s1], words[at.s2], words[at.s3], words[at.s4],
+                         words[at.s5], words[at.s6], words[at.s7]) ^ word;
+    bits = bits - ((bits >> 1) & 0x55555555u);
+    bits = (bits & 0x33333333u) + ((bits >> 2) & 0x33333333u);
+    bits = (bits + (bits >> 4)) & 0x0f0f0f0fu;
+    bits = (bits + (bits >> 8) + (bits >> 16)) & 0x1fu;
+    return convert_uchar8(seen ? bits : (uint8)UNRELATED);
+}
+
+/* Costs of a grid pixel at the planes of the blocks that it is given; others cost `elsewhere`.
+ *   words_r, words  census of the reference and, one after the other, of n_views images
+ *   views           per image 12 numbers: rows of (3 x 3 | 3), pixel (x, y) at inverse depth rho is
+ *                   seen at (M (x, y, 1) + rho m), to be divided by its third component
+ *   blocks          per grid pixel a bit for each block of 8 planes
+ *   n_dropped       views left out at each plane, those that fit worst: 0, 1 or 2 */
+__kernel void costs(__global const uint *words_r, __global const uint *words, const int width,
+                    const int height, __global const float *views, const int n_views,
+                    const int n_dropped, const float rho0, const float step,
+                    __global const uint *blocks, const int elsewhere, __global uchar *cost,
+                    const int grid_width, const int grid_height, const int stride)
+{
+    const int gx = get_global_id(0), gy = get_global_id(1);
+    if (gx >= grid_width || gy >= grid_height)
+        return;
+    const int cell = gy * grid_width + gx;
+    const float x = gx * stride, y = gy * stride;
+    const uint word = words_r[gy * stride * width + gx * stride];
+    const uint wanted = blocks[cell];
+    const float8 lane = (float8)(0, 1, 2, 3, 4, 5, 6, 7);
+    __global uchar8 *out = (__global uchar8 *)cost + (size_t)cell * BLOCKS;
+    for (int b = 0; b < BLOCKS; ++b) {
+        if (!(wanted >> b & 1)) {
+            out[b] = (uchar8)elsewhere;
+            continue;
+        }
+        const float8 rho = rho0 + step * (lane + (float)(BLOCK * b));
+        uchar8 sum = 0, worst = 0, second = 0;
+        for (int k = 0; k < n_views; ++k) {
+            __global const float *m = views + 12 * k;
+            const float3 base = (float3)(m[0] * x + m[1] * y + m[2], m[4] * x + m[5] * y + m[6],
+                                         m[8] * x + m[9] * y + m[10]);
+            const uchar8 bits = differing(words + (size_t)k * width * height, word, rho, base,
+                                          (float3)(m[3], m[7], m[11]), width, height);
+            sum += bits;
+            const uchar8 lesser = worst < bits ? worst : bits;
+            worst = worst > bits ? worst : bits;
+            second = second > lesser ? second : lesser;
+        }
+        out[b] = n_dropped == 0 ? sum : n_dropped == 1 ? sum - worst : sum - worst - second;
+    }
+}
+
+static uchar lowest(uchar16 v)
+{
+    const uchar8 a = v.lo < v.hi ? v.lo : v.hi;
+    const uchar4 b = a.lo < a.hi ? a.lo : a.hi;
+    const uchar2 c = b.lo < b.hi ? b.lo : b.hi;
+    return c.x < c.y ? c.x : c.y;
+}
+
+/* Adds one direction (dx, dy) of paths to the sums, or begins them. Grid: a work-item for each path:
+ * each row where dy is 0, else each column; a slanted path that leaves at one side begins anew at the
+ * other. small: penalty of a step by one plane; large: of any other, less where the image has an edge
+ * of many times `soft` grey levels. No cost may be above 255 - small - large. */
+__kernel void aggregate(__global const uchar *cost, __global ushort *sum, __global const uchar *image,
+                        const int width, const int grid_width, const int grid_height, const int stride,
+                        const int dx, const int dy, const int small, const int large, const int soft,
+                        const int begin)
+{
+    const int item = get_global_id(0);
+    if (item >= (dy ? grid_width : grid_height))
+        return;
+    const int n = dy ? grid_height : grid_width;
+    int x = dy ? item : dx > 0 ? 0 : grid_width - 1;
+    int y = !dy ? item : dy > 0 ? 0 : grid_height - 1;
+    uchar16 path[LANES];
+    for (int b = 0; b < LANES; ++b)
+        path[b] = 0;
+    const uchar16 one = (uchar)small;
+    const uchar beyond = 255 - small;
+    int low = 0, last = 0, fresh = 1;
+    for (int k = 0; k < n; ++k) {
+        const int cell = y * grid_width + x;
+        __global const uchar16 *here = (__global const uchar16 *)cost + (size_t)cell * LANES;
+        __global ushort16 *total = (__global ushort16 *)sum + (size_t)cell * LANES;
+        const int grey = image[y * stride * width + x * stride];
+        const int edge = grey > last ? grey - last : last - grey;
+        const int reduced = large * soft / (soft + edge);
+        last = grey;
+        const uchar16 any = (uchar)(fresh ? 0 : low + (reduced > small ? reduced : small));
+        const uchar16 level = (uchar)low;
+        uchar16 lows = 255;
+        uchar16 left = (uchar16)(beyond, path[0].s0, path[0].s1, path[0].s2, path[0].s3, path[0].s4,
+                                 path[0].s5, path[0].s6, path[0].s7, path[0].s8, path[0].s9,
+                                 path[0].sa, path[0].sb, path[0].sc, path[0].sd, path[0].se);
+#pragma unroll
+        for (int b = 0; b < LANES; ++b) {
+            const uchar16 v = path[b], next = b + 1 < LANES ? path[b + 1] : (uchar16)beyond;
+            const uchar16 right = (uchar16)(v.s1, v.s2, v.s3, v.s4, v.s5, v.s6, v.s7, v.s8, v.s9, v.sa,
+                                            v.sb, v.sc, v.sd, v.se, v.sf, next.s0);
+            uchar16 side = (left < right ? left : right) + one;
+            uchar16 best = v < any ? v : any;
+            best = best < side ? best : side;
+            const uchar16 now = here[b] + (best - level);
+            left = (uchar16)(v.sf, next.s0, next.s1, next.s2, next.s3, next.s4, next.s5, next.s6, next.s7,
+                             next.s8, next.s9, next.sa, next.sb, next.sc, next.sd, next.se);
+            path[b] = now;
+            lows = lows < now ? lows : now;
+            const ushort16 wide = convert_ushort16(now);
+            total[b] = begin ? wide : total[b] + wide;
+        }
+        low = lowest(lows);
+        fresh = 0;
+        x += dx;
+        y += dy;
+        if (dy && (x < 0 || x >= grid_width)) {
+            x = x < 0 ? grid_width - 1 : 0;
+            for (int b = 0; b < LANES; ++b)
+                path[b] = 0;
+            low = 0;
+            fresh = 1;
+        }
+    }
+}
+
+static ushort lowest16(ushort16 v)
+{
+    const ushort8 a = v.lo < v.hi ? v.lo : v.hi;
+    const ushort4 b = a.lo < a.hi ? a.lo : a.hi;
+    const ushort2 c = b.lo < b.hi ? b.lo : b.hi;
+    return c.x < c.y ? c.x : c.y;
+}
+
+/* The plane of the least sum, made finer by a parabola, as inverse depth; and how much worse, in
+ * proportion, the best plane is that lies more than two away. Grid: one work-item per grid pixel. */
+__kernel void winner(__global const ushort *sum, const int n, const float rho0, const float step,
+                     __global float *rho, __global float *margin)
+{
+    const int cell = get_global_id(0);
+    if (cell >= n)
+        return;
+    __global const ushort16 *wide = (__global const ushort16 *)sum + (size_t)cell * LANES;
+    __global const ushort *s = sum + (size_t)cell * PLANES;
+    ushort16 lows = 65535;
+    for (int b = 0; b < LANES; ++b)
+        lows = lows < wide[b] ? lows : wide[b];
+    const ushort best = lowest16(lows);
+    int at = 0;
+    while (at < PLANES - 1 && s[at] != best)
+        ++at;
+    const ushort16 lane = (ushort16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    ushort16 others = 65535;
+    for (int b = 0; b < LANES; ++b) {
+        /* unsigned: what lies below the band wraps round to far above it */
+        const ushort16 off = lane + (ushort)(16 * b + 2 - at);
+        const ushort16 v = off <= (ushort)4 ? (ushort16)65535 : wide[b];
+        others = others < v ? others : v;
+    }
+    const ushort second = lowest16(others);
+    float shift = 0.0f;
+    if (at > 0 && at < PLANES - 1) {
+        const float before = s[at - 1], after = s[at + 1], bend = before + after - 2.0f * best;
+        shift = bend > 0.0f ? 0.5f * (before - after) / bend : 0.0f;
+    }
+    rho[cell] = rho0 + step * (at + shift);
+    margin[cell] = (float)(second - best) / (best + 1.0f);
+}
+
+/* Blocks of planes that a fine grid pixel should look at: those about the planes of the coarse grid
+ * pixels around it; all where `margin` says that the coarse one is a guess. Grid: fine pixels. */
+__kernel void blocks_about(__global const float *rho, const int coarse_width, const int coarse_height,
+                           const float rho0, const float step, __global uint *blocks,
+                           const int grid_width, const int grid_height)
+{
+    const int gx = get_global_id(0), gy = get_global_id(1);
+    if (gx >= grid_width || gy >= grid_height)
+        return;
+    const int cx = (gx + 1) / 2, cy = (gy + 1) / 2;
+    uint bits = 0;
+    for (int j = -2; j <= 1; ++j)
+        for (int i = -2; i <= 1; ++i) {
+            const float value = rho[inside(cy + j, coarse_height - 1) * coarse_width
+                                    + inside(cx + i, coarse_width - 1)];
+            const int plane = (int)((value - rho0) / step + 0.5f);
+            bits |= 1u << inside(plane - 2, PLANES - 1) / BLOCK;
+            bits |= 1u << inside(plane + 2, PLANES - 1) / BLOCK;
+        }
+    blocks[gy * grid_width + gx] = bits;
+}
+
+/* Median of 3 x 3. Grid: width x height. */
+__kernel void median(__global const float *in, const int width, const int height, __global float *out)
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= width || y >= height)
+        return;
+    float v[9];
+    for (int j = 0; j < 3; ++j)
+        for (int i = 0; i < 3; ++i)
+            v[3 * j + i] = in[inside(y + j - 1, height - 1) * width + inside(x + i - 1, width - 1)];
+#define SORT(a, b) { const float low = v[a] < v[b] ? v[a] : v[b]; v[b] = v[a] < v[b] ? v[b] : v[a]; v[a] = low; }
+    SORT(1, 2) SORT(4, 5) SORT(7, 8) SORT(0, 1) SORT(3, 4) SORT(6, 7) SORT(1, 2) SORT(4, 5) SORT(7, 8)
+    SORT(0, 3) SORT(5, 8) SORT(4, 7) SORT(3, 6) SORT(1, 4) SORT(2, 5) SORT(4, 7) SORT(4, 2) SORT(6, 4)
+    SORT(4, 2)
+#undef SORT
+    out[y * width + x] = v[4];
+}
