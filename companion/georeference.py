@@ -46,6 +46,8 @@ SIGMA_TILT_RAD = np.radians(0.5)
 SIGMA_YAW_RAD = np.radians(6.0)
 SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.01, 0.05
 """No rangefinder and no barometer tells the scale better than this."""
+DISAGREE = 3.0
+"""Standard deviations by which two scales differ that cannot both be right."""
 MAX_PLACES = 400
 
 
@@ -154,8 +156,10 @@ class Georeferencer:
                     return found
         if level is None:
             return None
-        by_range = self._from_scale(places, level, self._range_scale(places))
-        return by_range or self._from_scale(places, level, self._height_scale(places, level))
+        by_range, by_height = self._range_scale(places), self._height_scale(places, level)
+        if by_range is None or by_height is None:
+            return self._from_scale(places, level, by_range or by_height)
+        return self._from_scale(places, level, _agreed(by_range, by_height))
 
     def _from_positions(
         self, places: list[Place], level: Array | None, source: PositionSource
@@ -256,6 +260,15 @@ class Georeferencer:
         return Georeference(
             similarity, sigma, float(SIGMA_YAW_RAD), method, n, 0.0, has_origin=False
         )
+
+
+def _agreed(first: _Scale, second: _Scale) -> _Scale:
+    """The better of two, no surer than they agree: a rangefinder may see what the map does not."""
+    best = min(first, second, key=lambda scale: scale.sigma)
+    apart = abs(float(np.log(first.scale / second.scale)))
+    if apart < DISAGREE * float(np.hypot(first.sigma, second.sigma)):
+        return best
+    return best._replace(sigma=apart)
 
 
 def _mean_rotation(places: list[Place]) -> Array | None:

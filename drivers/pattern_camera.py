@@ -118,10 +118,10 @@ class PatternScene:
              [0, 0, 1]]
         )  # fmt: skip
         self._plain_from_texel: Array = plain
-        # (height, corner north east, side) of each, the lowest first: the higher hide the lower
-        self._tops = [
+        self.tops = [
             (0.4 + 0.3 * k, rng.uniform(-10, 8, 2), rng.uniform(1.5, 3.0)) for k in range(9)
         ]
+        """Height, corner (north, east) and side of each; the lowest first, which others hide."""
 
     def picture(self, camera: Camera, pose: Pose) -> tuple[Bytes, Bytes]:
         """Grey and RGB as a camera without distortion sees it from above."""
@@ -134,7 +134,7 @@ class PatternScene:
             ),
             np.uint8,
         )  # fmt: skip
-        for number, (height, corner, side) in enumerate(self._tops):
+        for number, (height, corner, side) in enumerate(self.tops):
             self._draw_top(grey, _pixel_from_plane(camera, pose, -height), number, corner, side)
         rgb = cv2.LUT(np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), np.uint8), self._colours)
         return grey, np.asarray(rgb, np.uint8)

@@ -120,6 +120,19 @@ def test_barometer_gives_scale_of_a_climb() -> None:
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=0.05)
 
 
+@pytest.mark.parametrize(("stretch", "known"), [(1.0, True), (1.4, False)])
+def test_a_rangefinder_that_the_barometer_contradicts_is_not_believed(
+    stretch: float, known: bool
+) -> None:
+    kept, ned = places()
+    georeferencer = Georeferencer(GeoreferenceConfig(), None)
+    for i in range(400):
+        down = np.interp(i * 0.1, np.arange(len(ned)) * 0.5, ned[:, 2])
+        georeferencer.take(RangeSample(T0 + i * 100_000_000, 30.0 * stretch))
+        georeferencer.take(HeightSample(T0 + i * 100_000_000, 400.0 - down))
+    assert (georeferencer.solve(kept) is not None) is known
+
+
 def test_nothing_known_gives_nothing() -> None:
     kept, _ = places()
     assert Georeferencer(GeoreferenceConfig(), None).solve(kept) is None
