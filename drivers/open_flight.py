@@ -13,6 +13,12 @@ from drivers.flight import Flight
 from drivers.flight_folder import has_pictures, is_flight_folder, open_flight_folder
 from drivers.kitti import is_kitti, open_kitti
 from drivers.posed_flight import is_posed_folder, open_posed_flight
+from drivers.recording.recorded_flight import (
+    is_recorded_folder,
+    is_recording,
+    open_recorded_folder,
+    open_recording,
+)
 from drivers.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from drivers.video_flight import is_video, open_video
 
@@ -25,8 +31,12 @@ class Format(NamedTuple):
     open: Callable[[Path, CameraConfig, TelemetryConfig], Flight]
 
 
-FILES = (Format("video", is_video, open_video),)
+FILES = (
+    Format("recording", is_recording, open_recording),
+    Format("video", is_video, open_video),
+)
 FOLDERS = (
+    Format("folder of a live flight", is_recorded_folder, open_recorded_folder),
     Format("flight folder", is_flight_folder, open_flight_folder),
     Format("EuRoC (ASL)", is_euroc, open_euroc),
     Format("KITTI odometry", is_kitti, open_kitti),

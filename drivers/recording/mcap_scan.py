@@ -76,6 +76,8 @@ class ChunkPlace(NamedTuple):
     crc: int
     compression: str
     data_at: int
+    after_loss: bool = False
+    """Whether something that lay before it could not be read."""
 
 
 @dataclass(slots=True)
@@ -130,10 +132,20 @@ class McapFile:
 
     def bytes_at(self, begin: int, end: int) -> bytes:
         """Bytes of the file, fewer where it ends before."""
+        if not 0 <= begin < self.size:
+            return b""
         try:
             return os.pread(self.fd, max(0, min(end, self.size) - begin), begin)
         except OSError as error:
             raise FlightError(f"{self.path}: cannot be read: {error.strerror}") from error
+
+    def profile(self) -> str:
+        """What the header says that this is; "" where there is none."""
+        head = Scan()
+        record = self._record_at(len(MAGIC))
+        if record is not None and record[0] == Opcode.HEADER:
+            self._take_record(head, *record)
+        return head.profile
 
     def summary(self) -> Scan | None:
         """What the file's own end says of it, quickly; None where that is not to be believed."""
@@ -155,6 +167,9 @@ class McapFile:
             for kind, body in _records(memoryview(block[:-FOOTER_SIZE])):
                 _take_summary(found.contents, kind, body)
             self._take_notes(found)
+            found.chunks = [
+                self._chunk_at(index.chunk_start_offset) for index in found.contents.chunks
+            ]
         except DAMAGED:
             return None
         found.whole = True
@@ -166,7 +181,7 @@ class McapFile:
         Chunks whose checksum is wrong are left out and counted.
         """
         found = Scan(good_end=len(MAGIC))
-        at, in_data = len(MAGIC), True
+        at, in_data, lost = len(MAGIC), True, False
         while at < self.size and not found.whole:
             record = self._record_at(at)
             if record is not None and self._take_record(found, *record):
@@ -174,7 +189,8 @@ class McapFile:
                 if opcode == Opcode.DATA_END:
                     in_data = False
                 elif opcode == Opcode.CHUNK:
-                    in_data = True
+                    found.chunks[-1] = found.chunks[-1]._replace(after_loss=lost)
+                    in_data, lost = True, False
                 if in_data:
                     found.good_end = at
             else:
@@ -183,7 +199,7 @@ class McapFile:
                     break
                 found.n_lost_bytes += chunk - at
                 found.n_lost_places += 1
-                at = chunk
+                at, lost = chunk, True
             if told is not None:
                 told(at)
         if in_data:
@@ -192,7 +208,10 @@ class McapFile:
         return found
 
     def messages(self, chunk: ChunkPlace, channels: dict[int, Channel]) -> list[McapMessage]:
-        """All messages of a chunk whose channel is known, itself telling channels too."""
+        """All messages of a chunk whose channel is known, or told by the chunk itself.
+
+        One of DAMAGED where the chunk is not what was written.
+        """
         out = []
         for kind, body in _records(memoryview(self._content(chunk))):
             if kind == Opcode.CHANNEL:
@@ -279,10 +298,6 @@ class McapFile:
             )
         )  # fmt: skip
 
-    def chunk_of(self, index: ChunkIndex) -> ChunkPlace:
-        """The chunk that an index names; ValueError where there is none."""
-        return self._chunk_at(index.chunk_start_offset)
-
     def _chunk_at(self, at: int) -> ChunkPlace:
         head = self.bytes_at(at, at + RECORD.size + CHUNK_HEAD.size + 16)
         opcode, length = RECORD.unpack_from(head)
@@ -326,11 +341,7 @@ class McapFile:
     def _take_notes(self, found: Scan) -> None:
         """Header, attachments and metadata that a summary names."""
         contents = found.contents
-        head = self.bytes_at(len(MAGIC), len(MAGIC) + 4096)
-        for kind, body in _records(memoryview(head), stop_at_end=True):
-            if kind == Opcode.HEADER:
-                found.profile = Header.read(_stream(body)).profile
-            break
+        found.profile = self.profile()
         places = [(each.offset, each.length) for each in contents.attachments]
         places += [(each.offset, each.length) for each in contents.metadata]
         contents.attachments, contents.metadata = [], []
@@ -359,15 +370,13 @@ def _take_summary(contents: Contents, kind: int, body: memoryview) -> None:
         contents.metadata.append(MetadataIndex.read(stream))
 
 
-def _records(block: memoryview, stop_at_end: bool = False) -> Iterator[tuple[int, memoryview]]:
+def _records(block: memoryview) -> Iterator[tuple[int, memoryview]]:
     """Records in a block of memory; ValueError where one goes beyond its end."""
     at, size = 0, len(block)
     while at + RECORD.size <= size:
         opcode, length = RECORD.unpack_from(block, at)
         end = at + RECORD.size + length
         if end > size:
-            if stop_at_end:
-                return
             raise ValueError("a record in a chunk")
         yield opcode, block[at + RECORD.size : end]
         at = end

@@ -46,16 +46,18 @@ def n_cut_bytes(found: Scan) -> int:
 
 
 def opened(path: Path) -> tuple[McapFile, Scan]:
-    """A file whose chunks have all been looked at, repaired if need be and possible.
+    """A file and what is in it, repaired where it is cut short and that is possible.
 
-    FlightError where it is no MCAP file.
+    Of a whole file only its end is read: whether a chunk is whole shows when it is. FlightError
+    where it is no MCAP file.
     """
     file = McapFile(path)
-    found = file.scan()
+    found = file.summary() or file.scan()
     if not found.whole and repair(path, found):
         file.close()
         file = McapFile(path)
         again = file.scan()
-        again.n_lost_bytes, again.n_lost_places = found.n_lost_bytes, found.n_lost_places
+        again.n_lost_bytes = found.n_lost_bytes - found.n_cut_bytes
+        again.n_lost_places = found.n_lost_places
         return file, again
     return file, found

@@ -79,7 +79,7 @@ def test_cut_anywhere_it_keeps_all_chunks_before_and_is_repaired(
     path, ends = whole
     data = path.read_bytes()
     cut = tmp_path / "cut.mcap"
-    steps = sorted({*range(len(MAGIC), len(data), 29), *ends, *(end - 1 for end in ends)})
+    steps = sorted({*range(len(MAGIC), len(data), 43), *ends, *(end - 1 for end in ends)})
     for size in steps:
         cut.write_bytes(data[:size])
         file, found = opened(cut)
@@ -117,7 +117,7 @@ def test_damage_costs_the_chunk_that_it_hits_and_never_more_than_time(
     data = path.read_bytes()
     damaged = tmp_path / "damaged.mcap"
     expected = {f"/{'ab'[n % 2]}:{1000 + n}": content(n) for n in range(N_CHUNKS * PER_CHUNK)}
-    for seed in range(200):
+    for seed in range(120):
         rng = np.random.default_rng(seed)
         changed = np.frombuffer(data, np.uint8).copy()
         at = int(rng.integers(len(MAGIC), len(data)))
@@ -128,8 +128,9 @@ def test_damage_costs_the_chunk_that_it_hits_and_never_more_than_time(
         else:
             changed[at : at + 50] = rng.integers(0, 256, len(changed[at : at + 50]))
         damaged.write_bytes(changed.tobytes())
-        file, found = opened(damaged)
+        file, _ = opened(damaged)
         with file:
+            found = file.scan()
             told = read(file, found)
         for topic, _, t_ns, held in told:
             assert expected[f"{topic}:{t_ns}"] == held, seed

@@ -1,0 +1,68 @@
+"""A camera as JSON, exactly, in the layout of a flight folder's camera.json; and for Foxglove."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+
+from companion.camera import Camera, Distortion
+from companion.geometry import Pose
+from drivers.recording.content import serialised, set_time
+
+_FOXGLOVE = {
+    Distortion.NONE: "",
+    Distortion.RADTAN: "plumb_bob",
+    Distortion.EQUIDISTANT: "equidistant",
+}
+
+
+def camera_document(camera: Camera) -> bytes:
+    """All of it; numbers are read back as they are."""
+    document: dict[str, Any] = {
+        "width": camera.width, "height": camera.height,
+        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        "distortion_model": camera.distortion.value,
+        "D": [float(each) for each in camera.coefficients],
+        "assumed": camera.assumed,
+    }  # fmt: skip
+    mount = camera.body_from_camera
+    if mount is not None:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = mount.rotation, mount.translation
+        document["body_from_camera"] = matrix.tolist()
+    return (json.dumps(document, indent=1) + "\n").encode()
+
+
+def camera_of(document: bytes) -> Camera:
+    """The camera as it was; ValueError where the bytes are no such document."""
+    given = json.loads(document)
+    try:
+        width, height = int(given["width"]), int(given["height"])
+        fx, fy, cx, cy = (float(given[key]) for key in ("fx", "fy", "cx", "cy"))
+        model = Distortion(given["distortion_model"])
+        matrix = given.get("body_from_camera")
+        mount = None if matrix is None else Pose.from_matrix(np.array(matrix, np.float64))
+        coefficients = tuple(map(float, given["D"]))
+        assumed = bool(given["assumed"])
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"not a camera: {error}") from error
+    wanted = {Distortion.NONE: 0, Distortion.RADTAN: 5, Distortion.EQUIDISTANT: 4}[model]
+    if len(coefficients) != wanted or min(width, height, fx, fy) <= 0:
+        raise ValueError("not a camera: numbers are missing")
+    return Camera(width, height, fx, fy, cx, cy, model, coefficients, mount, assumed)
+
+
+def calibration_bytes(camera: Camera, t_ns: int) -> bytes:
+    """As Foxglove's CameraCalibration."""
+    matrix = camera.matrix()
+    message = CameraCalibration(
+        frame_id="camera", width=camera.width, height=camera.height,
+        distortion_model=_FOXGLOVE[camera.distortion], D=camera.coefficients,
+        K=matrix.ravel().tolist(), R=np.eye(3).ravel().tolist(),
+        P=np.column_stack([matrix, np.zeros(3)]).ravel().tolist(),
+    )  # fmt: skip
+    set_time(message.timestamp, t_ns)
+    return serialised(message)

@@ -1,0 +1,196 @@
+"""The thread that has to do with the disk, and may wait for it as long as the disk likes.
+
+What is to be written waits in memory, up to a limit; beyond it what comes is turned away, pictures
+first. Twice in a second or so all of it is written as a chunk and synced.
+"""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from companion.config import RecorderConfig
+from companion.errors import FlightError
+from companion.messages import Warned
+from drivers.recording.flights_folder import delete, flights_in, free_bytes, may_go
+from drivers.recording.growing_file import GrowingFile
+from drivers.recording.mcap_writer import McapWriter
+
+CHUNK_BYTES = 4 << 20
+"""A chunk is written before its time when it has grown to this."""
+PICTURES_SHARE = 0.8
+"""Of the buffer, so that there is room for what is small and matters more."""
+LOOK_S = 2.0
+"""The room on the disk is looked at so often."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+
+FULL, PRUNED = "the disk is full: the flight is no longer recorded", "an old flight was deleted"
+SLOW = "the disk is too slow: parts of the flight are not recorded"
+FAILED = "the recording cannot be written"
+
+
+class Entry(NamedTuple):
+    """One message that waits for the disk."""
+
+    channel: int
+    t_ns: int
+    data: bytes
+    sequence: int | None = None
+
+
+class DiskWriter:
+    """Writes messages and packets of one flight; `warn` is called in its thread."""
+
+    def __init__(
+        self, config: RecorderConfig, mcap: GrowingFile, writer: McapWriter, tlog: GrowingFile,
+        flight: Path, now_ns: Callable[[], int], warn: Callable[[Warned], None],
+    ) -> None:  # fmt: skip
+        self._config, self._mcap, self._writer, self._tlog = config, mcap, writer, tlog
+        self._flight, self._now_ns, self._warn = flight, now_ns, warn
+        self._most = config.buffer_mb << 20
+        self._entries: deque[Entry] = deque()
+        self._packets: list[bytes] = []
+        self._n_waiting = 0
+        self._changed = threading.Condition()
+        self._closing = False
+        self._ended = False
+        self._looked_s = -LOOK_S
+        self._told: set[str] = set()
+        self.n_dropped: Counter[str] = Counter()
+        """Messages turned away, by what they are."""
+        self.slowest_s = 0.0
+        """What the disk took for one chunk at most."""
+        self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
+        self._thread.start()
+
+    @property
+    def recording(self) -> bool:
+        """Whether what comes is still written."""
+        return not self._ended
+
+    def put(self, entry: Entry, kind: str, is_picture: bool = False) -> bool:
+        """Have a message written; never waits. False where there is no room for it."""
+        with self._changed:
+            room = self._most * (PICTURES_SHARE if is_picture else 1.0)
+            if self._ended or self._n_waiting + len(entry.data) > room:
+                self.n_dropped[kind] += 1
+                too_slow = not self._ended
+            else:
+                self._entries.append(entry)
+                self._n_waiting += len(entry.data)
+                self._changed.notify()
+                return True
+        if too_slow:
+            self._tell_once(SLOW, f"{self._most >> 20} MB wait for it")
+        return False
+
+    def put_packet(self, packet: bytes) -> None:
+        """Have a packet written to the .tlog; never waits."""
+        with self._changed:
+            if not self._ended and self._n_waiting + len(packet) <= self._most:
+                self._packets.append(packet)
+                self._n_waiting += len(packet)
+
+    def close(self) -> None:
+        """Write the rest, and the index; waits for it."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        while not self._ended:
+            with self._changed:
+                self._changed.wait_for(self._has_enough, max(0.0, due_s - time.monotonic()))
+                entries, self._entries = self._entries, deque()
+                packets, self._packets = self._packets, []
+                closing = self._closing
+            began_s = time.monotonic()
+            self._make_room()
+            for entry in entries:
+                self._writer.add(entry.channel, entry.t_ns, entry.data, entry.t_ns, entry.sequence)
+                if self._writer.n_waiting_bytes > CHUNK_BYTES:
+                    self._do(self._writer.flush)
+            self._do(self._writer.flush)
+            self._do(lambda: self._tlog.append(b"".join(packets)))  # noqa: B023 - done at once
+            self._do(self._mcap.sync)
+            self._do(self._tlog.sync)
+            self.slowest_s = max(self.slowest_s, time.monotonic() - began_s)
+            with self._changed:
+                self._n_waiting -= sum(len(entry.data) for entry in entries)
+                self._n_waiting -= sum(map(len, packets))
+            due_s = began_s + self._config.flush_s
+            if closing and not self._ended:
+                self._end()
+        self._mcap.close()
+        self._tlog.close()
+
+    def _has_enough(self) -> bool:
+        return self._closing or self._n_waiting > CHUNK_BYTES
+
+    def _do(self, step: Callable[[], None]) -> None:
+        """Do what may find the disk full: make room and try again, or end."""
+        while not self._ended:
+            try:
+                step()
+                return
+            except OSError as error:
+                if error.errno not in NO_ROOM:
+                    self._end(FAILED, f"{self._flight}: {error.strerror}")
+                elif not self._delete_oldest():
+                    self._end(FULL, str(self._flight))
+
+    def _make_room(self) -> None:
+        """Look whether the disk is nearly full, and do what is configured then."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s < LOOK_S:
+            return
+        self._looked_s = now_s
+        least = self._config.least_free_mb << 20
+        try:
+            while free_bytes(self._flight) < least:
+                if not self._delete_oldest():
+                    self._end(FULL, str(self._flight))
+                    return
+        except (OSError, FlightError) as error:
+            self._end(FAILED, str(error))
+
+    def _delete_oldest(self) -> bool:
+        """Whether some room was made."""
+        if self._config.when_full != "prune":
+            return False
+        for flight in may_go(flights_in(self._flight.parent), but=self._flight):
+            try:
+                delete(flight)
+            except OSError:
+                continue
+            detail = f"{flight.path.name}, {flight.n_bytes >> 20} MB"
+            self._warn(Warned(self._now_ns(), PRUNED, detail))
+            return True
+        return False
+
+    def _end(self, what: str = "", detail: str = "") -> None:
+        """No more is written; what is there becomes whole, if there is room for that."""
+        with self._changed:
+            self._ended = True
+            self.n_dropped["messages"] += len(self._entries)
+            self._entries.clear()
+        if what:
+            self.n_dropped["messages"] += self._writer.drop_waiting()
+            self._tell_once(what, detail)
+        try:
+            self._writer.finish()
+            self._mcap.sync()
+        except OSError:
+            pass  # it will be repaired when it is opened
+
+    def _tell_once(self, what: str, detail: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            self._warn(Warned(self._now_ns(), what, detail))

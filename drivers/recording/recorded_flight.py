@@ -1,0 +1,330 @@
+"""A recording read back: the frames and samples that the flight had, at the times it gave them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from companion.camera import Camera
+from companion.config import CameraConfig, TelemetryConfig
+from companion.errors import FlightError
+from companion.messages import Bytes, ClockReport, Frame, GeoOrigin, Telemetry, Warned
+from drivers.calibration import assumed_camera
+from drivers.flight import Flight
+from drivers.recording.camera_document import camera_of
+from drivers.recording.content import is_sample_topic, sample_of
+from drivers.recording.flights_folder import RECORDING
+from drivers.recording.mcap_scan import DAMAGED, ChunkPlace, McapFile, McapMessage
+from drivers.recording.pictures import VideoDecoder, grey_of, stands_alone, still
+from drivers.recording.recorder import CAMERA_JSON
+from drivers.recording.repair import n_cut_bytes, opened
+from drivers.recording.topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
+from drivers.telemetry_log import TelemetryLog, rates_hz
+
+CUT, DAMAGE = "the recording was cut short", "the recording is damaged"
+LOST = "a picture could not be decoded"
+
+
+class PicturePlace(NamedTuple):
+    """Where a picture lies: which chunk, and which message in it."""
+
+    seq: int
+    t_ns: int
+    chunk: int
+    message: int
+    alone: bool
+
+
+class Recording:
+    """An open recording and what is in it; FlightError where it is none.
+
+    `told` hears, chunk by chunk, how many bytes have been read.
+    """
+
+    def __init__(self, path: Path, told: Callable[[int], None] = lambda _: None) -> None:
+        self.path = path
+        self.file, self.found = opened(path)
+        self.pictures: list[PicturePlace] = []
+        """In order of their times, each number once."""
+        self.greys: dict[int, tuple[int, int]] = {}
+        """By the time of the picture: chunk and message of a grey one beside it."""
+        self.samples: list[Telemetry] = []
+        self.health: dict[str, Any] = {}
+        """The newest document."""
+        self.n_bad_messages = 0
+        self.counts: dict[str, int] = {}
+        """Messages that can be read, by topic."""
+        self._bad: set[int] = set()
+        self._held: tuple[int, list[McapMessage]] = (-1, [])
+        if self.found.profile not in ("", PROFILE):
+            self.file.close()
+            raise FlightError(f"{path}: an MCAP file, but not a recording of companion")
+        for number, chunk in enumerate(self.found.chunks):
+            self._index(number, chunk)
+            told(chunk.end)
+        self.pictures = _once_in_order(self.pictures)
+        self.samples.sort(key=lambda sample: sample.t_ns)
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+    @property
+    def warnings(self) -> tuple[Warned, ...]:
+        """What of it is missing."""
+        t_ns = self.pictures[0].t_ns if self.pictures else 0
+        out = []
+        n_cut, found = n_cut_bytes(self.found), self.found
+        if n_cut or not found.whole:
+            out.append(Warned(t_ns, CUT, f"{n_cut} bytes at its end were not whole"))
+        n_lost = found.n_lost_bytes - found.n_cut_bytes
+        if n_lost > 0 or self.n_bad_messages:
+            detail = f"{n_lost} bytes in {found.n_lost_places} places left out"
+            if self.n_bad_messages:
+                detail += f", {self.n_bad_messages} messages that cannot be read"
+            out.append(Warned(t_ns, DAMAGE, detail))
+        return tuple(out)
+
+    def messages(self, number: int) -> list[McapMessage]:
+        """All messages of a chunk; none of one that is damaged."""
+        if self._held[0] != number:
+            self._held = -1, []
+            try:
+                channels = dict(self.found.contents.channels)
+                self._held = number, self.file.messages(self.found.chunks[number], channels)
+            except DAMAGED:
+                return []
+        return self._held[1]
+
+    def picture_data(self, place: PicturePlace) -> tuple[str, bytes]:
+        """Topic and bytes of a picture."""
+        message = self.messages(place.chunk)[place.message]
+        return message.channel.topic, bytes(message.data)
+
+    def grey(self, t_ns: int) -> Bytes | None:
+        """The grey picture recorded beside the one of this time, if there is one."""
+        place = self.greys.get(t_ns)
+        if place is None:
+            return None
+        found = self.messages(place[0])
+        return still(GREY, found[place[1]].data) if place[1] < len(found) else None
+
+    def _index(self, number: int, chunk: ChunkPlace) -> None:
+        messages = self.messages(number)
+        if not messages:
+            self.found.n_lost_bytes += chunk.end - chunk.at
+            self.found.n_lost_places += 1
+            self._bad.add(number)
+        for at, message in enumerate(messages):
+            topic = message.channel.topic
+            try:
+                self._take(topic, number, at, message)
+            except (ValueError, TypeError, KeyError, RecursionError):
+                self.n_bad_messages += 1
+                continue
+            self.counts[topic] = self.counts.get(topic, 0) + 1
+
+    def _take(self, topic: str, number: int, at: int, message: McapMessage) -> None:
+        if topic in PICTURES:
+            alone = topic != VIDEO or stands_alone(message.data[:512])
+            self.pictures.append(PicturePlace(message.sequence, message.t_ns, number, at, alone))
+        elif topic == GREY:
+            self.greys[message.t_ns] = number, at
+        elif is_sample_topic(topic):
+            self.samples.append(sample_of(topic, message.t_ns, bytes(message.data)))
+        elif topic == HEALTH:
+            document = json.loads(bytes(message.data))
+            if isinstance(document, dict):
+                self.health = document
+
+    def lost_before(self, number: int) -> bool:
+        """Whether something is missing just before a chunk."""
+        return self.found.chunks[number].after_loss or number - 1 in self._bad
+
+
+class RecordedPictures:
+    """The pictures of a recording as a `FrameSource`; their numbers are those of the flight."""
+
+    def __init__(self, recording: Recording, camera: Camera) -> None:
+        self.path = recording.path
+        self.width, self.height = camera.width, camera.height
+        self.recording = recording
+
+    @property
+    def n_frames(self) -> int:
+        """How many there are."""
+        return len(self.recording.pictures)
+
+    def own_times_ns(self) -> list[int]:
+        """The flight's."""
+        return [place.t_ns for place in self.recording.pictures]
+
+    def epoch(self) -> tuple[int, str]:
+        """Zero: the times are the flight's."""
+        return 0, "the flight's own clock"
+
+    def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
+        """Number and RGB image of pictures first..last; None where one cannot be decoded."""
+        places = [p for p in self.recording.pictures if first <= p.seq <= last]
+        for place, rgb in self.decoded(places):
+            right = rgb is not None and rgb.shape == (self.height, self.width, 3)
+            yield place.seq, rgb if right else None
+
+    def decoded(self, places: list[PicturePlace]) -> Iterator[tuple[PicturePlace, Bytes | None]]:
+        """Each of these, which follow each other; None where one cannot be decoded."""
+        if not places:
+            return
+        if self.recording.picture_data(places[0])[0] != VIDEO:
+            for place in places:
+                yield place, still(*self.recording.picture_data(place))
+            return
+        every = self.recording.pictures
+        first = every.index(places[0])
+        begin = max((k for k in range(first + 1) if every[k].alone), default=first)
+        run = every[begin : first + len(places)]
+        wanted = set(places)
+        for number, rgb in VideoDecoder().pictures(self._packets(run)):
+            if run[number] in wanted:
+                yield run[number], rgb
+
+    def _packets(self, run: list[PicturePlace]) -> Iterator[tuple[int, bytes, bool]]:
+        before = run[0].chunk
+        for number, place in enumerate(run):
+            lost = any(map(self.recording.lost_before, range(before + 1, place.chunk + 1)))
+            before = place.chunk
+            yield number, self.recording.picture_data(place)[1], lost
+
+
+class RecordedFlight(Flight):
+    """A flight of which there is our own recording."""
+
+    def __init__(self, recording: Recording, camera: Camera, log: TelemetryLog) -> None:
+        places = recording.pictures
+        super().__init__(
+            recording.path, camera, RecordedPictures(recording, camera),
+            [place.seq for place in places], [place.t_ns for place in places],
+            recording.warnings, lambda _: log,
+        )  # fmt: skip
+        self.recording = recording
+
+    def _decode(self, first: int, beyond: int) -> Iterator[Frame | Warned]:
+        places = self.recording.pictures[first:beyond]
+        source = RecordedPictures(self.recording, self.camera)
+        shape = self.camera.height, self.camera.width
+        for place, rgb in source.decoded(places):
+            if rgb is None or rgb.shape != (*shape, 3):
+                yield Warned(place.t_ns, LOST, f"number {place.seq}")
+                continue
+            grey = self.recording.grey(place.t_ns)
+            fits = grey is not None and grey.shape == shape
+            yield Frame(place.seq, place.t_ns, grey if fits and grey is not None else grey_of(rgb),
+                        rgb)  # fmt: skip
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is MCAP and was recorded by us, whole or not."""
+    try:
+        with McapFile(path) as file:
+            return file.profile() == PROFILE
+    except FlightError:
+        return False
+
+
+def open_recording(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> RecordedFlight:
+    """Open a recording, repaired if need be; FlightError where there is no flight in it."""
+    recording = Recording(path)
+    if not recording.pictures:
+        recording.close()
+        raise FlightError(f"{path}: there are no pictures in it")
+    start_ns = recording.pictures[0].t_ns
+    camera, missing = _camera(recording, config, start_ns)
+    return RecordedFlight(recording, camera, _log(recording, telemetry, missing))
+
+
+def is_recorded_folder(path: Path) -> bool:
+    """Whether a folder is one of a live flight that was recorded."""
+    return (path / RECORDING).is_file()
+
+
+def open_recorded_folder(
+    path: Path, config: CameraConfig, telemetry: TelemetryConfig
+) -> RecordedFlight:
+    """Open the recording in the folder of a live flight; see `open_recording`."""
+    return open_recording(path / RECORDING, config, telemetry)
+
+
+def clock_of(health: dict[str, Any]) -> ClockReport | None:
+    """The state of the autopilot's clock in a health document."""
+    given = health.get("clock")
+    if not isinstance(given, dict):
+        return None
+    try:
+        return ClockReport(
+            str(given["method"]), float(given["offset_s"]), float(given["drift_ppm"]),
+            float(given["sigma_ms"]), int(given["n_reboots"]),
+        )  # fmt: skip
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def origin_of(health: dict[str, Any]) -> GeoOrigin | None:
+    """Where local NED has its zero, in a health document."""
+    given = health.get("origin")
+    if not isinstance(given, dict):
+        return None
+    try:
+        values = [float(given[f.name]) for f in dataclasses.fields(GeoOrigin)]
+    except (KeyError, TypeError, ValueError):
+        return None
+    return GeoOrigin(*values) if all(map(math.isfinite, values)) else None
+
+
+def _camera(
+    recording: Recording, config: CameraConfig, start_ns: int
+) -> tuple[Camera, tuple[Warned, ...]]:
+    try:
+        return camera_of(recording.found.attachments[CAMERA_JSON]), ()
+    except (KeyError, ValueError):
+        pass
+    source = recording.pictures[0]
+    topic, data = recording.picture_data(source)
+    rgb = still(topic, data) if topic != VIDEO else None
+    if topic == VIDEO:
+        rgb = next((p for _, p in VideoDecoder().pictures([(0, data, False)])), None)
+    if rgb is None or not config.assumed_hfov_deg:
+        raise FlightError(f"{recording.path}: its camera.json is damaged")
+    height, width = rgb.shape[:2]
+    detail = f"{config.assumed_hfov_deg:g} degrees wide, no distortion, place on body unknown"
+    warned = Warned(start_ns, "the camera's calibration is damaged: it is assumed", detail)
+    return assumed_camera(width, height, config.assumed_hfov_deg), (warned,)
+
+
+def _log(
+    recording: Recording, config: TelemetryConfig, warnings: tuple[Warned, ...]
+) -> TelemetryLog:
+    shift_ns = round(config.offset_s * 1e9)
+    samples = recording.samples
+    if shift_ns:
+        samples = [dataclasses.replace(each, t_ns=each.t_ns + shift_ns) for each in samples]
+    if not samples:
+        start_ns = recording.pictures[0].t_ns
+        missing = Warned(start_ns, "no telemetry", "neither scale nor level will be known")
+        warnings = (*warnings, missing)
+    health = recording.health
+    return TelemetryLog(
+        recording.path.name, samples, clock_of(health), origin_of(health), warnings,
+        rates_hz(samples),
+    )  # fmt: skip
+
+
+def _once_in_order(pictures: list[PicturePlace]) -> list[PicturePlace]:
+    """Pictures whose number and time are both larger than those of the one before."""
+    out: list[PicturePlace] = []
+    for place in sorted(pictures, key=lambda each: each.seq):
+        if not out or (place.seq > out[-1].seq and place.t_ns > out[-1].t_ns):
+            out.append(place)
+    return out

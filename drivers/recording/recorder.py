@@ -1,0 +1,200 @@
+"""Writes all that a flight took in and gave out, as it comes: flight.mcap, and flight.tlog."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+from companion.camera import Camera
+from companion.config import Config
+from companion.config_file import to_toml, without_passwords
+from companion.errors import StageError
+from companion.geometry import Similarity
+from companion.messages import (
+    ArmedSample,
+    AttitudeSample,
+    Frame,
+    HeightSample,
+    ImuSample,
+    MapUpdate,
+    Message,
+    Odometry,
+    PointChunk,
+    PositionSample,
+    RangeSample,
+    Warned,
+)
+from drivers.mavlink_stream import MavlinkStream, Packet
+from drivers.recording.camera_document import calibration_bytes, camera_document
+from drivers.recording.content import (
+    HealthNote,
+    LinkBytes,
+    cloud_bytes,
+    event_bytes,
+    json_bytes,
+    link_bytes,
+    odometry_bytes,
+    pose_bytes,
+    sample_bytes,
+    sample_topic,
+)
+from drivers.recording.disk_writer import DiskWriter, Entry
+from drivers.recording.flights_folder import RECORDING, TLOG
+from drivers.recording.growing_file import GrowingFile
+from drivers.recording.mcap_writer import McapWriter
+from drivers.recording.pictures import picture_encoder
+from drivers.recording.topics import (
+    CALIBRATION,
+    CLOUD,
+    EVENTS,
+    HEALTH,
+    ODOMETRY,
+    POSE,
+    PROFILE,
+    RECEIVED,
+    SENT,
+    TIMESYNC,
+    open_channels,
+)
+
+CAMERA_JSON, CONFIG_TOML = "camera.json", "config.toml"
+NOTES = "companion"
+"""Metadata: versions and what else is known at the beginning."""
+TELEMETRY = (
+    AttitudeSample, ImuSample, PositionSample, RangeSample, HeightSample, ArmedSample,
+)  # fmt: skip
+_TIMESYNC_ID, _TIMES = 111, struct.Struct("<qq")
+MOST_ROUND_TRIP_NS = 2_000_000_000
+
+
+class Recorder:
+    """The recording of one flight, in a folder that is there. Used from one thread.
+
+    StageError where it cannot be begun. Nothing waits for the disk but `close`.
+    """
+
+    def __init__(
+        self, folder: Path, config: Config, camera: Camera, versions: Mapping[str, str]
+    ) -> None:
+        self._config = config.recorder
+        self._warnings: list[Warned] = []
+        self._lock = threading.Lock()
+        self._newest_ns = 0
+        self._streams = {False: MavlinkStream(), True: MavlinkStream()}
+        self._map: MapUpdate | None = None
+        self._camera: Camera | None = camera
+        self._skips_until_alone = False
+        self.n_frames = 0
+        """Pictures taken in, written or not."""
+        self._encoder = picture_encoder(
+            self._config, camera.width, camera.height, config.camera.rate_hz
+        )
+        try:
+            mcap, tlog = GrowingFile(folder / RECORDING), GrowingFile(folder / TLOG)
+            writer = McapWriter(mcap.append, PROFILE)
+            self._channels = open_channels(writer)
+            writer.attach(CAMERA_JSON, "application/json", camera_document(camera), 0)
+            toml = without_passwords(to_toml(config)).encode()
+            writer.attach(CONFIG_TOML, "application/toml", toml, 0)
+            writer.note(NOTES, {**versions, "pictures": self._encoder.name, "flight": folder.name})
+        except OSError as error:
+            raise StageError(f"{folder}: cannot be recorded to: {error.strerror}") from error
+        self._disk = DiskWriter(
+            self._config, mcap, writer, tlog, folder, lambda: self._newest_ns, self._warned
+        )
+
+    @property
+    def n_dropped(self) -> Counter[str]:
+        """What there was no room for, by what it is."""
+        return self._disk.n_dropped
+
+    @property
+    def slowest_s(self) -> float:
+        """What the disk took at most, from a chunk's beginning until it was safe."""
+        return self._disk.slowest_s
+
+    def take(self, message: Message | LinkBytes | HealthNote) -> None:
+        """Record a message; of messages of the map only the points, and those if configured."""
+        self._newest_ns = max(self._newest_ns, message.t_ns)
+        if isinstance(message, LinkBytes):
+            self._link(message)
+        elif isinstance(message, Frame):
+            self._frame(message)
+        elif isinstance(message, TELEMETRY):
+            self._put(sample_topic(message), message.t_ns, sample_bytes(message))
+        elif isinstance(message, Odometry):
+            self._put(ODOMETRY, message.t_ns, odometry_bytes(message), message.seq)
+            pose = pose_bytes(message)
+            if pose is not None:
+                self._put(POSE, message.t_ns, pose, message.seq)
+        elif isinstance(message, Warned):
+            self._put(EVENTS, message.t_ns, event_bytes(message))
+        elif isinstance(message, HealthNote):
+            self._put(HEALTH, message.t_ns, json_bytes(message.document))
+        elif isinstance(message, MapUpdate):
+            self._map = message
+        elif isinstance(message, PointChunk) and self._config.point_cloud:
+            self._cloud(message)
+
+    def warnings(self) -> list[Warned]:
+        """What has gone wrong since this was last asked."""
+        with self._lock:
+            out, self._warnings = self._warnings, []
+        return out
+
+    def close(self) -> None:
+        """Make the files whole."""
+        self._encoder.close()
+        self._disk.close()
+
+    def _frame(self, frame: Frame) -> None:
+        if self._camera is not None:
+            self._put(CALIBRATION, frame.t_ns, calibration_bytes(self._camera, frame.t_ns))
+            self._camera = None
+        self.n_frames += 1
+        if not self._disk.recording:
+            self._disk.n_dropped["pictures"] += 1
+            return
+        for topic, data, alone in self._encoder.encode(frame):
+            if self._skips_until_alone and not alone:
+                self._disk.n_dropped["pictures"] += 1
+                continue
+            entry = Entry(self._channels[topic], frame.t_ns, data, frame.seq)
+            self._skips_until_alone = not self._disk.put(entry, "pictures", is_picture=True)
+            if self._skips_until_alone:
+                self._encoder.begin_anew()
+                return
+
+    def _link(self, taken: LinkBytes) -> None:
+        self._put(SENT if taken.outgoing else RECEIVED, taken.t_ns, link_bytes(taken))
+        for packet in self._streams[taken.outgoing].feed(taken.data, taken.monotonic_ns):
+            self._disk.put_packet(struct.pack(">Q", taken.t_ns // 1000) + packet.raw)
+            if packet.message_id == _TIMESYNC_ID and packet.known and not taken.outgoing:
+                self._exchange(packet, taken.t_ns)
+
+    def _exchange(self, packet: Packet, received_ns: int) -> None:
+        autopilot_ns, sent_ns = _TIMES.unpack_from(packet.payload.ljust(_TIMES.size, b"\0"))
+        # an answer to another computer has that one's time in it, which is not ours
+        if autopilot_ns and 0 <= received_ns - sent_ns <= MOST_ROUND_TRIP_NS:
+            exchange = {
+                "sent_ns": sent_ns, "autopilot_ns": autopilot_ns, "received_ns": received_ns
+            }  # fmt: skip
+            self._put(TIMESYNC, received_ns, json_bytes(exchange))
+
+    def _cloud(self, chunk: PointChunk) -> None:
+        place = self._map.place_of(chunk.keyframe_id) if self._map is not None else None
+        if self._map is None or place is None:
+            return
+        found = self._map.georeference
+        world: Similarity = place if found is None else found.world_from_map @ place
+        self._put(CLOUD, chunk.t_ns, cloud_bytes(chunk, world, found is not None))
+
+    def _put(self, topic: str, t_ns: int, data: bytes, sequence: int | None = None) -> None:
+        self._disk.put(Entry(self._channels[topic], t_ns, data, sequence), "messages")
+
+    def _warned(self, warning: Warned) -> None:
+        with self._lock:
+            self._warnings.append(warning)

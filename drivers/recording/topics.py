@@ -1,0 +1,183 @@
+"""What a recording holds, by topic, and the schema of each; docs/recording.md says it for people.
+
+Pictures, poses, clouds and events are in Foxglove's schemas, as protobuf; bytes of the link in our
+own, as protobuf; all else as JSON with a JSON schema.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from drivers.recording.mcap_writer import McapWriter
+
+PROFILE = "companion"
+"""What the header of a recording says; a number after it would tell a later layout."""
+
+IMAGE, VIDEO, RAW, GREY = "/camera/image", "/camera/video", "/camera/raw", "/camera/grey"
+CALIBRATION = "/camera/calibration"
+RECEIVED, SENT = "/mavlink/received", "/mavlink/sent"
+TIMESYNC = "/mavlink/timesync"
+POSE, ODOMETRY, CLOUD = "/pose", "/odometry", "/cloud"
+EVENTS, HEALTH = "/events", "/health"
+PICTURES = frozenset({IMAGE, VIDEO, RAW})
+"""One of them has the pictures of a flight."""
+
+_FIELD = descriptor_pb2.FieldDescriptorProto
+
+
+def _own_messages() -> descriptor_pb2.FileDescriptorProto:
+    """MavlinkBytes, as a .proto file would define it."""
+    file = descriptor_pb2.FileDescriptorProto(
+        name="companion/MavlinkBytes.proto", package="companion", syntax="proto3"
+    )
+    message = file.message_type.add(name="MavlinkBytes")
+    for number, (name, kind) in enumerate(
+        [
+            ("monotonic_ns", _FIELD.TYPE_FIXED64),
+            ("epoch_ns", _FIELD.TYPE_FIXED64),
+            ("data", _FIELD.TYPE_BYTES),
+        ],
+        1,
+    ):
+        message.field.add(name=name, number=number, type=kind, label=_FIELD.LABEL_OPTIONAL)
+    return file
+
+
+_pool = descriptor_pool.DescriptorPool()
+_pool.Add(_own_messages())
+MavlinkBytes: Any = message_factory.GetMessageClass(
+    _pool.FindMessageTypeByName("companion.MavlinkBytes")
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Json:
+    """A JSON object: its name, what it says, and its numbers, lists of numbers and words."""
+
+    name: str
+    says: str
+    properties: Mapping[str, Any]
+
+
+NUMBER, TEXT, FLAG, OBJECT = {"type": "number"}, {"type": "string"}, {"type": "boolean"}, {
+    "type": "object"
+}  # fmt: skip
+NUMBERS = {"type": "array", "items": {"type": ["number", "null"]}}
+INTEGER = {"type": "integer"}
+
+TOPICS: dict[str, Any] = {
+    IMAGE: CompressedImage,
+    VIDEO: CompressedVideo,
+    RAW: RawImage,
+    GREY: RawImage,
+    CALIBRATION: CameraCalibration,
+    RECEIVED: MavlinkBytes,
+    SENT: MavlinkBytes,
+    TIMESYNC: _Json(
+        "companion.TimesyncExchange",
+        "Unix ns of our clock at asking and at the answer, and the autopilot's between",
+        {"sent_ns": INTEGER, "autopilot_ns": INTEGER, "received_ns": INTEGER},
+    ),
+    "/telemetry/attitude": _Json(
+        "companion.AttitudeSample",
+        "Attitude of the body (FRD) in NED: quaternion w x y z; body rates, rad/s",
+        {"ned_from_body": NUMBERS, "rates_body_rad_s": NUMBERS},
+    ),
+    "/telemetry/imu": _Json(
+        "companion.ImuSample",
+        "Angular rate and specific force in the body frame (FRD)",
+        {"gyro_rad_s": NUMBERS, "accel_m_s2": NUMBERS},
+    ),
+    "/telemetry/position": _Json(
+        "companion.PositionSample",
+        "Position and velocity of the body in local NED",
+        {
+            "source": TEXT, "position_ned_m": NUMBERS, "velocity_ned_m_s": NUMBERS,
+            "sigma_horizontal_m": NUMBER, "sigma_vertical_m": NUMBER,
+        },
+    ),
+    "/telemetry/range": _Json(
+        "companion.RangeSample", "Distance to the ground along the body's down axis",
+        {"distance_m": NUMBER},
+    ),
+    "/telemetry/height": _Json(
+        "companion.HeightSample", "Barometric height above an arbitrary level, up positive",
+        {"height_m": NUMBER},
+    ),
+    "/telemetry/armed": _Json(
+        "companion.ArmedSample", "Whether the motors are armed", {"armed": FLAG}
+    ),
+    POSE: PoseInFrame,
+    ODOMETRY: _Json(
+        "companion.Odometry",
+        "What the autopilot may be told: body (FRD) in local NED, metres; null while not known",
+        {
+            "seq": INTEGER, "state": TEXT, "reset_counter": INTEGER, "quality": INTEGER,
+            "position_m": NUMBERS, "world_from_body": NUMBERS, "velocity_world_m_s": NUMBERS,
+            "sigma_position_m": NUMBER, "sigma_velocity_m_s": NUMBER, "sigma_attitude_rad": NUMBER,
+        },
+    ),
+    CLOUD: PointCloud,
+    EVENTS: Log,
+    HEALTH: _Json(
+        "companion.Health",
+        "How the daemon was: its status document, the autopilot's clock, the origin of local NED",
+        {"health": OBJECT, "clock": OBJECT, "origin": OBJECT},
+    ),
+}  # fmt: skip
+"""In the order of their channels."""
+
+
+def open_channels(writer: McapWriter) -> dict[str, int]:
+    """Have a channel for each topic; their numbers."""
+    schemas: dict[str, int] = {}
+    channels = {}
+    for topic, kind in TOPICS.items():
+        is_json = isinstance(kind, _Json)
+        name = kind.name if is_json else kind.DESCRIPTOR.full_name
+        if name not in schemas:
+            schemas[name] = (
+                writer.schema(name, "jsonschema", _json_schema(kind))
+                if is_json
+                else writer.schema(name, "protobuf", _descriptors(kind))
+            )
+        channels[topic] = writer.channel(topic, "json" if is_json else "protobuf", schemas[name])
+    return channels
+
+
+def _json_schema(kind: _Json) -> bytes:
+    schema = {
+        "title": kind.name,
+        "description": kind.says,
+        "type": "object",
+        "properties": dict(kind.properties),
+    }
+    return json.dumps(schema).encode()
+
+
+def _descriptors(kind: Any) -> bytes:
+    """The message's file and all that it imports, those first that others need."""
+    files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
+
+    def take(file: Any) -> None:
+        for needed in file.dependencies:
+            take(needed)
+        if file.name not in files:
+            files[file.name] = proto = descriptor_pb2.FileDescriptorProto()
+            file.CopyToProto(proto)
+
+    take(kind.DESCRIPTOR.file)
+    out: bytes = descriptor_pb2.FileDescriptorSet(file=files.values()).SerializeToString()
+    return out
