@@ -330,11 +330,41 @@ class CloudConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class StreamConfig:
+    """What viewers on the ground are given; see companion.stream."""
+
+    listen: str = "127.0.0.1:9870"
+    """HOST:PORT at which viewers connect; "" for none. 0.0.0.0 is every network."""
+    budget_kbit_s: Annotated[float, Range(0, 1e6)] = 0.0
+    """All viewers together get no more; 0 leaves it to what the link carries."""
+    most_viewers: Annotated[int, Range(1, 16)] = 4
+    store_mb: Annotated[int, Range(1, 4096)] = 128
+    """Points kept for viewers that come late; what is more is given up, the finest first."""
+
+
+@dataclass(frozen=True, slots=True)
 class ViewerConfig:
     """The recording and the live viewer."""
 
+    colours: Annotated[str, OneOf(("picture", "height", "confidence"))] = "picture"
+    """What the colours of the cloud tell."""
+    rrd_mb: Annotated[int, Range(0, 1000000)] = 4000
+    """Most that a flight's .rrd files may take; the oldest go. 0 for no limit."""
+
     jpeg_quality: Annotated[int, Range(1, 100)] = 60
     image_width: Annotated[int, Range(32, 8192)] = 640
+
+
+@dataclass(frozen=True, slots=True)
+class ExportConfig:
+    """What a replay writes beside its own results; `companion export` does so afterwards."""
+
+    formats: tuple[str, ...] = ()
+    """ply, pcd, las, laz, dsm, ortho, tum, kitti, euroc, gpx, kml, geojson."""
+    epsg: Annotated[int, Range(0, 999999)] = 0
+    """Projection of clouds and rasters; 0: the UTM zone in which the flight was."""
+    cell_m: Annotated[float, Range(0, 1000)] = 0.0
+    """Side of a raster's cell; 0: twice the spacing of the cloud's points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,4 +386,6 @@ class Config:
     opencl: OpenclConfig = field(default_factory=OpenclConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)
+    stream: StreamConfig = field(default_factory=StreamConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)

@@ -1,0 +1,57 @@
+"""Pieces of items on a TCP connection: so small that what is urgent never waits behind what is not.
+
+From the drone: kind (one byte, its high bit set in the last piece of an item), length (u16), piece.
+Of each kind one item at a time is on its way, so that pieces of different kinds may mix. Kind 0
+says only that the drone is there.
+
+To the drone: HELLO, 16 bytes that name the viewer, then again and again how many bytes it has taken
+in all (u64). Everything is little-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+
+from companion.errors import StreamError
+
+HELLO = b"CMPV\x01"
+VIEWER_BYTES = 16
+HELLO_BYTES = len(HELLO) + VIEWER_BYTES
+TAKEN = struct.Struct("<Q")
+HEAD = struct.Struct("<BH")
+HEAD_BYTES = HEAD.size
+LAST = 0x80
+MOST_ITEM_BYTES = 16 << 20
+
+
+def frame(kind: int, piece: bytes, is_last: bool) -> bytes:
+    """A piece as it goes over the wire."""
+    return HEAD.pack(kind | (LAST if is_last else 0), len(piece)) + piece
+
+
+class Reassembly:
+    """Bytes as they come, to items."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self._items: dict[int, bytearray] = {}
+
+    def take(self, data: bytes) -> list[tuple[int, bytes]]:
+        """Kind and payload of the items that are whole now; StreamError where that cannot be."""
+        self._bytes += data
+        out = []
+        at = 0
+        while len(self._bytes) - at >= HEAD_BYTES:
+            kind, length = HEAD.unpack_from(self._bytes, at)
+            end = at + HEAD_BYTES + length
+            if len(self._bytes) < end:
+                break
+            item = self._items.setdefault(kind & ~LAST, bytearray())
+            item += self._bytes[at + HEAD_BYTES : end]
+            at = end
+            if len(item) > MOST_ITEM_BYTES:
+                raise StreamError("an item that is too large came over the link")
+            if kind & LAST:
+                out.append((kind & ~LAST, bytes(self._items.pop(kind & ~LAST))))
+        del self._bytes[:at]
+        return out

@@ -1,0 +1,139 @@
+"""How much may be on its way to a viewer: as much as the link carries without a queue growing.
+
+A window of unacknowledged bytes. It grows while it is what limits the sender and the standing delay
+(the least round trip of late) stays near the least there was; it shrinks when the standing delay
+shows a queue. Losses, which TCP repairs, delay some acknowledgements but not all, and so do not
+shrink it. After Arun and Balakrishnan, Copa (NSDI 2018), whose standing delay this is, and LEDBAT
+(RFC 6817), whose target it has.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+LEAST_BYTES = 6_000
+MOST_BYTES = 4 << 20
+QUEUE_S = 0.05
+"""Delay beyond the least that counts as a queue."""
+STANDING_S = 0.1
+"""The standing delay is over so long, or a round trip where that is longer."""
+FORGET_S = 20.0
+"""The least round trip is that of the last so long, or twice so long."""
+SHRINK = 0.8
+RATE_OVER_S = 1.0
+
+
+class Window:
+    """Counts what is sent and acknowledged; times are seconds of one monotonic clock."""
+
+    def __init__(self) -> None:
+        self.size_bytes = float(LEAST_BYTES)
+        self.sent_bytes = 0
+        self.acknowledged_bytes = 0
+        self.round_trip_s: float | None = None
+        """The newest; None before any."""
+        self._on_way: deque[tuple[int, float]] = deque()
+        self._least: list[tuple[float, float]] = []
+        self._standing: deque[tuple[float, float]] = deque()
+        self._delivered: deque[tuple[float, int]] = deque()
+        self._was_limited = False
+        self._shrunk_s = -1e9
+        self._has_seen_queue = False
+
+    @property
+    def on_way_bytes(self) -> int:
+        """Sent and not yet acknowledged."""
+        return self.sent_bytes - self.acknowledged_bytes
+
+    def room_bytes(self) -> int:
+        """So much more may be sent now."""
+        room = int(self.size_bytes) - self.on_way_bytes
+        self._was_limited |= room <= 0
+        return max(0, room)
+
+    def sent(self, now_s: float, n_bytes: int) -> None:
+        """So much went out."""
+        self.sent_bytes += n_bytes
+        self._on_way.append((self.sent_bytes, now_s))
+
+    def acknowledged(self, now_s: float, total_bytes: int) -> None:
+        """So much in all has been taken by the viewer."""
+        if not self.acknowledged_bytes < total_bytes <= self.sent_bytes:
+            return
+        n_new, self.acknowledged_bytes = total_bytes - self.acknowledged_bytes, total_bytes
+        went_s = None
+        while self._on_way and self._on_way[0][0] <= total_bytes:
+            went_s = self._on_way.popleft()[1]
+        self._delivered.append((now_s, total_bytes))
+        while self._delivered[0][0] < now_s - RATE_OVER_S and len(self._delivered) > 2:
+            self._delivered.popleft()
+        if went_s is None:
+            return
+        self.round_trip_s = now_s - went_s
+        self._adjust(now_s, self.round_trip_s, n_new)
+
+    def waited_s(self, now_s: float) -> float:
+        """How long the oldest that is on its way has been."""
+        return now_s - self._on_way[0][1] if self._on_way else 0.0
+
+    @property
+    def rate_bytes_s(self) -> float:
+        """What has got through of late; 0 before anything has."""
+        if len(self._delivered) < 2:
+            return 0.0
+        (t0, n0), (t1, n1) = self._delivered[0], self._delivered[-1]
+        return (n1 - n0) / max(t1 - t0, 0.05)
+
+    @property
+    def capacity_bytes_s(self) -> float:
+        """What the link would carry, by window and round trip; 0 while not known."""
+        if self.round_trip_s is None or not self._least:
+            return 0.0
+        return self.size_bytes / max(min(r for _, r in self._least) + QUEUE_S / 2, 1e-3)
+
+    def _adjust(self, now_s: float, round_trip_s: float, n_new: int) -> None:
+        least_s = self._least_s(now_s, round_trip_s)
+        self._standing.append((now_s, round_trip_s))
+        while self._standing[0][0] < now_s - max(STANDING_S, least_s):
+            self._standing.popleft()
+        queue_s = min(r for _, r in self._standing) - least_s
+        if queue_s > QUEUE_S:
+            self._has_seen_queue = True
+            if now_s - self._shrunk_s > max(STANDING_S, round_trip_s):
+                self._shrunk_s = now_s
+                self.size_bytes = max(LEAST_BYTES, self.size_bytes * SHRINK)
+        elif self._was_limited:
+            gain = 0.25 if self._has_seen_queue else 1.0
+            self.size_bytes = min(MOST_BYTES, self.size_bytes + gain * n_new)
+        self._was_limited = False
+
+    def _least_s(self, now_s: float, round_trip_s: float) -> float:
+        """The least round trip, in two halves of which the older is forgotten."""
+        if not self._least or now_s - self._least[-1][0] > FORGET_S:
+            self._least = [*self._least[-1:], (now_s, round_trip_s)]
+        elif round_trip_s < self._least[-1][1]:
+            self._least[-1] = (self._least[-1][0], round_trip_s)
+        return min(r for _, r in self._least)
+
+
+class Budget:
+    """A bucket of bytes that fills at a rate, 0 for no limit; it may be overdrawn by one piece."""
+
+    def __init__(self, kbit_s: float) -> None:
+        self.bytes_s = kbit_s * 125.0
+        self._held = 0.0
+        self._t_s: float | None = None
+
+    def room_bytes(self, now_s: float) -> int:
+        """So much may be sent now."""
+        if self.bytes_s <= 0:
+            return MOST_BYTES
+        if self._t_s is not None:
+            self._held += (now_s - self._t_s) * self.bytes_s
+        self._t_s = now_s
+        self._held = min(self._held, max(0.05 * self.bytes_s, 3000.0))
+        return max(0, int(self._held))
+
+    def charge(self, n_bytes: int) -> None:
+        """So much was sent."""
+        self._held -= n_bytes
