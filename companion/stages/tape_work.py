@@ -1,0 +1,40 @@
+"""What is kept of a flight to fly it again, as a process: all that came in, and what went out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from companion.errors import StageError
+from companion.messages import Message
+from companion.output.surroundings import versions
+from companion.stages.protocol import Finish, Setup
+from companion.stages.work import Work
+from drivers.recording.recorder import Recorder
+
+
+class _Tape(Work):
+    def __init__(self, setup: Setup) -> None:
+        super().__init__()
+        if setup.folder is None:
+            raise StageError("a recorder needs a folder")
+        setup.folder.mkdir(parents=True, exist_ok=True)
+        self._recorder = Recorder(setup.folder, setup.config, setup.camera, versions())
+
+    @property
+    def n_turned_away(self) -> int:
+        """Pictures and other messages that the disk was too slow for, or had no room for."""
+        return self._recorder.n_dropped.total()
+
+    def step(self, message: Any) -> Iterable[Message]:
+        self._recorder.take(message)
+        return self._recorder.warnings()
+
+    def finish(self, finish: Finish) -> Iterable[Message]:
+        self._recorder.close()
+        return self._recorder.warnings()
+
+
+def work(setup: Setup) -> Work:
+    """The stage that a setup asks for."""
+    return _Tape(setup)
