@@ -7,6 +7,7 @@ the program raises on purpose is one line; anything else is a bug and shows its 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import sys
 import threading
@@ -14,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from companion import __version__
+from companion.config import ExportConfig
 from companion.config_file import load_config, to_toml
 from companion.errors import CompanionError, InputError
 from companion.progress import progress_on
@@ -49,6 +51,10 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
     if arguments.out.exists() and not arguments.out.is_dir():
         raise InputError(f"{arguments.out}: is a file; --out wants a folder")
+    if config.export.formats:
+        from companion.output.exports import check_formats
+
+        check_formats(config.export)
     from companion.replay import replay
 
     replay(
@@ -61,9 +67,33 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         paced=arguments.paced,
         progress=signals.between_frames(progress_on(sys.stderr)),
     )
+    if config.export.formats:
+        _export_into(arguments.out, arguments.out, config.export)
     print(f"report: {arguments.out / 'report.html'}")
     signals.take()
     return 0
+
+
+def _export(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    settings = load_config(arguments.config, arguments.set).export
+    if arguments.formats is not None:
+        settings = dataclasses.replace(settings, formats=_formats(arguments.formats))
+    if not settings.formats:
+        raise InputError("nothing to export: --as las,gpx,… says what")
+    _export_into(arguments.run, arguments.out or arguments.run, settings)
+    return 0
+
+
+def _formats(text: str) -> tuple[str, ...]:
+    return tuple(name.strip().lower() for name in text.split(",") if name.strip())
+
+
+def _export_into(run: Path, out: Path, settings: ExportConfig) -> None:
+    from companion.output.exports import export_run
+    from companion.output.run_folder import read_run
+
+    for path in export_run(read_run(run), out, settings):
+        print(f"export: {path}")
 
 
 def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -160,6 +190,7 @@ def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
 COMMANDS: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {
     "run": _run,
     "replay": _replay,
+    "export": _export,
     "status": _status,
     "devices": _devices,
     "calibrate": _calibrate,
@@ -218,6 +249,18 @@ def _parser() -> argparse.ArgumentParser:
         "--paced", action="store_true",
         help="in the flight's own time, dropping what a live run would drop",
     )  # fmt: skip
+
+    export = commands.add_parser(
+        "export", parents=[configuration], help="write a replay's results in other formats",
+        description="Clouds, rasters and paths for other programs, from the folder of a finished "
+        "replay, with a statement of accuracy beside each.",
+    )  # fmt: skip
+    export.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
+    export.add_argument(
+        "--as", dest="formats", metavar="FORMATS",
+        help="any of ply,pcd,las,laz,dsm,ortho,tum,kitti,euroc,gpx,kml,geojson; see [export]",
+    )  # fmt: skip
+    export.add_argument("--out", type=Path, metavar="DIR", help="folder for them (default: RUN)")
 
     as_json = argparse.ArgumentParser(add_help=False)
     as_json.add_argument("--json", action="store_true", help="as JSON, for programs")

@@ -1,0 +1,98 @@
+"""How far what is exported can be trusted, in words, from the numbers of the run's report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from companion.output.map_frame import MapFrame
+from companion.output.run_folder import FinishedRun
+
+ABSOLUTE = (
+    "Absolute position: no better than the autopilot's own. Without correction data that is 1 to "
+    "3 m horizontally and about twice that in height (a satellite receiver's usual figures, not "
+    "measured here); an error common to the whole flight shifts everything alike."
+)
+
+
+def accuracy_statement(run: FinishedRun, file: str, frame: MapFrame | None) -> bytes:
+    """A page of text beside an export; `frame` is None for formats with axes of their own."""
+    report = run.report
+    lines = [f"{file}: how it was placed, and how far that can be trusted", ""]
+    lines += _placed(run, frame)
+    lines += ["", *_scale(run, report.get("scale"))]
+    camera = report.get("camera") or {}
+    if camera.get("assumed"):
+        lines.append(
+            "Camera: ASSUMED, not calibrated. Shapes can be bent and heights wrong by several per "
+            "cent, beyond every figure given here."
+        )
+    clock = report.get("clock")
+    if clock and clock.get("sigma_ms") is not None:
+        lines.append(
+            f"Clocks: autopilot and camera put together by {clock['method']}, "
+            f"within {clock['sigma_ms']:.1f} ms (one standard deviation)."
+        )
+    lines.append(
+        f"Path: {report.get('tracked', 0)} of {report.get('frames', 0)} frames placed. "
+        "Times are of the middle of the exposure, on the recording computer's clock."
+    )
+    lines.append("No ground control was used; nothing here was checked against surveyed points.")
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _placed(run: FinishedRun, frame: MapFrame | None) -> list[str]:
+    if not run.metric:
+        return [
+            "Unit: map units. No metric scale was found, so lengths are only in proportion, and "
+            "axes and zero are arbitrary."
+        ]
+    if run.origin is None:
+        return [
+            "Frame: local, metres; zero at the first camera. No position was known, so neither "
+            "place nor, but for the compass, heading are."
+        ]
+    o = run.origin
+    zero = (
+        f"Zero of the local frame: latitude {o.latitude_deg:.8f}, longitude "
+        f"{o.longitude_deg:.8f} (WGS84), {o.altitude_m:.3f} m above mean sea level."
+    )
+    if frame is None:
+        return [zero, ABSOLUTE]
+    shift = "UTM by Krueger's series, error below a micrometre"
+    how = shift if frame.name.startswith("WGS 84 / UTM") else "projected by PROJ from WGS84"
+    return [
+        f"Coordinates: {frame.name} (EPSG:{frame.epsg}); {how}.",
+        "Heights: above mean sea level as the autopilot gives them, written as EGM96; no geoid "
+        "model was applied.",
+        zero,
+        ABSOLUTE,
+    ]
+
+
+def _scale(run: FinishedRun, scale: Mapping[str, Any] | None) -> list[str]:
+    if not run.metric or not scale:
+        return []
+    relative, yaw_deg = scale.get("sigma_relative"), scale.get("sigma_yaw_deg")
+    lines = [f"Scale and heading: from {scale.get('method')}, {scale.get('positions', 0)} samples."]
+    if scale.get("residual_m") is not None:
+        lines.append(f"Left between path and positions: {scale['residual_m']:.2f} m.")
+    if relative is not None and yaw_deg is not None:
+        reach = _reach_m(run)
+        lines.append(
+            f"Relative: scale within {100 * relative:.2f} %, heading within {yaw_deg:.2f} degrees "
+            f"(one standard deviation); at {reach:.0f} m from the middle of the flight, its far "
+            f"end, that is {reach * relative:.2f} m along and "
+            f"{reach * float(np.radians(yaw_deg)):.2f} m across."
+        )
+    return lines
+
+
+def _reach_m(run: FinishedRun) -> float:
+    if not run.poses:
+        return 0.0
+    path = np.stack([pose.world_from_camera.translation[:2] for pose in run.poses])
+    points = run.cloud.points[:, :2] if len(run.cloud) else path
+    return float(np.linalg.norm(points - path.mean(0), axis=1).max())
