@@ -4,8 +4,9 @@
         ... camera.url, camera.write_calibration(path)
         camera.frozen = True
 
-What it films is the test pattern, whose every pose is known: `world_from_body(monotonic_ns)`, which
-goes round faster than the pattern camera's own so that scale is found sooner.
+What it films is the test pattern, from where it is told to be, or else from where every pose is
+known: `world_from_body(monotonic_ns)`, which goes round faster than the pattern camera's own, so
+that scale is found sooner.
 
     on            False: nobody answers at its port, and whoever was connected is cut off
     stalled       True: the connection stays, and nothing comes
@@ -23,6 +24,7 @@ import random
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
@@ -54,7 +56,11 @@ def world_from_body(monotonic_ns: int) -> Pose:
 class HttpCamera:
     """See above. One client at a time; `on` may be set before it is started."""
 
-    def __init__(self, width: int = 320, height: int = 240, on: bool = True) -> None:
+    def __init__(
+        self, width: int = 320, height: int = 240, on: bool = True,
+        world_from_body: Callable[[int], Pose] = world_from_body,
+    ) -> None:  # fmt: skip
+        self._world_from_body = world_from_body
         self._full_size = width, height
         self.heal()
         self.on = on
@@ -148,7 +154,7 @@ class HttpCamera:
 
     def _picture(self, monotonic_ns: int) -> bytes:
         if self._last is None or not self.frozen:
-            pose = world_from_body(monotonic_ns) @ BODY_FROM_CAMERA
+            pose = self._world_from_body(monotonic_ns) @ BODY_FROM_CAMERA
             self._last = self._scene.picture(self._optics, pose)[1]
         seen = self._last
         if self.covered:

@@ -1,0 +1,119 @@
+"""A drone without GPS that flies by our poses alone: it stands, flies a square, loses its cable."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from companion.geometry import Array
+from tests.support.daemon import Daemon
+from tests.support.fake_wire import free_port
+from tests.support.flying_vehicle import FlownByVision, Moment
+from tests.support.http_camera import HttpCamera
+
+HEIGHT_M, SIDE_M = 7.0, 4.0
+CORNERS = ((SIDE_M, 0.0), (SIDE_M, SIDE_M), (0.0, SIDE_M), (0.0, 0.0))
+
+
+@dataclass
+class Flown:
+    """What truly happened. Lists of moments cover what is said, from its begin to its end."""
+
+    first_pose_s: float = 0.0
+    """After take-off."""
+    standing: list[Moment] = field(default_factory=list)
+    corners: list[Moment] = field(default_factory=list)
+    before_pull: Array = field(default_factory=lambda: np.zeros(3))
+    back_again: list[Moment] = field(default_factory=list)
+    without_pose_s: float = 0.0
+    again_s: float = 0.0
+    """From the cable's return to the next pose."""
+    n_refused: int = 0
+    texts: list[str] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module", params=["ardupilot", "px4"])
+def flown(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Flown]:
+    folder, out, udp_port = tmp_path_factory.mktemp("square"), Flown(), free_port()
+    drone = FlownByVision(request.param, f"udpout:127.0.0.1:{udp_port}")
+    if request.param == "ardupilot":
+        drone.parameters["VISO_DELAY_MS"] = 40
+    camera = HttpCamera(640, 480, world_from_body=drone.world_from_body)
+    calibration = camera.write_calibration(folder / "camera.json")
+    settings = (
+        "camera.source=network", f"camera.url={camera.url}", "camera.width=640",
+        "camera.height=480", f"camera.calibration={calibration}", "depth.enabled=false",
+        f"link.url=udpin:127.0.0.1:{udp_port}", "feedback.mode=odometry",
+    )  # fmt: skip
+
+    def during(seconds: float) -> list[Moment]:
+        n_before = len(drone.moments)
+        time.sleep(seconds)
+        return drone.moments[n_before:]
+
+    with camera, drone, Daemon(folder, *settings) as daemon:
+        daemon.until(
+            lambda health: {each["state"] for each in health["sources"]} == {"running"}, 30
+        )
+        begun_s = time.monotonic()
+        drone.take_off(HEIGHT_M)
+        while not drone.knows_its_place:
+            assert time.monotonic() - begun_s < 40, "no pose"
+            time.sleep(0.05)
+        out.first_pose_s = time.monotonic() - begun_s
+        during(4.0)
+        out.standing = during(5.0)
+        for corner in CORNERS:
+            drone.go_to(*corner)
+            out.corners.append(during(5.0)[-1])
+        out.before_pull = drone.moments[-1].place
+        drone.unplug()
+        pulled_s = time.monotonic()
+        during(2.5)
+        drone.plug()
+        plugged_s = time.monotonic()
+        while not drone.knows_its_place:
+            assert time.monotonic() - plugged_s < 20, "no pose again"
+            time.sleep(0.02)
+        out.again_s = time.monotonic() - plugged_s
+        out.without_pose_s = time.monotonic() - pulled_s
+        during(5.0)
+        out.back_again = during(2.0)
+        out.n_refused, out.texts = drone.n_refused, drone.texts()
+        daemon.stop()
+    yield out
+
+
+def test_it_stands(flown: Flown) -> None:
+    assert flown.first_pose_s < 15
+    place = np.array([each.place for each in flown.standing])
+    # a machine that is busy elsewhere may be late with a few pictures
+    assert np.mean([each.has_pose for each in flown.standing]) > 0.8
+    away_m = np.linalg.norm((place - place.mean(0))[:, :2], axis=1)
+    print(f"{flown.first_pose_s:.1f} s to the first pose; {away_m.max():.2f} m away at most")
+    assert away_m.max() < 0.7
+
+
+def test_it_flies_a_square(flown: Flown) -> None:
+    """Its sides are as long as they were meant to be, and it ends where it began."""
+    stood = np.mean([each.place for each in flown.standing], axis=0)
+    for wanted, got in zip(CORNERS, flown.corners, strict=True):
+        error_m = float(np.linalg.norm((got.place - stood)[:2] - wanted))
+        print(f"{wanted}: {error_m:.2f} m away")
+        assert error_m < 0.8
+    assert flown.n_refused == 0
+
+
+def test_it_comes_back_when_its_cable_was_pulled(flown: Flown) -> None:
+    assert flown.without_pose_s > 2.0
+    away_m = float(np.linalg.norm((flown.back_again[-1].place - flown.before_pull)[:2]))
+    print(f"a pose again after {flown.again_s:.2f} s; {away_m:.2f} m away")
+    assert flown.again_s < 2.5
+    assert away_m < 0.8
+    assert "Companion: vision pose on" in flown.texts
