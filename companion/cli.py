@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from companion import __version__
+from companion import __version__, cli_recordings
 from companion.config import ExportConfig
 from companion.config_file import load_config, to_toml
 from companion.errors import CompanionError, InputError
@@ -108,6 +108,16 @@ def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 0
 
 
+def _view(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.view import view
+
+    def told(text: str) -> None:
+        print(f"companion: {text}", file=sys.stderr, flush=True)
+
+    where = "web" if arguments.web else arguments.viewer
+    return view(arguments.host, where, arguments.bind, arguments.colours, told)
+
+
 def _devices(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.devices import devices
 
@@ -192,12 +202,14 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {
     "replay": _replay,
     "export": _export,
     "status": _status,
+    "view": _view,
     "devices": _devices,
     "calibrate": _calibrate,
     "doctor": _doctor,
     "depth": _depth,
     "bench": _bench,
     "check-config": _check_config,
+    **cli_recordings.COMMANDS,
 }
 
 
@@ -269,6 +281,29 @@ def _parser() -> argparse.ArgumentParser:
         "status", parents=[configuration, as_json], help="ask the running daemon how it is"
     )
     status.add_argument("--watch", action="store_true", help="again every second, until Ctrl-C")
+
+    view = commands.add_parser(
+        "view", help="watch a flight on the ground, over whatever link there is",
+        description="Connect to a companion that flies (its stream.listen) and show the map, the "
+        "camera and how all is, until Ctrl-C; the link may come and go.",
+    )  # fmt: skip
+    view.add_argument(
+        "host", nargs="?", default="127.0.0.1", metavar="HOST[:PORT]",
+        help="the drone's address (default: %(default)s, port 9870)",
+    )  # fmt: skip
+    view.add_argument("--web", action="store_true", help="on a page for a browser, not in a window")
+    view.add_argument(
+        "--viewer", type=_viewer, default="native", metavar="WHERE",
+        help="native, web, or the rerun+http://… of a running viewer (default: %(default)s)",
+    )  # fmt: skip
+    view.add_argument(
+        "--bind", default="127.0.0.1", metavar="ADDRESS",
+        help="where the page is served; 0.0.0.0 for other machines too (default: %(default)s)",
+    )  # fmt: skip
+    view.add_argument(
+        "--colours", choices=("picture", "height", "confidence"), default="picture",
+        help="what the colours of the cloud tell (default: %(default)s)",
+    )  # fmt: skip
 
     commands.add_parser(
         "devices", parents=[as_json], help="list cameras, serial ports and OpenCL devices"
@@ -353,6 +388,7 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, metavar="DIR", help="write slam.json and pictures of the paths there"
     )
 
+    cli_recordings.add_parsers(commands, configuration, _seconds)
     commands.add_parser(
         "check-config", parents=[configuration], help="print the configuration that would be used",
         description="Check a configuration and print the whole of it as TOML.",

@@ -38,15 +38,16 @@ class NoProgress:
 
 
 class TerminalProgress:
-    """A line in a terminal: bar, frames done, frames/s, state, points, time to go."""
+    """A line in a terminal: bar, frames (or what `unit` says) done, their rate, state, points."""
 
-    def __init__(self, stream: TextIO, counted: str = "points") -> None:
+    def __init__(self, stream: TextIO, counted: str = "points", unit: str = "frames") -> None:
         self._bar = RichProgress(
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("frames"),
-            _FramesPerSecond(),
-            TextColumn("{task.fields[state]}  {task.fields[points]:,} " + counted),
+            TextColumn(unit),
+            _PerSecond(unit),
+            TextColumn("{task.fields[state]}"),
+            *([TextColumn("{task.fields[points]:,} " + counted)] if counted else []),
             RemainingColumn(),
             console=Console(file=stream),
         )
@@ -68,12 +69,16 @@ class TerminalProgress:
         self._bar.stop()
 
 
-class _FramesPerSecond(ProgressColumn):
+class _PerSecond(ProgressColumn):
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.1f} frames/s")
+        return Text("" if speed is None else f"{speed:.1f} {self._unit}/s")
 
 
-def progress_on(stream: TextIO, counted: str = "points") -> Progress:
+def progress_on(stream: TextIO, counted: str = "points", unit: str = "frames") -> Progress:
     """A bar where there is a terminal to show it, nothing elsewhere."""
-    return TerminalProgress(stream, counted) if stream.isatty() else NoProgress()
+    return TerminalProgress(stream, counted, unit) if stream.isatty() else NoProgress()

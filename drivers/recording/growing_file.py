@@ -14,6 +14,7 @@ class GrowingFile:
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._size = 0
@@ -33,6 +34,11 @@ class GrowingFile:
     def sync(self) -> None:
         """Wait until the disk has it."""
         os.fdatasync(self._fd)
+
+    def discard(self) -> None:
+        """Close it and delete it."""
+        self.close()
+        self._path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close it; can be called twice."""

@@ -150,20 +150,11 @@ class McapFile:
     def summary(self) -> Scan | None:
         """What the file's own end says of it, quickly; None where that is not to be believed."""
         found = Scan()
-        tail = self.bytes_at(self.size - FOOTER_SIZE, self.size)
-        if len(tail) < FOOTER_SIZE or not tail.endswith(MAGIC):
+        begin = self._end_of_data()
+        if begin is None:
             return None
         try:
-            opcode, length = RECORD.unpack_from(tail)
-            footer = Footer.read(_stream(tail[RECORD.size :]))
-            begin = footer.summary_start
-            if opcode != Opcode.FOOTER or length != 20 or not 0 < begin < self.size - FOOTER_SIZE:
-                return None
-            if self.size - begin > MOST_IN_CHUNK:
-                return None
             block = self.bytes_at(begin, self.size)
-            if footer.summary_crc not in (0, zlib.crc32(block[: -len(MAGIC) - 4])):
-                return None
             for kind, body in _records(memoryview(block[:-FOOTER_SIZE])):
                 _take_summary(found.contents, kind, body)
             self._take_notes(found)
@@ -174,6 +165,21 @@ class McapFile:
             return None
         found.whole = True
         return found
+
+    def _end_of_data(self) -> int | None:
+        """Where the index begins that the footer names, if its checksum is right."""
+        tail = self.bytes_at(self.size - FOOTER_SIZE, self.size)
+        if len(tail) < FOOTER_SIZE or not tail.endswith(MAGIC):
+            return None
+        opcode, length = RECORD.unpack_from(tail)
+        footer = Footer.read(_stream(tail[RECORD.size :]))
+        begin = footer.summary_start
+        if opcode != Opcode.FOOTER or length != 20 or not 0 < begin < self.size - FOOTER_SIZE:
+            return None
+        if self.size - begin > MOST_IN_CHUNK:
+            return None
+        right = footer.summary_crc == zlib.crc32(self.bytes_at(begin, self.size - len(MAGIC) - 4))
+        return begin if right or not footer.summary_crc else None
 
     def scan(self, told: Callable[[int], None] | None = None) -> Scan:
         """Go through all of it; `told` hears how many bytes are done.
@@ -196,6 +202,11 @@ class McapFile:
             else:
                 chunk = self._next_chunk(at + 1)
                 if chunk is None:
+                    end = self._end_of_data()
+                    if in_data and end is not None and end > at:  # an index follows all the same
+                        found.whole, in_data = True, False
+                        found.n_lost_bytes += end - at
+                        found.n_lost_places += 1
                     break
                 found.n_lost_bytes += chunk - at
                 found.n_lost_places += 1

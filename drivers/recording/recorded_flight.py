@@ -21,7 +21,7 @@ from drivers.recording.flights_folder import RECORDING
 from drivers.recording.mcap_scan import DAMAGED, ChunkPlace, McapFile, McapMessage
 from drivers.recording.pictures import VideoDecoder, grey_of, stands_alone, still
 from drivers.recording.recorder import CAMERA_JSON
-from drivers.recording.repair import n_cut_bytes, opened
+from drivers.recording.repair import n_cut_bytes, opened, was_cut
 from drivers.recording.topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
 from drivers.telemetry_log import TelemetryLog, rates_hz
 
@@ -79,7 +79,7 @@ class Recording:
         t_ns = self.pictures[0].t_ns if self.pictures else 0
         out = []
         n_cut, found = n_cut_bytes(self.found), self.found
-        if n_cut or not found.whole:
+        if was_cut(found):
             out.append(Warned(t_ns, CUT, f"{n_cut} bytes at its end were not whole"))
         n_lost = found.n_lost_bytes - found.n_cut_bytes
         if n_lost > 0 or self.n_bad_messages:

@@ -92,18 +92,21 @@ class Recorder:
         self._encoder = picture_encoder(
             self._config, camera.width, camera.height, config.camera.rate_hz
         )
+        files: list[GrowingFile] = []
         try:
-            mcap, tlog = GrowingFile(folder / RECORDING), GrowingFile(folder / TLOG)
-            writer = McapWriter(mcap.append, PROFILE)
+            files += [GrowingFile(folder / RECORDING), GrowingFile(folder / TLOG)]
+            writer = McapWriter(files[0].append, PROFILE)
             self._channels = open_channels(writer)
             writer.attach(CAMERA_JSON, "application/json", camera_document(camera), 0)
             toml = without_passwords(to_toml(config)).encode()
             writer.attach(CONFIG_TOML, "application/toml", toml, 0)
             writer.note(NOTES, {**versions, "pictures": self._encoder.name, "flight": folder.name})
         except OSError as error:
+            for file in files:
+                file.discard()
             raise StageError(f"{folder}: cannot be recorded to: {error.strerror}") from error
         self._disk = DiskWriter(
-            self._config, mcap, writer, tlog, folder, lambda: self._newest_ns, self._warned
+            self._config, files[0], writer, files[1], folder, lambda: self._newest_ns, self._warned
         )
 
     @property

@@ -45,6 +45,11 @@ def n_cut_bytes(found: Scan) -> int:
     return found.n_cut_bytes + (int(noted) if noted.isdigit() else 0)
 
 
+def was_cut(found: Scan) -> bool:
+    """Whether its writer did not end it, repaired since or not."""
+    return not found.whole or NOTE in found.metadata
+
+
 def opened(path: Path) -> tuple[McapFile, Scan]:
     """A file and what is in it, repaired where it is cut short and that is possible.
 

@@ -1,0 +1,110 @@
+"""The part of the command line that has to do with recordings and runs that are there already."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from companion.config_file import load_config
+from companion.errors import InputError
+from companion.progress import progress_on
+from companion.stopping import StopSignals
+
+Command = Callable[[argparse.Namespace, StopSignals], int]
+
+
+def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    """List, show, trim, export, verify or prune."""
+    from companion import flights_command as flights
+
+    folder = arguments.flights
+    if folder is None:
+        folder = Path(load_config(arguments.config, arguments.set).daemon.flights)
+    what = arguments.what
+    megabytes = signals.between_frames(progress_on(sys.stderr, "", "MB"))
+    if what == "list":
+        print(flights.list_flights(folder, arguments.json))
+    elif what == "show":
+        path = flights.found_recording(arguments.flight, folder)
+        print(flights.show_flight(path, arguments.json))
+    elif what == "trim":
+        if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
+            raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
+        path = flights.found_recording(arguments.flight, folder)
+        print(flights.trim_flight(path, arguments.start, arguments.stop, arguments.out, megabytes))
+    elif what == "export":
+        path = flights.found_recording(arguments.flight, folder)
+        progress = signals.between_frames(progress_on(sys.stderr, ""))
+        print(flights.export_flight(path, arguments.out, progress))
+    elif what == "verify":
+        text, well = flights.verify_flights(
+            flights.recordings_meant(arguments.flights_named, folder), megabytes
+        )
+        print(text)
+        return 0 if well else 1
+    else:
+        print(
+            flights.prune_flights(
+                folder, keep_newest=arguments.keep_newest, older_than_days=arguments.older_than,
+                free_mb=arguments.free, dry_run=arguments.dry_run,
+            )
+        )  # fmt: skip
+    signals.take()
+    return 0
+
+
+COMMANDS: dict[str, Command] = {"flights": _flights}
+
+
+def add_parsers(
+    commands: Any, configuration: argparse.ArgumentParser, seconds: Callable[[str], float]
+) -> None:
+    """Describe these commands; `seconds` reads a time from the first frame on."""
+    _add_flights(commands, configuration, seconds)
+
+
+def _add_flights(
+    commands: Any, configuration: argparse.ArgumentParser, seconds: Callable[[str], float]
+) -> None:
+    place = argparse.ArgumentParser(add_help=False, parents=[configuration])
+    place.add_argument(
+        "--flights", type=Path, metavar="DIR", help="folder of all flights (daemon.flights)"
+    )
+    as_json = argparse.ArgumentParser(add_help=False)
+    as_json.add_argument("--json", action="store_true", help="as JSON, for programs")
+    flights = commands.add_parser("flights", help="recordings of live flights")
+    does = flights.add_subparsers(dest="what", required=True, metavar="WHAT")
+
+    does.add_parser("list", parents=[place, as_json], help="which there are")
+    show = does.add_parser("show", parents=[place, as_json], help="what is in one")
+    trim = does.add_parser("trim", parents=[place], help="a part of one, as a recording")
+    trim.add_argument("--start", type=seconds, metavar="S", help="from this second on")
+    trim.add_argument("--stop", type=seconds, metavar="S", help="up to this second")
+    trim.add_argument("--out", type=Path, required=True, metavar="FILE")
+    export = does.add_parser(
+        "export", parents=[place], help="one as a flight folder, for other programs",
+        description="Write pictures as they were recorded, frames.csv, camera.json, config.toml "
+        "and flight.tlog.",
+    )  # fmt: skip
+    export.add_argument("--out", type=Path, required=True, metavar="DIR")
+    for parser in (show, trim, export):
+        parser.add_argument("flight", metavar="FLIGHT", help="name, folder or file")
+    verify = does.add_parser(
+        "verify", parents=[place], help="check all checksums",
+        description="Exit status 1 where a recording is damaged or cut short. Changes nothing.",
+    )  # fmt: skip
+    verify.add_argument(
+        "flights_named", metavar="FLIGHT", nargs="*", help="name, folder or file (default: all)"
+    )
+    prune = does.add_parser(
+        "prune", parents=[place], help="delete the oldest",
+        description="Delete finished flights with all their results, the oldest first. One with a "
+        'file named "keep" in its folder stays. Of several conditions all must hold.',
+    )  # fmt: skip
+    prune.add_argument("--keep-newest", type=int, metavar="N", help="all but the newest N")
+    prune.add_argument("--older-than", type=float, metavar="DAYS")
+    prune.add_argument("--free", type=float, metavar="MB", help="until so much room is free")
+    prune.add_argument("--dry-run", action="store_true", help="only say which")

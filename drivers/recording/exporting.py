@@ -1,0 +1,118 @@
+"""A recording as a flight folder: pictures, their times, camera and telemetry, for other programs.
+
+Pictures are not encoded again: JPEG and PNG become files as they are, a video a video. What was
+recorded raw becomes PNG.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import av.error
+import cv2
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+
+from companion.errors import FlightError
+from drivers.mavlink_stream import MavlinkStream
+from drivers.recording.flights_folder import TLOG
+from drivers.recording.pictures import still
+from drivers.recording.recorded_flight import PicturePlace, Recording
+from drivers.recording.topics import IMAGE, RECEIVED, SENT, VIDEO, MavlinkBytes
+
+MICROSECONDS = Fraction(1, 1_000_000)
+NAMES = {"jpeg": "jpg", "png": "png"}
+
+
+def export(recording: Recording, out: Path, told: Callable[[int], None]) -> None:
+    """Write the folder `out`, which must not hold anything; `told` hears of pictures done.
+
+    FlightError where it cannot be written.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FlightError(f"{out}: is there already; give a folder that is not, or empty")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, data in recording.found.attachments.items():
+            (out / Path(name).name).write_bytes(data)
+        (out / TLOG).write_bytes(tlog(recording))
+        places = recording.pictures
+        if not places:
+            return
+        if recording.picture_data(places[0])[0] == VIDEO:
+            places = _video(recording, out / "camera.mp4", told)
+        else:
+            _images(recording, out / "images", told)
+    except OSError as error:
+        raise FlightError(f"{out}: cannot be written: {error.strerror}") from error
+    lines = ["index,unix_ns", *(f"{number},{place.t_ns}" for number, place in enumerate(places))]
+    (out / "frames.csv").write_text("\n".join(lines) + "\n")
+
+
+def tlog(recording: Recording) -> bytes:
+    """All packets of the link, both ways, as ground stations write them."""
+    streams = {RECEIVED: MavlinkStream(), SENT: MavlinkStream()}
+    out = []
+    for number in range(len(recording.found.chunks)):
+        for message in recording.messages(number):
+            stream = streams.get(message.channel.topic)
+            if stream is None:
+                continue
+            try:
+                taken = MavlinkBytes.FromString(bytes(message.data))
+            except ValueError:
+                continue
+            out += [
+                struct.pack(">Q", message.t_ns // 1000) + packet.raw
+                for packet in stream.feed(taken.data, taken.monotonic_ns)
+            ]
+    return b"".join(out)
+
+
+def _images(recording: Recording, folder: Path, told: Callable[[int], None]) -> None:
+    folder.mkdir()
+    for number, place in enumerate(recording.pictures):
+        topic, data = recording.picture_data(place)
+        if topic == IMAGE:
+            image = CompressedImage.FromString(data)
+            (folder / f"{number:06d}.{NAMES.get(image.format, 'jpg')}").write_bytes(image.data)
+        else:
+            rgb = still(topic, data)
+            if rgb is not None:
+                _, png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+                (folder / f"{number:06d}.png").write_bytes(png.tobytes())
+        told(number + 1)
+
+
+def _video(recording: Recording, path: Path, told: Callable[[int], None]) -> list[PicturePlace]:
+    """Put the pictures of a video, from the first that stands alone, into an MP4 file."""
+    places = recording.pictures
+    places = places[next((k for k, p in enumerate(places) if p.alone), len(places)) :]
+    stream = b"".join(CompressedVideo.FromString(recording.picture_data(p)[1]).data for p in places)
+    if not stream:
+        raise FlightError(f"{recording.path}: none of its pictures stands alone")
+    try:
+        with (
+            av.open(io.BytesIO(stream), "r", format="h264") as given,
+            av.open(str(path), "w") as made,
+        ):
+            video: Any = made.add_stream_from_template(given.streams.video[0])
+            number = 0
+            for packet in given.demux(given.streams.video[0]):
+                if not packet.size or number == len(places):
+                    continue
+                us = (places[number].t_ns - places[0].t_ns) // 1000
+                packet.stream, packet.time_base = video, MICROSECONDS
+                packet.pts = packet.dts = us
+                made.mux(packet)
+                number += 1
+                told(number)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise FlightError(f"{path}: the video cannot be written: {error}") from error
+    return places[:number]

@@ -1,0 +1,73 @@
+"""What a recording says of itself, without all of it being read where it is whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from drivers.recording.growing_file import is_growing
+from drivers.recording.mcap_scan import McapFile
+from drivers.recording.repair import was_cut
+from drivers.recording.topics import PICTURES
+
+State = Literal["whole", "repaired", "cut short", "damaged", "being recorded"]
+
+
+@dataclass(frozen=True, slots=True)
+class FlightSummary:
+    """Of one recording; times in ns of the flight's clock, 0 where there is nothing in it."""
+
+    path: Path
+    state: State
+    n_bytes: int
+    start_ns: int
+    stop_ns: int
+    counts: dict[str, int] = field(default_factory=dict)
+    """Messages by topic."""
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    n_lost_bytes: int = 0
+    n_lost_places: int = 0
+
+    @property
+    def n_pictures(self) -> int:
+        """Pictures in it."""
+        return sum(n for topic, n in self.counts.items() if topic in PICTURES)
+
+    @property
+    def duration_s(self) -> float:
+        """From its first message to its last."""
+        return (self.stop_ns - self.start_ns) * 1e-9
+
+
+def summarise(path: Path, told: Callable[[int], None] | None = None) -> FlightSummary:
+    """What there is in a recording; changes nothing.
+
+    With `told`, which hears of bytes read, every chunk is read and its checksum looked at.
+    FlightError where it is no MCAP file.
+    """
+    with McapFile(path) as file:
+        found = (None if told is not None else file.summary()) or file.scan(told)
+        growing = is_growing(file.fd)
+        n_bytes = file.size
+    contents = found.contents
+    state: State = "whole"
+    if growing:
+        state = "being recorded"
+    elif not found.whole:
+        state = "cut short"
+    elif found.n_lost_bytes:
+        state = "damaged"
+    elif was_cut(found):
+        state = "repaired"
+    counts = {
+        contents.channels[number].topic: n
+        for number, n in sorted(contents.counts.items())
+        if n and number in contents.channels
+    }
+    return FlightSummary(
+        path, state, n_bytes, contents.start_ns, contents.stop_ns, counts, found.metadata,
+        found.attachments, found.n_lost_bytes, found.n_lost_places,
+    )  # fmt: skip

@@ -1,0 +1,78 @@
+"""A part of a recording as a recording of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.errors import FlightError
+from drivers.recording.growing_file import GrowingFile
+from drivers.recording.mcap_writer import McapWriter
+from drivers.recording.recorded_flight import Recording
+from drivers.recording.topics import GREY, PICTURES, PROFILE, open_channels
+
+LEAD_NS = 10_000_000_000
+"""Of what is no picture so much from before the first is kept, as a replay uses it."""
+CHUNK_BYTES = 4 << 20
+
+
+def trim(
+    recording: Recording, start_ns: int, stop_ns: int, out: Path, told: Callable[[int], None]
+) -> int:
+    """Write start_ns <= time < stop_ns to a new file; how many pictures that are.
+
+    A video begins with the last picture before that needs no other. FlightError where nothing is
+    left, or the file cannot be written or is there already. `told` hears of bytes read.
+    """
+    first_ns = max(
+        (p.t_ns for p in recording.pictures if p.alone and p.t_ns <= start_ns), default=start_ns
+    )
+    wanted = {(p.chunk, p.message) for p in recording.pictures if first_ns <= p.t_ns < stop_ns}
+    if not any(start_ns <= p.t_ns < stop_ns for p in recording.pictures):
+        raise FlightError(f"{recording.path}: there is no picture in this part")
+    try:
+        file = GrowingFile(out)
+    except OSError as error:
+        raise FlightError(f"{out}: cannot be written: {error.strerror}") from error
+    try:
+        _copy(recording, wanted, (first_ns, stop_ns), McapWriter(file.append, PROFILE), told)
+        file.sync()
+    except BaseException as error:
+        file.discard()
+        if isinstance(error, OSError):
+            raise FlightError(f"{out}: cannot be written: {error.strerror}") from error
+        raise
+    file.close()
+    return len(wanted)
+
+
+def _copy(
+    recording: Recording, pictures: set[tuple[int, int]], span_ns: tuple[int, int],
+    writer: McapWriter, told: Callable[[int], None],
+) -> None:  # fmt: skip
+    channels = open_channels(writer)
+    found = recording.found
+    for index in found.contents.attachments:
+        data = found.attachments[index.name]
+        writer.attach(index.name, index.media_type, data, index.log_time)
+    for name, words in found.metadata.items():
+        writer.note(name, words)
+    writer.note("trimmed", {"from": recording.path.name})
+    first_ns, stop_ns = span_ns
+    for number, chunk in enumerate(found.chunks):
+        for at, message in enumerate(recording.messages(number)):
+            topic = message.channel.topic
+            if topic in PICTURES:
+                keep = (number, at) in pictures
+            else:
+                lead_ns = 0 if topic == GREY else LEAD_NS
+                keep = first_ns - lead_ns <= message.t_ns < stop_ns
+            if keep and topic in channels:
+                data = bytes(message.data)
+                writer.add(
+                    channels[topic], message.t_ns, data, message.publish_ns, message.sequence
+                )
+        if writer.n_waiting_bytes > CHUNK_BYTES:
+            writer.flush()
+        told(chunk.end)
+    writer.finish()
