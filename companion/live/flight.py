@@ -17,7 +17,7 @@ from typing import Any
 from companion.camera import Camera
 from companion.clock import FlightClock, monotonic_s
 from companion.config import Config
-from companion.errors import InputError
+from companion.live.viewing import Viewing
 from companion.messages import (
     Frame,
     KeyframeAdded,
@@ -33,7 +33,6 @@ from companion.output.flight_result import RunFacts
 from companion.stages.frame_ring import FrameRing
 from companion.stages.protocol import Finish, SetShare, Setup
 from companion.stages.stage_process import StageProcess
-from companion.viewer import LiveViewer
 
 NICE = {"localisation": 0, "recorder": 10, "depth": 20}
 """The pose comes first; the others take what is left over."""
@@ -43,7 +42,6 @@ RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
 """Between two starts of a stage that dies again and again."""
-NO_VIEWER = "the viewer cannot be shown"
 NOT_FINISHED = "a stage did not give its last results in time"
 
 
@@ -80,8 +78,7 @@ class LiveFlight:
         self._over = threading.Event()
         self._hurry_s: float | None = None
         self.n_frames = 0
-        self._viewer: LiveViewer | None = None
-        self.viewer_on = True
+        self._viewing: Viewing | None = None
         self._last_map: MapUpdate | None = None
         kinds = ["localisation", "recorder"] + (["depth"] if config.depth.enabled else [])
         self.stages = {kind: self._start(kind) for kind in kinds}
@@ -98,7 +95,7 @@ class LiveFlight:
         self.folder, self._began_s = folder, monotonic_s()
         self._set_up("recorder")
         if self._config.daemon.viewer != "none":
-            threading.Thread(target=self._open_viewer, name="viewer", daemon=True).start()
+            self._viewing = Viewing(self._config, self.camera, self._warn)
 
     def frame(self, frame: Frame) -> None:
         """Take a frame of the camera's size."""
@@ -120,7 +117,8 @@ class LiveFlight:
 
     def set_shares(self, features: float, dense: float, viewer: bool) -> None:
         """Leave out some of the work, or take it up again; see companion.governor."""
-        self.viewer_on = viewer
+        if self._viewing is not None:
+            self._viewing.pictures = viewer
         self.stages["localisation"].offer(SetShare(features))
         if "depth" in self.stages:
             self.stages["depth"].offer(SetShare(dense))
@@ -155,9 +153,8 @@ class LiveFlight:
             self._finish("recorder", facts(self))
         for stage in self.stages.values():
             stage.kill()
-        viewer, self._viewer = self._viewer, None
-        if viewer is not None:
-            viewer.__exit__(None, None, None)
+        if self._viewing is not None:
+            self._viewing.close(self._hurry_s is not None)
         self._ring.close()
 
     def _finish(self, kind: str, facts: RunFacts | None) -> None:
@@ -241,22 +238,8 @@ class LiveFlight:
         self._show(message)
 
     def _show(self, message: Message) -> None:
-        viewer = self._viewer
-        if viewer is not None and (self.viewer_on or not isinstance(message, Frame)):
-            viewer.take(message)
-
-    def _open_viewer(self) -> None:
-        try:
-            viewer = LiveViewer(self._config.viewer, self.camera, self._config.daemon.viewer)
-        except InputError as error:
-            self._warn(NO_VIEWER, str(error))
-            return
-        viewer.__enter__()
-        with self._lock:
-            if not self._over.is_set():
-                self._viewer = viewer
-                return
-        viewer.__exit__(None, None, None)
+        if self._viewing is not None:
+            self._viewing.take(message)
 
     def _warn(self, what: str, detail: str) -> None:
         warning = Warned(self._clock.now_ns(), what, detail)
@@ -265,6 +248,6 @@ class LiveFlight:
     def dropped(self) -> dict[str, int]:
         """Frames that stages passed over, by stage, and messages that the viewer did."""
         counts: dict[str, Any] = {f"{k} frames": s.n_dropped for k, s in self.stages.items()}
-        if self._viewer is not None:
-            counts["viewer messages"] = self._viewer.n_dropped
+        if self._viewing is not None:
+            counts["viewer messages"] = self._viewing.n_dropped
         return counts

@@ -59,8 +59,17 @@ class LiveViewer:
         if not self._inbox.offer(message):
             self.n_dropped += 1
 
-    def __enter__(self) -> LiveViewer:
+    @property
+    def alive(self) -> bool:
+        """Whether its process is there to be shown anything."""
+        return self._child.poll() is None
+
+    def start(self) -> None:
+        """Begin to show what is queued."""
         self._thread.start()
+
+    def __enter__(self) -> LiveViewer:
+        self.start()
         return self
 
     def __exit__(
@@ -69,16 +78,20 @@ class LiveViewer:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self.close(PATIENCE_S)
+
+    def close(self, patience_s: float) -> None:
+        """Show what is queued, and end; each in the time given."""
         self._inbox.close()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(patience_s)
         try:
             if not self._thread.is_alive():
-                self._child.wait(PATIENCE_S)
+                self._child.wait(patience_s)
         except subprocess.TimeoutExpired:
             pass  # it hangs, and is ended below
         finally:
             self._end_child()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(patience_s)
         self.n_dropped += len(self._inbox)
 
     def _answer(self) -> bytes:
