@@ -56,7 +56,21 @@ def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 0
 
 
-COMMANDS: dict[str, Command] = {"flights": _flights}
+def _compare(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    """Compare two runs; 1 where a limit is not kept."""
+    from companion.compare import beyond, compare, in_words
+
+    found = compare(arguments.run_a, arguments.run_b, arguments.out)
+    print(in_words(found))
+    if arguments.out is not None:
+        print(f"report: {arguments.out / 'compare.html'}")
+    too_far = beyond(found, arguments.max_apart, arguments.max_cloud)
+    for line in too_far:
+        print(f"companion: {line}", file=sys.stderr)
+    return 1 if too_far else 0
+
+
+COMMANDS: dict[str, Command] = {"flights": _flights, "compare": _compare}
 
 
 def add_parsers(
@@ -64,6 +78,20 @@ def add_parsers(
 ) -> None:
     """Describe these commands; `seconds` reads a time from the first frame on."""
     _add_flights(commands, configuration, seconds)
+    compare = commands.add_parser(
+        "compare", help="what differs between two runs of a flight",
+        description="Compare the --out folders of two replays of one flight: poses, cloud, times. "
+        "Exit status 1 where a limit is given and not kept.",
+    )  # fmt: skip
+    compare.add_argument("run_a", type=Path, metavar="RUN_A")
+    compare.add_argument("run_b", type=Path, metavar="RUN_B")
+    compare.add_argument("--out", type=Path, metavar="DIR", help="write a report with plots there")
+    compare.add_argument(
+        "--max-apart", type=float, metavar="M", help="poses at most so far apart, RMS"
+    )
+    compare.add_argument(
+        "--max-cloud", type=float, metavar="M", help="95 %% of points at most so far from the other"
+    )
 
 
 def _add_flights(
