@@ -61,6 +61,8 @@ class CameraConfig:
     """network: how RTSP brings its packets."""
     path: str = ""
     """file: a flight folder, a folder of images, or a video, played in real time."""
+    topic: str = ""
+    """The image topic of a bag that is replayed; "" takes the one with most images."""
     repeat: bool = False
     """file: begin again at the end, else the camera is silent from then on."""
     starts_at_unix_s: Annotated[float, Range(0, 1e11)] = 0.0

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
+from drivers.bag_flight import is_bag, is_ros2_folder, open_bag
 from drivers.euroc import is_euroc, open_euroc
 from drivers.flight import Flight
 from drivers.flight_folder import has_pictures, is_flight_folder, open_flight_folder
@@ -33,15 +34,18 @@ class Format(NamedTuple):
 
 FILES = (
     Format("recording", is_recording, open_recording),
+    Format("ROS bag", is_bag, open_bag),
     Format("video", is_video, open_video),
 )
 FOLDERS = (
+    Format("ROS bag", is_ros2_folder, open_bag),
     Format("folder of a live flight", is_recorded_folder, open_recorded_folder),
     Format("flight folder", is_flight_folder, open_flight_folder),
     Format("EuRoC (ASL)", is_euroc, open_euroc),
     Format("KITTI odometry", is_kitti, open_kitti),
     Format("TUM RGB-D", is_tum_rgbd, open_tum_rgbd),
     Format("images with poses", is_posed_folder, open_posed_flight),
+    Format("ROS bag", is_bag, open_bag),
     Format("video or images", has_pictures, open_flight_folder),
 )
 """In the order in which they are tried."""
@@ -68,7 +72,7 @@ def format_of(path: Path) -> Format:
     if known is not None:
         return known
     if path.is_dir():
-        names = ", ".join(f.name for f in FOLDERS)
+        names = ", ".join(dict.fromkeys(f.name for f in FOLDERS))
         raise FlightError(
             f"{path}: no video and no images, so not a flight; a folder can be: {names}"
         )

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.support.bags import write_bag
 from tests.support.command import Run, replay
 from tests.support.sequences import (
     Piece,
@@ -74,6 +75,18 @@ def test_kitti(ideal: list[list[str]], flown: Piece, tmp_path: Path) -> None:
     folder = write_kitti(tmp_path / "flight", flown.without_lens())
     assert len(ideal) >= 30
     assert_near(path_of(replay(folder, tmp_path / "out", *FAST)), ideal)
+
+
+def test_bag_with_odometry(flown: Piece, tmp_path: Path) -> None:
+    """Metric and in its place, as the flight itself is with its own telemetry."""
+    longer = piece(n_frames=60)
+    write_bag(tmp_path / "flight", "mcap", longer)
+    run = replay(tmp_path / "flight", tmp_path / "out", *FAST)
+    path = np.array(path_of(run), np.float64)[:, :3]
+    assert run.report["unit"] == "m"
+    assert len(path) >= 55
+    true = np.stack([pose.translation for pose in longer.truth])[-len(path) :]
+    assert np.linalg.norm(path - true, axis=1).max() < 1.5
 
 
 def test_images_without_times(flown: Piece, tmp_path: Path) -> None:
