@@ -194,7 +194,7 @@ class HealthWatch:
     def health(self) -> Health:
         """How all is now."""
         now_ns, flight = self._clock.now_ns(), self._flights.current
-        odometry = self._odometry
+        odometry = self._odometry if flight is not None else None
         sources = [self._feed.health] + ([self._link.health] if self._link is not None else [])
         return Health(
             t_ns=now_ns,

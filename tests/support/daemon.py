@@ -43,13 +43,18 @@ class Line:
 class Daemon:
     """See above. Settings are as after `--set`."""
 
-    def __init__(self, folder: Path, *settings: str, program: tuple[str, ...] = PROGRAM) -> None:
+    def __init__(
+        self, folder: Path, *settings: str, program: tuple[str, ...] = PROGRAM,
+        config: Path | None = None,
+    ) -> None:  # fmt: skip
         self.folder, self.flights = folder, folder / "flights"
         self.socket = folder / "run" / "status.sock"
         self.lines: list[Line] = []
         own = [f"daemon.socket={self.socket}", f"daemon.flights={self.flights}"]
         self.settings = [*own, *settings]
         self._command = [sys.executable, *program, "run"]
+        if config is not None:
+            self._command += ["--config", str(config)]
         for setting in self.settings:
             self._command += ["--set", setting]
         self._came = threading.Condition()
@@ -169,6 +174,11 @@ class Daemon:
         process = psutil.Process(self.stage(kind))
         self._signalled.append(process)
         process.send_signal(number)
+        return time.monotonic_ns()
+
+    def fill_disk_of(self, kind: str) -> int:
+        """From now on a stage can write nothing more to any file; the time of it."""
+        psutil.Process(self.stage(kind)).rlimit(psutil.RLIMIT_FSIZE, (0, 0))
         return time.monotonic_ns()
 
     @property

@@ -1,0 +1,135 @@
+"""What the daemon cannot do without, and what it does then; how it is told things, and how it ends.
+
+Each of these needs a daemon of its own, most of them not for long.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.support.command import refused
+from tests.support.daemon import Daemon
+from tests.support.fake_autopilot import FakeAutopilot
+from tests.support.fake_wire import free_port
+from tests.support.flying import STOP_S, Flying, source
+from tests.support.strain import Strain
+
+PATTERN = ("camera.source=pattern", "camera.width=160", "camera.height=120", "camera.rate_hz=5")
+NO_DEPTH = "depth.enabled=false"
+
+
+def assert_stops_soon(daemon: Daemon, strain: Strain) -> None:
+    told_ns = time.monotonic_ns()
+    took_s = daemon.stop()
+    assert took_s < strain.allowed_s(STOP_S, told_ns)
+    assert daemon.lines[-1].text == "companion: stopped"
+    assert not daemon.said("Traceback")
+
+
+def test_a_device_for_the_depth_that_there_is_not(tmp_path: Path) -> None:
+    with Daemon(tmp_path, *PATTERN, "opencl.device=no such device") as daemon:
+        run = daemon.ended(60)
+    assert run.status == 2
+    (line,) = [line for line in run.stderr.splitlines() if "companion: error: " in line]
+    assert "no such device" in line and "opencl.device" in line
+
+
+@pytest.mark.parametrize("missing", ["camera", "autopilot"])
+def test_a_device_that_stays_missing_ends_it(tmp_path: Path, missing: str) -> None:
+    there = {
+        "camera": ("camera.source=network", f"camera.url=http://127.0.0.1:{free_port()}/stream"),
+        "autopilot": PATTERN,
+    }[missing]
+    settings = (*there, NO_DEPTH, "daemon.missing_device_s=1.5")
+    with FakeAutopilot("ardupilot", f"udpout:127.0.0.1:{free_port()}") as autopilot:
+        url = autopilot.url if missing == "camera" else f"udpin:127.0.0.1:{free_port()}"
+        with Daemon(tmp_path, *settings, f"link.url={url}") as daemon:
+            run = daemon.ended(60)
+    assert run.status == 1
+    (line,) = [line for line in run.stderr.splitlines() if "companion: error: " in line]
+    assert f"the {missing} has been" in line and "daemon.missing_device_s" in line
+
+
+def test_before_there_is_anything(tmp_path: Path) -> None:
+    """It comes up without camera and autopilot, refuses a second one, and ends when told."""
+    settings = (
+        "camera.source=network", f"camera.url=http://127.0.0.1:{free_port()}/stream",
+        f"link.url=udpin:127.0.0.1:{free_port()}", NO_DEPTH,
+    )  # fmt: skip
+    with Strain() as strain, Daemon(tmp_path, *settings) as daemon:
+        health = daemon.until(
+            lambda health: source(health, "camera")["state"] == "missing", 30, "camera missing"
+        )
+        assert source(health, "autopilot")["state"] in ("missing", "opening")
+        assert health["tracker"] == "waiting for the camera"
+        with Daemon(tmp_path, *settings) as second:
+            assert "another companion runs here already" in refused(second.ended(30))
+        assert_stops_soon(daemon, strain)
+
+
+def test_told_to_read_its_configuration_again(tmp_path: Path) -> None:
+    """What can be taken over is, what cannot is named, and what is wrong changes nothing."""
+    config = tmp_path / "companion.toml"
+    config.write_text("[feedback]\nmin_quality = 30\n")
+    with Daemon(tmp_path, *PATTERN, NO_DEPTH, config=config) as daemon:
+        daemon.until(lambda health: True, 30, "it answers")
+        for text, answer in (
+            ("[feedback]\nmin_quality = 40\n", "configuration read again"),
+            ("[link]\nurl = 'udpin:127.0.0.1:9'\n", "these need a restart: link.url"),
+            ("[feedback]\nmin_quality = 4000\n", "configuration not taken over"),
+            ("no table", "configuration not taken over"),
+        ):
+            config.write_text(text)
+            sent_ns = time.monotonic_ns()
+            daemon.send(signal.SIGHUP)
+            line = daemon.line(answer, 10, sent_ns).text
+            assert ("restart" in line) == ("restart" in answer)
+        assert daemon.running
+        config.unlink()
+        sent_ns = time.monotonic_ns()
+        daemon.send(signal.SIGHUP)
+        assert "companion.toml" in daemon.line("not taken over", 10, sent_ns).text
+        assert daemon.status()["tracker"]
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    """The pose goes on without a recording; that there is none is told again and again."""
+    (tmp_path / "a_file").write_text("")
+    with Flying(tmp_path, f"daemon.flights={tmp_path}/a_file/flights") as flying:
+        flying.until_source("autopilot", "running")
+        flying.until_source("camera", "running")
+        flying.take_off()
+        line = flying.daemon.line("a stage has died and is started again", 20).text
+        assert "recorder: " in line and "a_file" in line
+        flying.until_told("a stage has died", 0)
+        went_on_ns = time.monotonic_ns()
+        flying.until_stage("recorder", lambda found: found["n_restarted"] >= 2)
+        flying.assert_went_on(went_on_ns)
+        flying.assert_true_poses()
+        flying.autopilot.disarm()
+        flying.daemon.line("flight over", 30)
+        flying.assert_stops()
+        assert not flying.daemon.said("Traceback")
+
+
+def test_a_disk_that_is_full(tmp_path: Path) -> None:
+    """Nothing can be written any more in mid-flight; told to end while it tries to, it ends."""
+    with Flying(tmp_path) as flying:
+        flying.until_source("autopilot", "running")
+        flying.until_source("camera", "running")
+        flying.take_off()
+        flying.until_stage("recorder", lambda found: found["detail"] != "starting")
+        full_ns = flying.daemon.fill_disk_of("recorder")
+        time.sleep(2.0)
+        flying.assert_went_on(full_ns)
+        disarmed_ns = time.monotonic_ns()
+        flying.autopilot.disarm()
+        flying.daemon.line("disarmed", 10)
+        flying.assert_stops()
+        flying.daemon.line("recorder", 5, disarmed_ns)
+        flying.assert_true_poses()
+        assert not flying.daemon.said("Traceback")
