@@ -60,12 +60,12 @@ def replay(
     with ExitStack() as stack:
         sinks: list[Sink] = [result]
         recording = stack.enter_context(
-            FileViewer(config.viewer, flight.camera, out / "flight.rrd")
+            FileViewer(config.viewer, flight.camera, out / "flight.rrd", log.origin)
         )
         sinks.append(recording)
         live: LiveViewer | None = None
         if viewer != "none":
-            live = stack.enter_context(LiveViewer(config.viewer, flight.camera, viewer))
+            live = stack.enter_context(LiveViewer(config.viewer, flight.camera, viewer, origin=log.origin))
             sinks.append(live)
         depth = _depth_stage(config, flight, device, times)
         pipeline = Pipeline(

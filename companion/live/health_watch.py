@@ -151,6 +151,8 @@ class HealthWatch:
         while True:
             flight = self._flights.current
             pids = {"daemon": 0} | ({k: s.pid for k, s in flight.stages.items()} if flight else {})
+            if flight is not None and flight.viewing is not None:
+                pids["viewers"] = flight.viewing.pid
             self.load = await loop.run_in_executor(None, self._load_reader.read, pids)
             self._step_governor()
             await asyncio.sleep(GOVERN_NS * 1e-9)
@@ -247,4 +249,6 @@ class HealthWatch:
                     detail=f"no sign of it for {no_sign_s:.0f} s" if hangs else detail,
                 )
             )
+        if flight.viewing is not None:
+            out.append(flight.viewing.health())
         return tuple(out)

@@ -1,4 +1,4 @@
-"""The viewer of a flight: opened when it can be reached, and again when it has gone.
+"""The viewers of a flight: its exporter, and what shows it on board if anything is to.
 
 Whoever calls `take` never waits, and nothing that becomes of a viewer matters to the flight.
 """
@@ -11,87 +11,127 @@ from collections.abc import Callable
 from companion.camera import Camera
 from companion.config import Config
 from companion.errors import InputError
-from companion.messages import Frame, Message
-from companion.viewer import LiveViewer
+from companion.health import StageHealth
+from companion.messages import Frame
+from companion.viewer import LiveViewer, Watched
 
 LOOK_S = 0.5
 AGAIN_S = 3.0
-"""Between two attempts to reach a viewer."""
+"""Between two attempts to show it."""
 PATIENCE_S, HURRIED_S = 3.0, 0.2
 """What a viewer may take to show the last of a flight."""
 MANY = 50
-"""So many messages given up between two looks are a viewer that hangs, or a slow link to it."""
+"""So many messages given up between two looks are an exporter that hangs."""
+NOWHERE = "none"
 NO_VIEWER = "the viewer cannot be shown"
 GONE = "the viewer has gone"
 BEHIND = "the viewer does not keep up"
+CLOSED = "viewers cannot connect"
 
 
 class Viewing:
-    """Keeps `daemon.viewer` shown in a thread of its own until `close`."""
+    """Exports to `stream.listen` and keeps `daemon.viewer` shown until `close`."""
 
-    def __init__(self, config: Config, camera: Camera, warn: Callable[[str, str], None]) -> None:
-        self._config, self._camera, self._warn = config, camera, warn
+    def __init__(
+        self, config: Config, camera: Camera, name: str, warn: Callable[[str, str], None]
+    ) -> None:
+        self._config, self._camera, self._name, self._warn = config, camera, name, warn
         self.pictures = True
         """Whether it is given pictures."""
-        self._n_dropped = 0
-        self._viewer: LiveViewer | None = None
+        self._n_dropped = self._n_seen = self._n_restarted = 0
+        self._where = config.daemon.viewer
         self._told = ""
+        self._was_shown = False
         self._over = threading.Event()
         self._patience_s = PATIENCE_S
+        self._viewer = self._open()
         self._thread = threading.Thread(target=self._run, name="viewing", daemon=True)
         self._thread.start()
 
     @property
     def n_dropped(self) -> int:
-        """Messages that there was no room for, or no viewer."""
-        viewer = self._viewer
-        return self._n_dropped + (viewer.n_dropped if viewer is not None else 0)
+        """Messages that there was no room for."""
+        return self._n_dropped + self._viewer.n_dropped
 
-    def take(self, message: Message) -> None:
+    @property
+    def pid(self) -> int:
+        """Of the exporter."""
+        return self._viewer.pid
+
+    def health(self) -> StageHealth:
+        """How the exporter is; what it gave up for want of room on links counts as dropped."""
+        report = self._viewer.report
+        n_viewers = int(report.get("viewers", 0))
+        plural = "" if n_viewers == 1 else "s"
+        detail = f"{n_viewers} viewer{plural}"
+        if n_viewers:
+            detail += f", {report['kbit_s']:.0f} kbit/s"
+        if self._viewer.closed:
+            detail += f"; closed: {self._viewer.closed}"
+        return StageHealth(
+            "viewers", alive=self._viewer.alive, n=n_viewers, detail=detail,
+            n_dropped=self.n_dropped + int(report.get("skipped", 0)),
+            n_restarted=self._n_restarted,
+        )  # fmt: skip
+
+    def take(self, message: Watched) -> None:
         """Show a message, or drop it."""
-        viewer = self._viewer
-        if not self.pictures and isinstance(message, Frame):
-            return
-        if viewer is not None:
-            viewer.take(message)
-        else:
-            self._n_dropped += 1
+        if self.pictures or not isinstance(message, Frame):
+            self._viewer.take(message)
 
     def close(self, hurry: bool) -> None:
-        """The flight is over; what the viewer has not shown by then it never will."""
+        """The flight is over; what viewers have not got by then they never will."""
         self._patience_s = HURRIED_S if hurry else PATIENCE_S
         self._over.set()
-        self._thread.join(3 * self._patience_s)
+        self._thread.join(4 * self._patience_s + 1.0)
+
+    def _open(self) -> LiveViewer:
+        return LiveViewer(
+            self._config.viewer, self._camera, name=self._name, stream=self._config.stream
+        )
 
     def _run(self) -> None:
         wait_s = 0.0
         while not self._over.wait(wait_s):
-            wait_s = AGAIN_S
-            where = self._config.daemon.viewer
-            try:
-                viewer = LiveViewer(self._config.viewer, self._camera, where)
-            except InputError as error:
-                self._tell(NO_VIEWER, str(error))
-                continue
-            viewer.start()
-            self._viewer, self._told = viewer, ""
-            self._watch(viewer)
-            self._viewer = None
-            viewer.close(self._patience_s if self._over.is_set() else HURRIED_S)
-            self._n_dropped += viewer.n_dropped
-            if where == "native" and not self._over.is_set():
-                return  # its window was closed by whoever looked at it
+            wait_s = LOOK_S
+            if not self._viewer.alive:
+                self._tell(GONE, "its exporter has ended")
+                self._n_restarted += 1
+                self._close_viewer(HURRIED_S)
+                self._viewer = self._open()
+                wait_s = AGAIN_S
+            elif self._where != NOWHERE and not self._viewer.is_shown:
+                wait_s = self._show()
+            self._look()
+        self._close_viewer(self._patience_s)
 
-    def _watch(self, viewer: LiveViewer) -> None:
-        """Until it has gone or the flight is over."""
-        n_dropped = 0
-        while not self._over.wait(LOOK_S):
-            if not viewer.alive:
-                self._tell(GONE, self._config.daemon.viewer)
-                return
-            if viewer.n_dropped - n_dropped > MANY:
-                self._tell(BEHIND, f"{viewer.n_dropped} messages were not shown")
-            n_dropped = viewer.n_dropped
+    def _show(self) -> float:
+        """Show it, for the first time or again; how long to wait after that."""
+        if self._told == "" and self._was_shown:
+            self._tell(GONE, self._where)
+            if self._where == "native":
+                self._where = NOWHERE  # its window was closed by whoever looked at it
+                return LOOK_S
+        try:
+            self._viewer.look(self._where)
+        except InputError as error:
+            self._tell(NO_VIEWER, str(error))
+            return AGAIN_S
+        self._was_shown, self._told = True, ""
+        return LOOK_S
+
+    def _look(self) -> None:
+        n_dropped = self._viewer.n_dropped
+        if n_dropped - self._n_seen > MANY:
+            self._tell(BEHIND, f"{n_dropped} messages were not shown")
+        self._n_seen = n_dropped
+        if self._viewer.closed:
+            self._tell(CLOSED, self._viewer.closed)
+
+    def _close_viewer(self, patience_s: float) -> None:
+        self._viewer.close(patience_s)
+        self._n_dropped += self._viewer.n_dropped
+        self._viewer.n_dropped = 0
 
     def _tell(self, what: str, detail: str) -> None:
         """Say it, but not again as long as nothing else is to be said."""

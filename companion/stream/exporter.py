@@ -59,16 +59,18 @@ class Exporter:
         self._stopping.set()
         self._rouse()
 
-    def is_drained(self) -> bool:
-        """Whether every viewer that is connected has taken all there is."""
+    def is_drained(self, n_least: int = 0) -> bool:
+        """Whether all viewers that are connected, so many at least, have taken all there is."""
         with self._lock:
-            return all(c.session is not None and c.session.is_complete for c in self._connections)
+            sessions = [c.session for c in self._connections]
+            done = [session is not None and session.is_complete for session in sessions]
+        return all(done) and len(done) >= n_least
 
     def report(self) -> dict[str, float]:
         """How many viewers there are, what they get, and what they were not given."""
         with self._lock:
             sessions = [c.session for c in self._connections if c.session is not None]
-            skipped = sum(s.n_skipped.total() for s in self._sessions.values())
+            skipped = sum(session.n_skipped.total() for session in sessions)
             return {
                 "viewers": len(sessions),
                 "kbit_s": sum(s.window.rate_bytes_s for s in sessions) / 125,

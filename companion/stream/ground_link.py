@@ -30,11 +30,16 @@ RECEIVE_BYTES = 65536
 
 
 class GroundLink:
-    """`items` gives them until `stop` is set; `told` hears in words what becomes of the link."""
+    """`items` gives them until `stop` is set; `told` hears in words what becomes of the link.
 
-    def __init__(self, host: str, port: int, told: Callable[[str], None]) -> None:
+    Without `again` the end of the first connection is the end.
+    """
+
+    def __init__(
+        self, host: str, port: int, told: Callable[[str], None], again: bool = True
+    ) -> None:
         self.host, self.port = host, port
-        self._told = told
+        self._told, self._again = told, again
         self._viewer = os.urandom(VIEWER_BYTES)
         self.n_connections = 0
         self.n_bytes = 0
@@ -62,6 +67,8 @@ class GroundLink:
                     yield from self._received(opened, stop)
                 except OSError as error:
                     self._told(f"the link to {self.host} is lost ({error.strerror or error})")
+                    if not self._again:
+                        return
                     wait_s(stop, 0.2)
 
     def _connect(self) -> socket.socket:

@@ -31,6 +31,18 @@ def picture_of(image: ImageItem, width: int, quality: int) -> PictureItem:
     return PictureItem(image.t_ns, jpeg.tobytes(), small.shape[1], found.astype(np.float32))
 
 
+def as_wide(picture: PictureItem, width: int) -> PictureItem:
+    """The same picture, this wide; as it is where it cannot be decoded."""
+    image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return picture
+    grow = width / image.shape[1]
+    size = (width, round(image.shape[0] * grow))
+    _, jpeg = cv2.imencode(".jpg", cv2.resize(image, size, interpolation=cv2.INTER_LINEAR))
+    found = picture.found_px * np.float32(grow)
+    return PictureItem(picture.t_ns, jpeg.tobytes(), width, found)
+
+
 class Pictures:
     """Makes pictures for one viewer."""
 

@@ -81,7 +81,8 @@ class Story:
     """A flight as it is told. `path_step_ns` thins the camera's path."""
 
     def __init__(self, flight: FlightItem, path_step_ns: int = 0) -> None:
-        self.flight = flight
+        self.flight = replace(flight, origin=None)
+        self._origin = flight.origin
         self._path_step_ns = path_step_ns
         self._facts = StatusFacts()
         self._status_ns = -(2**63)
@@ -107,8 +108,8 @@ class Story:
     def take(self, message: Watched) -> list[Item]:
         """What a message shows."""
         if isinstance(message, GeoOrigin):
-            self.flight = replace(self.flight, origin=message)
-            return [self.flight]
+            self._origin = message
+            return self._origin_if_known()
         out: list[Item] = []
         if isinstance(message, Frame):
             self._images[message.seq] = ImageItem(message.t_ns, message.rgb)
@@ -191,8 +192,11 @@ class Story:
         image = self._images.pop(track.seq, None)
         if image is None:
             return []
-        found = track.keypoints_px
-        return [ImageItem(image.t_ns, image.rgb, found if found is not None else NO_PIXELS)]
+        found = NO_PIXELS
+        if track.keypoints_px is not None:  # which count in the camera's pixels
+            shrink = np.float32(image.rgb.shape[1] / self.camera.width)
+            found = (track.keypoints_px + np.float32(0.5)) * shrink - np.float32(0.5)
+        return [ImageItem(image.t_ns, image.rgb, found)]
 
     def _pose(self, track: Track, pose: Pose) -> PoseItem:
         height = None
@@ -282,6 +286,7 @@ class Story:
     def _map(self, update: MapUpdate) -> list[Item]:
         self._update = update
         self._facts.mapped(update)
+        out = self._origin_if_known()
         places: dict[int, Similarity | None] = {}
         for keyframe_id in update.map_from_camera:
             place = update.place_of(keyframe_id)
@@ -292,10 +297,18 @@ class Story:
             if keyframe_id < last and keyframe_id not in places:
                 places[keyframe_id] = None
         world = update.georeference.world_from_map if update.georeference is not None else None
-        out = self._moved(update.t_ns, places, world)
+        out += self._moved(update.t_ns, places, world)
         if update.revision % SPARSE_EVERY == 1:
             out.append(SparseItem(update.t_ns, update.points_map.astype(np.float32)))
         return out
+
+    def _origin_if_known(self) -> list[Item]:
+        """Where the world lies on the earth, once the map is known to lie in that world."""
+        found = self._update.georeference if self._update is not None else None
+        if found is None or not found.has_origin or self._origin is self.flight.origin:
+            return []
+        self.flight = replace(self.flight, origin=self._origin)
+        return [self.flight]
 
     def _moved(
         self, t_ns: int, places: dict[int, Similarity] | dict[int, Similarity | None],

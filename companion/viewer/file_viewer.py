@@ -1,4 +1,4 @@
-"""A scene that goes to a file, written by its own thread."""
+"""A flight that goes to files, written by a thread of their own."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import threading
 from pathlib import Path
 from types import TracebackType
 
-import rerun as rr
-
 from companion.camera import Camera
 from companion.config import ViewerConfig
-from companion.messages import Message
+from companion.messages import GeoOrigin
+from companion.stream.items import FlightItem, ImageItem, Item
+from companion.stream.pictures import picture_of
+from companion.stream.story import Story, Watched
+from companion.viewer.colours import Colours
+from companion.viewer.drawing import Drawing
 from companion.viewer.inbox import Inbox
-from companion.viewer.layout import layout
-from companion.viewer.scene import APPLICATION, Scene
+from companion.viewer.rrd_files import RrdFiles
 
 ROOM_BYTES = 64 << 20
 
@@ -21,18 +23,21 @@ ROOM_BYTES = 64 << 20
 class FileViewer:
     """Everything, into a .rrd file: the caller waits when the file cannot keep up.
 
-    What goes wrong in the thread is raised when the file is closed, and not before.
+    No more than `rrd_mb` of it is kept, the newest, in several files. What goes wrong in the thread
+    is raised when the file is closed, and not before.
     """
 
-    def __init__(self, config: ViewerConfig, camera: Camera, path: Path) -> None:
-        self._recording = rr.RecordingStream(APPLICATION)
-        self._recording.save(path, default_blueprint=layout())
-        self._config, self._camera = config, camera
+    def __init__(
+        self, config: ViewerConfig, camera: Camera, path: Path, origin: GeoOrigin | None = None
+    ) -> None:
+        self._files = RrdFiles(path, config.rrd_mb << 20)
+        self._config = config
+        self._story = Story(FlightItem(path.parent.name, path.parent.name, camera, origin))
         self._inbox = Inbox(ROOM_BYTES)
         self._fault: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
 
-    def take(self, message: Message) -> None:
+    def take(self, message: Watched) -> None:
         """Queue one message."""
         self._inbox.put(message)
 
@@ -48,16 +53,27 @@ class FileViewer:
     ) -> None:
         self._inbox.close()
         self._thread.join()
-        self._recording.disconnect()
+        self._files.close()
         if self._fault is not None:
             raise self._fault
 
     def _work(self) -> None:
         try:
-            scene = Scene(self._recording, self._config, self._camera)
+            colours = Colours(self._config.colours)
+            drawing = Drawing(self._files.recording, live=False, colours=colours)
+            drawing.draw(self._story.flight)
             while (message := self._inbox.get()) is not None:
-                scene.take(message)
-            scene.close()
+                self._draw(drawing, self._story.take(message))
+            self._draw(drawing, self._story.close())
         except BaseException as fault:
             self._fault = fault
             self._inbox.close()
+
+    def _draw(self, drawing: Drawing, items: list[Item]) -> None:
+        for item in items:
+            if isinstance(item, ImageItem):
+                width, quality = self._config.image_width, self._config.jpeg_quality
+                item = picture_of(item, width, quality)
+            drawing.draw(item)
+            if self._files.is_full():
+                drawing.go_on_in(self._files.next())

@@ -8,7 +8,8 @@ from dataclasses import fields
 
 import numpy as np
 
-from companion.messages import Frame, MapUpdate, Message
+from companion.messages import Frame, MapUpdate
+from companion.stream.story import Watched
 
 SMALL_BYTES = 256
 POSE_BYTES = 400
@@ -22,7 +23,7 @@ class Inbox:
 
     def __init__(self, room_bytes: int) -> None:
         self._room = room_bytes
-        self._held: deque[tuple[Message, int]] = deque()
+        self._held: deque[tuple[Watched, int]] = deque()
         self._bytes = 0
         self._closed = False
         self._changed = threading.Condition()
@@ -30,7 +31,7 @@ class Inbox:
     def __len__(self) -> int:
         return len(self._held)
 
-    def put(self, message: Message) -> None:
+    def put(self, message: Watched) -> None:
         """Put in a message; wait for room. Does nothing once the inbox is closed."""
         size = size_bytes(message)
         with self._changed:
@@ -38,7 +39,7 @@ class Inbox:
             if not self._closed:
                 self._append(message, size)
 
-    def offer(self, message: Message) -> bool:
+    def offer(self, message: Watched) -> bool:
         """Put in a message if there is room now; images leave half the room to what is small."""
         size = size_bytes(message)
         room = self._room // 2 if isinstance(message, Frame) else self._room
@@ -48,7 +49,7 @@ class Inbox:
             self._append(message, size)
             return True
 
-    def get(self) -> Message | None:
+    def get(self) -> Watched | None:
         """Take out the oldest message; wait for one. None once it is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or bool(self._held))
@@ -68,13 +69,13 @@ class Inbox:
     def _fits(self, size: int, room: int) -> bool:
         return not self._held or self._bytes + size <= room
 
-    def _append(self, message: Message, size: int) -> None:
+    def _append(self, message: Watched, size: int) -> None:
         self._held.append((message, size))
         self._bytes += size
         self._changed.notify_all()
 
 
-def size_bytes(message: Message) -> int:
+def size_bytes(message: Watched) -> int:
     """About how much memory a message holds."""
     values = [getattr(message, field.name) for field in fields(message)]
     arrays = sum(value.nbytes for value in values if isinstance(value, np.ndarray))

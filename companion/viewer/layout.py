@@ -3,10 +3,24 @@
 from __future__ import annotations
 
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+
+TIMELINE = "flight"
+PLOTS = {
+    "Flying": ("height", "speed"), "Quality": ("quality", "cpu"), "Rate": ("rate",),
+    "Delay": ("latency",), "Link": ("link",),
+}  # fmt: skip
+"""What their numbers are is said by the names of the series; see companion.viewer.drawing."""
+PLOTTED_S = 120.0
+ZOOM = 17.0
+"""About a metre for a point of the screen."""
 
 
-def layout() -> rrb.Blueprint:
-    """Map on the left; image, depth and log on the right; plots below."""
+def layout(*, live: bool) -> rrb.Blueprint:
+    """Map on the left; camera and depth beside it; status and the map of the earth on the right.
+
+    Plots are below, of the last while if live, and the log.
+    """
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
@@ -20,25 +34,47 @@ def layout() -> rrb.Blueprint:
                 ),
                 rrb.Vertical(
                     rrb.Spatial2DView(origin="world/camera/image", name="Camera"),
-                    rrb.Spatial2DView(origin="depth", name="Depth of the newest keyframe"),
-                    rrb.TextLogView(origin="log", name="Log"),
-                    row_shares=[4, 4, 2],
+                    rrb.Spatial2DView(origin="depth", name="Depth (near is red)"),
+                    row_shares=[1, 1],
                 ),
-                column_shares=[7, 3],
+                rrb.Vertical(
+                    rrb.TextDocumentView(origin="status", name="Status"),
+                    rrb.MapView(origin="earth", name="On the earth", zoom=ZOOM),
+                    row_shares=[3, 2],
+                ),
+                column_shares=[6, 3, 3],
             ),
             rrb.Horizontal(
-                rrb.TimeSeriesView(origin="plots/height", name="Height above origin (m, up)"),
-                rrb.TimeSeriesView(origin="plots/speed", name="Speed (m/s)"),
-                rrb.TimeSeriesView(origin="plots/points", name="Map points found in the image"),
-                rrb.TimeSeriesView(
-                    origin="plots/state", name="State (2 tracking, 1 initialising, 0 lost)"
-                ),
-                rrb.Tabs(
-                    rrb.TimeSeriesView(origin="plots/kernels", name="Depth kernels (ms)"),
-                    rrb.TimeSeriesView(origin="plots/scale", name="Metres per map unit"),
-                ),
+                *(_plot(title, names, live) for title, names in PLOTS.items()),
+                rrb.TextLogView(origin="log", name="Log", columns=_log_columns()),
+                column_shares=[3] * len(PLOTS) + [9],
             ),
-            row_shares=[4, 1],
+            row_shares=[7, 2],
+        ),
+        rrb.TimePanel(
+            state="collapsed", timeline=TIMELINE, play_state="following" if live else None
         ),
         collapse_panels=True,
+    )
+
+
+def _plot(title: str, names: tuple[str, ...], live: bool) -> rrb.TimeSeriesView:
+    last = rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-PLOTTED_S),
+        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
+    )
+    return rrb.TimeSeriesView(
+        origin="plots",
+        contents=[f"+ $origin/{name}" for name in names],
+        name=title,
+        plot_legend=rrb.PlotLegend(corner="LeftTop"),
+        time_ranges=last if live else None,
+    )
+
+
+def _log_columns() -> rrb.TextLogColumns:
+    return rrb.TextLogColumns(
+        timeline_columns=[TimelineColumn(TIMELINE)],
+        text_log_columns=[TextLogColumn("loglevel"), TextLogColumn("body")],
     )

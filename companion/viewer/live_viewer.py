@@ -1,75 +1,127 @@
-"""A viewer that is looked at now, in a process of its own.
+"""A flight that is looked at now: an exporter in a process of its own, and who looks at it here.
 
-A call into Rerun whose peer hangs does not return, cannot be cancelled from its own process, and
-keeps that process from ending. A child process can be ended, so it is the child that calls.
+What links and viewers do happens there. Nothing that becomes of them makes the caller wait.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Mapping
 from types import TracebackType
+from typing import Any
 
 from companion.camera import Camera
-from companion.config import ViewerConfig
+from companion.config import StreamConfig, ViewerConfig
 from companion.errors import InputError
-from companion.messages import Message
+from companion.messages import Frame, GeoOrigin
+from companion.stream.export_process import ExportSetup
+from companion.stream.items import FlightItem
+from companion.stream.story import Watched
 from companion.viewer.inbox import Inbox
+from companion.viewer.reduced import SHOWN, reduced
 
-ROOM_BYTES = 64 << 20
+ROOM_BYTES = 32 << 20
 PATIENCE_S = 3.0
+START_S = 30.0
 READY = b"ready\n"
-CHILD = "companion.viewer.live_process"
+EXPORTER, GROUND = "companion.stream.export_process", "companion.viewer.ground_process"
+NOWHERE = "none"
+FRAME_EVERY_NS = 60_000_000
+"""Frames that come sooner after another are not for viewers."""
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
 class LiveViewer:
-    """A viewer at `web`, `native`, or the rerun+http address of one that runs.
+    """Exports a flight to viewers that connect to `stream.listen`; `look` shows it here, too.
 
-    It never makes the caller wait: what there is no room for is given up and counted. Raises
-    InputError where no viewer can be reached or started.
+    What there is no room for is given up and counted. `where` is as for `look`.
     """
 
-    def __init__(self, config: ViewerConfig, camera: Camera, where: str) -> None:
+    def __init__(
+        self, config: ViewerConfig, camera: Camera, where: str = NOWHERE, name: str = "",
+        stream: StreamConfig | None = None, origin: GeoOrigin | None = None,
+    ) -> None:  # fmt: skip
         self.n_dropped = 0
+        self.report: Mapping[str, Any] = {}
+        """What the exporter last said of itself."""
+        self.closed = ""
+        """Why nobody can connect, if so."""
+        self._config, self._width = config, min(config.image_width, camera.width)
         self._inbox = Inbox(ROOM_BYTES)
-        # a session of its own: Ctrl-C is for the run, and the whole of it can be ended at once
-        self._child = subprocess.Popen(
-            [sys.executable, "-m", CHILD],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )  # fmt: skip
-        self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
-        try:
-            self._send((config, camera, where))
-            answer = self._answer()
-        except BaseException:
-            self._end_child()
-            raise
-        if answer != READY:
-            self._end_child()
-            said = answer.decode(errors="replace").strip() or "its process ended"
-            raise InputError(f"--viewer {where}: {said}")
+        self._frame_ns = -(2**63)
+        self._port = 0
+        self._has_port = threading.Event()
+        listen = stream.listen if stream is not None else ""
+        flight = FlightItem(name or os.urandom(8).hex(), name, camera.pinhole(), origin)
+        setup = ExportSetup(
+            flight, stream or StreamConfig(), listen, int(where not in (NOWHERE, ""))
+        )
+        self._exporter = _child(EXPORTER, stdin=True)
+        self._ground: subprocess.Popen[bytes] | None = None
+        self._thread = threading.Thread(
+            target=self._work, args=(setup,), name="viewer", daemon=True
+        )
+        self._listener = threading.Thread(target=self._listen, name="exporter", daemon=True)
+        self._thread.start()
+        self._listener.start()
+        if where != NOWHERE:
+            try:
+                self.look(where)
+            except BaseException:
+                self.close(0.0)
+                raise
 
-    def take(self, message: Message) -> None:
+    def take(self, message: Watched) -> None:
         """Queue one message, or drop it."""
+        if not isinstance(message, SHOWN):
+            return
+        if isinstance(message, Frame):
+            if message.t_ns - self._frame_ns < FRAME_EVERY_NS:
+                return
+            self._frame_ns = message.t_ns
         if not self._inbox.offer(message):
             self.n_dropped += 1
 
+    def look(self, where: str) -> None:
+        """Show it at `web`, `native`, or the rerun+http address of a viewer that runs.
+
+        Raises InputError where no viewer can be reached or started.
+        """
+        if not self._has_port.wait(START_S) or not self._port:
+            raise InputError(f"--viewer {where}: the exporter ended as it began")
+        child = _child(GROUND, where, str(self._port), self._config.colours)
+        assert child.stdout is not None
+        answer = child.stdout.readline()
+        if answer != READY:
+            _end(child)
+            said = answer.decode(errors="replace").strip() or "its process ended"
+            raise InputError(f"--viewer {where}: {said}")
+        if self._ground is not None:
+            _end(self._ground)
+        self._ground = child
+
+    @property
+    def pid(self) -> int:
+        """Of the exporter."""
+        return self._exporter.pid
+
     @property
     def alive(self) -> bool:
-        """Whether its process is there to be shown anything."""
-        return self._child.poll() is None
+        """Whether the exporter is there."""
+        return self._exporter.poll() is None
 
-    def start(self) -> None:
-        """Begin to show what is queued."""
-        self._thread.start()
+    @property
+    def is_shown(self) -> bool:
+        """Whether the process is there that shows it here."""
+        return self._ground is not None and self._ground.poll() is None
 
     def __enter__(self) -> LiveViewer:
-        self.start()
         return self
 
     def __exit__(
@@ -84,47 +136,72 @@ class LiveViewer:
         """Show what is queued, and end; each in the time given."""
         self._inbox.close()
         self._thread.join(patience_s)
+        children = [child for child in (self._exporter, self._ground) if child is not None]
         try:
             if not self._thread.is_alive():
-                self._child.wait(patience_s)
+                for child in children:
+                    child.wait(patience_s)
         except subprocess.TimeoutExpired:
             pass  # it hangs, and is ended below
         finally:
-            self._end_child()
-        self._thread.join(patience_s)
+            for child in children:
+                _end(child)
+        for thread in (self._thread, self._listener):
+            thread.join(PATIENCE_S)
         self.n_dropped += len(self._inbox)
 
-    def _answer(self) -> bytes:
-        assert self._child.stdout is not None
-        return self._child.stdout.readline()
-
-    def _send(self, thing: object) -> None:
-        assert self._child.stdin is not None
-        pickle.dump(thing, self._child.stdin, protocol=pickle.HIGHEST_PROTOCOL)
-        self._child.stdin.flush()
-
-    def _work(self) -> None:
+    def _work(self, setup: ExportSetup) -> None:
         try:
+            self._send(setup)
             while (message := self._inbox.get()) is not None:
-                self._send(message)
-        except OSError:  # the viewer is gone; the flight goes on, and what follows is counted
+                self._send(reduced(message, self._width))
+        except OSError:  # the exporter is gone; the flight goes on, and what follows is counted
             self.n_dropped += 1
             self._inbox.close()
         finally:
-            self._close(self._child.stdin)
+            _close(self._exporter.stdin)
 
-    def _end_child(self) -> None:
-        """End the child and what it started; nothing where it has ended by itself."""
-        if self._child.poll() is None:
-            os.killpg(self._child.pid, signal.SIGKILL)
-            self._child.wait()
-        if not self._thread.is_alive():
-            self._close(self._child.stdin)
-        self._close(self._child.stdout)
+    def _listen(self) -> None:
+        assert self._exporter.stdout is not None
+        for line in self._exporter.stdout:
+            said = json.loads(line)
+            self.report = said.get("report", self.report)
+            self.closed = str(said.get("closed", ""))
+            if "own" in said:
+                self._port = int(said["own"])
+                self._has_port.set()
+        self._has_port.set()
+        _close(self._exporter.stdout)
 
-    @staticmethod
-    def _close(pipe: object) -> None:
+    def _send(self, thing: object) -> None:
+        assert self._exporter.stdin is not None
+        pickle.dump(thing, self._exporter.stdin, protocol=pickle.HIGHEST_PROTOCOL)
+        self._exporter.stdin.flush()
+
+
+def _child(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen[bytes]:
+    environment = {**dict.fromkeys(ONE_THREAD, "1"), **os.environ}
+    return subprocess.Popen(
+        [sys.executable, "-m", module, *arguments], env=environment,
+        stdin=subprocess.PIPE if stdin else subprocess.DEVNULL, stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """End a child and what it started; nothing where it has ended by itself."""
+    if child.poll() is None:
         try:
-            pipe.close()  # type: ignore[attr-defined]
-        except OSError:
-            pass  # what was buffered for a child that is gone
+            os.killpg(child.pid, signal.SIGKILL)
+        except ProcessLookupError:  # it has not got so far as to have a group of its own
+            child.kill()
+        child.wait()
+    if child.stdin is None:  # else its own thread reads it
+        _close(child.stdout)
+
+
+def _close(pipe: object) -> None:
+    try:
+        pipe.close()  # type: ignore[attr-defined]
+    except OSError:
+        pass  # what was buffered for a child that is gone

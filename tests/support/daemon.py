@@ -50,7 +50,9 @@ class Daemon:
         self.folder, self.flights = folder, folder / "flights"
         self.socket = folder / "run" / "status.sock"
         self.lines: list[Line] = []
-        own = [f"daemon.socket={self.socket}", f"daemon.flights={self.flights}"]
+        own = [
+            f"daemon.socket={self.socket}", f"daemon.flights={self.flights}", "stream.listen=",
+        ]  # fmt: skip
         self.settings = [*own, *settings]
         self._command = [sys.executable, *program, "run"]
         if config is not None:

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -12,12 +14,15 @@ import numpy as np
 import pytest
 
 from companion.camera import Camera
-from companion.config import ViewerConfig
+from companion.config import StreamConfig, ViewerConfig
 from companion.errors import InputError
-from companion.messages import Frame
+from companion.health import Health
+from companion.messages import Frame, GeoOrigin
+from companion.stream.ground_link import GroundLink
+from companion.stream.items import Item, PictureItem, PointsItem, PoseItem, StatusItem
 from companion.viewer import LiveViewer
 from companion.viewer.inbox import Inbox, size_bytes
-from companion.viewer.live_process import GRPC_PORT, WEB_PORT, listens
+from companion.viewer.screen import GRPC_PORT, WEB_PORT, listens
 from tests.support import flown
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -25,7 +30,7 @@ CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
 def image(seq: int) -> Frame:
     rgb = np.random.default_rng(seq).integers(0, 255, (480, 640, 3)).astype(np.uint8)
-    return Frame(seq, flown.time_ns(seq), rgb[..., 0].copy(), rgb)
+    return Frame(seq, flown.time_ns(2 * seq), rgb[..., 0].copy(), rgb)
 
 
 @contextmanager
@@ -38,29 +43,89 @@ def hanging_peer() -> Iterator[str]:
 
 
 def test_a_viewer_that_hangs_neither_stalls_nor_outlives_the_flight() -> None:
-    frame = image(0)
+    frames = [image(seq) for seq in range(30)]
     with hanging_peer() as address:
         with LiveViewer(ViewerConfig(jpeg_quality=95), CAMERA, address) as viewer:
             slowest = 0.0
-            for _ in range(1500):
+            for n in range(1500):
                 start = time.perf_counter()
-                viewer.take(frame)
+                viewer.take(frames[n % 30])
+                viewer.take(flown.track(n % flown.N_FRAMES))
                 slowest = max(slowest, time.perf_counter() - start)
-            child = viewer._child.pid
+            assert viewer._ground is not None
+            children = [viewer.pid, viewer._ground.pid]
             start = time.perf_counter()
         assert time.perf_counter() - start < 10
         assert slowest < 0.5
-        assert viewer.n_dropped > 0
-        assert not os.path.exists(f"/proc/{child}")
+        assert not any(os.path.exists(f"/proc/{child}") for child in children)
 
 
-def test_a_viewer_that_dies_does_not_end_the_flight() -> None:
-    with hanging_peer() as address, LiveViewer(ViewerConfig(), CAMERA, address) as viewer:
-        viewer._child.kill()
-        viewer._child.wait()
-        for seq in range(200):
+def test_an_exporter_that_dies_does_not_end_the_flight() -> None:
+    with LiveViewer(ViewerConfig(), CAMERA) as viewer:
+        assert viewer.alive
+        viewer._exporter.kill()
+        viewer._exporter.wait()
+        assert not viewer.alive
+        for seq in range(400):
             viewer.take(flown.frame(seq))
     assert viewer.n_dropped > 0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_who_connects_sees_the_flight_of_all_of_it_the_newest() -> None:
+    stream = StreamConfig(listen=f"127.0.0.1:{free_port()}")
+    got: list[Item] = []
+    with LiveViewer(
+        ViewerConfig(), CAMERA, name="a", stream=stream, origin=GeoOrigin(47, 8, 400)
+    ) as viewer:  # fmt: skip
+        link = GroundLink("127.0.0.1", int(stream.listen.rsplit(":")[1]), lambda text: None)
+        stop = threading.Event()
+        reader = threading.Thread(target=lambda: got.extend(link.items(stop)))
+        reader.start()
+        viewer.take(flown.update())
+        for message in flown.messages():
+            viewer.take(message)
+        viewer.take(Health(flown.time_ns(flown.N_FRAMES + 100), degraded="viewer off"))
+        end = time.monotonic() + 20
+        while time.monotonic() < end and not any(
+            isinstance(item, StatusItem) and item.facts.get("reduced") for item in got
+        ):
+            time.sleep(0.02)
+        stop.set()
+        reader.join()
+    points = {item.keyframe_id for item in got if isinstance(item, PointsItem)}
+    assert points == set(range(12))
+    assert any(isinstance(item, PictureItem) for item in got)
+    last = [item for item in got if isinstance(item, PoseItem)][-1]
+    assert last.t_ns == flown.time_ns(flown.N_FRAMES - 1)
+    true = flown.world_from_camera(flown.N_FRAMES - 1)
+    assert last.world_from_camera is not None
+    assert np.allclose(last.world_from_camera.translation, true.translation, atol=1e-3)
+    assert np.allclose(last.world_from_camera.rotation, true.rotation, atol=1e-4)
+    assert viewer.n_dropped == 0
+
+
+def test_a_port_that_is_taken_is_told_and_opened_when_it_is_free() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with LiveViewer(
+            ViewerConfig(), CAMERA, stream=StreamConfig(listen=f"127.0.0.1:{port}")
+        ) as viewer:
+            end = time.monotonic() + 10
+            while not viewer.closed and time.monotonic() < end:
+                time.sleep(0.02)
+            assert "in use" in viewer.closed
+            other.close()
+            while viewer.closed and time.monotonic() < end:
+                time.sleep(0.02)
+            assert not viewer.closed and listens("127.0.0.1", port)
 
 
 @pytest.mark.parametrize("where", ["rerun+http://127.0.0.1:1/proxy", "rerun+http:///proxy"])
@@ -91,6 +156,19 @@ def test_the_web_viewer_listens_on_loopback_only_and_ends_with_the_flight() -> N
         assert ours == {("0100007F", GRPC_PORT), ("0100007F", WEB_PORT)}  # 127.0.0.1
     assert viewer.n_dropped == 0
     assert free(GRPC_PORT) and free(WEB_PORT)
+
+
+def test_view_refuses_what_is_no_host_and_what_is_no_viewer() -> None:
+    for arguments, said in (
+        (["drone:x", "--web"], "wanted HOST or HOST:PORT"),
+        (["--viewer", "rerun+http://127.0.0.1:1/proxy"], "no viewer listens there"),
+    ):
+        run = subprocess.run(
+            [sys.executable, "-m", "companion", "view", *arguments],
+            capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
+        assert run.returncode == 2
+        assert said in run.stderr and run.stderr.count("\n") == 1
 
 
 def test_inbox_is_bounded_by_bytes_and_keeps_room_for_what_is_small() -> None:
