@@ -169,7 +169,23 @@ def _bench_slam(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 0
 
 
-BENCHES: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {"slam": _bench_slam}
+def _bench_depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.bench_depth import bench_depth
+    from companion.output.depth_bench import as_json, tables
+
+    bench = bench_depth(
+        arguments.dataset, load_config(arguments.config, arguments.set), arguments.out,
+        reference=arguments.reference, frames=arguments.frames, serial=arguments.serial,
+        progress=signals.between_frames(progress_on(sys.stderr)),
+    )  # fmt: skip
+    print(as_json(bench) if arguments.json else tables(bench))
+    return 0
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {
+    "slam": _bench_slam,
+    "depth": _bench_depth,
+}
 
 
 def _depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -389,6 +405,24 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     cli_recordings.add_parsers(commands, configuration, _seconds)
+    dense = benches.add_parser(
+        "depth", parents=[configuration, as_json], help="time and accuracy of dense depth",
+        description="Reconstruct one reference of a data set with true depth, its range taken from "
+        "the truth, and do the same with REMODE's filter on one core.",
+    )  # fmt: skip
+    dense.add_argument("dataset", type=Path, metavar="DATASET")
+    dense.add_argument("--reference", type=int, default=0, metavar="N", help="frame (default: 0)")
+    dense.add_argument(
+        "--frames", type=_frames, default=(None, None), metavar="A:B",
+        help="use frames from A up to, not including, B",
+    )  # fmt: skip
+    dense.add_argument(
+        "--no-serial", dest="serial", action="store_false", help="leave out the serial reference"
+    )
+    dense.add_argument(
+        "--out", type=Path, metavar="DIR", help="write depth_bench.json and a picture there"
+    )
+
     commands.add_parser(
         "check-config", parents=[configuration], help="print the configuration that would be used",
         description="Check a configuration and print the whole of it as TOML.",

@@ -84,3 +84,8 @@ def wait_s(stop: threading.Event, seconds: float) -> None:
     """Wait for a while, or until `stop` is set."""
     if seconds > 0:
         stop.wait(seconds)
+
+
+def cpu_s() -> float:
+    """Seconds of all processors that this process has used."""
+    return time.process_time()

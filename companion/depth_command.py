@@ -13,8 +13,7 @@ from companion.config import Config
 from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion
 from companion.depth.opencl import ComputeDevice, open_device
-from companion.depth.undistortion import undistortion
-from companion.depth.views import Intrinsics
+from companion.depth.undistortion import Undistortion
 from companion.errors import FlightError
 from companion.geometry import Array, Pose
 from companion.messages import Bytes, DepthMap, MapUpdate, PixelState, PointChunk
@@ -43,12 +42,11 @@ class Reconstruction:
 
     def __init__(self, images: PosedImages, config: Config, device: ComputeDevice) -> None:
         self.images = images
-        self._map_u, self._map_v, k = undistortion(images.camera)
-        self.intrinsics = Intrinsics(*k)
+        self._undistortion = Undistortion(images.camera)
         camera = images.camera
         self.times = StageTimes()
         self.engine = DepthEngine(
-            device, camera.width, camera.height, self.intrinsics, config.depth
+            device, camera.width, camera.height, self._undistortion.intrinsics, config.depth
         )
         self._kept: dict[int, Bytes] = {}
 
@@ -56,7 +54,7 @@ class Reconstruction:
         """The undistorted RGB image at a position."""
         if position not in self._kept:
             for at, rgb in self.images.pictures([position]):
-                self.keep(at, rgb)
+                self._kept[at] = self._undistortion.image(rgb)
         return self._kept[position]
 
     def load(self, positions: list[int]) -> None:
@@ -64,12 +62,7 @@ class Reconstruction:
         self._kept = {p: self._kept[p] for p in positions if p in self._kept}
         missing = [p for p in positions if p not in self._kept]
         for at, rgb in self.images.pictures(missing):
-            self.keep(at, rgb)
-
-    def keep(self, position: int, rgb: Bytes) -> None:
-        """Undistort an image and keep it."""
-        out = cv2.remap(rgb, self._map_u, self._map_v, cv2.INTER_LINEAR)
-        self._kept[position] = np.asarray(out, np.uint8)
+            self._kept[at] = self._undistortion.image(rgb)
 
     def grey(self, position: int) -> Bytes:
         """The undistorted grey image at a position."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from companion.camera import Camera
@@ -18,8 +17,7 @@ from companion.config import CloudConfig, DepthConfig
 from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion
 from companion.depth.opencl import ComputeDevice
-from companion.depth.undistortion import undistortion
-from companion.depth.views import Intrinsics
+from companion.depth.undistortion import Undistortion
 from companion.geometry import Pose, Similarity
 from companion.messages import (
     Bytes,
@@ -56,10 +54,10 @@ class DepthStage:
     ) -> None:
         self._config = config
         self._fusion = Fusion(cloud)
-        self._maps = undistortion(camera)
-        fx, fy, cx, cy = self._maps[2]
+        self._undistortion = Undistortion(camera)
+        intrinsics = self._undistortion.intrinsics
         self._engine = DepthEngine(
-            device, camera.width, camera.height, Intrinsics(fx, fy, cx, cy), config, eager=False
+            device, camera.width, camera.height, intrinsics, config, eager=False
         )
         self._times = times
         self._held: OrderedDict[int, _Held] = OrderedDict()
@@ -67,7 +65,7 @@ class DepthStage:
         self._update: MapUpdate | None = None
         self._last_reference: int | None = None
         self._share, self._credit = 1.0, 0.0
-        self._half_view_rad = float(np.arctan(0.5 * camera.width / fx))
+        self._half_view_rad = float(np.arctan(0.5 * camera.width / intrinsics.fx))
 
     def set_share(self, share: float) -> None:
         """Give only this share of the keyframes a depth map from now on, 0 to 1."""
@@ -104,9 +102,7 @@ class DepthStage:
         return out
 
     def _hold(self, frame: Frame) -> None:
-        map_u, map_v, _ = self._maps
-        grey = cv2.remap(frame.grey, map_u, map_v, cv2.INTER_LINEAR)
-        self._held[frame.seq] = _Held(np.asarray(grey, np.uint8), frame.rgb)
+        self._held[frame.seq] = _Held(self._undistortion.image(frame.grey), frame.rgb)
         if len(self._held) > MAX_HELD:
             # thin out the older half; what a waiting keyframe needs stays
             needed = {k.seq for k in self._waiting}
@@ -133,8 +129,7 @@ class DepthStage:
         for seq, current_from_reference in chosen:
             self._engine.update(self._held[seq].grey, current_from_reference)
         assert held.rgb is not None
-        map_u, map_v, _ = self._maps
-        rgb = np.asarray(cv2.remap(held.rgb, map_u, map_v, cv2.INTER_LINEAR), np.uint8)
+        rgb = self._undistortion.image(held.rgb)
         depth_map = self._engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb)
         self._forget(keyframe)
         chunks: list[PointChunk] = self._fusion.add(depth_map, update)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from companion.geometry import Array
 
 UNRELATED = 12
+Real = NDArray[np.floating]
 
 
 def census(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
@@ -25,7 +26,7 @@ def census(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
     return out
 
 
-def project(projection: Array, x: float, y: float, rho: Array) -> tuple[Array, Array, Array]:
+def project(projection: Real, x: float, y: float, rho: Real) -> tuple[Array, Array, Array]:
     """Where a pixel of the reference is seen at inverse depths, and the third component there."""
     rows = projection.reshape(3, 4)
     q = rows[:, :3] @ np.array([x, y, 1.0])
@@ -35,8 +36,8 @@ def project(projection: Array, x: float, y: float, rho: Array) -> tuple[Array, A
 
 
 def costs(
-    words_r: NDArray[np.uint32], words: list[NDArray[np.uint32]], projections: Array,
-    n_dropped: int, rhos: Array, stride: int,
+    words_r: NDArray[np.uint32], words: list[NDArray[np.uint32]], projections: Real,
+    n_dropped: int, rhos: Real, stride: int,
 ) -> NDArray[np.uint8]:  # fmt: skip
     """Cost (grid height, grid width, planes) when all planes are looked at."""
     height, width = words_r.shape
@@ -107,7 +108,7 @@ def sample(image: Array, x: Array, y: Array) -> Array:
     return out
 
 
-def follow(image: Array, projection: Array, rho: Array, stride: int) -> tuple[Array, Array]:
+def follow(image: Array, projection: Real, rho: Real, stride: int) -> tuple[Array, Array]:
     """Value (nan where unseen) and change along the epipolar line of each grid pixel (H, W)."""
     height, width = image.shape
     m = projection.reshape(3, 4)
