@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from drivers.mavlink_router import ClientCounts
+from drivers.mavlink_wire import Tap
 
 OnMessage = Callable[[Any, int], None]
 """Takes a message as pymavlink has it, and the flight's time at which it came, ns."""
@@ -46,6 +47,9 @@ class MavlinkPort(Protocol):
 
     def clients(self) -> list[ClientCounts]:
         """How those do who share the link."""
+
+    def set_tap(self, tap: Tap | None) -> None:
+        """Have all bytes told to it, as they come from the wire and go on it; whoever sent them."""
 
     async def run(self, on_message: OnMessage) -> None:
         """Receive for ever, reconnecting as needed; ends when it is cancelled."""

@@ -6,7 +6,7 @@ import asyncio
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any, Protocol
 
 from companion.errors import SourceError
@@ -25,6 +25,10 @@ async def run_together(*parts: Coroutine[Any, Any, None]) -> None:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+Tap = Callable[[bool, bytes, int], None]
+"""Takes whether bytes went out, the bytes, and when by CLOCK_MONOTONIC; must not block."""
 
 
 class WireEnd(Protocol):
@@ -60,6 +64,8 @@ class Wire(ABC):
         self.n_opened = 0
         self.n_unsent = 0
         """Packets dropped while the wire was not there."""
+        self.tap: Tap | None = None
+        """Hears of all bytes as they come and go."""
         self._read_limit = read_limit
         self._fd = -1
         self._lost: asyncio.Future[str] | None = None
@@ -164,6 +170,8 @@ class Wire(ABC):
             except OSError as error:
                 self.lose(error.strerror or str(error))
                 return
+            if self.tap is not None:
+                self.tap(False, data, monotonic_ns)
             must_pause = self._has_too_much(data, monotonic_ns, end)
             self._deliver(end, data, monotonic_ns)
             if must_pause or not self.connected:
@@ -196,9 +204,12 @@ class Wire(ABC):
                 if wait_s > 0:
                     self._wait(wait_s)
                     return
-                n_bytes = self._write(self.queue.head())
+                head = self.queue.head()
+                n_bytes = self._write(head)
                 self.queue.written(n_bytes)
                 self._progress_ns = time.monotonic_ns()
+                if self.tap is not None:
+                    self.tap(True, head[:n_bytes], self._progress_ns)
         except (BlockingIOError, InterruptedError):
             self._waiting = True
             asyncio.get_running_loop().add_writer(self._fd, self._writable)

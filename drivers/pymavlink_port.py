@@ -16,7 +16,7 @@ from drivers.mavlink_signing import MavlinkSigning, read_key
 from drivers.mavlink_stream import MavlinkStream, Packet, decode
 from drivers.mavlink_transport import link_wire
 from drivers.mavlink_url import link_endpoint
-from drivers.mavlink_wire import Wire, run_together
+from drivers.mavlink_wire import Tap, Wire, run_together
 
 FIRST_SYSTEM = 1
 """What ArduPilot and PX4 are numbered unless somebody changed it."""
@@ -95,6 +95,10 @@ class PymavlinkPort:
     def clients(self) -> list[ClientCounts]:
         """How those do who share the link."""
         return self.router.counts()
+
+    def set_tap(self, tap: Tap | None) -> None:
+        """See `MavlinkPort`."""
+        self._wire.tap = tap
 
     async def run(self, on_message: OnMessage) -> None:
         """Receive, and serve the router's clients, until cancelled."""

@@ -27,6 +27,7 @@ from companion.live.loop_delay import measure_loop_delay
 from companion.live.missing import Missing
 from companion.live.pose_sender import make_pose_sender
 from companion.live.reload import reloaded
+from companion.live.tape_notes import TapeNotes
 from companion.live.vehicle_reports import VehicleReports
 from companion.messages import (
     ArmedSample,
@@ -93,6 +94,7 @@ class Daemon:
             config, clock, self._journal, self._feed, self._link, self._sender, self._flights,
             self._loop_delay,
         )  # fmt: skip
+        self._notes = TapeNotes(clock, self._flights, self._watch, self._link)
         self._reports: VehicleReports | None = None
         if self._link is not None:
             self._reports = VehicleReports(
@@ -118,6 +120,7 @@ class Daemon:
             self._run_watch(),
             self._watch.govern(),
             measure_loop_delay(self._clock, self._loop_delay),
+            self._notes.run(),
         ]
         if self._link is not None:
             work.append(self._link.run())
@@ -266,9 +269,6 @@ class Daemon:
             if self._link_watch is not None:
                 self._link_watch.step(self._clock.now_ns())
             health = self._watch.health()
-            if self._flights.current is not None:
-                origin = self._link.origin if self._link is not None else None
-                self._flights.current.tell(health, origin)
             now_s = (self._clock.now_ns() - began_ns) * 1e-9
             if not is_ready and (self._watch.pipeline_up or now_s > READY_AFTER_S):
                 is_ready = True

@@ -1,6 +1,7 @@
 """One live flight: its stages, each in a process, joined from the first frame to the report.
 
     frames, telemetry -> localisation -> depth -> recorder, viewer
+    all that comes in, poses, warnings -> tape
 
 Whoever calls `frame` or `telemetry` never waits. A stage that dies takes nothing with it but its
 own state: depth and recorder begin again within the flight, localisation ends it.
@@ -17,11 +18,9 @@ from typing import Any
 from companion.camera import Camera
 from companion.clock import FlightClock, monotonic_s
 from companion.config import Config
-from companion.health import Health
 from companion.live.viewing import Viewing
 from companion.messages import (
     Frame,
-    GeoOrigin,
     KeyframeAdded,
     MapUpdate,
     Message,
@@ -35,17 +34,18 @@ from companion.output.flight_result import RunFacts
 from companion.stages.frame_ring import FrameRing
 from companion.stages.protocol import Finish, SetShare, Setup
 from companion.stages.stage_process import StageProcess
-from companion.viewer import Watched
+from drivers.recording.content import HealthNote, LinkBytes
 
-NICE = {"localisation": 0, "recorder": 10, "depth": 20}
+NICE = {"localisation": 0, "tape": 5, "recorder": 10, "depth": 20}
 """The pose comes first; the others take what is left over."""
-PATIENCE_S = {"localisation": 120.0, "depth": 60.0, "recorder": 180.0}
-HURRIED_S = {"localisation": 0.7, "depth": 0.2, "recorder": 1.6}
+PATIENCE_S = {"localisation": 120.0, "depth": 60.0, "tape": 60.0, "recorder": 180.0}
+HURRIED_S = {"localisation": 0.7, "depth": 0.2, "tape": 0.3, "recorder": 1.6}
+IN_FOLDER = frozenset({"tape", "recorder"})
+"""Stages that leave something in the flight's folder."""
 RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
 """Between two starts of a stage that dies again and again."""
-TELL_NS = 1_000_000_000
 NOT_FINISHED = "a stage did not give its last results in time"
 
 
@@ -76,7 +76,7 @@ class LiveFlight:
         self._listener = listener(self)
         self.folder: Path | None = None
         """Where the results go; None until it has begun."""
-        self.n_restarted = {"depth": 0, "recorder": 0}
+        self.n_restarted = {"depth": 0, "recorder": 0, "tape": 0}
         self._ring = FrameRing(camera.width, camera.height)
         self._lock = threading.Lock()
         self._over = threading.Event()
@@ -84,9 +84,8 @@ class LiveFlight:
         self.n_frames = 0
         self._viewing: Viewing | None = None
         self._last_map: MapUpdate | None = None
-        self._told_ns = 0
-        self._origin: GeoOrigin | None = None
-        kinds = ["localisation", "recorder"] + (["depth"] if config.depth.enabled else [])
+        kinds = ["localisation", "recorder"]
+        kinds += ["tape"] * config.recorder.enabled + ["depth"] * config.depth.enabled
         self.stages = {kind: self._start(kind) for kind in kinds}
         for kind in kinds:
             self._set_up(kind)
@@ -99,9 +98,10 @@ class LiveFlight:
     def begin(self, folder: Path) -> None:
         """The flight begins, and leaves its results there."""
         self.folder, self._began_s = folder, monotonic_s()
-        self._set_up("recorder")
-        if self._config.daemon.viewer != "none" or self._config.stream.listen:
-            self._viewing = Viewing(self._config, self.camera, folder.name, self._warn)
+        for kind in self.stages.keys() & IN_FOLDER:
+            self._set_up(kind)
+        if self._config.daemon.viewer != "none":
+            self._viewing = Viewing(self._config, self.camera, self._warn)
 
     def frame(self, frame: Frame) -> None:
         """Take a frame of the camera's size."""
@@ -119,22 +119,13 @@ class LiveFlight:
             return
         if not isinstance(message, Warned):
             self.stages["localisation"].offer(message)
+        self.keep(message)
         self._record(message)
 
-    def tell(self, health: Health, origin: GeoOrigin | None) -> None:
-        """Have viewers and recording told how all is, once a second, and where the world lies."""
-        if self.folder is None or self._over.is_set() or health.t_ns - self._told_ns < TELL_NS:
-            return
-        self._told_ns = health.t_ns
-        self._record(health)
-        if origin is not None and origin != self._origin:
-            self._origin = origin
-            self._record(origin)
-
-    @property
-    def viewing(self) -> Viewing | None:
-        """Who looks on; None if nobody may."""
-        return self._viewing
+    def keep(self, message: Message | LinkBytes | HealthNote) -> None:
+        """Have something in the recording; nobody else hears of it."""
+        if "tape" in self.stages and self.folder is not None and not self._over.is_set():
+            self.stages["tape"].offer(message)
 
     def set_shares(self, features: float, dense: float, viewer: bool) -> None:
         """Leave out some of the work, or take it up again; see companion.governor."""
@@ -169,26 +160,34 @@ class LiveFlight:
             self._over.set()
         if self.folder is not None:
             for kind in ("localisation", "depth"):
-                if kind in self.stages:
-                    self._finish(kind, None)
+                self._finish(kind)
+            self._ask("tape")
             self._finish("recorder", facts(self))
+            self._wait("tape")
         for stage in self.stages.values():
             stage.kill()
         if self._viewing is not None:
             self._viewing.close(self._hurry_s is not None)
         self._ring.close()
 
-    def _finish(self, kind: str, facts: RunFacts | None) -> None:
-        stage = self.stages[kind]
-        if not stage.alive:
+    def _finish(self, kind: str, facts: RunFacts | None = None) -> None:
+        self._ask(kind, facts)
+        self._wait(kind)
+
+    def _ask(self, kind: str, facts: RunFacts | None = None) -> None:
+        if kind in self.stages and self.stages[kind].alive:
+            self.stages[kind].ask_to_finish(Finish(self._hurry_s is not None, facts))
+
+    def _wait(self, kind: str) -> None:
+        """Wait for the last results of a stage that was asked to finish."""
+        stage = self.stages.get(kind)
+        if stage is None or not stage.asked_to_end:
             return
         began_s = monotonic_s()
-        stage.ask_to_finish(Finish(self._hurry_s is not None, facts))
         while not stage.wait(0.02):
             now_s = monotonic_s()
             if now_s > began_s + PATIENCE_S[kind] or (
-                self._hurry_s is not None
-                and now_s > max(began_s, self._hurry_s) + HURRIED_S[kind]
+                self._hurry_s is not None and now_s > max(began_s, self._hurry_s) + HURRIED_S[kind]
             ):
                 break
         if stage.finished is None:
@@ -199,11 +198,13 @@ class LiveFlight:
         def ended(why: str) -> None:
             self._ended(kind, why)
 
-        return StageProcess(kind, NICE[kind], self._ring, self._deliver, ended)
+        return StageProcess(
+            kind, NICE[kind], self._ring, self._deliver, ended, every_frame=kind == "tape"
+        )
 
     def _set_up(self, kind: str) -> None:
         folder = self.folder
-        if kind == "recorder":
+        if kind in IN_FOLDER:
             if folder is None:
                 return  # what it records is yet to begin
             if self.n_restarted[kind]:
@@ -243,7 +244,7 @@ class LiveFlight:
         """What a stage gives goes to whom it is for; called from the stages' threads."""
         if isinstance(message, Odometry):
             self._listener.odometry(message)
-            self._show(message)
+            self.keep(message)
             return
         if isinstance(message, (Track, KeyframeAdded, MapUpdate)) and "depth" in self.stages:
             self.stages["depth"].offer(message)
@@ -253,13 +254,15 @@ class LiveFlight:
             self._listener.mapped(message)
         elif isinstance(message, Warned):
             self._listener.warned(message)
+        if isinstance(message, (MapUpdate, PointChunk)) and self._config.recorder.point_cloud:
+            self.keep(message)
         self._record(message)
 
-    def _record(self, message: Watched) -> None:
+    def _record(self, message: Message) -> None:
         self.stages["recorder"].offer(message)
         self._show(message)
 
-    def _show(self, message: Watched) -> None:
+    def _show(self, message: Message) -> None:
         if self._viewing is not None:
             self._viewing.take(message)
 

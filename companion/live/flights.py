@@ -15,6 +15,7 @@ from companion.live.flight import Listener, LiveFlight
 from companion.live.journal import Journal
 from companion.messages import Frame, Telemetry, Warned
 from companion.output.flight_result import RunFacts
+from drivers.recording.content import HealthNote, LinkBytes
 
 
 class Flights:
@@ -77,6 +78,11 @@ class Flights:
         """Take telemetry or a warning."""
         if self.current is not None:
             self.current.take(message)
+
+    def keep(self, message: LinkBytes | HealthNote) -> None:
+        """Have something in the recording."""
+        if self.current is not None:
+            self.current.keep(message)
 
     async def close(self, patience_s: float) -> None:
         """End all flights in a hurry."""

@@ -112,7 +112,7 @@ def _serve(
         n_done += isinstance(message, Frame)
         if monotonic_s() - reported_s > REPORT_EVERY_S:
             reported_s = monotonic_s()
-            n_dropped = inbox.n_dropped + n_overwritten
+            n_dropped = inbox.n_dropped + n_overwritten + work.n_turned_away
             send(Progress(n_done, n_dropped, work.times.summary(), work.device))
     send(Finished(work.times.summary(), work.device))
 

@@ -29,7 +29,7 @@ class StageProcess:
 
     `deliver` gets its messages, and `ended` one call when it is gone. Both are called from a
     thread of this object. `ended` gets "" where it was asked to end, else what became of the
-    process, in words.
+    process, in words. With `every_frame` no frame gives way to a newer one.
     """
 
     def __init__(
@@ -39,6 +39,7 @@ class StageProcess:
         ring: FrameRing,
         deliver: Callable[[Any], None],
         ended: Callable[[str], None],
+        every_frame: bool = False,
     ) -> None:
         self.name = kind
         self.progress: Progress | None = None
@@ -48,8 +49,11 @@ class StageProcess:
         self.heard_s = monotonic_s()
         """When it last gave a sign of its work."""
         self._deliver, self._ended = deliver, ended
-        self._asked_to_end = False
-        self._outbox: LatestWins[Any] = LatestWins(lambda message: isinstance(message, FrameInRing))
+        self.asked_to_end = False
+        """Whether it was told to end, one way or the other."""
+        self._outbox: LatestWins[Any] = LatestWins(
+            lambda message: not every_frame and isinstance(message, FrameInRing)
+        )
         ours, theirs = socket.socketpair()
         self._child = subprocess.Popen(
             [sys.executable, "-m", CHILD, kind, str(nice), str(theirs.fileno()), str(ring.fd)],
@@ -77,7 +81,7 @@ class StageProcess:
     def n_dropped(self) -> int:
         """Frames that it did not get or did not get round to."""
         inside = self.progress.n_dropped if self.progress is not None else 0
-        return self._outbox.n_dropped + inside
+        return self._outbox.n_dropped + self._outbox.n_overflown + inside
 
     def begin(self, setup: Setup) -> None:
         """Say what to do; to be said first."""
@@ -89,7 +93,7 @@ class StageProcess:
 
     def ask_to_finish(self, finish: Finish) -> None:
         """Have it give its last results and end."""
-        self._asked_to_end = True
+        self.asked_to_end = True
         self._outbox.put(finish)
         self._outbox.close()
 
@@ -104,7 +108,7 @@ class StageProcess:
 
     def kill(self) -> None:
         """End it now."""
-        self._asked_to_end = True
+        self.asked_to_end = True
         self._outbox.close()
         if self._child.poll() is None:
             self._child.kill()
@@ -139,7 +143,7 @@ class StageProcess:
         self._outbox.close()
         status = self._child.wait()
         why = self.failed.why if self.failed is not None else _in_words(status)
-        self._ended("" if self._asked_to_end else why)
+        self._ended("" if self.asked_to_end else why)
 
 
 def _in_words(status: int) -> str:

@@ -27,6 +27,11 @@ class Work:
         """Frames that wait."""
 
     @property
+    def n_turned_away(self) -> int:
+        """Messages taken and then given up."""
+        return 0
+
+    @property
     def has_room(self) -> bool:
         """Whether another frame may wait."""
         return self.n_held < MOST_HELD

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drivers.mavlink_port import OnMessage
 from drivers.mavlink_router import ClientCounts
+from drivers.mavlink_wire import Tap
 
 
 class MemoryPort:
@@ -29,6 +30,9 @@ class MemoryPort:
 
     def clients(self) -> list[ClientCounts]:
         return []
+
+    def set_tap(self, tap: Tap | None) -> None:
+        """There are no bytes to be told of."""
 
     def send(self, message: Any) -> None:
         message.pack(self._codec)  # fails where a field is out of its range

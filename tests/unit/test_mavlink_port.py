@@ -54,6 +54,33 @@ def test_an_autopilot_on_any_wire(tmp_path: Path, kind: str) -> None:
     asyncio.run(play())
 
 
+@pytest.mark.parametrize("kind", ["udpin", "tcpin", "pty"])
+def test_a_tap_hears_every_byte_both_ways(tmp_path: Path, kind: str) -> None:
+    tapped: list[tuple[bool, bytes, int]] = []
+
+    async def play() -> None:
+        place = f"{tmp_path}/autopilot" if kind == "pty" else f"{HOST}:0"
+        with FakeAutopilot("px4", f"{kind}:{place}") as autopilot:
+            port = port_at(autopilot.url.replace(":auto", ":57600"))
+            port.set_tap(lambda out, data, ns: tapped.append((out, data, ns)))
+            heard = Heard()
+            async with running(port.run(heard)):
+                await until(lambda: port.connected)
+                while not autopilot.of("ATTITUDE") or len(heard.of("ATTITUDE")) < 5:
+                    port.send(attitude(1))
+                    await asyncio.sleep(0.02)
+            n_heard = port.n_received
+        began = {out: b"".join(d for o, d, _ in tapped if o is out) for out in (False, True)}
+        codec = mavlink.MAVLink(None)
+        assert len(codec.parse_buffer(began[False]) or []) == n_heard
+        sent = mavlink.MAVLink(None).parse_buffer(began[True])
+        assert len(sent or []) == port.n_sent and {m.get_type() for m in sent} == {"ATTITUDE"}
+        stamps = [ns for _, _, ns in tapped]
+        assert max(stamps) <= time.monotonic_ns() and max(stamps) - min(stamps) < 60e9
+
+    asyncio.run(play())
+
+
 def test_the_wire_pulled_and_plugged_again(tmp_path: Path) -> None:
     async def play() -> None:
         with FakeAutopilot("px4", f"pty:{tmp_path}/autopilot") as autopilot:
