@@ -36,6 +36,8 @@ from companion.messages import (
 
 Bools = NDArray[np.bool_]
 MAX_GAP_NS = 1_500_000_000
+SAME_TIME_NS = 1_000_000
+"""A sample of a frame's own time, as photographs have one, needs no other beside it."""
 MIN_SPACING_NS = 45_000_000
 DRIFT_TAU_S = 40.0
 SIGMA_DRIFT_M = 1.0
@@ -85,7 +87,9 @@ class _Series:
         i = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)
         span = times[i] - times[i - 1]
         f = ((t_ns - times[i - 1]) / np.maximum(span, 1)).reshape(-1, *([1] * (values.ndim - 1)))
-        inside = (t_ns >= times[0]) & (t_ns <= times[-1]) & (span < MAX_GAP_NS)
+        nearest = np.minimum(np.abs(t_ns - times[i - 1]), np.abs(times[i] - t_ns))
+        told = (span < MAX_GAP_NS) | (nearest <= SAME_TIME_NS)
+        inside = (t_ns >= times[0]) & (t_ns <= times[-1]) & told
         return values[i - 1] * (1 - f) + values[i] * f, inside
 
     def __len__(self) -> int:

@@ -12,6 +12,7 @@ from drivers.bag_flight import is_bag, is_ros2_folder, open_bag
 from drivers.euroc import is_euroc, open_euroc
 from drivers.flight import Flight
 from drivers.flight_folder import has_pictures, is_flight_folder, open_flight_folder
+from drivers.geotagged_stills import is_geotagged, open_geotagged
 from drivers.kitti import is_kitti, open_kitti
 from drivers.posed_flight import is_posed_folder, open_posed_flight
 from drivers.recording.recorded_flight import (
@@ -46,6 +47,7 @@ FOLDERS = (
     Format("TUM RGB-D", is_tum_rgbd, open_tum_rgbd),
     Format("images with poses", is_posed_folder, open_posed_flight),
     Format("ROS bag", is_bag, open_bag),
+    Format("geotagged photographs", is_geotagged, open_geotagged),
     Format("video or images", has_pictures, open_flight_folder),
 )
 """In the order in which they are tried."""

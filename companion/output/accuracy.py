@@ -10,6 +10,7 @@ import numpy as np
 from companion.output.map_frame import MapFrame
 from companion.output.run_folder import FinishedRun
 
+USUAL_M = 3.0
 ABSOLUTE = (
     "Absolute position: no better than the autopilot's own. Without correction data that is 1 to "
     "3 m horizontally and about twice that in height (a satellite receiver's usual figures, not "
@@ -77,8 +78,14 @@ def _scale(run: FinishedRun, scale: Mapping[str, Any] | None) -> list[str]:
         return []
     relative, yaw_deg = scale.get("sigma_relative"), scale.get("sigma_yaw_deg")
     lines = [f"Scale and heading: from {scale.get('method')}, {scale.get('positions', 0)} samples."]
-    if scale.get("residual_m") is not None:
-        lines.append(f"Left between path and positions: {scale['residual_m']:.2f} m.")
+    left_m = scale.get("residual_m")
+    if left_m is not None:
+        lines.append(f"Left between path and positions: {left_m:.2f} m.")
+        if left_m > USUAL_M:
+            lines.append(
+                f"That is more than positions of satellites usually err: they disagree with what "
+                f"the pictures show, and absolute position is no better than {left_m:.0f} m."
+            )
     if relative is not None and yaw_deg is not None:
         reach = _reach_m(run)
         lines.append(
