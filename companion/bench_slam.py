@@ -19,7 +19,7 @@ from companion.errors import FlightError
 from companion.faults import FAULTS, NO_FAULT, Fault, Span
 from companion.geometry import Array, rotation_from_quaternion
 from companion.localisation import LocalisationStage
-from companion.messages import Frame, Odometry, Track
+from companion.messages import Frame, Odometry, Track, TrackState
 from companion.output.flight_result import FlightResult
 from companion.output.slam_bench import write_bench
 from companion.output.surroundings import peak_memory_mb
@@ -55,6 +55,7 @@ class BenchRow:
     worst_step_m: float | None
     resets: int
     longest_gap_s: float
+    coasted: int
     keyframes: int
     segments: int
     loops: int
@@ -188,6 +189,7 @@ def _row(
         _worst_step(listener.odometry, truth, stage),
         max((o.reset_counter for o in listener.odometry), default=0),
         _longest_gap_s(due, known),
+        sum(o.state is TrackState.COASTING for o in listener.odometry),
         len(update.map_from_camera) if update is not None else 0, stage.n_segments, stage.n_loops,
         found.method if found is not None else "none",
         round(float(np.median(cost.frame_ms)), 2),

@@ -38,6 +38,8 @@ Bools = NDArray[np.bool_]
 MAX_GAP_NS = 1_500_000_000
 SAME_TIME_NS = 1_000_000
 """A sample of a frame's own time, as photographs have one, needs no other beside it."""
+MAX_HELD_NS = 400_000_000
+"""A velocity may be as old as this."""
 MIN_SPACING_NS = 45_000_000
 DRIFT_TAU_S = 40.0
 SIGMA_DRIFT_M = 1.0
@@ -146,6 +148,34 @@ class Georeferencer:
         dt = (t_ns - series.times[-1]) * 1e-9
         travelled = way + 0.5 * (previous + velocity) * dt
         series.add(t_ns, np.stack([velocity, travelled]), horizontal_only=True)
+
+    def way_between(self, from_ns: int, to_ns: int) -> Array | None:
+        """How far the autopilot says the body went (3,), NED metres; None where it does not."""
+        for source in self._sources:
+            if len(self._positions[source]) >= 4:
+                where, ok = self._positions[source].at(np.array([from_ns, to_ns]))
+                if ok.all():
+                    return np.asarray(where[1] - where[0], np.float64)
+        return None
+
+    def moved(self, from_ns: int, to_ns: int) -> Array | None:
+        """The way (3,) by the autopilot's velocity, NED metres; None where it is not known.
+
+        Beyond the newest sample the last velocity is held for a while.
+        """
+        for source in self._sources:
+            series = self._travel[source]
+            if len(series) < 2:
+                continue
+            newest_ns = series.times[-1]
+            end_ns = min(to_ns, newest_ns)
+            if to_ns - newest_ns > MAX_HELD_NS or from_ns > end_ns:
+                continue
+            (start, end), ok = series.at(np.array([from_ns, end_ns]))
+            if ok.all():
+                way = end[1] - start[1] + end[0] * ((to_ns - end_ns) * 1e-9)
+                return np.asarray(np.nan_to_num(way), np.float64)
+        return None
 
     def solve(self, places: list[Place]) -> Georeference | None:
         """Where the map lies; None until it is known well enough."""

@@ -112,6 +112,8 @@ class TrackState(Enum):
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
+    COASTING = "coasting"
+    """Nothing is recognised; the pose is carried on by the autopilot's attitude and velocity."""
     LOST = "lost"
 
 
@@ -176,6 +178,22 @@ class KeyframeAdded:
     t_ns: int
     map_from_camera: Pose
     points_camera: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Reunited:
+    """A place was known again: keyframe `keyframe_id` shows what `other_id` showed before.
+
+    Within the same map a loop closed, which moved the newer end by `moved` map units; else two maps
+    became one, the other's unit being `scale` of this one's.
+    """
+
+    t_ns: int
+    keyframe_id: int
+    other_id: int
+    same_map: bool
+    moved: float
+    scale: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -289,8 +307,8 @@ class ClockReport:
 
 
 Message = (
-    Frame | Telemetry | Track | Odometry | KeyframeAdded | MapUpdate | DepthMap | PointChunk
-    | Warned
+    Frame | Telemetry | Track | Odometry | KeyframeAdded | Reunited | MapUpdate | DepthMap
+    | PointChunk | Warned
 )  # fmt: skip
 
 Details = Mapping[str, Any]

@@ -52,6 +52,14 @@ class AttitudeHistory:
         """Time of the last sample; 0 before the first."""
         return self._times[-1] if self._times else 0
 
+    def with_rates_at(self, t_ns: int, step_ns: int) -> tuple[Array, Array] | None:
+        """`ned_from_body` (3, 3) and body rates (3,) in rad/s from a step before to one after."""
+        here = self.at(t_ns)
+        before, after = self.at(t_ns - step_ns), self.at(t_ns + step_ns)
+        if here is None or before is None or after is None:
+            return None
+        return here, vector_from_rotation(before.T @ after) / (2e-9 * step_ns)
+
     def at(self, t_ns: int) -> Array | None:
         """Rotation `ned_from_body` (3, 3) at a time; None where no sample is near enough."""
         if not self._times:
@@ -126,6 +134,33 @@ class MotionFilter:
         if t1 == t0 or dt > 1.0:
             return Pose(b.rotation, position)
         return Pose(interpolate_rotation(a.rotation, b.rotation, (t_ns - t0) / (t1 - t0)), position)
+
+    def map_moved(self, before: Pose, after: Pose, scale: float = 1.0) -> None:
+        """The map was corrected: the last `map_from_camera` was `before` and is now `after`."""
+        if self._filter is None:
+            return
+        turn = after.rotation @ before.rotation.T
+        x = self._filter.x.ravel().copy()
+        x[:3] = after.translation + scale * turn @ (x[:3] - before.translation)
+        x[3:6] = scale * turn @ x[3:6]
+        x[6:9] = vector_from_rotation(turn @ rotation_from_vector(x[6:9]))
+        self._filter.x = x.reshape(-1, 1)
+        moved = [
+            (t_ns, Pose(
+                turn @ pose.rotation,
+                after.translation + scale * turn @ (pose.translation - before.translation),
+            ))
+            for t_ns, pose in self._poses
+        ]  # fmt: skip
+        self._poses.clear()
+        self._poses.extend(moved)
+
+    def attitude_corrected(self, old_from_new: Array) -> None:
+        """The attitude was given as `old`; what it is now takes this turn before the old error."""
+        if self._filter is not None:
+            x = self._filter.x.ravel().copy()
+            x[6:9] = vector_from_rotation(rotation_from_vector(x[6:9]) @ old_from_new)
+            self._filter.x = x.reshape(-1, 1)
 
     def correct(self, t_ns: int, map_from_camera: Pose, ned_from_camera: Array | None) -> None:
         """Take the pose that the image gave."""

@@ -21,6 +21,8 @@ MAX_ACCELERATION_M_S2 = 4.0
 DOUBTED_FRAMES = 6
 """A pose where motion cannot have brought the camera is believed when so many others agree."""
 WAY_KEPT_NS = 10_000_000_000
+SIGMA_COASTING_M_S = 0.3
+"""Of the velocity by which a pose is carried on where nothing is recognised."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
 SIGMAS_BEYOND_NOISE = 3.0
 """How much more matches of one image err together than each by itself says."""
@@ -44,6 +46,7 @@ class SmoothOdometry:
         self._anchored = False
         self._velocity = np.zeros(3)
         self._n_doubted = 0
+        self._coasting = False
         self._way: deque[tuple[int, Array]] = deque()
         self.reset_counter = 0
 
@@ -60,13 +63,18 @@ class SmoothOdometry:
         `velocity_map` the camera's velocity in it with its standard deviation.
         """
         pose = track.map_from_camera
-        if track.state is not TrackState.TRACKING or pose is None or georeference is None:
+        known = track.state in (TrackState.TRACKING, TrackState.COASTING)
+        if not known or pose is None or georeference is None:
             return self._unknown(track)
         if segment != self._segment or self._georeference is None:
             self._begin(segment, georeference, pose)
         elif georeference is not self._georeference:
             self._change(georeference)
         raw = self._raw(georeference, pose)
+        if track.state is TrackState.COASTING:
+            return self._coast(track, raw)
+        if self._coasting:
+            self._land(raw, track.t_ns)
         self._work_in(raw, track.t_ns)
         placed = self._odometry_from_world @ raw
         if not self._believable(placed, track.t_ns):
@@ -100,6 +108,34 @@ class SmoothOdometry:
             float(np.hypot(FLOOR_RAD, SIGMAS_BEYOND_NOISE * track.sigma_rotation_rad)),
         )  # fmt: skip
 
+    def _coast(self, track: Track, raw: Pose) -> Odometry:
+        """Carried on without seeing: of the lowest quality, and ever less certain."""
+        assert track.map_from_camera is not None
+        placed = self._odometry_from_world @ raw
+        if self._last is not None:
+            dt_s = max((track.t_ns - self._last[0]) * 1e-9, 1e-3)
+            self._velocity = (placed.translation - self._last[2].translation) / dt_s
+        self._coasting = True
+        self._last = (track.t_ns, track.map_from_camera, placed)
+        assert self._georeference is not None
+        scale = self._georeference.world_from_map.scale
+        return Odometry(
+            track.seq, track.t_ns, track.state, self.reset_counter, 1, placed,
+            self._velocity.copy(), max(FLOOR_M, scale * track.sigma_position),
+            SIGMA_COASTING_M_S, float(np.hypot(FLOOR_RAD, track.sigma_rotation_rad)),
+        )  # fmt: skip
+
+    def _land(self, raw: Pose, t_ns: int) -> None:
+        """See again: go on from where coasting led, as long as that is not far off."""
+        self._coasting = False
+        if self._last is None:
+            return
+        expected = self._last[2].translation + self._velocity * ((t_ns - self._last[0]) * 1e-9)
+        off = expected - (self._odometry_from_world @ raw).translation
+        if float(np.linalg.norm(off)) < self._max_jump_m:
+            before = self._odometry_from_world
+            self._odometry_from_world = Pose(before.rotation, before.translation + off)
+
     def _unknown(self, track: Track) -> Odometry:
         return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
 
@@ -118,6 +154,7 @@ class SmoothOdometry:
         self._anchored = georeference.has_origin
         self._segment, self._georeference = segment, georeference
         self._last = None
+        self._coasting = False
         self._way.clear()
 
     def _change(self, georeference: Georeference) -> None:
@@ -128,6 +165,17 @@ class SmoothOdometry:
             turn = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
             self._odometry_from_world = Pose(turn, placed.translation - turn @ raw.translation)
         self._georeference = georeference
+
+    def map_moved(self, map_from_camera: Pose) -> None:
+        """The map was corrected: where in it the last believed frame is now.
+
+        What was given stays where it was; the rest is worked in as slowly as anything learned.
+        """
+        if self._last is None or self._georeference is None:
+            return
+        t_ns, _, placed = self._last
+        self._last = (t_ns, map_from_camera, placed)
+        self._change(self._georeference)
 
     def _work_in(self, raw: Pose, t_ns: int) -> None:
         """Move towards the pose that the map has, where it began with a place in the world.

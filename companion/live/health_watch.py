@@ -44,6 +44,7 @@ STUCK = "localisation hangs and is ended"
 IN_WORDS = {
     TrackState.INITIALISING: "initialising",
     TrackState.TRACKING: "tracking",
+    TrackState.COASTING: "coasting",
     TrackState.LOST: "lost",
 }
 

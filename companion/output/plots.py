@@ -112,7 +112,9 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
         known = np.array([track.state is TrackState.TRACKING for track in tracks])
         found = np.where(known, [float(track.n_inliers) for track in tracks], np.nan)
         axes.plot(*_thin(np.stack([t_s, found], 1)).T, color=PATH, lw=1.2, label="map points found")
-        for state, colour in ((TrackState.INITIALISING, IDLE), (TrackState.LOST, BAD)):
+        for state, colour in (
+            (TrackState.INITIALISING, IDLE), (TrackState.COASTING, OTHER), (TrackState.LOST, BAD),
+        ):  # fmt: skip
             here = np.array([track.state is state for track in tracks])
             axes.fill_between(
                 _edges(t_s), 0, 1, where=np.append(here, False), step="post",

@@ -10,10 +10,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from companion.geometry import Array, Pose
+from companion.geometry import Array, Pose, Similarity
 from companion.messages import Bytes, Floats
 from companion.slam.features import Bools, Features, Ints
 from companion.slam.patches import STORED, Patches, cut, level_of
+
+ARRAYS = (
+    "positions", "alive", "descriptors", "normals", "base_distance", "n_visible", "n_found",
+    "n_observers", "born", "first_seen", "first_unproject", "patch_grey", "patch_centre",
+    "patch_level",
+)  # fmt: skip
 
 
 @dataclass(slots=True, eq=False)
@@ -49,7 +55,12 @@ class SlamMap:
     n_levels: int
     first_keyframe_id: int = -1
     """By which it is told from other maps; -1 before it has begun."""
+    level: bool = False
+    """Whether the z axis is known to point down."""
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    """In order of their ids."""
+    unit_of: dict[int, float] = field(default_factory=dict)
+    """Map units to one unit of what was said of a keyframe when it was made, where not 1."""
     n_points: int = 0
     positions: Array = field(default_factory=lambda: np.zeros((0, 3)))
     alive: Bools = field(default_factory=lambda: np.zeros(0, bool))
@@ -76,11 +87,7 @@ class SlamMap:
         if n <= size:
             return
         new = max(4096, 2 * size, n)
-        for name in (
-            "positions", "alive", "descriptors", "normals", "base_distance",
-            "n_visible", "n_found", "n_observers", "born", "first_seen", "first_unproject",
-            "patch_grey", "patch_centre", "patch_level",
-        ):  # fmt: skip
+        for name in ARRAYS:
             old = getattr(self, name)
             grown = np.zeros((new, *old.shape[1:]), old.dtype)
             grown[:size] = old
@@ -112,6 +119,19 @@ class SlamMap:
         self.patch_level[ids] = patches.level
         self.n_points += len(positions)
         return ids
+
+    def take_points(self, other: SlamMap, own_from_other: Similarity) -> int:
+        """Take all points of another map; returns what their ids grow by."""
+        offset, n = self.n_points, other.n_points
+        self._reserve(offset + n)
+        for name in ARRAYS:
+            getattr(self, name)[offset : offset + n] = getattr(other, name)[:n]
+        new = slice(offset, offset + n)
+        self.positions[new] = own_from_other.apply(self.positions[new])
+        self.normals[new] = self.normals[new] @ own_from_other.rotation.T
+        self.base_distance[new] *= own_from_other.scale
+        self.n_points += n
+        return offset
 
     def patches_of(self, points: Ints) -> Patches:
         """The patches of some points."""

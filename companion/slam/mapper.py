@@ -178,6 +178,21 @@ class Mapper:
     def _observers(self, point: int) -> list[Keyframe]:
         return [k for k in self._map.keyframes.values() if np.any(k.point_ids == point)]
 
+    def unite(self, keyframe: Keyframe, other: Keyframe, seen_there: Ints) -> None:
+        """Let the two parts of the map around a place seen again know each other's points."""
+        slam_map = self._map
+        _, ids = slam_map.seen_by(keyframe)
+        here = [slam_map.keyframes[k] for _, k in slam_map.covisible(ids, 10)][:N_NEIGHBOURS]
+        _, ids = slam_map.seen_by(other)
+        there = [slam_map.keyframes[k] for _, k in slam_map.covisible(ids, 10)][:N_NEIGHBOURS]
+        seen_here = np.unique(np.concatenate([slam_map.seen_by(k)[1] for k in [keyframe, *here]]))
+        for k in [keyframe, *here]:
+            self._search_in(k, seen_there)
+        for k in [other, *there]:
+            self._search_in(k, seen_here)
+        slam_map.sweep([keyframe, other, *here, *there])
+        self.adjust_locally(keyframe)
+
     def adjust_locally(self, keyframe: Keyframe) -> None:
         """Adjust a keyframe and those that share most with it, and all points they see."""
         slam_map, config = self._map, self._config
@@ -243,7 +258,11 @@ class Mapper:
             np.concatenate([k.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
             np.concatenate([k.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
         )  # fmt: skip
-        result = adjust(bundle, iterations or self._config.iterations, self._turn.give_way)
+        if iterations is None:
+            result = adjust(bundle, self._config.iterations, self._turn.give_way)
+        else:  # it takes long, and works on copies
+            with self._turn.away():
+                result = adjust(bundle, iterations)
         for i, k in enumerate(variable):
             k.camera_from_map = result.poses[i]
         slam_map.positions[points] = result.points

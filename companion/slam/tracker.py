@@ -15,33 +15,34 @@ from companion.camera import Camera
 from companion.clock import Timer
 from companion.config import Config
 from companion.geometry import Array, Pose, angle_between
-from companion.messages import Frame, KeyframeAdded, Track, TrackState
+from companion.messages import Frame, KeyframeAdded, Reunited, Track, TrackState
+from companion.slam.atlas import MAX_YOUNG_KEYFRAMES, Atlas
 from companion.slam.bootstrap import Bootstrap
 from companion.slam.features import FeatureExtractor, Features, Ints
 from companion.slam.local_map import Projector, local_points
 from companion.slam.map import Keyframe, SlamMap
-from companion.slam.mapper import Mapper
 from companion.slam.patches import image_levels
 from companion.slam.pose_refinement import refine_pose
 from companion.slam.refinement import refine_features
-from companion.slam.relocalizer import Relocalizer
+from companion.slam.relocalizer import Located
 from companion.slam.view import View
-from companion.slam.worker import AtOnce, Beside, MappingWorker, MapTurn
+from companion.slam.worker import AtOnce, Beside, Done, MappingWorker, MapTurn
 
 MAX_TURN_UNSEEN_RAD = np.radians(15.0)
-MAX_YOUNG_KEYFRAMES = 5
-"""A map that is lost again with so few keyframes was not worth keeping."""
+Told = Track | KeyframeAdded | Reunited
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
     """What is believed of a frame before its image is looked at.
 
-    `map_from_camera` predicted pose or None; `ned_from_camera` rotation by the autopilot or None.
+    `map_from_camera` predicted pose or None; `ned_from_camera` rotation by the autopilot or None,
+    and `map_from_camera_rotation` the same in the map's axes, which may be some degrees off level.
     """
 
     map_from_camera: Pose | None
     ned_from_camera: Array | None
+    map_from_camera_rotation: Array | None = None
 
 
 class Tracker:
@@ -57,36 +58,33 @@ class Tracker:
         self._times = times
         self._extractor = FeatureExtractor(config.features, camera)
         self._projector = Projector(camera)
-        self._mapping = config.mapping
-        self._features = config.features
         self._next_keyframe_id = 0
         self.turn = MapTurn()
         """Taken by whoever else looks at the map."""
         self._worker: MappingWorker = Beside(self.turn) if beside else AtOnce()
-        self.segments: list[SlamMap] = []
-        """Maps that stand for themselves: one more each time a lost camera had to begin anew."""
+        self.atlas = Atlas(config.features, config.mapping, camera, self.turn)
         self.state = TrackState.INITIALISING
         self._bootstrap = Bootstrap(self._config, camera)
         self._lost_since_ns: int | None = None
-        self._begin_segment()
+        self._forget()
 
     @property
     def map(self) -> SlamMap:
         """The map in use."""
-        return self.segments[-1]
+        return self.atlas.map
 
-    def _begin_segment(self) -> None:
-        """A fresh map; one that was hardly begun is given up for it."""
-        if self.segments and len(self.map.keyframes) <= MAX_YOUNG_KEYFRAMES:
-            self.segments.pop()
-        self.segments.append(SlamMap(self._features.scale_factor, self._features.n_levels))
-        self.mapper = Mapper(self._mapping, self._camera, self.map, self.turn)
-        self._relocalizer = Relocalizer(self.map, self._camera.focal_px)
+    @property
+    def segments(self) -> list[SlamMap]:
+        """Maps that stand for themselves: one more each time a lost camera had to begin anew."""
+        return self.atlas.segments
+
+    def _forget(self) -> None:
+        """Another map is in use: what was known of the last frame is not of it."""
         self._last: View | None = None
         self._reference: Keyframe | None = None
         self._local: Ints = np.zeros(0, np.int64)
 
-    def step(self, frame: Frame, prior: Prior) -> list[Track | KeyframeAdded]:
+    def step(self, frame: Frame, prior: Prior) -> list[Told]:
         """Take one frame; frames come in order of time."""
         with self._times("features"):
             features = self._extractor.extract(frame.grey)
@@ -98,20 +96,19 @@ class Tracker:
         """Look for this share of the features from now on."""
         self._extractor.effort = share
 
-    def close(self) -> list[KeyframeAdded]:
+    def close(self) -> Done:
         """Finish the mapping that is under way; what it gave."""
         self._worker.close()
         return self._worker.done()
 
-    def _place_frame(
-        self, frame: Frame, features: Features, prior: Prior
-    ) -> list[Track | KeyframeAdded]:
+    def _place_frame(self, frame: Frame, features: Features, prior: Prior) -> list[Told]:
         if self.state is TrackState.INITIALISING:
             return self._initialise(frame, features, prior)
         view = View(
             frame.seq, frame.t_ns, features, prior.ned_from_camera, frame.grey,
             Pose.identity(), np.full(len(features), -1),
         )  # fmt: skip
+        view.map_from_camera_rotation = prior.map_from_camera_rotation
         with self._times("tracking"):
             found = self._track(view, prior)
         if not found:
@@ -125,14 +122,13 @@ class Tracker:
 
     # -- initialising ---------------------------------------------------------------------------
 
-    def _initialise(
-        self, frame: Frame, features: Features, prior: Prior
-    ) -> list[Track | KeyframeAdded]:
+    def _initialise(self, frame: Frame, features: Features, prior: Prior) -> list[Told]:
         with self._times("initialising"):
             start = self._bootstrap.step(frame, features, prior.ned_from_camera)
         if start is None or not self._given_up(frame.t_ns):
             return [Track(frame.seq, frame.t_ns, self.state)]
-        self._begin_segment()
+        self.atlas.begin(level=start.first.ned_from_camera is not None)
+        self._forget()
         with self._times("mapping"):
             first = self._keyframe(start.first)
             second = self._keyframe(start.second)
@@ -146,16 +142,17 @@ class Tracker:
             self.map.observe(second, start.features_second, ids)
             self.map.refresh(ids, [first, second])
             self._reference = second
-            self.mapper.add(second)
-            self.mapper.adjust_all(10)
+            mapper = self.atlas.mapper
+            mapper.add(second)
+            mapper.adjust_all(10)
+            self.atlas.remember(first)
+            self.atlas.remember(second)
         start.second.camera_from_map = second.camera_from_map
         start.second.point_ids = second.point_ids.copy()
         self._last = start.second
         self._refresh_local(start.second)
         self.state, self._lost_since_ns = TrackState.TRACKING, None
-        out: list[Track | KeyframeAdded] = [
-            self._backfilled(v, first) for v in self._backfill(first, second)
-        ]
+        out: list[Told] = [self._backfilled(v, first) for v in self._backfill(first, second)]
         out += [self._report(start.second), _added(self.map, first), _added(self.map, second)]
         return out
 
@@ -173,7 +170,7 @@ class Tracker:
                     share = (v.t_ns - start.t_ns) / max(end.t_ns - start.t_ns, 1)
                     centre = (1 - share) * start.centre + share * end.centre
                     guess = Pose(pose.rotation, -pose.rotation @ centre)
-                if self._place(v, guess):
+                if self._place(v, guess) or self._locate_by(v, start):
                     pose, misses, last = v.camera_from_map, 0, v.t_ns
                     placed.append(v)
                 else:
@@ -204,10 +201,8 @@ class Tracker:
             if not found:
                 found = self._match(view, guess, self._local, 25.0)
             if not found and self.state is TrackState.TRACKING and self._reference is not None:
-                found = self._relocalise(view, [self._reference])
-        if not found:
-            found = self._relocalise(view, self._relocalizer.candidates())
-        if not found:
+                found = self._locate_by(view, self._reference)
+        if not found and not self._relocalise(view):
             return False
         self._refresh_local(view)
         if not self._match(view, view.camera_from_map, self._local, 5.0, count=True):
@@ -258,16 +253,29 @@ class Tracker:
             self.map.n_found[points[inlier]] += 1
         return True
 
-    def _relocalise(self, view: View, keyframes: list[Keyframe]) -> bool:
-        located = self._relocalizer.locate(view.features, view.seq, keyframes)
-        if located is None:
+    def _locate_by(self, view: View, keyframe: Keyframe) -> bool:
+        """As a lost camera would, by what one keyframe shows."""
+        located = self.atlas.locate_by(view.features, keyframe, view.level_from_camera, view.seq)
+        return located is not None and self._accept(view, located)
+
+    def _relocalise(self, view: View) -> bool:
+        """By any keyframe of any map; the map is then the one in use."""
+        found = self.atlas.find(view.features, view.level_from_camera, view.seq)
+        if found is None:
             return False
-        pose, points, found = located
-        view.camera_from_map = pose
+        segment, located = found
+        if segment is not self.map:
+            self.atlas.use(segment)
+            self._forget()
+            self._reference = located.keyframe
+        return self._accept(view, located)
+
+    def _accept(self, view: View, located: Located) -> bool:
+        view.camera_from_map = located.camera_from_map
         view.point_ids[:] = -1
-        view.point_ids[found] = points
+        view.point_ids[located.features] = located.points
         self._refresh_local(view)
-        return self._match(view, pose, self._local, 12.0)
+        return self._match(view, located.camera_from_map, self._local, 12.0)
 
     def _refresh_local(self, view: View) -> None:
         seen = view.point_ids[view.point_ids >= 0]
@@ -281,7 +289,7 @@ class Tracker:
             return True
         return t_ns - since > self._config.restart_after_s * 1e9
 
-    def _lost(self, frame: Frame, features: Features, prior: Prior) -> list[Track | KeyframeAdded]:
+    def _lost(self, frame: Frame, features: Features, prior: Prior) -> list[Told]:
         """Note the loss, and see whether this frame could begin a new map."""
         if self.state is TrackState.TRACKING:
             self._lost_since_ns = frame.t_ns
@@ -317,12 +325,13 @@ class Tracker:
         features = np.flatnonzero(view.point_ids >= 0)
         self.map.observe(keyframe, features, view.point_ids[features])
         self._reference = keyframe
-        mapper, slam_map = self.mapper, self.map
+        slam_map = self.map
 
-        def extend() -> KeyframeAdded:
+        def extend() -> Done:
             with self._times("mapping"):
-                mapper.add(keyframe)
-            return _added(slam_map, keyframe)
+                reunited = self.atlas.extend(slam_map, keyframe)
+            added = _added(slam_map, keyframe)
+            return [added] if reunited is None else [added, reunited]
 
         self._worker.submit(extend)
         # already adjusted, where it was done at once
@@ -349,9 +358,11 @@ class Tracker:
         reference = keyframe or self._reference
         assert reference is not None
         map_from_camera = view.camera_from_map.inverse()
+        relative = reference.camera_from_map @ map_from_camera
+        unit = self.map.unit_of.get(reference.keyframe_id, 1.0)
         return Track(
             view.seq, view.t_ns, TrackState.TRACKING, map_from_camera, reference.keyframe_id,
-            reference.camera_from_map @ map_from_camera, view.n_inliers, view.n_matches,
+            Pose(relative.rotation, relative.translation / unit), view.n_inliers, view.n_matches,
             view.features.pixels[view.point_ids >= 0], backfilled, *_sigmas(view),
         )  # fmt: skip
 

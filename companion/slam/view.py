@@ -23,6 +23,8 @@ class View:
     camera_from_map: Pose
     point_ids: Ints
     n_matches: int = 0
+    map_from_camera_rotation: Array | None = None
+    """by the autopilot, in the axes of the map in use"""
     normalised: Array | None = None
     whitening: Array | None = None
     refined_for: Ints | None = None
@@ -34,3 +36,9 @@ class View:
     def n_inliers(self) -> int:
         """Features that show a map point."""
         return int(np.count_nonzero(self.point_ids >= 0))
+
+    @property
+    def level_from_camera(self) -> Array | None:
+        """To a frame whose z axis is the map's, where the autopilot tells it."""
+        by_map = self.map_from_camera_rotation
+        return self.ned_from_camera if by_map is None else by_map

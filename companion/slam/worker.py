@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from companion.messages import KeyframeAdded
+from companion.messages import KeyframeAdded, Reunited
 
-Job = Callable[[], KeyframeAdded]
+Done = list[KeyframeAdded | Reunited]
+Job = Callable[[], Done]
 MAX_WAITING = 2
 
 
@@ -58,6 +59,20 @@ class MapTurn:
                 self._changed.notify_all()
             self._take()
 
+    @contextmanager
+    def away(self) -> Iterator[None]:
+        """Let the map go for a longer while, within `mapping`; without effect outside of it."""
+        if not self._mapping:
+            yield
+            return
+        with self._changed:
+            self._mapping = False
+            self._changed.notify_all()
+        try:
+            yield
+        finally:
+            self._take()
+
     def _take(self) -> None:
         with self._changed:
             self._changed.wait_for(lambda: not (self._wanted or self._tracking))
@@ -74,7 +89,7 @@ class MappingWorker(Protocol):
     def submit(self, job: Job) -> None:
         """Have a job done."""
 
-    def done(self) -> list[KeyframeAdded]:
+    def done(self) -> Done:
         """What was finished since the last call; raises what a job raised."""
 
     def close(self) -> None:
@@ -87,13 +102,13 @@ class AtOnce:
     busy = False
 
     def __init__(self) -> None:
-        self._finished: list[KeyframeAdded] = []
+        self._finished: Done = []
 
     def submit(self, job: Job) -> None:
         """Do it."""
-        self._finished.append(job())
+        self._finished.extend(job())
 
-    def done(self) -> list[KeyframeAdded]:
+    def done(self) -> Done:
         """What was finished since the last call."""
         finished, self._finished = self._finished, []
         return finished
@@ -108,7 +123,7 @@ class Beside:
     def __init__(self, turn: MapTurn) -> None:
         self._turn = turn
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self._finished: queue.SimpleQueue[KeyframeAdded] = queue.SimpleQueue()
+        self._finished: queue.SimpleQueue[Done] = queue.SimpleQueue()
         self._fault: BaseException | None = None
         self._waiting = 0
         self._thread = threading.Thread(target=self._work, name="mapping", daemon=True)
@@ -124,14 +139,14 @@ class Beside:
         self._waiting += 1
         self._jobs.put(job)
 
-    def done(self) -> list[KeyframeAdded]:
+    def done(self) -> Done:
         """What was finished since the last call; raises what a job raised."""
         if self._fault is not None:
             raise self._fault
-        out: list[KeyframeAdded] = []
+        out: Done = []
         while not self._finished.empty():
-            out.append(self._finished.get())
-        self._waiting -= len(out)
+            out += self._finished.get()
+            self._waiting -= 1
         return out
 
     def close(self) -> None:
