@@ -269,6 +269,9 @@ class Daemon:
             if self._link_watch is not None:
                 self._link_watch.step(self._clock.now_ns())
             health = self._watch.health()
+            if self._flights.current is not None:
+                origin = self._link.origin if self._link is not None else None
+                self._flights.current.tell(health, origin)
             now_s = (self._clock.now_ns() - began_ns) * 1e-9
             if not is_ready and (self._watch.pipeline_up or now_s > READY_AFTER_S):
                 is_ready = True

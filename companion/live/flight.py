@@ -18,9 +18,11 @@ from typing import Any
 from companion.camera import Camera
 from companion.clock import FlightClock, monotonic_s
 from companion.config import Config
+from companion.health import Health
 from companion.live.viewing import Viewing
 from companion.messages import (
     Frame,
+    GeoOrigin,
     KeyframeAdded,
     MapUpdate,
     Message,
@@ -34,6 +36,7 @@ from companion.output.flight_result import RunFacts
 from companion.stages.frame_ring import FrameRing
 from companion.stages.protocol import Finish, SetShare, Setup
 from companion.stages.stage_process import StageProcess
+from companion.viewer import Watched
 from drivers.recording.content import HealthNote, LinkBytes
 
 NICE = {"localisation": 0, "tape": 5, "recorder": 10, "depth": 20}
@@ -46,6 +49,7 @@ RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
 """Between two starts of a stage that dies again and again."""
+TELL_NS = 1_000_000_000
 NOT_FINISHED = "a stage did not give its last results in time"
 
 
@@ -84,6 +88,8 @@ class LiveFlight:
         self.n_frames = 0
         self._viewing: Viewing | None = None
         self._last_map: MapUpdate | None = None
+        self._told_ns = 0
+        self._origin: GeoOrigin | None = None
         kinds = ["localisation", "recorder"]
         kinds += ["tape"] * config.recorder.enabled + ["depth"] * config.depth.enabled
         self.stages = {kind: self._start(kind) for kind in kinds}
@@ -100,8 +106,8 @@ class LiveFlight:
         self.folder, self._began_s = folder, monotonic_s()
         for kind in self.stages.keys() & IN_FOLDER:
             self._set_up(kind)
-        if self._config.daemon.viewer != "none":
-            self._viewing = Viewing(self._config, self.camera, self._warn)
+        if self._config.daemon.viewer != "none" or self._config.stream.listen:
+            self._viewing = Viewing(self._config, self.camera, folder.name, self._warn)
 
     def frame(self, frame: Frame) -> None:
         """Take a frame of the camera's size."""
@@ -126,6 +132,21 @@ class LiveFlight:
         """Have something in the recording; nobody else hears of it."""
         if "tape" in self.stages and self.folder is not None and not self._over.is_set():
             self.stages["tape"].offer(message)
+
+    def tell(self, health: Health, origin: GeoOrigin | None) -> None:
+        """Have viewers and recording told how all is, once a second, and where the world lies."""
+        if self.folder is None or self._over.is_set() or health.t_ns - self._told_ns < TELL_NS:
+            return
+        self._told_ns = health.t_ns
+        self._record(health)
+        if origin is not None and origin != self._origin:
+            self._origin = origin
+            self._record(origin)
+
+    @property
+    def viewing(self) -> Viewing | None:
+        """Who looks on; None if nobody may."""
+        return self._viewing
 
     def set_shares(self, features: float, dense: float, viewer: bool) -> None:
         """Leave out some of the work, or take it up again; see companion.governor."""
@@ -244,6 +265,7 @@ class LiveFlight:
         """What a stage gives goes to whom it is for; called from the stages' threads."""
         if isinstance(message, Odometry):
             self._listener.odometry(message)
+            self._show(message)
             self.keep(message)
             return
         if isinstance(message, (Track, KeyframeAdded, MapUpdate)) and "depth" in self.stages:
@@ -258,11 +280,11 @@ class LiveFlight:
             self.keep(message)
         self._record(message)
 
-    def _record(self, message: Message) -> None:
+    def _record(self, message: Watched) -> None:
         self.stages["recorder"].offer(message)
         self._show(message)
 
-    def _show(self, message: Message) -> None:
+    def _show(self, message: Watched) -> None:
         if self._viewing is not None:
             self._viewing.take(message)
 

@@ -89,7 +89,9 @@ def _serve(
                     work.n_held += 1
                 inbox.put(message)
         except (OSError, EOFError):
-            os._exit(0)  # the daemon is gone, and nobody waits for results
+            if not work.outlives_daemon:
+                os._exit(0)  # the daemon is gone, and nobody waits for results
+            inbox.put(Finish(hurry=True))
 
     threading.Thread(target=read, name="from the daemon", daemon=True).start()
     reported_s = monotonic_s()
@@ -122,7 +124,7 @@ def _sender(pipe: Connection[Any, Any]) -> Callable[[Any], None]:
         try:
             pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
         except OSError:
-            os._exit(0)  # as above
+            pass  # the daemon is gone, which the reader sees
 
     return send
 

@@ -14,6 +14,8 @@ from drivers.recording.recorder import Recorder
 
 
 class _Tape(Work):
+    outlives_daemon = True
+
     def __init__(self, setup: Setup) -> None:
         super().__init__()
         if setup.folder is None:

@@ -19,6 +19,8 @@ class Work:
 
     latest_only = False
     """Whether it wants the latest frame only, and that without its colours."""
+    outlives_daemon = False
+    """Whether it finishes by itself when the daemon is gone; else it ends at once."""
     device = ""
 
     def __init__(self) -> None:

@@ -1,0 +1,123 @@
+"""What a live flight leaves behind, however the daemon ends, and what a replay makes of it."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from companion.config import CameraConfig
+from companion.messages import Frame, PositionSample
+from drivers.open_flight import open_flight
+from drivers.pattern_camera import world_from_body
+from drivers.recording.mcap_scan import McapFile
+from drivers.recording.recorded_flight import CUT, RecordedFlight
+from drivers.tlog_records import TlogRecords
+from tests.support.command import replay
+from tests.support.daemon import Daemon
+from tests.support.fake_autopilot import FakeAutopilot
+from tests.support.fake_flight import MadeUpFlight
+from tests.support.fake_wire import free_port
+from tests.support.strain import Strain
+
+SETTINGS = (
+    "camera.source=pattern", "camera.rate_hz=15", "camera.width=320", "camera.height=240",
+    "depth.enabled=false", "daemon.flight=always", "recorder.least_free_mb=0",
+)  # fmt: skip
+OLDER_S = 1.0
+"""What is older than this when all is killed is on the disk."""
+
+
+def processes() -> list[psutil.Process]:
+    """The daemon, and all that it has started."""
+    (daemon,) = (p for p in psutil.Process().children() if "companion" in p.cmdline())
+    return [daemon, *daemon.children(recursive=True)]
+
+
+def kill(victims: list[psutil.Process]) -> None:
+    for victim in victims:
+        victim.send_signal(signal.SIGKILL)
+    psutil.wait_procs(victims, 10)
+
+
+def recorded(folder: Path) -> RecordedFlight:
+    (flight,) = (folder / "flights").iterdir()
+    opened = open_flight(flight, CameraConfig())
+    assert isinstance(opened, RecordedFlight)
+    return opened
+
+
+def fly(folder: Path, seconds: float, *settings: str) -> Daemon:
+    """A daemon that has recorded for so long."""
+    daemon = Daemon(folder, *SETTINGS, *settings)
+    daemon.__enter__()
+    daemon.until(lambda health: health["tracker"] in ("tracking", "initialising"), 60)
+    time.sleep(seconds)
+    return daemon
+
+
+@pytest.mark.parametrize("codec", ["mjpeg", "h264"])
+def test_killed_at_once_with_all_that_it_started_it_loses_less_than_a_second(
+    tmp_path: Path, codec: str
+) -> None:
+    with Strain() as strain, FakeAutopilot("px4", f"udpout:127.0.0.1:{free_port()}") as autopilot:
+        daemon = fly(tmp_path, 5, f"link.url={autopilot.url}", f"recorder.codec={codec}")
+        try:
+            everything = processes()
+            before_ns, killed_ns = time.monotonic_ns(), time.time_ns()
+            kill(everything)
+        finally:
+            daemon.__exit__(None, None, None)
+        allowed_s = strain.allowed_s(OLDER_S, before_ns - round(OLDER_S * 1e9))
+    (flight,) = (tmp_path / "flights").iterdir()
+    with McapFile(flight / "flight.mcap") as file:
+        assert file.summary() is None
+    opened = recorded(tmp_path)
+    assert CUT in [warning.what for warning in opened.warnings]
+    assert (killed_ns - opened.times_ns[-1]) * 1e-9 < allowed_s
+    last_ns = max(sample.t_ns for sample in opened.telemetry().samples)
+    assert (killed_ns - last_ns) * 1e-9 < allowed_s
+    assert sum(isinstance(frame, Frame) for frame in opened.frames()) == opened.n_frames > 30
+    tlog = TlogRecords((flight / "flight.tlog").read_bytes())
+    assert (killed_ns // 1000 - list(tlog)[-1].unix_us) * 1e-6 < allowed_s
+
+
+def test_without_its_daemon_the_recording_ends_whole(tmp_path: Path) -> None:
+    daemon = fly(tmp_path, 2)
+    try:
+        whole, *children = processes()
+        kill([whole])
+        assert not psutil.wait_procs(children, 20)[1]
+    finally:
+        daemon.__exit__(None, None, None)
+    (flight,) = (tmp_path / "flights").iterdir()
+    with McapFile(flight / "flight.mcap") as file:
+        assert file.summary() is not None
+    assert recorded(tmp_path).warnings == ()
+
+
+def test_two_replays_of_a_live_flight_give_the_same_bytes(tmp_path: Path) -> None:
+    flight = MadeUpFlight(lambda t_s: world_from_body(round(t_s * 1e9)))
+    with FakeAutopilot("ardupilot", f"udpout:127.0.0.1:{free_port()}", flight) as autopilot:
+        autopilot.fly(at_monotonic_ns=0, arm=False)
+        with Daemon(
+            tmp_path, *SETTINGS, f"link.url={autopilot.url}", "recorder.codec=png"
+        ) as daemon:
+            daemon.until(lambda health: health["tracker"] == "tracking", 60)
+            time.sleep(8)
+            daemon.stop()
+    (folder,) = (tmp_path / "flights").iterdir()
+    opened = recorded(tmp_path)
+    sources = {s.source for s in opened.telemetry().samples if isinstance(s, PositionSample)}
+    assert opened.n_frames > 60 and len(sources) == 3
+    for out in ("a", "b"):
+        run = replay(folder, tmp_path / out, "--set", "depth.enabled=false")
+        assert run.status == 0, run.stderr
+    a, b = ((tmp_path / out / "trajectory.tum").read_bytes() for out in ("a", "b"))
+    assert a == b
+    tracked = np.loadtxt(a.decode().splitlines())
+    assert len(tracked) > 0.6 * opened.n_frames
