@@ -63,6 +63,7 @@ MOST_IMAGES_HELD = 4
 IN_WORDS = {
     TrackState.INITIALISING: Shown.INITIALISING,
     TrackState.TRACKING: Shown.TRACKING,
+    TrackState.COASTING: Shown.COASTING,
     TrackState.LOST: Shown.LOST,
 }
 
