@@ -11,9 +11,10 @@ from companion.errors import FlightError
 from companion.messages import Warned
 from drivers.calibration import assumed_camera, read_calibration, read_matrix
 from drivers.flight import ENDS_EARLY, Flight
-from drivers.frame_source import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FrameSource, find_frames
+from drivers.frame_source import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FrameSource, Video, find_frames
 from drivers.frame_times import read_frame_times
 from drivers.telemetry_folder import logs_in, read_telemetry
+from drivers.telemetry_srt import srt_camera
 
 
 def is_flight_folder(path: Path) -> bool:
@@ -44,12 +45,18 @@ def open_flight_folder(
 def camera_of(
     calibration: Path, source: FrameSource, config: CameraConfig, t_ns: int
 ) -> tuple[Camera, list[Warned]]:
-    """The camera by its file or by `K.txt` beside it, else an assumed one, with a warning."""
+    """The camera by its file or `K.txt` beside it, else an assumed one, with a warning."""
     if calibration.exists():
         return read_calibration(calibration, source.width, source.height), []
     matrix = calibration.with_name("K.txt")
     if matrix.exists():
         return read_matrix(matrix, source.width, source.height), []
+    told = (
+        srt_camera(source.path, source.width, source.height) if isinstance(source, Video) else None
+    )
+    if told is not None:
+        camera, detail = told
+        return camera, [Warned(t_ns, "no camera.json: the lens is that of the subtitles", detail)]
     if config.assumed_hfov_deg <= 0:
         raise FlightError(
             f"{calibration.parent}: no camera.json; give one, or a field of view by "

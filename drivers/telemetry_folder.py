@@ -15,6 +15,7 @@ from companion.messages import Warned
 from drivers.telemetry_dataflash import read_dataflash
 from drivers.telemetry_gpmf import read_gpmf
 from drivers.telemetry_log import HostTimes, LogContent, Pictures, TelemetryLog, no_telemetry
+from drivers.telemetry_srt import read_srt
 from drivers.telemetry_tlog import read_tlog
 from drivers.telemetry_ulog import read_ulog
 
@@ -53,6 +54,8 @@ def read_telemetry(
         found.append((path, aligned(content, pictures, config)))
     if not paths:
         inside = read_gpmf(pictures.path, pictures.host_from_file_ns)
+        if inside is None and pictures.path.is_file():
+            inside = read_srt(pictures.path, pictures.host_from_file_ns)
         if inside is None:
             return no_telemetry(pictures)
         found.append((pictures.path, aligned(inside, pictures, config)))
