@@ -7,7 +7,8 @@
 
 Its physics are those of a point that leans into where it is told to go, in gusts. What flies it
 knows its attitude, its height by barometer, and the acceleration that it feels, with a bias.
-Position and velocity it takes from ODOMETRY alone, fused at the time of its stamp, as autopilots do.
+Position and velocity it takes from ODOMETRY alone, fused at the time of its stamp, as autopilots
+do.
 """
 
 from __future__ import annotations
