@@ -70,7 +70,26 @@ def _compare(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 1 if too_far else 0
 
 
-COMMANDS: dict[str, Command] = {"flights": _flights, "compare": _compare}
+def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    """Replay many; 1 where one has failed."""
+    from companion.batch import INDEX, batch
+
+    results = batch(
+        arguments.flights, arguments.out, load_config(arguments.config, arguments.set),
+        scheduler=arguments.scheduler, n_workers=arguments.workers,
+        progress=signals.between_frames(progress_on(sys.stderr, "", "flights")),
+    )  # fmt: skip
+    failed = [result for result in results if result.error]
+    for result in failed:
+        print(f"companion: {result.name}: {result.error}", file=sys.stderr)
+    before = sum(result.done_before for result in results)
+    print(f"{len(results)} flights, {before} done before, {len(failed)} failed")
+    print(f"index: {arguments.out / INDEX}")
+    signals.take()
+    return 1 if failed else 0
+
+
+COMMANDS: dict[str, Command] = {"flights": _flights, "compare": _compare, "batch": _batch}
 
 
 def add_parsers(
@@ -92,6 +111,19 @@ def add_parsers(
     compare.add_argument(
         "--max-cloud", type=float, metavar="M", help="95 %% of points at most so far from the other"
     )
+
+    batch = commands.add_parser(
+        "batch", parents=[configuration], help="replay an archive of flights on many cores",
+        description="Replay each flight into a folder of DIR, and write DIR/index.html with a row "
+        "for each. What is done already is not done again. Exit status 1 where a flight failed.",
+    )  # fmt: skip
+    batch.add_argument("flights", type=Path, nargs="+", metavar="FLIGHT")
+    batch.add_argument("--out", type=Path, required=True, metavar="DIR")
+    batch.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    batch.add_argument(
+        "--scheduler", metavar="ADDRESS",
+        help="a Dask cluster that sees the same files, as tcp://192.168.1.5:8786",
+    )  # fmt: skip
 
 
 def _add_flights(

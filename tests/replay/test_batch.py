@@ -1,0 +1,52 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.recorded import record
+
+pytest.importorskip("distributed")
+FIRST, SECOND = "2026-01-01T00-00-00Z", "2026-01-02T00-00-00Z"
+
+
+def batch(*words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "companion", "batch", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
+
+
+def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> None:
+    record(tmp_path / FIRST, 12)
+    record(tmp_path / SECOND, 12, "raw")
+    (tmp_path / "empty").mkdir()
+    flights = [tmp_path / FIRST, tmp_path / SECOND / "flight.mcap", tmp_path / "empty"]
+    out = tmp_path / "out"
+    settings = "--out", out, "--workers", 2, "--set", "depth.enabled=false"
+    done = batch(*flights, *settings)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("companion: empty: ")
+    assert "3 flights, 0 done before, 1 failed" in done.stdout
+    for name in (FIRST, SECOND):
+        assert json.loads((out / name / "report.json").read_text())["frames"] == 12
+    page = (out / "index.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 2
+    assert f'href="{FIRST}/report.html"' in page and "no video and no images" in page
+
+    stamps = [(out / name / "report.json").stat().st_mtime_ns for name in (FIRST, SECOND)]
+    record(tmp_path / "other" / SECOND, 10)
+    (tmp_path / "other" / SECOND / "flight.mcap").replace(tmp_path / SECOND / "flight.mcap")
+    done = batch(*flights[:2], *settings)
+    assert done.returncode == 0, done.stderr
+    assert "2 flights, 1 done before, 0 failed" in done.stdout
+    again = [(out / name / "report.json").stat().st_mtime_ns for name in (FIRST, SECOND)]
+    assert again[0] == stamps[0] and again[1] > stamps[1]
+    assert json.loads((out / SECOND / "report.json").read_text())["frames"] == 10
+
+
+def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
+    record(tmp_path / FIRST, 3)
+    done = batch(tmp_path / FIRST, "--out", tmp_path / "out", "--scheduler", "tcp://127.0.0.1:1")
+    assert done.returncode == 2
+    assert "tcp://127.0.0.1:1: there is no Dask scheduler" in done.stderr
