@@ -305,11 +305,11 @@ class DepthConfig:
     """Longest baseline used, as a share of the median depth."""
     lag_keyframes: Annotated[int, Range(1, 20)] = 2
     """A keyframe waits for so many later ones, whose frames and adjusted poses it uses."""
-    min_zncc: Annotated[float, Range(0, 1)] = 0.6
+    min_zncc: Annotated[float, Range(0, 1)] = 0.5
     """Least correlation of an image that is said to fit."""
-    noise_grey: Annotated[float, Range(0, 50)] = 1.5
+    noise_grey: Annotated[float, Range(0, 50)] = 1.0
     """Patches whose grey levels vary less than this are blank."""
-    converged_sigma: Annotated[float, Range(0.0001, 0.1)] = 0.01
+    converged_sigma: Annotated[float, Range(0.0001, 0.1)] = 0.012
     """Relative standard deviation at which a pixel has converged."""
     min_inlier_ratio: Annotated[float, Range(0, 1)] = 0.35
     """Share of images that fit, which a converged pixel has at least; some may not see it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,17 @@ from companion.depth.views import Intrinsics, Views
 from companion.geometry import Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
 
+STEP_PX = 0.75
+"""From plane to plane, in the image where points move most: nearer ones look the same."""
+LEAST_PLANES = 8
 LEAST_VIEWS = 3
 FIRST_SPREAD, NEXT_SPREAD = 0.05, 1.5
 """A sweep is due when the kept images lie so far apart, as a share of the depth; then whenever they
 lie so many times as far apart as they did."""
+
+
+SMOOTHING_SCALE = 8.0
+"""What the regulariser sees the range of inverse depths as."""
 
 
 class DepthEngine:
@@ -50,7 +58,7 @@ class DepthEngine:
         self._shape = self._sweep.grid[::-1]
         self._grey = np.zeros((height, width), np.uint8)
         self._labels = np.zeros(self._shape, np.uint8)
-        self._rho, self._step = (0.0, 0.0), 0.0
+        self._rho = (0.0, 0.0)
         self._events: list[tuple[str, cl.Event]] = []
         self._n_taken, self._n_swept, self._due = 0, 0, FIRST_SPREAD
 
@@ -69,7 +77,6 @@ class DepthEngine:
         self._events = []
         self._grey = grey
         self._rho = (1.0 / far, 1.0 / near)
-        self._step = (self._rho[1] - self._rho[0]) / (PLANES - 1)
         self._views.begin(*self._rho)
         self._sweep.set_reference(grey, self._run)
         self._labels[:] = PixelState.UPDATING.value
@@ -93,8 +100,11 @@ class DepthEngine:
 
     def _estimate(self) -> None:
         projections = self._views.projections()
-        self._sweep.run(projections, self._rho[0], self._step, self._run)
-        self._verification.run(projections, self._step, self._run)
+        wanted = math.ceil(self._views.parallax_px() / STEP_PX) + 1
+        n_planes = min(max(wanted, LEAST_PLANES), PLANES[-1])
+        step = (self._rho[1] - self._rho[0]) / (n_planes - 1)
+        self._sweep.run(projections, self._rho[0], step, n_planes, self._run)
+        self._verification.run(projections, step, self._run)
         self._device.read(self._labels, self._verification.label)
         self._n_swept = self._views.n_novel
 
@@ -133,7 +143,7 @@ class DepthEngine:
         low, high = self._rho
         stride = self._config.stride
         edge = edges(self._grey[::stride, ::stride].astype(np.float32))
-        scale = np.float32(PLANES / 16 / (high - low))
+        scale = np.float32(SMOOTHING_SCALE / (high - low))
         smooth = self._regularisation.run(
             (rho - np.float32(low)) * scale, weight * np.float32(self._config.regularise_weight),
             edge, self._config.regularise_iterations, self._run,

@@ -12,7 +12,9 @@ from companion.depth.views import MAX_VIEWS
 from companion.geometry import Array
 from companion.messages import Bytes
 
-PLANES = 128
+PLANES = (32, 64, 128)
+"""Numbers of planes that there are kernels for; each is a multiple of 16."""
+BLOCK = 8
 SMALL, LARGE = 3.5, 27.0
 """Penalties of a step by one plane and by more, in bits for each image that counts."""
 SOFT_GREY = 16
@@ -29,7 +31,7 @@ class PlaneSweep:
     """Buffers and kernels of a sweep for images of one size; results stay on the device.
 
     `rho` and `margin` hold, after `run`, inverse depth f32 on the grid (a median of 3 x 3) and by
-    how much, in proportion, the next best plane is worse.
+    how much, in proportion, the next best plane is worse; `noise` how rough the depth is there.
     """
 
     def __init__(self, device: ComputeDevice, width: int, height: int, stride: int) -> None:
@@ -39,9 +41,7 @@ class PlaneSweep:
         self.grid = (-(-width // stride), -(-height // stride))
         self._coarse = (-(-width // (2 * stride)), -(-height // (2 * stride)))
         n = self.grid[0] * self.grid[1]
-        program = device.build("sweep.cl", {"PLANES": PLANES})
-        names = ("census", "costs", "aggregate", "winner", "blocks_about", "median")
-        self._kernels = {name: cl.Kernel(program, name) for name in names}
+        self._kernels = {n: _kernels(device, n) for n in PLANES}
         self._n_pixels = width * height
         self.reference = device.buffer(self._n_pixels)
         self._words_r = device.buffer(4 * self._n_pixels)
@@ -51,10 +51,9 @@ class PlaneSweep:
         self._word = device.buffer(4 * self._n_pixels)
         self._views = device.buffer(4 * 12 * MAX_VIEWS)
         self._blocks = device.buffer(4 * n)
-        self._all_blocks = np.full(self._coarse[0] * self._coarse[1], 0xFFFFFFFF, np.uint32)
-        self._cost, self._sum = device.buffer(PLANES * n), device.buffer(2 * PLANES * n)
+        self._cost, self._sum = device.buffer(PLANES[-1] * n), device.buffer(2 * PLANES[-1] * n)
         self._winner = device.buffer(4 * n)
-        self.rho, self.margin = device.buffer(4 * n), device.buffer(4 * n)
+        self.rho, self.margin, self.noise = (device.buffer(4 * n) for _ in range(3))
 
     def set_reference(self, grey: Bytes, run: Run) -> None:
         """Take the reference image (H, W)."""
@@ -66,8 +65,13 @@ class PlaneSweep:
         self._device.write(self.images[slot], np.ascontiguousarray(grey))
         self._stale.add(slot)
 
-    def run(self, projections: Array, rho_low: float, step: float, run: Run) -> None:
-        """Sweep planes rho_low + k * step; `projections` (n, 12) of those in slots 0 to n-1."""
+    def run(self, projections: Array, rho_low: float, step: float, n_planes: int, run: Run) -> None:
+        """Sweep planes rho_low + k * step, at most `PLANES[-1]` of them.
+
+        `projections` (n, 12) are those of the images in slots 0 to n - 1.
+        """
+        planes = next(n for n in PLANES if n >= n_planes)
+        looked_at = (1 << -(-n_planes // BLOCK)) - 1
         n = len(projections)
         n_bytes = 4 * self._n_pixels
         for slot in sorted(self._stale):
@@ -78,18 +82,20 @@ class PlaneSweep:
         self._device.write(self._views, np.ascontiguousarray(projections, np.float32))
         for coarse in (True, False):
             if coarse:
-                self._device.write(self._blocks, self._all_blocks)
+                everywhere = np.full(self._coarse[0] * self._coarse[1], looked_at, np.uint32)
+                self._device.write(self._blocks, everywhere)
             else:
                 run(
-                    "blocks", self._kernels["blocks_about"], self.grid, (64, 1), self.rho,
+                    "blocks", self._kernels[planes]["blocks_about"], self.grid, (64, 1), self.rho,
                     *map(np.int32, self._coarse), np.float32(rho_low), np.float32(step),
-                    self._blocks, *map(np.int32, self.grid),
+                    np.uint32(looked_at), self._blocks, *map(np.int32, self.grid),
                 )  # fmt: skip
-            self._level(coarse, n, dropped, rho_low, step, run)
+            self._level(coarse, self._kernels[planes], n, dropped, rho_low, step, run)
 
     def _level(
-        self, coarse: bool, n: int, dropped: int, rho_low: float, step: float, run: Run
-    ) -> None:
+        self, coarse: bool, kernels: dict[str, cl.Kernel], n: int, dropped: int,
+        rho_low: float, step: float, run: Run,
+    ) -> None:  # fmt: skip
         grid = tuple(map(np.int32, self._coarse if coarse else self.grid))
         stride = np.int32(self.stride * (2 if coarse else 1))
         width, height = map(np.int32, self.size)
@@ -97,29 +103,42 @@ class PlaneSweep:
         small, large = int(SMALL * counted), int(LARGE * counted)
         level = "coarse" if coarse else "fine"
         run(
-            f"costs {level}", self._kernels["costs"], grid, (16, 1), self._words_r, self._words,
+            f"costs {level}", kernels["costs"], grid, (16, 1), self._words_r, self._words,
             width, height, self._views, np.int32(n), np.int32(dropped), np.float32(rho_low),
             np.float32(step), self._blocks, np.int32(UNLOOKED * counted), self._cost, *grid, stride,
         )  # fmt: skip
         for k, (dx, dy) in enumerate(COARSE_PATHS if coarse else PATHS):
             run(
-                f"aggregate {level}", self._kernels["aggregate"], (grid[0] if dy else grid[1],),
+                f"aggregate {level}", kernels["aggregate"], (grid[0] if dy else grid[1],),
                 (8,), self._cost, self._sum, self.reference, width, *grid, stride, np.int32(dx),
                 np.int32(dy), np.int32(small), np.int32(large), np.int32(SOFT_GREY),
                 np.int32(k == 0),
             )  # fmt: skip
         n_cells = grid[0] * grid[1]
         run(
-            f"winner {level}", self._kernels["winner"], (n_cells,), (64,), self._sum, n_cells,
+            f"winner {level}", kernels["winner"], (n_cells,), (64,), self._sum, n_cells,
             np.float32(rho_low), np.float32(step), self._winner, self.margin,
         )  # fmt: skip
         run(
-            f"median {level}", self._kernels["median"], grid, (64, 1), self._winner, *grid, self.rho
+            f"median {level}",
+            kernels["median"],
+            grid,
+            (64, 1),
+            self._winner,
+            *grid,
+            self.rho,
+            self.noise,
         )
 
     def _census(self, image: cl.Buffer, words: cl.Buffer, run: Run) -> None:
         width, height = self.size
         run(
-            "census", self._kernels["census"], (-(-width // 8), height), (16, 1), image,
+            "census", self._kernels[PLANES[0]]["census"], (-(-width // 8), height), (16, 1), image,
             np.int32(width), np.int32(height), words,
         )  # fmt: skip
+
+
+def _kernels(device: ComputeDevice, planes: int) -> dict[str, cl.Kernel]:
+    program = device.build("sweep.cl", {"PLANES": planes})
+    names = ("census", "costs", "aggregate", "winner", "blocks_about", "median")
+    return {name: cl.Kernel(program, name) for name in names}

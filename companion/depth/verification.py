@@ -40,8 +40,8 @@ class Verification:
         grid = tuple(map(np.int32, sweep.grid))
         width, height = map(np.int32, sweep.size)
         stride = np.int32(sweep.stride)
-        self._device.write(self._good, self._zeros)
-        self._device.write(self._bad, self._zeros)
+        for counts in (self._good, self._bad):
+            self._device.write(counts, self._zeros)
         run(
             "grey", self._kernels["to_grid"], grid, (64, 1), sweep.reference, width, self._grey,
             *grid, stride,
@@ -63,6 +63,6 @@ class Verification:
         )  # fmt: skip
         run(
             "judge", self._kernels["judge"], grid, (64, 1), sweep.rho, sweep.margin, self._good,
-            self._bad, np.float32(step), np.array(accept, np.float32), np.int32(BORDER), self.sigma,
-            self.ratio, self.label, self.weight, *grid,
+            self._bad, sweep.noise, np.float32(step), np.array(accept, np.float32),
+            np.int32(BORDER), self.sigma, self.ratio, self.label, self.weight, *grid,
         )  # fmt: skip

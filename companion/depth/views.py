@@ -58,7 +58,7 @@ class Views:
         self._rays = np.stack(
             [(u.ravel() - self._k.cx) / self._k.fx, (v.ravel() - self._k.cy) / self._k.fy, ones], 1
         )
-        self._rho = 1.0
+        self._rho, self._range = 1.0, (1.0, 1.0)
         self.kept: list[View] = []
         self.n_novel = 0
         """Images since `begin` that were worth keeping, whether they still are kept or not."""
@@ -67,6 +67,7 @@ class Views:
     def begin(self, rho_low: float, rho_high: float) -> None:
         """Forget all; depths of the new reference have inverses between these two."""
         self._rho = 0.5 * (rho_low + rho_high)
+        self._range = (rho_high, rho_low)
         self.kept = []
         self.n_novel = 0
         self._seen = [np.zeros(3)]
@@ -132,6 +133,22 @@ class Views:
         order = np.sort(relative, axis=1)
         # of the nearest two the one whose next neighbour is nearer
         return int(np.lexsort((order[:, 1], order[:, 0]))[0])
+
+    def parallax_px(self) -> float:
+        """By how many pixels a point moves between the least and the greatest depth, at most.
+
+        Of the kept images the one where it moves most, and there the median over the image.
+        """
+        most = 0.0
+        for view in self.kept:
+            near, far = (view.current_from_reference.apply(self._rays / rho) for rho in self._range)
+            front = (near[:, 2] > 1e-6) & (far[:, 2] > 1e-6)
+            if front.any():
+                a, b = near[front], far[front]
+                move = a[:, :2] / a[:, 2:] - b[:, :2] / b[:, 2:]
+                length = np.linalg.norm(move * [self._k.fx, self._k.fy], axis=1)
+                most = max(most, float(np.median(length)))
+        return most
 
     def projections(self) -> Array:
         """(n, 12) f32, in order of slots: rows of K (R | t) K^-1, the last column K t."""

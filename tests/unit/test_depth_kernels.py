@@ -157,10 +157,17 @@ def test_median(device: ComputeDevice, sweep: cl.Program, rng: np.random.Generat
     values = rng.uniform(0, 1, (21, 37)).astype(np.float32)
     out = np.zeros_like(values)
     buffer = put(device, out)
-    run(device, sweep, "median", (37, 21), put(device, values), *i32(37, 21), buffer)
+    noise = put(device, out)
+    run(device, sweep, "median", (37, 21), put(device, values), *i32(37, 21), buffer, noise)
     device.read(out, buffer)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(values, 1, mode="edge"), (3, 3))
     np.testing.assert_array_equal(out, np.median(around, axis=(2, 3)))
+    device.read(out, noise)
+    pairs = [
+        (around[..., j, i], around[..., 2 - j, 2 - i]) for j, i in ((0, 0), (0, 1), (0, 2), (1, 0))
+    ]
+    second = sum(np.abs(a + b - 2 * around[..., 1, 1]) for a, b in pairs)
+    np.testing.assert_allclose(out, second / (4 * 1.95), atol=1e-6)
 
 
 def test_blocks_hold_the_planes_of_the_coarse_neighbours(
@@ -173,13 +180,14 @@ def test_blocks_hold_the_planes_of_the_coarse_neighbours(
     buffer = put(device, out)
     run(
         device, sweep, "blocks_about", fine, put(device, rho), *i32(*coarse), np.float32(0.1),
-        np.float32(0.02), buffer, *i32(*fine),
+        np.float32(0.02), np.uint32(0b0111), buffer, *i32(*fine),
     )  # fmt: skip
     device.read(out, buffer)
     for y, x in np.ndindex(out.shape):
         for cy, cx in ((y // 2, x // 2), (min((y + 1) // 2, 10), min((x + 1) // 2, 16))):
-            assert out[y, x] >> (int(planes[cy, cx]) // 8) & 1
-    assert not (out >> np.uint32(PLANES // 8)).any()
+            block = int(planes[cy, cx]) // 8
+            assert out[y, x] >> block & 1 == (block < 3)
+    assert not (out >> np.uint32(3)).any()
 
 
 @pytest.mark.parametrize(("width", "height", "stride"), [(65, 49, 1), (97, 66, 2), (40, 48, 3)])

@@ -10,6 +10,8 @@
 #define WINDOW 2
 #define AREA 25.0f
 #define UNSEEN -1e4f
+/* How much of the noise of neighbours counts. */
+#define ROUGH 1.0f
 
 typedef float8 float8_anywhere __attribute__((aligned(4)));
 
@@ -134,7 +136,7 @@ __kernel void verify(__global const float *reference, __global const float *valu
  * The error of a winner was found to be 0.15 planes where it stands out, and 0.2 planes / margin where
  * it does not, whatever the scene (companion/depth/README.md). */
 __kernel void judge(__global const float *rho, __global const float *margin, __global const float *good,
-                    __global const float *bad, const float step, const float4 accept, const int border,
+                    __global const float *bad, __global const float *noise, const float step, const float4 accept, const int border,
                     __global float *sigma, __global float *ratio, __global uchar *label,
                     __global float *weight, const int grid_width, const int grid_height)
 {
@@ -144,7 +146,8 @@ __kernel void judge(__global const float *rho, __global const float *margin, __g
     const int cell = y * grid_width + x;
     const float r = rho[cell], g = good[cell], b = bad[cell];
     const float unsure = 0.2f / (margin[cell] > 0.01f ? margin[cell] : 0.01f);
-    const float s = step * sqrt(0.0225f + unsure * unsure);
+    const float rough = ROUGH * noise[cell] / step;
+    const float s = step * sqrt(0.0225f + unsure * unsure + rough * rough);
     const float share = (g + 1.0f) / (g + b + 2.0f);
     const bool outer = x < border || y < border || x >= grid_width - border || y >= grid_height - border;
     const bool done = g >= accept.w && share >= accept.y && s < accept.x * r;

@@ -240,9 +240,10 @@ __kernel void winner(__global const ushort *sum, const int n, const float rho0, 
 }
 
 /* Blocks of planes that a fine grid pixel should look at: those about the planes of the coarse grid
- * pixels around it; all where `margin` says that the coarse one is a guess. Grid: fine pixels. */
+ * pixels around it, of those allowed. Grid: fine pixels. */
 __kernel void blocks_about(__global const float *rho, const int coarse_width, const int coarse_height,
-                           const float rho0, const float step, __global uint *blocks,
+                           const float rho0, const float step, const uint allowed,
+                           __global uint *blocks,
                            const int grid_width, const int grid_height)
 {
     const int gx = get_global_id(0), gy = get_global_id(1);
@@ -258,11 +259,13 @@ __kernel void blocks_about(__global const float *rho, const int coarse_width, co
             bits |= 1u << inside(plane - 2, PLANES - 1) / BLOCK;
             bits |= 1u << inside(plane + 2, PLANES - 1) / BLOCK;
         }
-    blocks[gy * grid_width + gx] = bits;
+    blocks[gy * grid_width + gx] = bits & allowed;
 }
 
-/* Median of 3 x 3. Grid: width x height. */
-__kernel void median(__global const float *in, const int width, const int height, __global float *out)
+/* Median of 3 x 3, and the noise there as one standard deviation: from second differences, which a
+ * slope does not raise. Grid: width x height. */
+__kernel void median(__global const float *in, const int width, const int height, __global float *out,
+                     __global float *noise)
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height)
@@ -271,6 +274,9 @@ __kernel void median(__global const float *in, const int width, const int height
     for (int j = 0; j < 3; ++j)
         for (int i = 0; i < 3; ++i)
             v[3 * j + i] = in[inside(y + j - 1, height - 1) * width + inside(x + i - 1, width - 1)];
+    /* of independent noise, a second difference has 1.95 times its deviation on average */
+    noise[y * width + x] = (fabs(v[0] + v[8] - 2 * v[4]) + fabs(v[1] + v[7] - 2 * v[4])
+                            + fabs(v[2] + v[6] - 2 * v[4]) + fabs(v[3] + v[5] - 2 * v[4])) / (4 * 1.95f);
 #define SORT(a, b) { const float low = v[a] < v[b] ? v[a] : v[b]; v[b] = v[a] < v[b] ? v[b] : v[a]; v[a] = low; }
     SORT(1, 2) SORT(4, 5) SORT(7, 8) SORT(0, 1) SORT(3, 4) SORT(6, 7) SORT(1, 2) SORT(4, 5) SORT(7, 8)
     SORT(0, 3) SORT(5, 8) SORT(4, 7) SORT(3, 6) SORT(1, 4) SORT(2, 5) SORT(4, 7) SORT(4, 2) SORT(6, 4)
