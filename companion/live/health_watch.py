@@ -33,7 +33,9 @@ from drivers.system_load import SystemLoad
 
 GOVERN_NS = 1_000_000_000
 STUCK_NS = 3_000_000_000
-"""Frames come but no track does: the pose loop hangs."""
+"""Frames come but no track does: the pose loop hangs,"""
+BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
+"""unless it works: then the computer has too much else to do, and it is given longer."""
 START_S = 30.0
 """A localisation that is not ready by then never will be."""
 NO_SIGN_S = 10.0
@@ -136,7 +138,11 @@ class HealthWatch:
         if flight is None or not flight.ready or not frames_come:
             self._odometry_ns = max(self._odometry_ns, now_ns - STUCK_NS // 2)
             return flight is None or flight.ready or flight.duration_s < START_S
-        return now_ns - self._odometry_ns < STUCK_NS
+        works = any(
+            each.name == "localisation" and each.cpu_cores > BUSY_CORES
+            for each in self.load.processes
+        )
+        return now_ns - self._odometry_ns < (BUSY_STUCK_NS if works else STUCK_NS)
 
     def kill_stuck(self) -> None:
         """End a localisation that hangs, so that another takes its place."""

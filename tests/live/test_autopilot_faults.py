@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.support.flying import Flying, source
 
-LASTS_S = 2.5
+LASTS_S = 2.0
 """Of what goes on for a while."""
 JUMPS = """
 import os, sys, time
