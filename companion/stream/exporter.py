@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from companion.clock import monotonic_s
 from companion.errors import StreamError
 from companion.stream.connection import Connection
+from companion.stream.datagrams import Datagrams
 from companion.stream.items import Item
 from companion.stream.parts import Part
 from companion.stream.session import Session
@@ -33,6 +34,7 @@ class Exporter:
         self._budget = Budget(budget_kbit_s)
         self._lock = threading.Lock()
         self._selector = selectors.DefaultSelector()
+        self._datagrams: list[Datagrams] = []
         self._connections: list[Connection] = []
         self._given: dict[Connection, int] = {}
         self._sessions: OrderedDict[bytes, Session] = OrderedDict()
@@ -53,6 +55,10 @@ class Exporter:
         """Take viewers that connect there; to be called before `run`."""
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
+        with contextlib.suppress(OSError):  # somebody has that port: poses go with all else
+            datagrams = Datagrams(listener)
+            self._datagrams.append(datagrams)
+            self._selector.register(datagrams.socket, selectors.EVENT_READ)
 
     def stop(self) -> None:
         """End `run`; from any thread."""
@@ -88,6 +94,8 @@ class Exporter:
         finally:
             for connection in list(self._connections):
                 self._forget(connection)
+            for datagrams in self._datagrams:
+                datagrams.socket.close()
             self._selector.close()
             self._wake.close()
             self._woken.close()
@@ -98,6 +106,11 @@ class Exporter:
             with contextlib.suppress(BlockingIOError):
                 self._woken.recv(4096)
             return
+        for datagrams in self._datagrams:
+            if fileobj is datagrams.socket:
+                connected = {c.viewer: c.peer for c in self._connections if c.viewer is not None}
+                datagrams.hear(now_s, connected)
+                return
         connection = next((c for c in self._connections if c.socket is fileobj), None)
         if connection is None:
             assert isinstance(fileobj, socket.socket)
@@ -165,6 +178,7 @@ class Exporter:
                 raise StreamError("it does not say who it is")
             return
         connection.session.limit_bytes_s = self._budget.bytes_s / n_viewers
+        self._send_pose(connection.session, connection.viewer, now_s)
         for _ in range(PIECES_AT_ONCE):
             with self._lock:
                 n = connection.send(now_s, self._budget.room_bytes(now_s))
@@ -175,6 +189,17 @@ class Exporter:
         else:
             self._rouse()
         self._budget.charge(connection.wire_bytes(self._given[connection]))
+
+    def _send_pose(self, session: Session, viewer: bytes | None, now_s: float) -> None:
+        """The newest pose by datagram, where that may get through."""
+        datagrams = next((d for d in self._datagrams if viewer and d.is_heard(viewer)), None)
+        session.datagrams_work = bool(datagrams and viewer and datagrams.work(viewer, now_s))
+        if datagrams is None or viewer is None or not self._budget.room_bytes(now_s):
+            return
+        with self._lock:
+            data = session.next_datagram(now_s)
+        if data is not None:
+            self._budget.charge(datagrams.send(viewer, data))
 
     def _forget(self, connection: Connection) -> None:
         if connection in self._connections:

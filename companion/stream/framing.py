@@ -6,6 +6,11 @@ says only that the drone is there.
 
 To the drone: HELLO, 16 bytes that name the viewer, then again and again how many bytes it has taken
 in all (u64). Everything is little-endian.
+
+Beside it go datagrams over UDP, between the same ports: to the drone HELLO, the name, and how many
+have come (u32), once a second; from the drone kind and payload of a pose, which so does not wait
+until TCP has repaired what was lost before it. Where datagrams do not get through, nothing is
+missing.
 """
 
 from __future__ import annotations
@@ -18,6 +23,7 @@ HELLO = b"CMPV\x01"
 VIEWER_BYTES = 16
 HELLO_BYTES = len(HELLO) + VIEWER_BYTES
 TAKEN = struct.Struct("<Q")
+COUNT = struct.Struct("<I")
 HEAD = struct.Struct("<BH")
 HEAD_BYTES = HEAD.size
 LAST = 0x80
@@ -27,6 +33,19 @@ MOST_ITEM_BYTES = 16 << 20
 def frame(kind: int, piece: bytes, is_last: bool) -> bytes:
     """A piece as it goes over the wire."""
     return HEAD.pack(kind | (LAST if is_last else 0), len(piece)) + piece
+
+
+def greeting(viewer: bytes, n_came: int) -> bytes:
+    """The viewer's datagram."""
+    return HELLO + viewer + COUNT.pack(n_came & 0xFFFFFFFF)
+
+
+def greeted(data: bytes) -> tuple[bytes, int] | None:
+    """Name and count of such a datagram; None for any other."""
+    if len(data) != HELLO_BYTES + COUNT.size or not data.startswith(HELLO):
+        return None
+    (n_came,) = COUNT.unpack(data[HELLO_BYTES:])
+    return data[len(HELLO) : HELLO_BYTES], n_came
 
 
 class Reassembly:

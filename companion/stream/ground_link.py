@@ -7,16 +7,17 @@ the drone send less.
 from __future__ import annotations
 
 import os
+import select
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 
 from companion.clock import monotonic_s, wait_s
 from companion.errors import StreamError
 from companion.stream.encoding import decode
-from companion.stream.framing import HELLO, TAKEN, VIEWER_BYTES, Reassembly
-from companion.stream.items import Item
+from companion.stream.framing import HELLO, TAKEN, VIEWER_BYTES, Reassembly, greeting
+from companion.stream.items import Item, PoseItem
 
 PORT = 9870
 CONNECT_S = 1.0
@@ -27,6 +28,7 @@ SILENT_S = 3.0
 dead."""
 TAKE_EVERY_S, TAKE_EVERY_BYTES = 0.04, 8192
 RECEIVE_BYTES = 65536
+GREET_EVERY_S = 1.0
 
 
 class GroundLink:
@@ -42,7 +44,8 @@ class GroundLink:
         self._told, self._again = told, again
         self._viewer = os.urandom(VIEWER_BYTES)
         self.n_connections = 0
-        self.n_bytes = 0
+        self.n_bytes = self.n_datagrams = 0
+        self._pose_ns = -(2**63)
 
     def items(self, stop: threading.Event) -> Iterator[Item]:
         """What the drone sends; an item is acknowledged when the next one is asked for.
@@ -62,9 +65,9 @@ class GroundLink:
             self._told(f"connected to {self.host}:{self.port}")
             is_away = False
             self.n_connections += 1
-            with closing(opened):
+            with closing(opened), closing(self._datagrams()) as datagrams:
                 try:
-                    yield from self._received(opened, stop)
+                    yield from self._received(opened, datagrams, stop)
                 except OSError as error:
                     self._told(f"the link to {self.host} is lost ({error.strerror or error})")
                     if not self._again:
@@ -74,27 +77,62 @@ class GroundLink:
     def _connect(self) -> socket.socket:
         opened = socket.create_connection((self.host, self.port), timeout=CONNECT_S)
         opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        opened.settimeout(TAKE_EVERY_S)
         opened.sendall(HELLO + self._viewer)
+        opened.setblocking(False)
         return opened
 
-    def _received(self, opened: socket.socket, stop: threading.Event) -> Iterator[Item]:
+    def _datagrams(self) -> socket.socket:
+        """What brings poses beside the connection, where it can."""
+        found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_DGRAM)[0]
+        opened = socket.socket(found[0], socket.SOCK_DGRAM)
+        opened.setblocking(False)
+        opened.connect(found[4])
+        return opened
+
+    def _poses(self, datagrams: socket.socket) -> Iterator[PoseItem]:
+        """Poses that have come beside the connection, and are the newest."""
+        with suppress(OSError):  # nothing more, or nobody there
+            while True:
+                data = datagrams.recv(256)
+                self.n_datagrams += 1
+                item = decode(data[0], data[1:]) if data else None
+                if isinstance(item, PoseItem) and item.t_ns > self._pose_ns:
+                    self._pose_ns = item.t_ns
+                    yield item
+
+    def _received(
+        self, opened: socket.socket, datagrams: socket.socket, stop: threading.Event
+    ) -> Iterator[Item]:
         parts = Reassembly()
         n_taken = n_acknowledged = 0
         heard_s = acknowledged_s = monotonic_s()
+        greeted_s = 0.0
+        self._pose_ns = -(2**63)
         while not stop.is_set():
+            select.select([opened, datagrams], [], [], TAKE_EVERY_S)
+            yield from self._poses(datagrams)
             try:
                 data = opened.recv(RECEIVE_BYTES)
-            except TimeoutError:
+            except BlockingIOError:
                 data = None
             if data == b"":
                 raise ConnectionResetError("closed by the drone")
             now_s = monotonic_s()
+            if now_s - greeted_s > GREET_EVERY_S:
+                greeted_s = now_s
+                with suppress(OSError):  # nobody hears it, and TCP brings all
+                    datagrams.send(greeting(self._viewer, self.n_datagrams))
             if data is not None:
                 heard_s = now_s
                 for kind, payload in parts.take(data):
-                    if kind != 0:
-                        yield decode(kind, payload)
+                    item = decode(kind, payload) if kind != 0 else None
+                    if isinstance(item, PoseItem):
+                        if item.t_ns <= self._pose_ns:
+                            continue  # a newer one has come already
+                        self._pose_ns = item.t_ns
+                    if item is not None:
+                        yield item
+                        yield from self._poses(datagrams)
                 n_taken += len(data)
                 self.n_bytes += len(data)
                 now_s = monotonic_s()

@@ -29,6 +29,8 @@ PICTURE_SHARE = 0.15
 MOST_CREDIT_BYTES = 20_000
 POSE_SHARE, POSE_BYTES = 0.15, 120
 MOST_POSES_HZ, LEAST_POSES_HZ = 30.0, 2.0
+POSES_BESIDE_HZ = 2.0
+"""Poses over the connection where datagrams bring them as well."""
 STATUS_EVERY_S, ALIVE_EVERY_S = 1.0, 0.5
 PICTURES_HZ = 15.0
 PLACES_AT_ONCE = 40
@@ -60,6 +62,10 @@ class Session:
         self._went_s = dict.fromkeys((*ORDER, None), -1e9)
         self._pictures = Pictures()
         self._credit = 0.0
+        self._pose_is_new = False
+        self._datagram_s = -1e9
+        self.datagrams_work = False
+        """Whether poses get through beside the connection."""
         self.limit_bytes_s = 0.0
         """What the budget allows this viewer; 0 for no limit."""
         self.n_skipped: Counter[str] = Counter()
@@ -71,8 +77,11 @@ class Session:
     def changed(self, kind: Kind, key: Hashable) -> None:
         """There is a new one of a kind."""
         waiting = self._waiting[kind]
-        if kind in (Kind.POSE, Kind.PICTURE) and key in waiting:
-            self.n_skipped["poses" if kind is Kind.POSE else "pictures"] += 1
+        if kind is Kind.POSE:
+            self.n_skipped["poses"] += self._pose_is_new
+            self._pose_is_new = True
+        elif kind is Kind.PICTURE:
+            self.n_skipped["pictures"] += key in waiting
         waiting.pop(key, None)  # so that the newest is the last
         waiting[key] = None
 
@@ -109,6 +118,15 @@ class Session:
     def is_complete(self) -> bool:
         """Whether it has taken all there is."""
         return not self._on_way and not self._going and not any(self._waiting.values())
+
+    def next_datagram(self, now_s: float) -> bytes | None:
+        """The newest pose, if it is time for it and it has not been sent."""
+        every_s = self._pose_every_s() if self.datagrams_work else 1.0 / POSES_BESIDE_HZ
+        if not self._pose_is_new or now_s - self._datagram_s < every_s:
+            return None
+        self._pose_is_new, self._datagram_s = False, now_s
+        payload = self._store.get(Kind.POSE, NEWEST)
+        return bytes([Kind.POSE]) + payload if payload is not None else None
 
     def next_piece(self, now_s: float, most_bytes: int) -> bytes | None:
         """A piece of what comes next, framed; None if there is nothing now, or no room for it."""
@@ -172,10 +190,14 @@ class Session:
 
     def _every_s(self, kind: Kind, rate: float) -> float:
         if kind is Kind.POSE:
-            return 1.0 / min(max(POSE_SHARE * rate / POSE_BYTES, LEAST_POSES_HZ), MOST_POSES_HZ)
+            return 1.0 / POSES_BESIDE_HZ if self.datagrams_work else self._pose_every_s()
         if kind is Kind.STATUS:
             return STATUS_EVERY_S
         return 1.0 / PICTURES_HZ if kind in PICTURES else 0.0
+
+    def _pose_every_s(self) -> float:
+        often = POSE_SHARE * self.rate_bytes_s / POSE_BYTES
+        return 1.0 / min(max(often, LEAST_POSES_HZ), MOST_POSES_HZ)
 
     def _taken(self, kind: Kind, now_s: float, share: float) -> tuple[Keys, bytes | None]:
         """Take out what waits, newest first; log lines, which a person reads, oldest first."""
@@ -189,6 +211,8 @@ class Session:
             del waiting[key]
         else:
             key = waiting.popitem()[0]
+        if kind is Kind.POSE:
+            self._pose_is_new = False
         if kind is Kind.STATUS:
             return [key], self._status(now_s)
         if kind is Kind.PICTURE:

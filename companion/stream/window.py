@@ -16,7 +16,8 @@ MOST_BYTES = 4 << 20
 QUEUE_S = 0.05
 """Delay beyond the least that counts as a queue."""
 STANDING_S = 0.1
-"""The standing delay is over so long, or a round trip where that is longer."""
+"""The standing delay is over so long, or two round trips where that is longer: what repairs a loss
+delays all that follows it by one."""
 FORGET_S = 20.0
 """The least round trip is that of the last so long, or twice so long."""
 SHRINK = 0.8
@@ -94,7 +95,7 @@ class Window:
     def _adjust(self, now_s: float, round_trip_s: float, n_new: int) -> None:
         least_s = self._least_s(now_s, round_trip_s)
         self._standing.append((now_s, round_trip_s))
-        while self._standing[0][0] < now_s - max(STANDING_S, least_s):
+        while self._standing[0][0] < now_s - max(STANDING_S, 2 * least_s):
             self._standing.popleft()
         queue_s = min(r for _, r in self._standing) - least_s
         if queue_s > QUEUE_S:

@@ -132,7 +132,7 @@ class Drawing:
             self._rec.log("log", rr.TextLog(item.text, level=level))
         elif isinstance(item, DepthItem):
             for kernel, ms in item.kernel_ms.items():
-                self._rec.log(f"plots/kernels/{kernel}", rr.Scalars(float(ms)))
+                self._plot(f"kernels/{kernel.replace(' ', '-')}", ms)
             image = rr.EncodedImage(contents=item.image, media_type=item.media_type)
             self._rec.log("depth", image)
         elif isinstance(item, SparseItem):
