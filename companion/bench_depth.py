@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.clock import StageTimes, cpu_s
+from companion.clock import StageTimes, cpu_s, monotonic_s
 from companion.config import Config
+from companion.depth.device_choice import choose_device
 from companion.depth.engine import DepthEngine
-from companion.depth.opencl import open_device
 from companion.depth.undistortion import Undistortion
 from companion.depth.views import Intrinsics
 from companion.depth_accuracy import Accuracy, accuracy
@@ -108,7 +108,7 @@ def bench_depth(
     """Measure, and write depth_bench.json and pictures into `out`; FlightError without truth."""
     images = open_posed_images(path)
     scene = _scene(images, reference, frames)
-    device = open_device(config.opencl)
+    device = choose_device(config.opencl, monotonic_s)
     full = replace(config.depth, stride=1)
     height, width = scene.grey.shape
     engine = DepthEngine(device, width, height, scene.intrinsics, full)
@@ -149,7 +149,7 @@ def bench_depth(
     finally:
         progress.finish()
     bench = DepthBench(
-        str(path), device.name, width, height, len(scene.others), searched, tuple(runs),
+        str(path), device.described, width, height, len(scene.others), searched, tuple(runs),
         {name: round(ms, 2) for name, ms in depth_map.kernel_ms.items()}, tuple(after),
         tuple(serial_after), tuple(thresholds),
     )  # fmt: skip

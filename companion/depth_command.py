@@ -8,11 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from companion.clock import StageTimes
+from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
+from companion.depth.device_choice import choose_device
 from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion
-from companion.depth.opencl import ComputeDevice, open_device
+from companion.depth.opencl import ComputeDevice
 from companion.depth.undistortion import Undistortion
 from companion.errors import FlightError
 from companion.geometry import Array, Pose
@@ -107,7 +108,7 @@ def reconstruct(
 ) -> list[DepthMap]:
     """Write depth of the wanted references, their cloud and depth.json into the folder `out`."""
     images = open_posed_images(path)
-    device = open_device(config.opencl)
+    device = choose_device(config.opencl, monotonic_s)
     work = Reconstruction(images, config, device)
     positions = _positions(images, wanted.frames)
     references = _references(images, positions, wanted, config)
@@ -136,7 +137,7 @@ def reconstruct(
     chunks += fusion.flush(update) if len(references) > 1 else _alone(done[0])
     write_cloud(out, chunks, places)
     write_log(
-        out, device=device.name, layout=images.layout, maps=done, frames=log,
+        out, device=device.described, layout=images.layout, maps=done, frames=log,
         stages=work.times.summary(),
     )  # fmt: skip
     return done

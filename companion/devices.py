@@ -7,22 +7,20 @@ import json
 from itertools import groupby
 from typing import Any
 
-from companion.depth.opencl import device_names
+from companion.clock import monotonic_s
+from companion.depth.device_choice import MeasuredDevice, measured_devices
 from drivers.camera_devices import CameraControl, CameraDevice, CameraFormat, cameras
 from drivers.serial_devices import SerialDevice, serial_devices
 
 
 def devices(as_json: bool) -> str:
     """Cameras, serial ports and OpenCL devices, as text for people or as JSON."""
-    found_cameras, found_ports, compute = cameras(), serial_devices(), device_names()
+    found_cameras, found_ports, compute = cameras(), serial_devices(), measured_devices(monotonic_s)
     if as_json:
         document = {
             "cameras": [_plain(each) for each in found_cameras],
             "serial_ports": [_plain(each) for each in found_ports],
-            "opencl_devices": [
-                {"number": number, "name": name, "platform": platform}
-                for number, name, platform in compute
-            ],
+            "opencl_devices": [dataclasses.asdict(device) for device in compute],
         }
         return json.dumps(document, indent=2, ensure_ascii=False)
     lines = ["Cameras (camera.device)"]
@@ -33,10 +31,13 @@ def devices(as_json: bool) -> str:
     lines.append('Serial ports (link.url = "serial:PORT:auto")')
     lines += [_port(port) for port in found_ports] or ["  none"]
     lines.append("OpenCL devices (opencl.device)")
-    lines += [f"  {number}  {name} ({platform})" for number, name, platform in compute] or [
-        "  none"
-    ]
+    lines += [_compute(device) for device in compute] or ["  none"]
     return "\n".join(lines)
+
+
+def _compute(device: MeasuredDevice) -> str:
+    speed = device.problem or f"{device.frames_per_s:.0f} frames/s of 640 x 480"
+    return f"  {device.number}  {device.name} ({device.platform}): {speed}"
 
 
 def _plain(device: CameraDevice | SerialDevice) -> dict[str, Any]:

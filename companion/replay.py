@@ -11,7 +11,8 @@ from pathlib import Path
 from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
 from companion.config_file import shown, without_passwords
-from companion.depth.opencl import ComputeDevice, open_device
+from companion.depth.device_choice import choose_device
+from companion.depth.opencl import ComputeDevice
 from companion.depth.stage import DepthStage
 from companion.errors import FlightError
 from companion.gaps import with_gaps_named
@@ -50,7 +51,7 @@ def replay(
     flight = open_flight(flight_path, config.camera, config.telemetry)
     start_ns, stop_ns = _span(flight, start_s, stop_s)
     log = flight.telemetry()
-    device = open_device(config.opencl) if config.depth.enabled else None
+    device = choose_device(config.opencl, monotonic_s) if config.depth.enabled else None
     out.mkdir(parents=True, exist_ok=True)
     times = StageTimes()
     result = FlightResult()
@@ -84,7 +85,7 @@ def replay(
             facts = RunFacts(
                 stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
                 origin=log.origin if _has_origin(result) else None,
-                device=device.name if device else "none (depth.enabled = false)",
+                device=device.described if device else "none (depth.enabled = false)",
                 config=shown(config), versions=versions(),
                 command=without_passwords(shlex.join(sys.argv)),
                 peak_memory_mb=peak_memory_mb(), camera=flight.camera,

@@ -24,11 +24,18 @@ class ComputeDevice:
 
     def __init__(self, device: cl.Device) -> None:
         self.device = device
+        self.why = ""
+        """Why it was taken, where it was chosen among others."""
         self.name = f"{device.name.strip()} ({device.platform.name.strip()})"
         self.context = cl.Context([device])
         self.queue = cl.CommandQueue(
             self.context, properties=cl.command_queue_properties.PROFILING_ENABLE
         )
+
+    @property
+    def described(self) -> str:
+        """Its name, and why it was taken."""
+        return f"{self.name}, {self.why}" if self.why else self.name
 
     def build(self, source_name: str, constants: dict[str, int]) -> cl.Program:
         """Build kernels/`source_name` with -D constants; DeviceError with the compiler's log."""

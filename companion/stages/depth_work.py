@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from companion.depth.opencl import open_device
+from companion.clock import monotonic_s
+from companion.depth.device_choice import choose_device
 from companion.depth.stage import DepthStage
 from companion.messages import Message
 from companion.stages.protocol import Finish, SetShare, Setup
@@ -15,8 +16,8 @@ from companion.stages.work import Work
 class _Depth(Work):
     def __init__(self, setup: Setup) -> None:
         super().__init__()
-        opened = open_device(setup.config.opencl)
-        self.device = opened.name
+        opened = choose_device(setup.config.opencl, monotonic_s)
+        self.device = opened.described
         self._stage = DepthStage(
             setup.config.depth, setup.config.cloud, setup.camera, opened, self.times
         )

@@ -16,7 +16,9 @@
 #define BLOCKS (PLANES / BLOCK)
 #define LANES (PLANES / 16)
 /* Of 24 bits: what two patches that have nothing in common differ by. */
+#ifndef UNRELATED
 #define UNRELATED 12
+#endif
 
 typedef uchar8 uchar8_anywhere __attribute__((aligned(1)));
 typedef uint8 uint8_anywhere __attribute__((aligned(4)));

@@ -1,0 +1,120 @@
+"""Whether a device computes what it should, and how fast: a small scene with a known answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import resources
+
+import numpy as np
+
+from companion.config import DepthConfig
+from companion.depth.engine import DepthEngine
+from companion.depth.opencl import ComputeDevice
+from companion.depth.views import Intrinsics
+from companion.errors import DeviceError
+from companion.geometry import Array, Pose
+from companion.messages import Bytes, DepthMap
+
+VALUES = "self_test.npz"
+SIZE = (97, 65)
+"""Odd, so that rows and vectors do not line up."""
+FAR, NEAR = 10.0, 5.0
+SHIFTS_PX = ((4, 0), (-4, 0), (0, 4), (6, 4), (-6, -4), (8, -4))
+"""By how much the far plane moves in each image; the near one moves by twice that."""
+NOISE = 0.005
+"""Relative difference of depth up to which two devices agree: they round differently."""
+LEAST_AGREEING = 0.99
+SPEED_SIZE = (640, 480)
+SPEED_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Images of a square before a wall, the first the reference, and the others' poses."""
+
+    images: tuple[Bytes, ...]
+    poses: tuple[Pose, ...]
+    intrinsics: Intrinsics
+    depth: Array
+
+
+def scene(width: int, height: int) -> Scene:
+    """Made of whole numbers and moved by whole pixels: the same to the last bit everywhere."""
+    margin = 16
+    pattern = _pattern(width + 4 * margin, height + 4 * margin)
+    v, u = np.indices((height, width))
+    focal = 0.8 * width
+    images, poses, depth = [], [], np.zeros((height, width))
+    for dx, dy in ((0, 0), *SHIFTS_PX):
+        left, top = width // 3 + 2 * dx, height // 3 + 2 * dy
+        near = (u >= left) & (u < left + width // 3) & (v >= top) & (v < top + height // 3)
+        wall = pattern[v - dy + margin, u - dx + margin]
+        square = pattern.T[(u - 2 * dx) % height + margin, (v - 2 * dy) % width + margin]
+        images.append(np.where(near, square, wall).astype(np.uint8))
+        poses.append(Pose(np.eye(3), np.array([dx, dy, 0]) * FAR / focal))
+        if (dx, dy) == (0, 0):
+            depth = np.where(near, NEAR, FAR)
+    camera = Intrinsics(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
+    return Scene(tuple(images), tuple(poses[1:]), camera, depth)
+
+
+def _pattern(width: int, height: int) -> Bytes:
+    """Detail at several scales from a linear congruence."""
+    side = max(width, height)
+    out = np.zeros((side, side), np.int64)
+    seed = 12345
+    for cell in (2, 5, 11):
+        n = -(-side // cell)
+        values = np.zeros(n * n, np.int64)
+        for i in range(n * n):
+            seed = (seed * 1103515245 + 12345) % 2147483648
+            values[i] = seed // 65536 % 81
+        out += np.repeat(np.repeat(values.reshape(n, n), cell, 0), cell, 1)[:side, :side]
+    return out.astype(np.uint8)
+
+
+def reconstruct(device: ComputeDevice, it: Scene) -> DepthMap:
+    """The scene's depth by this device."""
+    height, width = it.images[0].shape
+    # so small an image tells depths no better than by some percent
+    config = DepthConfig(stride=1, converged_sigma=0.1)
+    engine = DepthEngine(device, width, height, it.intrinsics, config, eager=False)
+    return _once(engine, it)
+
+
+def _once(engine: DepthEngine, it: Scene) -> DepthMap:
+    engine.begin(it.images[0], 0.7 * NEAR, 2.0 * FAR)
+    for image, pose in zip(it.images[1:], it.poses, strict=True):
+        engine.update(image, pose)
+    return engine.finish(0, 0, np.repeat(it.images[0][..., None], 3, 2))
+
+
+def check(device: ComputeDevice) -> None:
+    """DeviceError where this device's result is not the one that the program is shipped with."""
+    with (resources.files("companion.depth") / VALUES).open("rb") as file:
+        values = np.load(file)
+        want_depth, want_state = values["depth"].astype(np.float64), values["state"]
+    found = reconstruct(device, scene(*SIZE))
+    if not np.isfinite(found.depth).all() or not np.isfinite(found.sigma).all():
+        raise DeviceError(f"{device.name}: self-test failed: results that are not numbers")
+    near = np.abs(found.depth - want_depth) <= NOISE * want_depth
+    same = found.state == want_state
+    worst = float(min(near.mean(), same.mean()))
+    if worst < LEAST_AGREEING:
+        raise DeviceError(
+            f"{device.name}: self-test failed: only {100 * worst:.1f} % of its depths are right"
+        )
+
+
+def frames_per_s(device: ComputeDevice, seconds: Callable[[], float]) -> float:
+    """Images of 640 x 480 per second that it makes depth of, at every second pixel, for 2 s."""
+    it = scene(*SPEED_SIZE)
+    height, width = it.images[0].shape
+    engine = DepthEngine(device, width, height, it.intrinsics, DepthConfig(), eager=False)
+    _once(engine, it)  # compilers are done after the first
+    begun, n = seconds(), 0
+    while seconds() - begun < SPEED_S:
+        _once(engine, it)
+        n += len(it.images)
+    return n / (seconds() - begun)

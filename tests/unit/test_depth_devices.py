@@ -1,0 +1,60 @@
+"""Every OpenCL device there is computes what the program was shipped with; a wrong one is found."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from companion.clock import monotonic_s
+from companion.config import OpenclConfig
+from companion.depth.device_choice import choose_device
+from companion.depth.opencl import ComputeDevice, device_names, open_device
+from companion.depth.self_test import SIZE, check, reconstruct, scene
+from companion.devices import devices
+from companion.errors import DeviceError
+from companion.messages import PixelState
+
+EVERY = [number for number, _, _ in device_names()]
+
+
+class WrongDevice(ComputeDevice):
+    """Counts bits as a broken compiler might."""
+
+    def build(self, source_name: str, constants: dict[str, int]) -> cl.Program:
+        if source_name != "sweep.cl":
+            return super().build(source_name, constants)
+        return super().build(source_name, {**constants, "UNRELATED": 2})
+
+
+@pytest.mark.parametrize("number", EVERY)
+def test_devices_pass(number: str) -> None:
+    device = open_device(OpenclConfig(device=number))
+    check(device)
+    it = scene(*SIZE)
+    found = reconstruct(device, it)
+    known = found.state == PixelState.CONVERGED.value
+    assert known.mean() > 0.8
+    error = np.abs(found.depth - it.depth)[known] / it.depth[known]
+    assert np.median(error) < 0.01 and (error < 0.03).mean() > 0.95
+
+
+def test_a_device_that_computes_wrongly_is_refused() -> None:
+    good = open_device(OpenclConfig())
+    with pytest.raises(DeviceError, match=r"self-test failed: only .* are right"):
+        check(WrongDevice(good.device))
+
+
+def test_the_choice_says_why() -> None:
+    chosen = choose_device(OpenclConfig(), monotonic_s)
+    assert chosen.why.startswith("the only one" if len(EVERY) == 1 else "the fastest of")
+    asked = choose_device(OpenclConfig(device=EVERY[0]), monotonic_s)
+    assert asked.described.endswith(", asked for")
+
+
+def test_devices_are_listed_with_their_speed() -> None:
+    listed = json.loads(devices(as_json=True))["opencl_devices"]
+    assert [device["number"] for device in listed] == EVERY
+    assert all(device["frames_per_s"] > 0 and not device["problem"] for device in listed)
