@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from companion import __version__, cli_recordings
-from companion.config import ExportConfig
+from companion.config import Config, ExportConfig
 from companion.config_file import load_config, to_toml
 from companion.errors import CompanionError, InputError
 from companion.progress import progress_on
@@ -45,8 +45,22 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return run(lambda: load_config(arguments.config, arguments.set))
 
 
-def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
+def _with_telemetry(arguments: argparse.Namespace) -> Config:
+    """The configuration, with what the options say of the log."""
     config = load_config(arguments.config, arguments.set)
+    telemetry = config.telemetry
+    if arguments.log is not None:
+        telemetry = dataclasses.replace(telemetry, log=str(arguments.log))
+    if arguments.offset is not None:
+        # a log without absolute time counts from the first picture then
+        telemetry = dataclasses.replace(
+            telemetry, offset_s=arguments.offset, align="never", starts_with_video=True
+        )
+    return dataclasses.replace(config, telemetry=telemetry)
+
+
+def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    config = _with_telemetry(arguments)
     if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
         raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
     if arguments.out.exists() and not arguments.out.is_dir():
@@ -66,6 +80,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         viewer=arguments.viewer,
         paced=arguments.paced,
         progress=signals.between_frames(progress_on(sys.stderr)),
+        told=lambda remark: print(f"telemetry: {remark}"),
     )
     if config.export.formats:
         _export_into(arguments.out, arguments.out, config.export)
@@ -252,8 +267,17 @@ def _parser() -> argparse.ArgumentParser:
         "configuration again.",
     )  # fmt: skip
 
+    timing = argparse.ArgumentParser(add_help=False)
+    timing.add_argument(
+        "--log", type=Path, metavar="LOG", help="telemetry log, where it does not lie beside FLIGHT"
+    )
+    timing.add_argument(
+        "--offset", type=_shift, metavar="S",
+        help="seconds added to the log's times, instead of finding them by rotation",
+    )  # fmt: skip
+
     replay = commands.add_parser(
-        "replay", parents=[configuration], help="turn a logged flight into a metric map",
+        "replay", parents=[configuration, timing], help="turn a logged flight into a metric map",
         description="Track the camera of a logged flight, reconstruct what it saw, report on it.",
     )  # fmt: skip
     replay.add_argument(
@@ -428,6 +452,13 @@ def _parser() -> argparse.ArgumentParser:
         description="Check a configuration and print the whole of it as TOML.",
     )  # fmt: skip
     return parser
+
+
+def _shift(text: str) -> float:
+    seconds = float(text)
+    if not abs(seconds) <= 1e10:
+        raise ValueError
+    return seconds
 
 
 def _seconds(text: str) -> float:

@@ -219,6 +219,10 @@ class RecorderConfig:
 class TelemetryConfig:
     """How the autopilot's log is put on the flight's clock."""
 
+    log: str = ""
+    """The log to read; "" takes what lies beside the pictures."""
+    align: Annotated[str, OneOf(("auto", "never"))] = "auto"
+    """Whether a log is put on the time of a video without frames.csv by how both turned."""
     offset_s: Annotated[float, Range(-1e10, 1e10)] = 0.0
     """Added to all times of the log, for a log or a video whose clock was set wrong."""
     starts_with_video: bool = False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -43,14 +43,19 @@ def replay(
     viewer: str,
     paced: bool,
     progress: Progress,
+    told: Callable[[str], None] = lambda remark: None,
 ) -> FlightResult:
     """Replay a flight into the folder `out`; InputError when it cannot begin.
+
+    `told` hears of how the telemetry was read.
 
     What was done so far is written also when it is interrupted or fails on the way.
     """
     flight = open_flight(flight_path, config.camera, config.telemetry)
     start_ns, stop_ns = _span(flight, start_s, stop_s)
     log = flight.telemetry()
+    for remark in log.remarks:
+        told(remark)
     device = choose_device(config.opencl, monotonic_s) if config.depth.enabled else None
     out.mkdir(parents=True, exist_ok=True)
     times = StageTimes()

@@ -13,8 +13,10 @@ from drivers.calibration import assumed_camera, read_calibration, read_matrix
 from drivers.flight import ENDS_EARLY, Flight
 from drivers.frame_source import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FrameSource, Video, find_frames
 from drivers.frame_times import read_frame_times
-from drivers.telemetry_folder import logs_in, read_telemetry
+from drivers.telemetry_folder import logs_asked_for, logs_in, read_telemetry
+from drivers.telemetry_log import Pictures, TelemetryLog
 from drivers.telemetry_srt import srt_camera
+from drivers.time_alignment import read_unaligned
 
 
 def is_flight_folder(path: Path) -> bool:
@@ -36,10 +38,17 @@ def open_flight_folder(
     source = find_frames(path)
     numbers, times_ns, warnings = _times(path, source)
     camera, assumed = camera_of(path / "camera.json", source, config, times_ns[0])
-    return Flight(
-        path, camera, source, numbers, times_ns, [*warnings, *assumed],
-        lambda pictures: read_telemetry(logs_in(path), pictures, telemetry_config),
-    )  # fmt: skip
+    logs = logs_asked_for(telemetry_config, logs_in(path))
+
+    def read_log(pictures: Pictures) -> TelemetryLog:
+        if isinstance(source, Video) and not (path / "frames.csv").exists():
+            return read_unaligned(logs, pictures, telemetry_config, camera, flight.frames)
+        return read_telemetry(logs, pictures, telemetry_config)
+
+    flight = Flight(
+        path, camera, source, numbers, times_ns, [*warnings, *assumed], read_log
+    )
+    return flight
 
 
 def camera_of(

@@ -37,6 +37,25 @@ def logs_beside(video: Path) -> list[Path]:
     return [path for path in logs_in(video.parent) if path.stem == video.stem]
 
 
+def logs_asked_for(config: TelemetryConfig, beside: Sequence[Path]) -> list[Path]:
+    """The log that is configured, else those that lie there; FlightError where it is none."""
+    if not config.log:
+        return list(beside)
+    path = Path(config.log)
+    if not path.is_file() or path.suffix.lower() not in READERS:
+        kinds = ", ".join(READERS)
+        raise FlightError(f"{path}: no telemetry log; wanted is a file with one of {kinds}")
+    return [path]
+
+
+def read_log_file(path: Path) -> LogContent:
+    """What is in a log; FlightError where it cannot be read."""
+    try:
+        return READERS[path.suffix.lower()](path)
+    except OSError as error:
+        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
+
+
 def read_telemetry(
     paths: Sequence[Path], pictures: Pictures, config: TelemetryConfig
 ) -> TelemetryLog:
@@ -45,13 +64,7 @@ def read_telemetry(
     Of several logs the one that has most of the pictures' time. FlightError where there are logs
     and none is of that time.
     """
-    found = []
-    for path in paths:
-        try:
-            content = READERS[path.suffix.lower()](path)
-        except OSError as error:
-            raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
-        found.append((path, aligned(content, pictures, config)))
+    found = [(path, aligned(read_log_file(path), pictures, config)) for path in paths]
     if not paths:
         inside = read_gpmf(pictures.path, pictures.host_from_file_ns)
         if inside is None and pictures.path.is_file():

@@ -60,6 +60,8 @@ class TelemetryLog:
     origin: GeoOrigin | None = None
     warnings: tuple[Warned, ...] = ()
     rates_hz: Mapping[str, float] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    """What the user should be told of how it was read."""
 
 
 def no_telemetry(pictures: Pictures) -> TelemetryLog:

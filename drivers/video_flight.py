@@ -9,7 +9,8 @@ from companion.messages import Warned
 from drivers.flight import Flight
 from drivers.flight_folder import camera_of
 from drivers.frame_source import VIDEO_SUFFIXES, Video
-from drivers.telemetry_folder import logs_beside, read_telemetry
+from drivers.telemetry_folder import logs_asked_for, logs_beside
+from drivers.time_alignment import read_unaligned
 
 
 def is_video(path: Path) -> bool:
@@ -24,7 +25,9 @@ def open_video(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> 
     times_ns = [epoch_ns + t_ns for t_ns in source.own_times_ns()]
     camera, warnings = camera_of(path.with_suffix(".json"), source, config, times_ns[0])
     own = Warned(times_ns[0], "no frames.csv: times are the file's own", f"counted from {epoch}")
-    return Flight(
+    logs = logs_asked_for(telemetry, logs_beside(path))
+    flight = Flight(
         path, camera, source, list(range(source.n_frames)), times_ns, [own, *warnings],
-        lambda pictures: read_telemetry(logs_beside(path), pictures, telemetry),
+        lambda pictures: read_unaligned(logs, pictures, telemetry, camera, flight.frames),
     )  # fmt: skip
+    return flight

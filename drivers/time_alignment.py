@@ -1,0 +1,122 @@
+"""A log put on the time of a video by the turns that both saw, where no clock does it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from companion.alignment import TimeAlignment, TurnRecord, align_turns
+from companion.camera import Camera
+from companion.config import TelemetryConfig
+from companion.errors import FlightError
+from companion.geometry import Array, rotation_from_quaternion, vector_from_rotation
+from companion.image_rotation import RotationMeter
+from companion.messages import AttitudeSample, ClockReport, Frame, ImuSample, Telemetry, Warned
+from drivers.telemetry_folder import aligned, read_log_file, read_telemetry
+from drivers.telemetry_log import Pictures, TelemetryLog
+
+MAX_FRAMES = 6000
+LEAST_SAMPLES = 20
+Frames = Callable[[], Iterator[Frame | Warned]]
+
+
+def read_unaligned(
+    paths: Sequence[Path], pictures: Pictures, config: TelemetryConfig, camera: Camera,
+    frames: Frames,
+) -> TelemetryLog:  # fmt: skip
+    """The log of a video whose times are its own; of several the one whose turns agree best.
+
+    As `telemetry.align` says. FlightError where no log agrees so well that it must be the one.
+    """
+    if not paths or config.align == "never" or config.offset_s:
+        return read_telemetry(paths, pictures, config)
+    seen = _seen(camera, frames(), pictures.start_ns)
+    free = dataclasses.replace(config, starts_with_video=True)
+    mounted = camera.body_from_camera.rotation if camera.body_from_camera is not None else None
+    found: list[tuple[TimeAlignment, Path, TelemetryLog]] = []
+    reasons = []
+    for path in paths:
+        log = aligned(read_log_file(path), pictures, free)
+        logged = _logged(log.samples, pictures.start_ns)
+        if logged is None:
+            reasons.append(f"{path.name} has neither rates nor attitude")
+            continue
+        step_s = float(np.median(np.diff(seen.t_s))) if len(seen.t_s) > 1 else 0.0
+        by_turns = align_turns(seen, logged, step_s, mounted) if step_s > 0 else None
+        if by_turns is None:
+            reasons.append(f"{path.name}: too little is in both")
+        elif by_turns.why_not is not None:
+            reasons.append(f"{path.name}: {by_turns.why_not}")
+        else:
+            found.append((by_turns, path, log))
+    if not found:
+        raise FlightError(
+            f"{pictures.path}: no log can be put on its time by rotation ({'; '.join(reasons)}); "
+            "say the shift by --offset S, seconds added to the log's times, or give frames.csv, or "
+            "--set telemetry.align=never to trust the clocks"
+        )
+    best, path, log = max(found, key=lambda each: each[0].score)
+    return _moved(log, best, path, pictures)
+
+
+def _moved(
+    log: TelemetryLog, by_turns: TimeAlignment, path: Path, pictures: Pictures
+) -> TelemetryLog:
+    shift_ns = round(by_turns.offset_s * 1e9)
+    samples = [dataclasses.replace(sample, t_ns=sample.t_ns + shift_ns) for sample in log.samples]
+    clock = ClockReport(
+        "rotation of the pictures", by_turns.offset_s, 0.0, by_turns.sigma_s * 1e3,
+        log.clock.n_reboots if log.clock is not None else 0,
+    )  # fmt: skip
+    remark = f"{path.name} put on the time of {pictures.path.name} by rotation: {by_turns}"
+    warnings = tuple(w for w in log.warnings if "begin with the video" not in w.what)
+    return dataclasses.replace(
+        log, samples=samples, clock=clock, warnings=warnings, remarks=(remark,)
+    )
+
+
+def _seen(camera: Camera, frames: Iterator[Frame | Warned], start_ns: int) -> TurnRecord:
+    meter = RotationMeter(camera)
+    times_s: list[float] = []
+    angles: list[Array] = []
+    angle = np.zeros(3)
+    for frame in frames:
+        if not isinstance(frame, Frame):
+            continue
+        turn = meter.turn(frame)
+        angle = angle if turn is None else angle + turn
+        times_s.append((frame.t_ns - start_ns) * 1e-9)
+        angles.append(angle)
+        if len(times_s) == MAX_FRAMES:
+            break
+    return TurnRecord(np.array(times_s), np.array(angles).reshape(-1, 3))
+
+
+def _logged(samples: Sequence[Telemetry], start_ns: int) -> TurnRecord | None:
+    """The turns of the kind of sample that there is most of; times after `start_ns`."""
+    rates = [(s.t_ns, s.gyro_rad_s) for s in samples if isinstance(s, ImuSample)]
+    attitudes = [s for s in samples if isinstance(s, AttitudeSample)]
+    if max(len(rates), len(attitudes)) < LEAST_SAMPLES:
+        return None
+    if len(rates) >= len(attitudes):
+        t_s, gyro = _ascending([(t_ns - start_ns) * 1e-9 for t_ns, _ in rates],
+                               [rate for _, rate in rates])  # fmt: skip
+        turns = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(t_s)[:, None]
+    else:
+        t_s, quaternions = _ascending(
+            [(s.t_ns - start_ns) * 1e-9 for s in attitudes], [s.ned_from_body for s in attitudes]
+        )
+        turned = [rotation_from_quaternion(q) for q in quaternions]
+        turns = np.array([
+            vector_from_rotation(a.T @ b) for a, b in pairwise(turned)
+        ])  # fmt: skip
+    return TurnRecord(t_s, np.vstack([np.zeros(3), np.cumsum(turns, axis=0)]))
+
+
+def _ascending(t_s: Sequence[float], values: Sequence[Array]) -> tuple[Array, Array]:
+    times, first = np.unique(np.array(t_s), return_index=True)
+    return times, np.stack(values)[first]

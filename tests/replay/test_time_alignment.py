@@ -1,0 +1,73 @@
+"""The sample's video without its list of times: its log is put on its time by rotation."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.command import refused, replay
+
+SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
+FAST = ["--stop", "14", "--set", "depth.enabled=false"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("camera.mp4", "camera.json", "telemetry.tlog"):
+        shutil.copy(SAMPLE / name, tmp_path / name)
+    return tmp_path
+
+
+def true_offset_s() -> float:
+    """The video's own times begin at zero."""
+    return -float((SAMPLE / "frames.csv").read_text().splitlines()[1].split(",")[1]) * 1e-9
+
+
+def test_aligned_by_rotation_and_said(folder: Path) -> None:
+    run = replay(folder, folder / "out", *FAST)
+    assert run.status == 0, run.stderr
+    said = re.search(r"by rotation: ([-+][\d.]+) s, within (\d+) ms", run.stdout)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(true_offset_s(), abs=0.05)
+    assert run.report["unit"] == "m"
+    assert run.report["clock"]["method"] == "rotation of the pictures"
+    # the path is that of the flight itself, by its own clocks
+    with_times = replay(SAMPLE, folder / "own", *FAST)
+    a, b = (np.loadtxt(folder / name / "trajectory.tum") for name in ("out", "own"))
+    assert len(a) == len(b)
+    assert with_times.status == 0
+    assert np.linalg.norm(a[:, 1:4] - b[:, 1:4], axis=1).max() < 0.5
+
+
+def test_offset_that_is_given(folder: Path) -> None:
+    run = replay(folder, folder / "out", *FAST, f"--offset={true_offset_s():.3f}")
+    assert run.status == 0, run.stderr
+    assert "rotation" not in run.stdout
+    assert run.report["unit"] == "m"
+
+
+def test_log_of_another_flight_is_refused(folder: Path) -> None:
+    """The first ten seconds of the log say too little of the last thirty of the video."""
+    log = (folder / "telemetry.tlog").read_bytes()
+    (folder / "telemetry.tlog").write_bytes(log[: len(log) // 5])
+    line = refused(replay(folder, folder / "out", *FAST))
+    assert "--offset" in line
+    assert "telemetry.tlog" in line
+
+
+def test_log_elsewhere(folder: Path) -> None:
+    (folder / "elsewhere").mkdir()
+    (folder / "telemetry.tlog").rename(folder / "elsewhere" / "a.tlog")
+    (folder / "camera.mp4").rename(folder / "flown.mp4")
+    (folder / "camera.json").rename(folder / "flown.json")
+    log = folder / "elsewhere" / "a.tlog"
+    run = replay(folder / "flown.mp4", folder / "out", *FAST, "--log", str(log))
+    assert run.status == 0, run.stderr
+    assert "a.tlog put on the time of flown.mp4" in run.stdout
+    assert "no telemetry log" in refused(
+        replay(folder / "flown.mp4", folder / "out", *FAST, "--log", str(folder / "flown.json"))
+    )
