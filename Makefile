@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 FLIGHT ?= sample/survey
 OUT ?= out/demo
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint clean reference regression
 
 demo: $(VENV)/.installed
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
@@ -18,6 +18,18 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# What a change does to the sample flight, against the results that are kept of it.
+regression: $(VENV)/.installed
+	$(BIN)/companion replay sample/survey --out out/regression --set cloud.voxel_m=0.5
+	$(BIN)/companion compare sample/reference out/regression --out out/regression \
+	  --max-apart 0.3 --max-cloud 0.5
+
+# Keep the results of this version instead.
+reference: $(VENV)/.installed
+	$(BIN)/companion replay sample/survey --out out/reference --set cloud.voxel_m=0.5
+	mkdir -p sample/reference
+	cp out/reference/trajectory.tum out/reference/cloud.ply out/reference/report.json sample/reference
 
 # A stamp beside the environment: reinstalled only when the dependencies may have changed.
 $(VENV)/.installed: pyproject.toml | $(BIN)/python

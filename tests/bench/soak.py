@@ -7,8 +7,9 @@ pictures are played as a camera; each lap is a flight with its recording, which 
 deleted. Once a second all processes of the daemon are looked at.
 
 Written are soak.csv (a row a second), laps.csv (a row a lap), journal.txt, soak.svg, and at the end
-a few lines: rates, latency, and how fast memory, file handles and threads have grown after the first three laps.
-A day is --seconds 86400. Exit status 1 where something was lost, restarted, or has grown.
+a few lines: rates, latency, and how fast memory, file handles and threads have grown after the
+first three laps. A day is --seconds 86400. Exit status 1 where something was lost, restarted or has
+grown.
 """
 
 from __future__ import annotations
