@@ -89,6 +89,18 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 0
 
 
+def _import(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.import_command import import_flight
+
+    n = import_flight(
+        arguments.source, arguments.out, _with_telemetry(arguments),
+        signals.between_frames(progress_on(sys.stderr, "images")), print,
+    )  # fmt: skip
+    print(f"flight: {arguments.out}, {n} frames")
+    signals.take()
+    return 0
+
+
 def _export(arguments: argparse.Namespace, signals: StopSignals) -> int:
     settings = load_config(arguments.config, arguments.set).export
     if arguments.formats is not None:
@@ -231,6 +243,7 @@ def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
 COMMANDS: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {
     "run": _run,
     "replay": _replay,
+    "import": _import,
     "export": _export,
     "status": _status,
     "view": _view,
@@ -301,6 +314,14 @@ def _parser() -> argparse.ArgumentParser:
         "--paced", action="store_true",
         help="in the flight's own time, dropping what a live run would drop",
     )  # fmt: skip
+
+    imported = commands.add_parser(
+        "import", parents=[configuration, timing], help="write any flight as a flight folder",
+        description="Read a flight of any format and write it as a folder with pictures, their "
+        "times, calibration and telemetry, all on one clock.",
+    )  # fmt: skip
+    imported.add_argument("source", type=Path, metavar="SOURCE", help="as FLIGHT of replay")
+    imported.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder")
 
     export = commands.add_parser(
         "export", parents=[configuration], help="write a replay's results in other formats",

@@ -62,7 +62,7 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
     model = _model(path, content)
     return Camera(
         width, height, fx, fy, cx, cy, model, _coefficients(path, content, model),
-        body_from_camera_of(path, content.get("body_from_camera")),
+        body_from_camera_of(path, content.get("body_from_camera")), content.get("assumed") is True,
     )  # fmt: skip
 
 

@@ -56,15 +56,17 @@ def camera_of(
 ) -> tuple[Camera, list[Warned]]:
     """The camera by its file or `K.txt` beside it, else an assumed one, with a warning."""
     if calibration.exists():
-        return read_calibration(calibration, source.width, source.height), []
+        camera = read_calibration(calibration, source.width, source.height)
+        told = f"{calibration.name} says so itself"
+        return camera, [Warned(t_ns, "the camera is assumed", told)] if camera.assumed else []
     matrix = calibration.with_name("K.txt")
     if matrix.exists():
         return read_matrix(matrix, source.width, source.height), []
-    told = (
+    by_srt = (
         srt_camera(source.path, source.width, source.height) if isinstance(source, Video) else None
     )
-    if told is not None:
-        camera, detail = told
+    if by_srt is not None:
+        camera, detail = by_srt
         return camera, [Warned(t_ns, "no camera.json: the lens is that of the subtitles", detail)]
     if config.assumed_hfov_deg <= 0:
         raise FlightError(

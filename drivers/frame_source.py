@@ -193,6 +193,10 @@ class ImageFolder:
         """How many image files there are."""
         return len(self._files)
 
+    def file(self, number: int) -> Path:
+        """Where image `number` lies, if it does."""
+        return self._files[number]
+
     def own_times_ns(self) -> list[int]:
         """Ten images a second: image files say nothing of time."""
         return [number * 100_000_000 for number in range(self.n_frames)]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from companion.config import TelemetryConfig
 from companion.errors import FlightError
 from companion.messages import Warned
+from drivers.telemetry_csv import NAME, read_telemetry_csv
 from drivers.telemetry_dataflash import read_dataflash
 from drivers.telemetry_gpmf import read_gpmf
 from drivers.telemetry_log import HostTimes, LogContent, Pictures, TelemetryLog, no_telemetry
@@ -23,13 +24,15 @@ READERS: dict[str, Callable[[Path], LogContent]] = {
     ".tlog": read_tlog,
     ".bin": read_dataflash,
     ".ulg": read_ulog,
+    ".csv": read_telemetry_csv,
 }
 Times = NDArray[np.int64]
 
 
 def logs_in(folder: Path) -> list[Path]:
     """The telemetry logs of a folder."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in READERS)
+    found = (p for p in folder.iterdir() if p.suffix.lower() in READERS)
+    return sorted(p for p in found if p.suffix.lower() != ".csv" or p.name == NAME)
 
 
 def logs_beside(video: Path) -> list[Path]:
