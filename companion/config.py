@@ -344,6 +344,8 @@ class StreamConfig:
     budget_kbit_s: Annotated[float, Range(0, 1e6)] = 0.0
     """All viewers together get no more; 0 leaves it to what the link carries."""
     most_viewers: Annotated[int, Range(1, 16)] = 4
+    web_bind: str = "127.0.0.1"
+    """Address at which daemon.viewer = "web" serves its page; 0.0.0.0 is every network."""
     store_mb: Annotated[int, Range(1, 4096)] = 128
     """Points kept for viewers that come late; what is more is given up, the finest first."""
 
