@@ -25,7 +25,7 @@ from drivers.recording.flights_folder import (
     may_go,
     recordings_in,
 )
-from drivers.recording.recorded_flight import Recording
+from drivers.recording.recording import Recording
 from drivers.recording.trimming import trim
 
 MB = 1 << 20

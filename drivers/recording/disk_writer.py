@@ -121,6 +121,8 @@ class DiskWriter:
             self._do(lambda: self._tlog.append(b"".join(packets)))  # noqa: B023 - done at once
             self._do(self._mcap.sync)
             self._do(self._tlog.sync)
+            if self._ended:
+                self.n_dropped["messages"] += self._writer.drop_waiting()
             self.slowest_s = max(self.slowest_s, time.monotonic() - began_s)
             with self._changed:
                 self._n_waiting -= sum(len(entry.data) for entry in entries)

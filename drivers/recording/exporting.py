@@ -23,7 +23,7 @@ from companion.errors import FlightError
 from drivers.mavlink_stream import MavlinkStream
 from drivers.recording.flights_folder import TLOG
 from drivers.recording.pictures import still
-from drivers.recording.recorded_flight import PicturePlace, Recording
+from drivers.recording.recording import PicturePlace, Recording
 from drivers.recording.topics import IMAGE, RECEIVED, SENT, VIDEO, MavlinkBytes
 
 MICROSECONDS = Fraction(1, 1_000_000)

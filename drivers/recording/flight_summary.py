@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from drivers.recording.growing_file import is_growing
-from drivers.recording.mcap_scan import McapFile
+from drivers.recording.mcap_file import McapFile
+from drivers.recording.mcap_scan import scan, summary
 from drivers.recording.repair import was_cut
 from drivers.recording.topics import PICTURES
 
@@ -49,7 +50,7 @@ def summarise(path: Path, told: Callable[[int], None] | None = None) -> FlightSu
     FlightError where it is no MCAP file.
     """
     with McapFile(path) as file:
-        found = (None if told is not None else file.summary()) or file.scan(told)
+        found = (None if told is not None else summary(file)) or scan(file, told)
         growing = is_growing(file.fd)
         n_bytes = file.size
     contents = found.contents

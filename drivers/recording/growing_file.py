@@ -18,6 +18,8 @@ class GrowingFile:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._size = 0
+        for folder in (path.parent, path.parent.parent):
+            _sync_folder(folder)  # else a power cut could leave a file without a name
 
     def append(self, data: bytes) -> None:
         """Put all of it at the end; OSError, and none of it stays, where there is no room."""
@@ -45,6 +47,14 @@ class GrowingFile:
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
+
+
+def _sync_folder(folder: Path) -> None:
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
 def is_growing(fd: int) -> bool:

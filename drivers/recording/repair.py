@@ -6,7 +6,8 @@ import os
 from pathlib import Path
 
 from drivers.recording.growing_file import is_growing
-from drivers.recording.mcap_scan import McapFile, Scan
+from drivers.recording.mcap_file import McapFile
+from drivers.recording.mcap_scan import Scan, scan, summary
 from drivers.recording.mcap_writer import ending, note_record
 
 NOTE = "repaired"
@@ -57,11 +58,11 @@ def opened(path: Path) -> tuple[McapFile, Scan]:
     where it is no MCAP file.
     """
     file = McapFile(path)
-    found = file.summary() or file.scan()
+    found = summary(file) or scan(file)
     if not found.whole and repair(path, found):
         file.close()
         file = McapFile(path)
-        again = file.scan()
+        again = scan(file)
         again.n_lost_bytes = found.n_lost_bytes - found.n_cut_bytes
         again.n_lost_places = found.n_lost_places
         return file, again

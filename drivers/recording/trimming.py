@@ -8,7 +8,7 @@ from pathlib import Path
 from companion.errors import FlightError
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.recorded_flight import Recording
+from drivers.recording.recording import Recording
 from drivers.recording.topics import GREY, PICTURES, PROFILE, open_channels
 
 LEAD_NS = 10_000_000_000

@@ -32,7 +32,7 @@ from matplotlib.figure import Figure
 from companion.config import CameraConfig
 from companion.errors import CompanionError
 from drivers.open_flight import open_flight
-from drivers.recording.recorded_flight import Recording
+from drivers.recording.recording import Recording
 from tests.support.daemon import Daemon
 from tests.support.fake_autopilot import FakeAutopilot
 from tests.support.fake_flight import RecordedFlight

@@ -14,8 +14,10 @@ from companion.config import CameraConfig
 from companion.messages import Frame, PositionSample
 from drivers.open_flight import open_flight
 from drivers.pattern_camera import world_from_body
-from drivers.recording.mcap_scan import McapFile
-from drivers.recording.recorded_flight import CUT, RecordedFlight
+from drivers.recording.mcap_file import McapFile
+from drivers.recording.mcap_scan import summary
+from drivers.recording.recorded_flight import RecordedFlight
+from drivers.recording.recording import CUT
 from drivers.tlog_records import TlogRecords
 from tests.support.command import replay
 from tests.support.daemon import Daemon
@@ -75,7 +77,7 @@ def test_killed_at_once_with_all_that_it_started_it_loses_less_than_a_second(
         allowed_s = strain.allowed_s(OLDER_S, before_ns - round(OLDER_S * 1e9))
     (flight,) = (tmp_path / "flights").iterdir()
     with McapFile(flight / "flight.mcap") as file:
-        assert file.summary() is None
+        assert summary(file) is None
     opened = recorded(tmp_path)
     assert CUT in [warning.what for warning in opened.warnings]
     assert (killed_ns - opened.times_ns[-1]) * 1e-9 < allowed_s
@@ -96,7 +98,7 @@ def test_without_its_daemon_the_recording_ends_whole(tmp_path: Path) -> None:
         daemon.__exit__(None, None, None)
     (flight,) = (tmp_path / "flights").iterdir()
     with McapFile(flight / "flight.mcap") as file:
-        assert file.summary() is not None
+        assert summary(file) is not None
     assert recorded(tmp_path).warnings == ()
 
 

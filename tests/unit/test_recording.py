@@ -10,7 +10,8 @@ from companion.config import CameraConfig, RecorderConfig, TelemetryConfig
 from companion.errors import ConfigError, FlightError
 from companion.messages import ClockReport, Frame, GeoOrigin, Warned
 from drivers.open_flight import open_flight
-from drivers.recording.mcap_scan import McapFile
+from drivers.recording.mcap_file import McapFile
+from drivers.recording.mcap_scan import scan
 from drivers.recording.pictures import picture_encoder
 from drivers.recording.recorded_flight import RecordedFlight, is_recording, open_recording
 from drivers.tlog_records import TlogRecords
@@ -118,7 +119,7 @@ def test_cut_short_it_is_repaired_and_says_so(tmp_path: Path) -> None:
     record(tmp_path / "f", N, per_chunk=10)
     path = tmp_path / "f" / "flight.mcap"
     with McapFile(path) as file:
-        chunks = file.scan().chunks
+        chunks = scan(file).chunks
     assert len(chunks) >= 4
     path.write_bytes(path.read_bytes()[: chunks[-1].end - 100])
     for _ in range(2):  # said again when it is opened again

@@ -8,7 +8,8 @@ from mcap.reader import make_reader
 
 from companion.errors import FlightError
 from drivers.recording.growing_file import GrowingFile, is_growing
-from drivers.recording.mcap_scan import McapFile, Scan
+from drivers.recording.mcap_file import McapFile
+from drivers.recording.mcap_scan import Scan, scan, summary
 from drivers.recording.mcap_writer import MAGIC, McapWriter
 from drivers.recording.repair import n_cut_bytes, opened
 
@@ -56,10 +57,10 @@ def whole(tmp_path: Path) -> tuple[Path, list[int]]:
 def test_what_is_written_is_read_and_others_read_it_too(whole: tuple[Path, list[int]]) -> None:
     path, _ = whole
     with McapFile(path) as file:
-        found, summary = file.scan(), file.summary()
+        found, by_end = scan(file), summary(file)
         told = read(file, found)
-    assert summary is not None and summary.contents == found.contents
-    assert found.whole and found.profile == summary.profile == "companion"
+    assert by_end is not None and by_end.contents == found.contents
+    assert found.whole and found.profile == by_end.profile == "companion"
     assert (found.n_lost_bytes, found.n_cut_bytes) == (0, 0)
     assert found.attachments == {"camera.json": b'{"fx": 1}'}
     assert found.metadata == {"companion": {"version": "1"}}
@@ -86,12 +87,12 @@ def test_cut_anywhere_it_keeps_all_chunks_before_and_is_repaired(
         with file:
             n_whole = len(found.chunks)
             told = read(file, found)
-            summary = file.summary()
+            by_end = summary(file)
         assert n_whole >= sum(end <= size for end in ends), size
         assert told == [
             (f"/{'ab'[n % 2]}", n // 2, 1000 + n, content(n)) for n in range(n_whole * PER_CHUNK)
         ]
-        assert found.whole and summary is not None
+        assert found.whole and by_end is not None
         assert n_cut_bytes(found) < 700
         with cut.open("rb") as stream:
             assert len(list(make_reader(stream).iter_messages())) == len(told)
@@ -130,7 +131,7 @@ def test_damage_costs_the_chunk_that_it_hits_and_never_more_than_time(
         damaged.write_bytes(changed.tobytes())
         file, _ = opened(damaged)
         with file:
-            found = file.scan()
+            found = scan(file)
             told = read(file, found)
         for topic, _, t_ns, held in told:
             assert expected[f"{topic}:{t_ns}"] == held, seed
@@ -143,7 +144,7 @@ def test_damage_is_counted(whole: tuple[Path, list[int]]) -> None:
     data[ends[2] + 100] ^= 1
     path.write_bytes(data)
     with McapFile(path) as file:
-        found = file.scan()
+        found = scan(file)
     assert len(found.chunks) == N_CHUNKS - 1
     assert found.n_lost_places == 1
     assert ends[3] - ends[2] == found.n_lost_bytes
@@ -198,5 +199,5 @@ def test_a_write_that_fails_leaves_nothing_of_itself(
     writer.finish()
     file.close()
     with McapFile(path) as again:
-        found = again.scan()
+        found = scan(again)
     assert found.whole and found.contents.counts == {channel: 1}
