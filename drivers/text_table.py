@@ -21,13 +21,15 @@ def read_rows(path: Path, n_words: int) -> list[list[str]]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise FlightError(f"{path}: longer than {MAX_BYTES // 10**6} MB; that is no such list")
-        lines = path.read_text("utf-8").splitlines()
+        text = path.read_text("utf-8")
     except OSError as error:
         raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise FlightError(f"{path}: it is not text") from error
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise FlightError(f"{path}: it is not text")
     out = []
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(text.splitlines(), 1):
         words = line.replace(",", " ").split()
         if not words or words[0].startswith("#"):
             continue
