@@ -43,7 +43,7 @@ NICE = {"localisation": 0, "tape": 5, "recorder": 10, "depth": 20}
 """The pose comes first; the others take what is left over."""
 PATIENCE_S = {"localisation": 120.0, "depth": 60.0, "tape": 60.0, "recorder": 180.0}
 HURRIED_S = {"localisation": 0.7, "depth": 0.2, "tape": 0.3, "recorder": 1.6}
-IN_FOLDER = frozenset({"tape", "recorder"})
+IN_FOLDER = ("tape", "recorder")
 """Stages that leave something in the flight's folder."""
 RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
@@ -104,8 +104,9 @@ class LiveFlight:
     def begin(self, folder: Path) -> None:
         """The flight begins, and leaves its results there."""
         self.folder, self._began_s = folder, monotonic_s()
-        for kind in self.stages.keys() & IN_FOLDER:
-            self._set_up(kind)
+        for kind in IN_FOLDER:
+            if kind in self.stages:
+                self._set_up(kind)
         if self._config.daemon.viewer != "none" or self._config.stream.listen:
             self._viewing = Viewing(self._config, self.camera, folder.name, self._warn)
 
