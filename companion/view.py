@@ -33,7 +33,7 @@ def view(host: str, where: str, bind: str, colours: str, told: Callable[[str], N
 
     def work() -> None:
         try:
-            show(link, screen.address, Colours(colours), stop)
+            show(link, screen, Colours(colours), stop)
         except BaseException as fault:
             faults.append(fault)
 

@@ -13,6 +13,8 @@ from collections import deque
 
 LEAST_BYTES = 6_000
 MOST_BYTES = 4 << 20
+LEAST_USED = 1_000
+"""Less room than this is none: a piece would be too small."""
 QUEUE_S = 0.05
 """Delay beyond the least that counts as a queue."""
 STANDING_S = 0.1
@@ -37,7 +39,8 @@ class Window:
         self._least: list[tuple[float, float]] = []
         self._standing: deque[tuple[float, float]] = deque()
         self._delivered: deque[tuple[float, int]] = deque()
-        self._was_limited = False
+        self._limited_at = -1
+        """What was sent up to here left no room; so acknowledged, it says that more would do."""
         self._shrunk_s = -1e9
         self._has_seen_queue = False
 
@@ -49,7 +52,8 @@ class Window:
     def room_bytes(self) -> int:
         """So much more may be sent now."""
         room = int(self.size_bytes) - self.on_way_bytes
-        self._was_limited |= room <= 0
+        if room < LEAST_USED:
+            self._limited_at = self.sent_bytes
         return max(0, room)
 
     def sent(self, now_s: float, n_bytes: int) -> None:
@@ -103,10 +107,9 @@ class Window:
             if now_s - self._shrunk_s > max(STANDING_S, round_trip_s):
                 self._shrunk_s = now_s
                 self.size_bytes = max(LEAST_BYTES, self.size_bytes * SHRINK)
-        elif self._was_limited:
+        elif self.acknowledged_bytes <= self._limited_at:
             gain = 0.25 if self._has_seen_queue else 1.0
             self.size_bytes = min(MOST_BYTES, self.size_bytes + gain * n_new)
-        self._was_limited = False
 
     def _least_s(self, now_s: float, round_trip_s: float) -> float:
         """The least round trip, in two halves of which the older is forgotten."""

@@ -11,16 +11,17 @@ import threading
 import rerun as rr
 
 from companion.stream.ground_link import GroundLink
-from companion.stream.items import FlightItem
+from companion.stream.items import FlightItem, PoseItem, StatusItem
 from companion.viewer.colours import Colours
 from companion.viewer.drawing import Drawing
 from companion.viewer.layout import layout
 from companion.viewer.rrd_files import APPLICATION
+from companion.viewer.screen import Screen
 
 FLUSH_S = 2.0
 
 
-def show(link: GroundLink, address: str, colours: Colours, stop: threading.Event) -> None:
+def show(link: GroundLink, screen: Screen, colours: Colours, stop: threading.Event) -> None:
     """Draw all that a link gives, each flight in a recording of its own."""
     recording: rr.RecordingStream | None = None
     drawing: Drawing | None = None
@@ -34,8 +35,10 @@ def show(link: GroundLink, address: str, colours: Colours, stop: threading.Event
             recording = rr.RecordingStream(
                 APPLICATION, batcher_config=rr.ChunkBatcherConfig.LOW_LATENCY()
             )
-            recording.connect_grpc(address, default_blueprint=layout(live=True))
+            recording.connect_grpc(screen.address, default_blueprint=layout(live=True))
             drawing = Drawing(recording, live=True, colours=colours)
+        if screen.gate is not None and not isinstance(item, (PoseItem, StatusItem)):
+            screen.gate.wait_for_room(stop)
         if drawing is not None:
             drawing.draw(item)
     if recording is not None:

@@ -1,4 +1,4 @@
-"""The process that shows a flight on the machine where it runs: WHERE PORT COLOURS."""
+"""The process that shows a flight on the machine where it runs: WHERE PORT COLOURS BIND."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from companion.stream.ground_link import GroundLink
 from companion.viewer.colours import Colours
 from companion.viewer.ground import show
 from companion.viewer.live_viewer import READY
-from companion.viewer.screen import LOOPBACK, Screen
+from companion.viewer.screen import Screen
+from companion.viewer.web_gate import LOOPBACK
 
 NICE = 10
 
@@ -22,15 +23,15 @@ def main() -> int:
     os.setpgid(0, 0)  # it is ended with what it starts; see companion.stream.export_process
     os.nice(NICE)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    where, port, colours = sys.argv[1], int(sys.argv[2]), Colours(sys.argv[3])
+    where, port, colours, bind = sys.argv[1], int(sys.argv[2]), Colours(sys.argv[3]), sys.argv[4]
     try:
-        screen = Screen(where)
+        screen = Screen(where, bind)
     except InputError as error:
         _say(str(error).encode() + b"\n")
         return 1
     _say(READY)
     link = GroundLink(LOOPBACK, port, lambda text: None, again=False)
-    show(link, screen.address, colours, threading.Event())
+    show(link, screen, colours, threading.Event())
     screen.close()
     return 0
 

@@ -58,6 +58,7 @@ class LiveViewer:
         self._port = 0
         self._has_port = threading.Event()
         listen = stream.listen if stream is not None else ""
+        self._bind = stream.web_bind if stream is not None else StreamConfig().web_bind
         flight = FlightItem(name or os.urandom(8).hex(), name, camera.pinhole(), origin)
         setup = ExportSetup(
             flight, stream or StreamConfig(), listen, int(where not in (NOWHERE, ""))
@@ -95,7 +96,7 @@ class LiveViewer:
         """
         if not self._has_port.wait(START_S) or not self._port:
             raise InputError(f"--viewer {where}: the exporter ended as it began")
-        child = _child(GROUND, where, str(self._port), self._config.colours)
+        child = _child(GROUND, where, str(self._port), self._config.colours, self._bind)
         assert child.stdout is not None
         answer = child.stdout.readline()
         if answer != READY:

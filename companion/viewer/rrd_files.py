@@ -15,7 +15,7 @@ from companion.viewer.layout import layout
 APPLICATION = "companion"
 N_FILES = 4
 """The files that there is room for; each is one such part of it."""
-LOOK_EVERY = 256
+LOOK_EVERY = 16
 
 
 class RrdFiles:

@@ -11,13 +11,17 @@ from urllib.parse import urlsplit
 
 from companion.clock import monotonic_s, wait_s
 from companion.errors import InputError
+from companion.viewer.web_gate import LOOPBACK, WebGate, free_ports
 
-LOOPBACK = "127.0.0.1"
 WEB_PORT = 9090
 GRPC_PORT = 9876
 START_S = 20.0
 MEMORY = "50%"
 """Of the ground's memory; the oldest poses and pictures go first, the map stays."""
+
+
+SERVER_MEMORY = "256MB"
+"""What is kept for browsers that come late; the map, which is drawn for all times, stays."""
 
 
 class Screen:
@@ -34,21 +38,13 @@ class Screen:
         """Whether it ends with the flight: a page does, a window stays."""
         self.page = ""
         """What to open in a browser."""
+        self.gate: WebGate | None = None
+        """Through which browsers come; None where none do."""
         if where == "web":
-            for port in (GRPC_PORT, WEB_PORT):
-                if listens(LOOPBACK, port):
-                    raise InputError(
-                        f"port {port} is taken; end what listens there, or give its address"
-                    )
-            self.process = _start("--serve-web", "--bind", bind, "--web-viewer-port", str(WEB_PORT))
-            self.is_ours = True
-            host = LOOPBACK if bind in ("0.0.0.0", "::") else bind
-            if host != LOOPBACK:
-                self.address = f"rerun+http://{host}:{GRPC_PORT}/proxy"
-            self.page = page_of(host)
+            self._serve(bind)
         elif where == "native":
             if not listens(LOOPBACK, GRPC_PORT):
-                self.process = _start("--bind", LOOPBACK, detached=True)
+                self.process = _start(GRPC_PORT, detached=True)
         else:
             parts = urlsplit(where.removeprefix("rerun+"))
             if parts.hostname is None or not listens(parts.hostname, parts.port or GRPC_PORT):
@@ -57,6 +53,28 @@ class Screen:
                 )
             self.address = where
 
+    def _serve(self, bind: str) -> None:
+        for port in (GRPC_PORT, WEB_PORT):
+            if listens(LOOPBACK, port):
+                raise InputError(
+                    f"port {port} is taken; end what listens there, or give its address"
+                )
+        inner_grpc, inner_web = free_ports(2)
+        self.process = _start(
+            inner_grpc, "--serve-web", "--web-viewer-port", str(inner_web),
+            "--newest-first", "--cors-allow-origin", f"http://*:{WEB_PORT}",
+        )  # fmt: skip
+        self.is_ours = True
+        self.address = f"rerun+http://{LOOPBACK}:{inner_grpc}/proxy"
+        doors = {(bind, GRPC_PORT): inner_grpc, (bind, WEB_PORT): inner_web}
+        try:
+            self.gate = WebGate(doors, watched=GRPC_PORT)
+        except OSError as error:
+            self.process.kill()
+            self.process.wait()
+            raise InputError(f"{bind}: no page can be served there: {error.strerror}") from error
+        self.page = page_of(LOOPBACK if bind in ("0.0.0.0", "::") else bind)
+
     @property
     def is_gone(self) -> bool:
         """Whether a viewer that was started here has ended."""
@@ -64,6 +82,8 @@ class Screen:
 
     def close(self) -> None:
         """End what is to end with the flight."""
+        if self.gate is not None:
+            self.gate.close()
         if self.process is not None and self.is_ours:
             self.process.terminate()
             self.process.wait()
@@ -83,19 +103,17 @@ def listens(host: str, port: int) -> bool:
         return False
 
 
-def _start(*arguments: str, detached: bool = False) -> subprocess.Popen[bytes]:
+def _start(port: int, *arguments: str, detached: bool = False) -> subprocess.Popen[bytes]:
     command = [
-        str(_executable()), "--port", str(GRPC_PORT), "--memory-limit", MEMORY,
-        "--server-memory-limit", "25%", *arguments,
+        str(_executable()), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", MEMORY,
+        "--server-memory-limit", SERVER_MEMORY, *arguments,
     ]  # fmt: skip
     process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL, start_new_session=detached,
     )  # fmt: skip
-    bind = arguments[arguments.index("--bind") + 1]
-    host = LOOPBACK if bind in ("0.0.0.0", "::") else bind
     until_s, never = monotonic_s() + START_S, threading.Event()
-    while not listens(host, GRPC_PORT):
+    while not listens(LOOPBACK, port):
         if process.poll() is not None:
             raise InputError(
                 f"the viewer ended at once (status {process.returncode}); is there a display?"

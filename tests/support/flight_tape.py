@@ -49,27 +49,39 @@ class _Jpeg:
     jpeg: bytes
 
 
+class Keeper:
+    """Writes a tape."""
+
+    def __init__(self, path: Path, camera: Camera, origin: GeoOrigin | None) -> None:
+        self._camera = camera
+        self._tape = path.open("wb")
+        pickle.dump((camera, origin), self._tape)
+
+    def take(self, message: Message) -> None:
+        """Keep a message, if viewers are shown it."""
+        if isinstance(message, Frame):
+            bgr = cv2.cvtColor(message.rgb, cv2.COLOR_RGB2BGR)
+            _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 90])
+            pickle.dump(_Jpeg(message.seq, message.t_ns, jpeg.tobytes()), self._tape)
+        elif isinstance(message, KEPT):
+            pickle.dump(reduced(message, self._camera.width), self._tape)
+
+    def __enter__(self) -> Keeper:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._tape.close()
+
+
 def make_tape(flight_path: Path, path: Path, config: Config) -> None:
     """Replay a flight once, and keep all that a viewer is shown."""
     flight = open_flight(flight_path, config.camera, config.telemetry)
     log = flight.telemetry()
     times, device = StageTimes(), open_device(config.opencl)
-    with path.open("wb") as tape:
-        pickle.dump((flight.camera, log.origin), tape)
-
-        class Keeper:
-            def take(self, message: Message) -> None:
-                if isinstance(message, Frame):
-                    quality = [cv2.IMWRITE_JPEG_QUALITY, 90]
-                    bgr = cv2.cvtColor(message.rgb, cv2.COLOR_RGB2BGR)
-                    _, jpeg = cv2.imencode(".jpg", bgr, quality)
-                    pickle.dump(_Jpeg(message.seq, message.t_ns, jpeg.tobytes()), tape)
-                elif isinstance(message, KEPT):
-                    pickle.dump(reduced(message, flight.camera.width), tape)
-
+    with Keeper(path, flight.camera, log.origin) as keeper:
         pipeline = Pipeline(
             LocalisationStage(config, flight.camera, times, beside=False),
-            DepthStage(config.depth, config.cloud, flight.camera, device, times), [Keeper()],
+            DepthStage(config.depth, config.cloud, flight.camera, device, times), [keeper],
             lossless=True,
         )  # fmt: skip
         start_ns, stop_ns = flight.start_ns, flight.stop_ns

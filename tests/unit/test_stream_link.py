@@ -13,7 +13,7 @@ import pytest
 from companion.errors import StreamError
 from companion.stream.encoding import Kind, decode
 from companion.stream.exporter import Exporter, open_listener
-from companion.stream.framing import HELLO, MOST_ITEM_BYTES, Reassembly, frame
+from companion.stream.framing import HELLO, MOST_ITEM_BYTES, Reassembly, frame, greeting
 from companion.stream.ground_link import GroundLink, host_and_port
 from companion.stream.items import COARSE, FlightItem, Item, PointsItem, PoseItem, Shown
 from companion.stream.parts import parts_of
@@ -137,6 +137,34 @@ def test_a_viewer_that_stands_still_costs_the_others_nothing_and_catches_up() ->
         slow.may_take.set()
         until(lambda: len(slow.coarse()) == 200)
         until(lambda: any(isinstance(i, PoseItem) and i.t_ns == 99 for i in slow.items))
+
+
+def test_poses_come_by_datagrams_and_in_order() -> None:
+    with serving(filled(1)) as (exporter, port), watching(port) as viewer:
+        until(lambda: viewer.items)
+        t_ns = 0
+
+        def flying() -> bool:
+            nonlocal t_ns
+            t_ns += 1
+            tell(exporter, pose(t_ns))
+            time.sleep(0.02)
+            return viewer.link.n_datagrams > 20
+
+        until(flying)
+        seen = [item.t_ns for item in viewer.items if isinstance(item, PoseItem)]
+        assert seen == sorted(set(seen))
+
+
+def test_datagrams_go_to_nobody_who_is_not_connected() -> None:
+    with serving(filled(1)) as (exporter, port):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.settimeout(0.5)
+            stranger.sendto(greeting(bytes(16), 1), ("127.0.0.1", port))
+            stranger.sendto(b"x" * 300, ("127.0.0.1", port))
+            tell(exporter, pose(1))
+            with pytest.raises(TimeoutError):
+                stranger.recv(100)
 
 
 def test_the_budget_holds_headers_and_all() -> None:

@@ -180,6 +180,24 @@ def test_states_warnings_and_timings_are_there(flight: Rows) -> None:
     assert heights[0] == pytest.approx(-flown.place_m(flown.N_INITIALISING)[2])
 
 
+def test_a_recording_stays_within_its_room_and_keeps_the_newest(tmp_path: Path) -> None:
+    random = np.random.default_rng(4)
+    noise = random.integers(0, 255, (480, 640, 3)).astype(np.uint8)
+    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+    config = ViewerConfig(rrd_mb=12, jpeg_quality=90)
+    with FileViewer(config, camera, tmp_path / "flight.rrd") as viewer:
+        viewer.take(flown.update())
+        for seq in range(400):
+            viewer.take(replace(flown.frame(seq), rgb=noise))
+            viewer.take(replace(flown.track(30), seq=seq, t_ns=flown.time_ns(seq)))
+    paths = sorted(tmp_path.glob("flight*.rrd"), key=lambda path: path.stat().st_mtime)
+    assert len(paths) == 4 and not (tmp_path / "flight.rrd").exists()
+    assert sum(path.stat().st_size for path in paths) < 24 << 20
+    streams = [RrdReader(path).stream().to_chunks() for path in paths]
+    last = {str(chunk.entity_path) for chunk in streams[-1]}
+    assert {"/world/map", "/world/map/keyframes/3", "/world/camera/image"} <= last
+
+
 def test_kernel_times_are_plotted(tmp_path: Path) -> None:
     timed = replace(flown.depth_map(2), kernel_ms={"update": 12.5})
     rows = record(tmp_path / "f.rrd", [timed])
