@@ -8,8 +8,8 @@ deleted. Once a second all processes of the daemon are looked at.
 
 Written are soak.csv (a row a second), laps.csv (a row a lap), journal.txt, soak.svg, and at the end
 a few lines: rates, latency, and how fast memory, file handles and threads have grown after the
-first three laps. A day is --seconds 86400. Exit status 1 where something was lost, restarted or has
-grown.
+first three laps. Ctrl-C or SIGTERM ends it early. A day is --seconds 86400. Exit status 1 where
+something was lost, restarted or has grown.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import contextlib
 import csv
 import json
 import shutil
+import signal
 import sys
 import time
 from dataclasses import dataclass, field
@@ -150,30 +151,33 @@ def fly(arguments: argparse.Namespace) -> Soak:
         began_s = begins_s + time.monotonic() - time.time()
         known: set[Path] = set()
         lap = 0
-        while lap * lap_s < arguments.seconds:
-            begin_s = began_s + lap * lap_s
-            autopilot.fly(flight.start_ns, round(begin_s * 1e9), arm=False)
-            armed = disarmed = False
-            while (into_s := time.monotonic() - begin_s) < lap_s:
-                if not armed and into_s > ARM_S:
-                    autopilot.arm()
-                    armed = True
-                elif not disarmed and into_s > lap_s - LAST_S:
-                    autopilot.disarm()
-                    disarmed = True
-                row = looked_at(began_s, lap, daemon, process)
-                soak.rows.append(row)
-                rows.writerow(row)
-                rows_file.flush()
-                for path in sorted(set(daemon.flown()) - known):
-                    if daemon.said(f"flight over: {path}"):
-                        known.add(path)
-                        done = lap_of(len(soak.laps), path, autopilot)
-                        soak.laps.append(done)
-                        laps.writerow(done)
-                        laps_file.flush()
-                time.sleep(max(0.05, 1.0 - (time.monotonic() - began_s) % 1.0))
-            lap += 1
+        try:
+            while lap * lap_s < arguments.seconds:
+                begin_s = began_s + lap * lap_s
+                autopilot.fly(flight.start_ns, round(begin_s * 1e9), arm=False)
+                armed = disarmed = False
+                while (into_s := time.monotonic() - begin_s) < lap_s:
+                    if not armed and into_s > ARM_S:
+                        autopilot.arm()
+                        armed = True
+                    elif not disarmed and into_s > lap_s - LAST_S:
+                        autopilot.disarm()
+                        disarmed = True
+                    row = looked_at(began_s, lap, daemon, process)
+                    soak.rows.append(row)
+                    rows.writerow(row)
+                    rows_file.flush()
+                    for path in sorted(set(daemon.flown()) - known):
+                        if daemon.said(f"flight over: {path}"):
+                            known.add(path)
+                            done = lap_of(len(soak.laps), path, autopilot)
+                            soak.laps.append(done)
+                            laps.writerow(done)
+                            laps_file.flush()
+                    time.sleep(max(0.05, 1.0 - (time.monotonic() - began_s) % 1.0))
+                lap += 1
+        except KeyboardInterrupt:
+            pass  # what was seen so far is told all the same
         daemon.stop()
         soak.wrong += [line.text for line in daemon.lines if "Traceback" in line.text]
     return soak
@@ -252,6 +256,8 @@ def main() -> int:
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     with (arguments.out / "journal.txt").open("w") as journal, contextlib.redirect_stdout(journal):
         soak = fly(arguments)
     lines = verdict(soak)
