@@ -21,6 +21,7 @@ from drivers.recording.recorded_flight import (
     open_recorded_folder,
     open_recording,
 )
+from drivers.telemetry_folder import READERS as LOGS
 from drivers.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from drivers.video_flight import is_video, open_video
 
@@ -77,6 +78,10 @@ def format_of(path: Path) -> Format:
         names = ", ".join(dict.fromkeys(f.name for f in FOLDERS))
         raise FlightError(
             f"{path}: no video and no images, so not a flight; a folder can be: {names}"
+        )
+    if path.suffix.lower() in LOGS:
+        raise FlightError(
+            f"{path}: a telemetry log has no pictures; FLIGHT is the video, and this goes to --log"
         )
     names = ", ".join(f.name for f in FILES)
     raise FlightError(

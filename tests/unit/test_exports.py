@@ -17,6 +17,7 @@ import pytest
 import rasterio
 from pyproj import CRS, Transformer
 
+from companion.cli import main
 from companion.config import ExportConfig
 from companion.errors import InputError
 from companion.geometry import Pose, quaternion_from_euler, rotation_from_quaternion
@@ -313,3 +314,17 @@ def test_cloud_cut_short(tmp_path: Path) -> None:
     (tmp_path / "cloud.ply").write_bytes(whole[:-5])
     with pytest.raises(InputError, match="cut short"):
         read_run(tmp_path)
+
+
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(tmp_path / "run")
+    run, out = str(tmp_path / "run"), tmp_path / "out"
+    assert main(["export", run, "--as", "las, GPX", "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"export: {out}/cloud.las\nexport: {out}/trajectory.gpx\n"
+    assert len(list(out.iterdir())) == 4
+    assert main(["export", run, "--set", 'export.formats=["kml"]']) == 0
+    assert (tmp_path / "run" / "trajectory.kml").exists()
+    assert main(["export", run]) == 2
+    assert main(["export", run, "--as", "dwg"]) == 2
+    assert main(["export", str(tmp_path / "nowhere"), "--as", "las"]) == 2
+    assert "nothing to export" in capsys.readouterr().err

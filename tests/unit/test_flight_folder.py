@@ -218,6 +218,9 @@ def test_no_flight(tmp_path: Path) -> None:
         opened(tmp_path)
     with pytest.raises(FlightError, match=r"camera\.mp4"):
         opened(tmp_path / "camera.mp4")
+    (tmp_path / "a.tlog").write_bytes(b"")
+    with pytest.raises(FlightError, match="goes to --log"):
+        opened(tmp_path / "a.tlog")
     (tmp_path / "note.txt").write_text("no flight")
     with pytest.raises(FlightError, match="not a folder, and no file that holds a flight"):
         opened(tmp_path / "note.txt")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from companion.camera import Camera
+from companion.cli import main
 from companion.config import CameraConfig, Config
 from companion.errors import FlightError, InputError
 from companion.import_command import import_flight
@@ -148,6 +149,18 @@ def test_nothing_is_left_of_an_import_that_fails(tmp_path: Path, flown: Piece) -
     with pytest.raises(KeyboardInterrupt):
         import_flight(tmp_path / "flown", tmp_path / "out", Config(), Stopped(), print)
     assert [p.name for p in tmp_path.iterdir()] == ["flown"]
+
+
+def test_command(tmp_path: Path, flown: Piece, capsys: pytest.CaptureFixture[str]) -> None:
+    write_remode(tmp_path / "flown", flown)
+    source, out = str(tmp_path / "flown"), tmp_path / "out"
+    assert main(["import", source, "--out", str(out)]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "no times: images are taken to come at 10/s: REMODE",
+        "no telemetry: neither scale nor level will be known",
+        f"flight: {out}, 5 frames",
+    ]
+    assert main(["import", source, "--out", str(out)]) == 2
 
 
 SAMPLES: list[Telemetry] = [
