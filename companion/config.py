@@ -313,7 +313,7 @@ class DepthConfig:
     """Least correlation of an image that is said to fit."""
     noise_grey: Annotated[float, Range(0, 50)] = 1.0
     """Patches whose grey levels vary less than this are blank."""
-    converged_sigma: Annotated[float, Range(0.0001, 0.1)] = 0.012
+    converged_sigma: Annotated[float, Range(0.0001, 0.1)] = 0.02
     """Relative standard deviation at which a pixel has converged."""
     min_inlier_ratio: Annotated[float, Range(0, 1)] = 0.35
     """Share of images that fit, which a converged pixel has at least; some may not see it."""
