@@ -44,6 +44,16 @@ def accuracy_statement(run: FinishedRun, file: str, frame: MapFrame | None) -> b
     return ("\n".join(lines) + "\n").encode()
 
 
+def remarks_on_heights(run: FinishedRun) -> list[str]:
+    """What the run's warnings say against its heights: they are then not those above the sea."""
+    warnings = run.report.get("warnings") or []
+    return [
+        f"{warning['what']}: {warning.get('first_detail', '')}"
+        for warning in warnings
+        if isinstance(warning, dict) and str(warning.get("what")).startswith("heights")
+    ]
+
+
 def _placed(run: FinishedRun, frame: MapFrame | None) -> list[str]:
     if not run.metric:
         return [
@@ -64,10 +74,16 @@ def _placed(run: FinishedRun, frame: MapFrame | None) -> list[str]:
         return [zero, ABSOLUTE]
     shift = "UTM by Krueger's series, error below a micrometre"
     how = shift if frame.name.startswith("WGS 84 / UTM") else "projected by PROJ from WGS84"
+    against = remarks_on_heights(run)
+    heights = (
+        "Heights: NOT above mean sea level. " + "; ".join(against) + "."
+        if against
+        else "Heights: above mean sea level as the autopilot gives them, written as EGM96; no "
+        "geoid model was applied."
+    )
     return [
         f"Coordinates: {frame.name} (EPSG:{frame.epsg}); {how}.",
-        "Heights: above mean sea level as the autopilot gives them, written as EGM96; no geoid "
-        "model was applied.",
+        heights,
         zero,
         ABSOLUTE,
     ]

@@ -12,7 +12,7 @@ from companion import __version__
 from companion.config import ExportConfig
 from companion.errors import InputError
 from companion.messages import GeoOrigin
-from companion.output.accuracy import accuracy_statement
+from companion.output.accuracy import accuracy_statement, remarks_on_heights
 from companion.output.atomic_file import write_atomically
 from companion.output.cloud_las import cloud_las
 from companion.output.cloud_pcd import cloud_pcd
@@ -34,7 +34,8 @@ class Export:
     @cached_property
     def frame(self) -> MapFrame:
         """Of maps and clouds."""
-        return map_frame(self.run.origin, self.run.metric, self.config.epsg)
+        above_sea = not remarks_on_heights(self.run)
+        return map_frame(self.run.origin, self.run.metric, self.config.epsg, above_sea)
 
     @cached_property
     def surface(self) -> Surface:

@@ -41,17 +41,22 @@ class MapFrame:
     epsg: int | None
     wkt: str
     coordinates: Callable[[Array], Array]
+    above_sea: bool = True
 
     @property
     def wkt_with_height(self) -> str:
-        """What is written where heights are meant too."""
-        return f'COMPD_CS["{self.name} + EGM96 height",{self.wkt},{EGM96}]' if self.wkt else ""
+        """What is written where heights are meant too, if they are what they should be."""
+        if not (self.wkt and self.above_sea):
+            return self.wkt
+        return f'COMPD_CS["{self.name} + EGM96 height",{self.wkt},{EGM96}]'
 
 
-def map_frame(origin: GeoOrigin | None, metric: bool, epsg: int) -> MapFrame:
+def map_frame(
+    origin: GeoOrigin | None, metric: bool, epsg: int, above_sea: bool = True
+) -> MapFrame:
     """The frame with this EPSG number; by 0 the UTM zone of the origin, or without one local.
 
-    What is not `metric` keeps the map's own axes.
+    What is not `metric` keeps the map's own axes. `above_sea` tells whether heights are.
 
     InputError where there is no such projection in metres, or no origin for it.
     """
@@ -66,13 +71,13 @@ def map_frame(origin: GeoOrigin | None, metric: bool, epsg: int) -> MapFrame:
         return MapFrame("local east, north, up in metres", None, "", _enu)
     zone = _zone_of(epsg) if epsg else utm_zone(origin.latitude_deg, origin.longitude_deg)
     if zone is None:
-        return _by_proj(origin, epsg)
+        return _by_proj(origin, epsg, above_sea)
 
     def coordinates(points_ned: Array) -> Array:
         places = geodetic_from_ned(points_ned, origin)
         return np.column_stack([utm_from_geodetic(places[:, 0], places[:, 1], zone), places[:, 2]])
 
-    return MapFrame(zone.name, zone.epsg, _utm_wkt(zone), coordinates)
+    return MapFrame(zone.name, zone.epsg, _utm_wkt(zone), coordinates, above_sea)
 
 
 def _enu(points_ned: Array) -> Array:
@@ -90,7 +95,7 @@ def _zone_of(epsg: int) -> UtmZone | None:
     return None
 
 
-def _by_proj(origin: GeoOrigin, epsg: int) -> MapFrame:
+def _by_proj(origin: GeoOrigin, epsg: int, above_sea: bool) -> MapFrame:
     try:
         from pyproj import CRS, Transformer
         from pyproj.enums import WktVersion
@@ -116,7 +121,8 @@ def _by_proj(origin: GeoOrigin, epsg: int) -> MapFrame:
             raise InputError(f"EPSG:{epsg} ({crs.name}) does not reach to where the flight was")
         return out
 
-    return MapFrame(crs.name, epsg, crs.to_wkt(WktVersion.WKT1_GDAL), coordinates)
+    wkt = crs.to_wkt(WktVersion.WKT1_GDAL)
+    return MapFrame(crs.name, epsg, wkt, coordinates, above_sea)
 
 
 def _utm_wkt(zone: UtmZone) -> str:

@@ -253,6 +253,19 @@ def test_accuracy_beside_each_file(run: FinishedRun, tmp_path: Path) -> None:
     assert "EPSG:32632" in (tmp_path / "surface.tif.accuracy.txt").read_text()
 
 
+def test_heights_that_are_not_above_the_sea(tmp_path: Path) -> None:
+    """They are not given out as such."""
+    run = write_run(tmp_path / "run")
+    what = "heights of NavSatFix are above the ellipsoid"
+    told = {**run.report, "warnings": [{"what": what, "count": 1, "first_detail": "so"}]}
+    (path,) = exported(replace(run, report=told), tmp_path, "las")
+    crs = laspy.read(path).header.parse_crs()
+    assert crs is not None
+    assert crs.to_epsg() == 32632
+    text = (tmp_path / "cloud.las.accuracy.txt").read_text()
+    assert "NOT above mean sea level. heights of NavSatFix" in text
+
+
 @pytest.mark.parametrize("formats", [("gpx",), ("las", "kml"), ("geojson",)])
 def test_no_place_on_earth(tmp_path: Path, formats: Sequence[str]) -> None:
     run = write_run(tmp_path / "run", origin=None)
