@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -14,6 +15,8 @@ from companion.config import CameraConfig
 from companion.messages import Frame, PositionSample
 from drivers.open_flight import open_flight
 from drivers.pattern_camera import world_from_body
+from drivers.recording.disk_writer import FAILED
+from drivers.recording.flights_folder import recordings_in
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.mcap_scan import summary
 from drivers.recording.recorded_flight import RecordedFlight
@@ -123,3 +126,39 @@ def test_two_replays_of_a_live_flight_give_the_same_bytes(tmp_path: Path) -> Non
     assert a == b
     tracked = np.loadtxt(a.decode().splitlines())
     assert len(tracked) > 0.6 * opened.n_frames
+
+
+def test_a_recorder_that_dies_goes_on_in_another_part(tmp_path: Path) -> None:
+    daemon = fly(tmp_path, 1)
+    try:
+        daemon.signal_stage("tape", signal.SIGKILL)
+        daemon.line("a stage has died and is started again: tape", 10)
+        time.sleep(3)
+        daemon.stop()
+    finally:
+        daemon.__exit__(None, None, None)
+    (folder,) = (tmp_path / "flights").iterdir()
+    parts = [open_flight(p, CameraConfig()) for p in recordings_in(folder)]
+    assert [p.path.parent.name for p in parts] == [folder.name, "part-2"]
+    assert parts[0].stop_ns < parts[1].start_ns and min(p.n_frames for p in parts) > 5
+    assert parts[1].warnings == ()
+
+
+def test_a_disk_that_takes_nothing_ends_the_recording_not_the_flight(tmp_path: Path) -> None:
+    daemon = fly(tmp_path, 2)
+    try:
+        full_ns = daemon.fill_disk_of("tape")
+        daemon.line(FAILED, 10, full_ns)
+        n_before = done(daemon.status())
+        daemon.until(lambda health: done(health) > n_before + 15, 20, "frames are tracked")
+        assert not daemon.said("a stage has died")
+        daemon.stop()
+    finally:
+        daemon.__exit__(None, None, None)
+    opened = recorded(tmp_path)
+    assert opened.n_frames > 10
+
+
+def done(health: dict[str, Any]) -> int:
+    """Frames that localisation has worked on."""
+    return sum(stage["n"] for stage in health["stages"] if stage["name"] == "localisation")
