@@ -86,7 +86,9 @@ def made(folder: Path) -> list[Path]:
     write_posed_video(folder / "posed", flown)
     for kind, name in (("ros1", "flight.bag"), ("sqlite", "sqlite"), ("mcap", "mcap")):
         write_bag(folder / name, kind, flown)
-    write_bag(folder / "packed.bag", "ros1", flown, compressed=True)
+    write_bag(folder / "pictures.bag", "ros1", flown, compressed=True)
+    for kind, name in (("ros1", "packed.bag"), ("sqlite", "packed"), ("mcap", "packed_mcap")):
+        write_bag(folder / name, kind, flown, packed=True)
     (folder / "photos").mkdir()
     for k in range(6):
         write_photo(
@@ -94,7 +96,7 @@ def made(folder: Path) -> list[Path]:
             place=(47.0 + k * 1e-4, 8.5, 500.0),
         )  # fmt: skip
     names = ["flight", "euroc", "tum", "remode", "posed", "flight.bag", "sqlite", "mcap",
-             "packed.bag", "photos"]  # fmt: skip
+             "pictures.bag", "packed.bag", "packed", "packed_mcap", "photos"]  # fmt: skip
     return [*(folder / name for name in names), kitti]
 
 

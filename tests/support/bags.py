@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -37,7 +37,7 @@ LATE_NS = 3_000_000
 class BagWriter:
     """Writes messages into a bag of one kind: "ros1", "sqlite" or "mcap"."""
 
-    def __init__(self, path: Path, kind: str) -> None:
+    def __init__(self, path: Path, kind: str, packed: bool = False) -> None:
         self.is2 = kind != "ros1"
         self.types = get_typestore(Stores.ROS2_HUMBLE if self.is2 else Stores.ROS1_NOETIC)
         transforms = {} if self.is2 else get_types_from_msg(TRANSFORMS, "tf2_msgs/msg/TFMessage")
@@ -46,8 +46,13 @@ class BagWriter:
         if self.is2:
             plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
             self._writer = Writer2(path, version=8, storage_plugin=plugin)
+            if packed:
+                mode = CompressionMode.STORAGE if kind == "mcap" else CompressionMode.MESSAGE
+                self._writer.set_compression(mode, CompressionFormat.ZSTD)
         else:
             self._writer = Writer1(path)
+            if packed:
+                self._writer.set_compression(Writer1.CompressionFormat.LZ4)
         self._topics: dict[str, Any] = {}
         self._seq = 0
 
@@ -85,10 +90,14 @@ class BagWriter:
 
 
 def write_bag(
-    path: Path, kind: str, flown: Piece, origin: GeoOrigin | None = None, compressed: bool = False
-) -> None:
-    """Camera, IMU and odometry; with an origin satellite fixes instead of the odometry."""
-    with BagWriter(path, kind) as bag:
+    path: Path, kind: str, flown: Piece, origin: GeoOrigin | None = None, compressed: bool = False,
+    packed: bool = False,
+) -> None:  # fmt: skip
+    """Camera, IMU and odometry; with an origin satellite fixes instead of the odometry.
+
+    Its pictures are `compressed`, or it is `packed` as a whole.
+    """
+    with BagWriter(path, kind, packed) as bag:
         _transforms(bag, flown)
         _camera_info(bag, flown)
         for frame in flown.frames:

@@ -153,6 +153,15 @@ def test_compressed_pictures(tmp_path: Path, flown: Piece) -> None:
     assert flight.camera.fx == flown.camera.fx  # camera_info lies one name higher
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_packed_bags(tmp_path: Path, flown: Piece, kind: str) -> None:
+    write_bag(tmp_path / name_of(kind), kind, flown, packed=True)
+    flight = opened(tmp_path / name_of(kind))
+    first = next(f for f in flight.frames() if isinstance(f, Frame))
+    assert (first.rgb == flown.frames[0].rgb).all()
+    assert flight.telemetry().rates_hz["imu"] > 1
+
+
 def test_topic_by_name(bags: dict[str, Path]) -> None:
     assert opened(bags["mcap"], topic=CAMERA).n_frames == 4
     with pytest.raises(FlightError, match=f"/rear.*{CAMERA}"):
