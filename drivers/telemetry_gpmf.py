@@ -1,6 +1,7 @@
-"""Telemetry inside a GoPro video: what a Karma drone's autopilot told its camera (GPMF).
+"""Telemetry inside a GoPro video (GPMF): what a Karma drone's autopilot told its camera.
 
-The camera's own sensors (ACCL, GYRO, GPS5) are not the autopilot's and are not read.
+Where there was none, the places of the camera's own receiver. Its gyro and accelerometer (ACCL,
+GYRO) are not read: their axes differ from model to model.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from companion.messages import (
     Telemetry,
     Warned,
 )
+from drivers.gpmf_camera import HEIGHTS, camera_fixes
 from drivers.gpmf_records import GpmfError, read_streams
 from drivers.mavlink_samples import FIX_3D, STANDARD_GRAVITY, height_from_pressure
 from drivers.stamp_filter import MAX_BOOT_NS, believable
@@ -37,7 +39,7 @@ Times = NDArray[np.int64]
 
 
 def read_gpmf(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogContent | None:
-    """The autopilot's telemetry in a video; None where there is none.
+    """The telemetry in a video; None where there is none.
 
     Autopilot time is put on the video's by the payloads, each of which holds what came in its span
     of the video, then on the flight's clock by `host_from_file_ns`, given times after the first
@@ -69,6 +71,12 @@ def read_gpmf(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogCo
         detail = f"{n_damaged} of {len(payloads)} blocks in {video.name}"
         warnings.append(Warned(0, "damaged telemetry", detail))
     if not spans:
+        own = camera_fixes(video.name, payloads)
+        if len(own):
+            return LogContent(
+                own, lambda file_ns, segment: host_from_file_ns(file_ns), None,
+                (*warnings, HEIGHTS),
+            )  # fmt: skip
         return LogContent(collected, warnings=tuple(warnings)) if warnings else None
     offset_ns, sigma_ns = _offset(spans)
 

@@ -5,6 +5,8 @@ import struct
 import numpy as np
 import pytest
 
+from companion.messages import PositionSample
+from drivers.gpmf_camera import camera_fixes
 from drivers.gpmf_records import GpmfError, read_streams
 from drivers.telemetry_gpmf import _offset
 from tests.support.logs import klv
@@ -66,3 +68,38 @@ def test_a_block_that_is_late() -> None:
     found, sigma_ns = _offset(spans)
     assert found == pytest.approx(-50e9, abs=1e8)
     assert sigma_ns > 1e8
+
+
+def camera_block(latitude: float, fix: int, dilution: int = 150) -> bytes:
+    """Two places of a camera's own receiver, as GPS5."""
+    rows = [(latitude, -8.5, 500.5, 3.0, 3.5), (latitude + 1e-5, -8.50002, 501.5, 3.0, 3.5)]
+    scales = (10_000_000, 10_000_000, 1000, 1000, 100)
+    data = b"".join(
+        struct.pack(">5l", *(round(v * s) for v, s in zip(row, scales, strict=True)))
+        for row in rows
+    )
+    stream = (
+        klv("GPSF", "L", 4, struct.pack(">L", fix))
+        + klv("GPSP", "S", 2, struct.pack(">H", dilution))
+        + klv("SCAL", "l", 4, struct.pack(">5l", *scales))
+        + klv("GPS5", "l", 20, data)
+    )
+    return klv("DEVC", "\0", 1, klv("STRM", "\0", 1, stream))
+
+
+def test_places_of_the_camera_itself() -> None:
+    """Spread over their blocks; those without a fix, or a bad one, are left out."""
+    second = 1_000_000_000
+    blocks = [camera_block(47.1, 3), camera_block(47.2, 0), camera_block(47.3, 3, 2500),
+              camera_block(47.4, 3)]  # fmt: skip
+    payloads = [(k * second, (k + 1) * second, block) for k, block in enumerate(blocks)]
+    collected = camera_fixes("video", payloads)
+    log = collected.finish(lambda t_ns, _: t_ns, None)
+    found = [s for s in log.samples if isinstance(s, PositionSample)]
+    assert [s.t_ns for s in found] == [second // 4, 3 * second // 4, 13 * second // 4,
+                                       15 * second // 4]  # fmt: skip
+    assert log.origin is not None
+    assert log.origin.latitude_deg == pytest.approx(47.1)
+    assert log.origin.longitude_deg == pytest.approx(-8.5)
+    assert found[0].sigma_horizontal_m == 4.5
+    assert found[1].position_ned_m[2] == pytest.approx(-1, abs=0.01)
