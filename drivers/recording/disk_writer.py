@@ -59,6 +59,7 @@ class DiskWriter:
         self._changed = threading.Condition()
         self._closing = False
         self._ended = False
+        self._fault: BaseException | None = None
         self._looked_s = -LOOK_S
         self._told: set[str] = set()
         self.n_dropped: Counter[str] = Counter()
@@ -74,7 +75,12 @@ class DiskWriter:
         return not self._ended
 
     def put(self, entry: Entry, kind: str, is_picture: bool = False) -> bool:
-        """Have a message written; never waits. False where there is no room for it."""
+        """Have a message written; never waits. False where there is no room for it.
+
+        Raises what has ended the thread, should it have a bug.
+        """
+        if self._fault is not None:
+            raise self._fault
         with self._changed:
             room = self._most * (PICTURES_SHARE if is_picture else 1.0)
             if self._ended or self._n_waiting + len(entry.data) > room:
@@ -104,6 +110,15 @@ class DiskWriter:
         self._thread.join()
 
     def _run(self) -> None:
+        try:
+            self._work()
+        except BaseException as fault:  # handed to the thread that records, which raises it
+            self._fault = fault
+        finally:
+            self._mcap.close()
+            self._tlog.close()
+
+    def _work(self) -> None:
         due_s = time.monotonic()
         while not self._ended:
             with self._changed:
@@ -130,8 +145,6 @@ class DiskWriter:
             due_s = began_s + self._config.flush_s
             if closing and not self._ended:
                 self._end()
-        self._mcap.close()
-        self._tlog.close()
 
     def _has_enough(self) -> bool:
         return self._closing or self._n_waiting > CHUNK_BYTES

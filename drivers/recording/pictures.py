@@ -24,6 +24,8 @@ from drivers.recording.topics import GREY, IMAGE, RAW, VIDEO
 
 FRAME_ID = "camera"
 PNG_LEVEL = 1
+MOST_INSIDE = 64
+"""Pictures that an encoder may hold."""
 SOFTWARE = "libx264"
 HARDWARE = ("h264_v4l2m2m", "h264_nvenc")
 """What of FFmpeg's encoders is tried before the processor has to do it."""
@@ -33,9 +35,11 @@ _BEGINS = re.compile(rb"\x00\x00\x01(?:[\x25\x45\x65\x05]|[\x27\x47\x67\x07])")
 
 
 class Recorded(NamedTuple):
-    """One message of a picture; what follows a picture that is lost needs it unless `alone`."""
+    """One message of the picture of a frame; unless `alone` it needs the picture before it."""
 
     topic: str
+    seq: int
+    t_ns: int
     data: bytes
     alone: bool = True
 
@@ -47,13 +51,13 @@ class PictureEncoder(Protocol):
     """For people."""
 
     def encode(self, frame: Frame) -> list[Recorded]:
-        """The messages of a frame; those of one that went before may be among them."""
+        """Take a frame; what is ready, of this one or of one before it."""
 
     def begin_anew(self) -> None:
         """Something was lost: the next picture is to need none before it."""
 
-    def close(self) -> None:
-        """No more frames come."""
+    def finish(self) -> list[Recorded]:
+        """No more frames come; what is left."""
 
 
 def picture_encoder(config: RecorderConfig, width: int, height: int, rate_hz: float) -> (
@@ -82,14 +86,15 @@ class Stills:
         _, data = cv2.imencode(f".{self.name}", bgr, self._parameters)
         image = CompressedImage(frame_id=FRAME_ID, format=self.name, data=data.tobytes())
         set_time(image.timestamp, frame.t_ns)
-        out = [Recorded(IMAGE, serialised(image))]
+        out = [Recorded(IMAGE, frame.seq, frame.t_ns, serialised(image))]
         return out + _grey_beside(frame) if self.name == "png" else out
 
     def begin_anew(self) -> None:
         """See `PictureEncoder`."""
 
-    def close(self) -> None:
+    def finish(self) -> list[Recorded]:
         """See `PictureEncoder`."""
+        return []
 
 
 class Raw:
@@ -99,13 +104,14 @@ class Raw:
 
     def encode(self, frame: Frame) -> list[Recorded]:
         """See `PictureEncoder`."""
-        return [Recorded(RAW, _raw(frame.t_ns, frame.rgb, "rgb8")), *_grey_beside(frame)]
+        return [_raw(RAW, frame, frame.rgb, "rgb8"), *_grey_beside(frame)]
 
     def begin_anew(self) -> None:
         """See `PictureEncoder`."""
 
-    def close(self) -> None:
+    def finish(self) -> list[Recorded]:
         """See `PictureEncoder`."""
+        return []
 
 
 class H264:
@@ -113,7 +119,8 @@ class H264:
 
     def __init__(self, config: RecorderConfig, width: int, height: int, rate_hz: float) -> None:
         self._config, self._size, self._rate_hz = config, (width, height), rate_hz
-        self._times: dict[int, int] = {}
+        self._inside: dict[int, tuple[int, int]] = {}
+        """By presentation stamp: number and time of the frames in the encoder."""
         self._number = 0
         self._anew = False
         wanted = config.h264_encoder
@@ -132,14 +139,18 @@ class H264:
 
     def encode(self, frame: Frame) -> list[Recorded]:
         """See `PictureEncoder`."""
-        return self._encode(self._codec, frame.t_ns, frame.rgb)
+        return self._encode(self._codec, frame.seq, frame.t_ns, frame.rgb)
 
     def begin_anew(self) -> None:
         """See `PictureEncoder`."""
         self._anew = True
 
-    def close(self) -> None:
+    def finish(self) -> list[Recorded]:
         """See `PictureEncoder`."""
+        try:
+            return self._messages(self._codec, self._codec.encode(None))
+        except av.error.FFmpegError:
+            return []
 
     def _opened(self, name: str) -> Any:
         """An encoder that has shown that it works."""
@@ -147,9 +158,9 @@ class H264:
         blank = np.zeros((height, width, 3), np.uint8)
         with av.logging.Capture():
             codec = self._open(name)
-            if not any(self._encode(codec, number, blank) for number in range(8)):
+            if not any(self._encode(codec, number, number, blank) for number in range(8)):
                 raise ValueError("it gives nothing")
-        self._times.clear()
+        self._inside.clear()
         return self._open(name)
 
     def _open(self, name: str) -> Any:
@@ -165,7 +176,7 @@ class H264:
         codec.options = OPTIONS.get(name, {})
         return codec
 
-    def _encode(self, codec: Any, t_ns: int, rgb: Bytes) -> list[Recorded]:
+    def _encode(self, codec: Any, seq: int, t_ns: int, rgb: Bytes) -> list[Recorded]:
         picture = av.VideoFrame.from_ndarray(rgb, "rgb24").reformat(format="yuv420p")
         self._number += 1
         picture.pts = self._number
@@ -173,20 +184,25 @@ class H264:
         if self._anew:
             picture.pict_type = av.video.frame.PictureType.I
             self._anew = False
-        self._times[self._number] = t_ns
-        return [
-            self._message(bytes(packet), self._times.pop(packet.pts), codec.extradata)
-            for packet in codec.encode(picture)
-            if packet.pts in self._times
-        ]
+        self._inside[self._number] = seq, t_ns
+        if len(self._inside) > MOST_INSIDE:  # it has dropped that one
+            del self._inside[next(iter(self._inside))]
+        return self._messages(codec, codec.encode(picture))
 
-    def _message(self, data: bytes, t_ns: int, extradata: bytes | None) -> Recorded:
-        alone = stands_alone(data)
-        if alone and extradata and b"\x00\x00\x01\x67" not in data[:64]:
-            data = extradata + data
-        video = CompressedVideo(frame_id=FRAME_ID, format="h264", data=data)
-        set_time(video.timestamp, t_ns)
-        return Recorded(VIDEO, serialised(video), alone)
+    def _messages(self, codec: Any, packets: Iterable[Any]) -> list[Recorded]:
+        out = []
+        for packet in packets:
+            if packet.pts not in self._inside:
+                continue
+            seq, t_ns = self._inside.pop(packet.pts)
+            data = bytes(packet)
+            alone = stands_alone(data)
+            if alone and codec.extradata and b"\x00\x00\x01\x67" not in data[:64]:
+                data = codec.extradata + data
+            video = CompressedVideo(frame_id=FRAME_ID, format="h264", data=data)
+            set_time(video.timestamp, t_ns)
+            out.append(Recorded(VIDEO, seq, t_ns, serialised(video), alone))
+        return out
 
 
 def stands_alone(h264: bytes | memoryview) -> bool:
@@ -275,15 +291,15 @@ def _grey_beside(frame: Frame) -> list[Recorded]:
     """The grey picture, where it is not what the colours give (of a camera that gives Y, say)."""
     if np.array_equal(frame.grey, grey_of(frame.rgb)):
         return []
-    return [Recorded(GREY, _raw(frame.t_ns, frame.grey, "mono8"))]
+    return [_raw(GREY, frame, frame.grey, "mono8")]
 
 
-def _raw(t_ns: int, pixels: Bytes, encoding: str) -> bytes:
+def _raw(topic: str, frame: Frame, pixels: Bytes, encoding: str) -> Recorded:
     height, width = pixels.shape[:2]
     step = width * (3 if encoding == "rgb8" else 1)
     image = RawImage(
         frame_id=FRAME_ID, width=width, height=height, encoding=encoding, step=step,
         data=pixels.tobytes(),
     )  # fmt: skip
-    set_time(image.timestamp, t_ns)
-    return serialised(image)
+    set_time(image.timestamp, frame.t_ns)
+    return Recorded(topic, frame.seq, frame.t_ns, serialised(image))

@@ -45,7 +45,7 @@ from drivers.recording.disk_writer import DiskWriter, Entry
 from drivers.recording.flights_folder import RECORDING, TLOG
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.pictures import picture_encoder
+from drivers.recording.pictures import Recorded, picture_encoder
 from drivers.recording.topics import (
     CALIBRATION,
     CLOUD,
@@ -150,7 +150,7 @@ class Recorder:
 
     def close(self) -> None:
         """Make the files whole."""
-        self._encoder.close()
+        self._put_pictures(self._encoder.finish())
         self._disk.close()
 
     def _frame(self, frame: Frame) -> None:
@@ -161,11 +161,14 @@ class Recorder:
         if not self._disk.recording:
             self._disk.n_dropped["pictures"] += 1
             return
-        for topic, data, alone in self._encoder.encode(frame):
+        self._put_pictures(self._encoder.encode(frame))
+
+    def _put_pictures(self, messages: list[Recorded]) -> None:
+        for topic, seq, t_ns, data, alone in messages:
             if self._skips_until_alone and not alone:
                 self._disk.n_dropped["pictures"] += 1
                 continue
-            entry = Entry(self._channels[topic], frame.t_ns, data, frame.seq)
+            entry = Entry(self._channels[topic], t_ns, data, seq)
             self._skips_until_alone = not self._disk.put(entry, "pictures", is_picture=True)
             if self._skips_until_alone:
                 self._encoder.begin_anew()

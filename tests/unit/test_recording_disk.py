@@ -135,3 +135,15 @@ def test_what_is_recorded_now_is_never_deleted(tmp_path: Path) -> None:
     assert [f.growing for f in flights] == [True, False]
     assert [f.path.name for f in may_go(flights)] == ["2025-02-01T00-00-00Z"]
     recorder.close()
+
+
+def test_a_bug_in_the_thread_that_writes_is_not_kept_secret(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(fd: int) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(os, "fdatasync", broken)
+    recorder = recorder_in(tmp_path / "f")
+    with pytest.raises(ZeroDivisionError):
+        fly(recorder, 100, 0.01)
