@@ -10,6 +10,7 @@ from companion.config import CameraConfig, RecorderConfig, TelemetryConfig
 from companion.errors import ConfigError, FlightError
 from companion.messages import ClockReport, Frame, GeoOrigin, Warned
 from drivers.open_flight import open_flight
+from drivers.recording import pictures
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.mcap_scan import scan
 from drivers.recording.pictures import picture_encoder
@@ -18,6 +19,8 @@ from drivers.tlog_records import TlogRecords
 from tests.support.recorded import SIZE, START_NS, STEP_NS, camera, frames, record, samples
 
 N = 30
+X264 = "libx264"
+HOLDS_BACK = {"preset": "veryfast", "x264-params": "sync-lookahead=0:rc-lookahead=4"}
 
 
 def opened(folder: Path) -> RecordedFlight:
@@ -59,6 +62,18 @@ def test_frames_come_back_with_their_numbers_and_times(tmp_path: Path, codec: st
     part = list(flight.frames(START_NS + 10 * STEP_NS, START_NS + 13 * STEP_NS))
     assert [f.seq for f in part if isinstance(f, Frame)] == [15, 16, 17]
     assert all(isinstance(f, Frame) and np.array_equal(f.rgb, now[f.seq - 5].rgb) for f in part)
+
+
+def test_an_encoder_that_holds_pictures_back_loses_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pictures, "OPTIONS", {X264: HOLDS_BACK})
+    record(tmp_path / "f", N, "h264", config=RecorderConfig(least_free_mb=0, h264_encoder=X264))
+    was, now = frames(N), frames_of(opened(tmp_path / "f"))
+    assert [(f.seq, f.t_ns) for f in now] == [(f.seq, f.t_ns) for f in was]
+    for k in range(0, N, 7):  # each is its own picture, not its neighbour's
+        away = [np.abs(was[k].rgb.astype(float) - each.rgb).mean() for each in now]
+        assert int(np.argmin(away)) == k
 
 
 @pytest.mark.parametrize("codec", ["png", "raw"])
