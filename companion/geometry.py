@@ -107,6 +107,13 @@ def skew(v: Array) -> Array:
     return out
 
 
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotation nearest to what is one but for rounding, which products of many gather."""
+    u, _, vt = np.linalg.svd(matrix)
+    out: Array = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return out
+
+
 def rotation_from_vector(rotvec: Array) -> Array:
     """Rotation (3, 3) of a rotation vector (3,) in radians (Rodrigues).
 

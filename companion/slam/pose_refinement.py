@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from companion.geometry import Array, Pose, rotation_from_vector
+from companion.geometry import Array, Pose, nearest_rotation, rotation_from_vector
 from companion.slam.features import Bools
 
 CHI2_2D = 5.991
@@ -20,6 +21,33 @@ def residuals(
     z = np.where(np.abs(p[:, 2]) < 1e-9, 1e-9, p[:, 2])
     error = p[:, :2] / z[:, None] - normalised
     return np.einsum("nij,nj->ni", whitening, error), p[:, 2]
+
+
+def robust_cost(
+    camera_from_map: Pose, points_map: Array, normalised: Array, whitening: Array
+) -> float:
+    """Huber's loss of all N points, those behind the camera at a high price."""
+    r, depth = residuals(camera_from_map, points_map, normalised, whitening)
+    size = np.sqrt((r * r).sum(1))
+    loss = np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER))
+    return float(np.where(depth > 0, loss, HUBER * 100.0).sum())
+
+
+def other_pose(points_map: Array, normalised: Array) -> Pose | None:
+    """`camera_from_map` that fits N points best, from nowhere (Terzakis & Lourakis, ECCV 2020).
+
+    Before a plane a pose can have two minima; this does not depend on where a search begins. It
+    knows no outliers.
+    """
+    if len(points_map) < 6:
+        return None
+    ok, rotvec, translation = cv2.solvePnP(
+        points_map, normalised, np.eye(3), np.zeros(0), flags=cv2.SOLVEPNP_SQPNP
+    )
+    if not ok:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(rotvec)[0], np.float64)
+    return Pose(rotation, np.asarray(translation, np.float64).ravel())
 
 
 def refine_pose(
@@ -75,4 +103,5 @@ def refine_pose(
                 break
         r, depth = residuals(pose, points_map, normalised, whitening)
         inlier = ((r * r).sum(1) < CHI2_2D) & (depth > 0)
-    return pose, inlier, information
+    # a pose is refined from one predicted from the last: what rounding adds would grow with each
+    return Pose(nearest_rotation(pose.rotation), pose.translation), inlier, information

@@ -8,6 +8,7 @@ from companion.geometry import (
     Similarity,
     angle_between,
     interpolate_rotation,
+    nearest_rotation,
     quaternion_from_euler,
     quaternion_from_rotation,
     rotation_from_quaternion,
@@ -98,3 +99,12 @@ def test_interpolation_turns_evenly() -> None:
     for fraction in (0.0, 0.25, 1.0, 1.5):
         turned = interpolate_rotation(a, b, fraction)
         assert angle_between(a, turned) == pytest.approx(fraction * whole, abs=1e-9)
+
+
+def test_rounding_does_not_grow_in_a_long_product() -> None:
+    turn = rotation_from_vector(np.array([0.3, -0.2, 0.5]))
+    spoilt = turn @ (np.eye(3) + 1e-3 * np.array([[1.0, 2, 0], [0, -1, 1], [1, 0, 2]]))
+    mended = nearest_rotation(spoilt)
+    np.testing.assert_allclose(mended @ mended.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(mended) == pytest.approx(1.0)
+    assert angle_between(mended, turn) < 2e-3
