@@ -9,7 +9,7 @@ from collections import deque
 from typing import Any
 
 from companion.health import Health
-from companion.messages import MapUpdate, Track, TrackState, Warned
+from companion.messages import MapUpdate, Track, Warned
 from companion.stream.items import Shown
 
 RATE_OVER_NS = 2_000_000_000
@@ -36,7 +36,7 @@ class StatusFacts:
     def tracked(self, track: Track) -> None:
         """A frame has its pose, or has none."""
         self._t_ns = max(self._t_ns, track.t_ns)
-        if track.state is not TrackState.LOST:
+        if track.map_from_camera is not None:
             self._tracked.append(track.t_ns)
         while self._tracked and self._tracked[0] < self._t_ns - RATE_OVER_NS:
             self._tracked.popleft()

@@ -47,8 +47,6 @@ from companion.stream.status_facts import StatusFacts
 
 Watched = Message | Health | GeoOrigin
 """What may be told."""
-COAST_NS = 1_000_000_000
-"""So soon after the last pose the vehicle is still about where motion has it."""
 STATUS_EVERY_NS = 1_000_000_000
 SPEED_OVER_NS = 400_000_000
 PIECE = 50
@@ -63,6 +61,7 @@ MOST_IMAGES_HELD = 4
 IN_WORDS = {
     TrackState.INITIALISING: Shown.INITIALISING,
     TrackState.TRACKING: Shown.TRACKING,
+    TrackState.COASTING: Shown.COASTING,
     TrackState.COASTING: Shown.COASTING,
     TrackState.LOST: Shown.LOST,
 }
@@ -95,7 +94,6 @@ class Story:
         self._last_position_map: Array | None = None
         self._source = PositionSource.GPS
         self._shown = Shown.WAITING
-        self._tracked_ns = -(2**63)
         self._quality = -1
         self._speed: float | None = None
         self._speed_from: tuple[int, Array] | None = None
@@ -178,10 +176,6 @@ class Story:
 
     def _state(self, track: Track) -> list[Item]:
         shown = IN_WORDS[track.state]
-        if track.state is TrackState.TRACKING:
-            self._tracked_ns = track.t_ns
-        elif track.state is TrackState.LOST and track.t_ns - self._tracked_ns < COAST_NS:
-            shown = Shown.COASTING
         if shown is self._shown:
             return []
         self._shown = shown

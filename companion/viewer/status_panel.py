@@ -8,7 +8,7 @@ from typing import Any
 MEANINGS = {
     "Tracking": "The camera knows where it is.",
     "Initialising": "Move sideways, so that the camera sees depth.",
-    "Coasting": "Out of sight for a moment; the place is a guess.",
+    "Coasting": "Nothing is recognised; the place follows from attitude and speed.",
     "Lost": "The camera does not know where it is. Go back to where it did.",
     "Waiting": "No pictures yet.",
 }

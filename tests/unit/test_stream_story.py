@@ -35,11 +35,13 @@ def lost(seq: int) -> Track:
     return Track(seq, flown.time_ns(seq), TrackState.LOST)
 
 
-def test_it_coasts_for_a_second_before_it_is_lost() -> None:
-    items = told([flown.update(), flown.track(20), *(lost(seq) for seq in range(21, 60))])
-    shown = [item.shown for item in items if isinstance(item, PoseItem)]
-    n = round(1e9 / flown.STEP_NS) - 1
-    assert shown == [Shown.TRACKING, *[Shown.COASTING] * n, *[Shown.LOST] * (39 - n)]
+def test_each_state_of_the_tracker_has_its_word() -> None:
+    coasting = replace(flown.track(21), state=TrackState.COASTING, n_inliers=0)
+    items = told([flown.update(), flown.track(20), coasting, lost(22), lost(23)])
+    poses = [item for item in items if isinstance(item, PoseItem)]
+    assert [p.shown for p in poses] == [Shown.TRACKING, Shown.COASTING, Shown.LOST, Shown.LOST]
+    assert [p.world_from_camera is not None for p in poses] == [True, True, False, False]
+    assert {state.value for state in TrackState} <= {shown.value.lower() for shown in Shown}
     said = [(item.text, item.is_warning) for item in items if isinstance(item, LogItem)]
     assert said == [
         ("Tracker: tracking", False), ("Tracker: coasting", True), ("Tracker: lost", True)
