@@ -18,6 +18,7 @@ from drivers.pose_messages import odometry_message, vision_messages
 TICK_S = 0.005
 IDLE_TICK_S = 0.05
 INFO, WARNING = 6, 4
+UNHEARD = "the autopilot is silent"
 
 
 class PoseSender:
@@ -61,8 +62,8 @@ class PoseSender:
         p95_ms = self._latency.percentile_ms(95, now_ns)
         return FeedbackHealth(
             mode=self._config.mode,
-            sending=self._gate.sending,
-            why_not=self._gate.why_not,
+            sending=self._gate.sending and self._link.alive,
+            why_not=self._gate.why_not or ("" if self._link.alive else UNHEARD),
             rate_hz=self._rate.hz(now_ns),
             latency_p50_ms=self._latency.percentile_ms(50, now_ns),
             latency_p95_ms=p95_ms,
