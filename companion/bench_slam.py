@@ -31,6 +31,7 @@ from drivers.open_flight import open_flight
 LEAD_NS = 10_000_000_000
 FRAME_PARTS = ("features", "tracking", "initialising")
 """What a frame waits for; the rest is done beside it in flight."""
+NEES_NS = 10_000_000_000
 STEP_NS = 500_000_000
 """Poses of odometry further apart than this are not one step."""
 
@@ -41,7 +42,9 @@ class BenchRow:
 
     `tracked_share` is of the frames in which there is something to see, above the asked height.
     `live_ate_m` is of the poses as they were first given, aligned by similarity; `worst_step_m`
-    is the largest error of the motion between two consecutive poses of smooth odometry.
+    is the largest error of the motion between two consecutive poses of smooth odometry; `nees` is
+    the mean square of its position's error since its last reset over the variance that it states,
+    1 where that is true.
     `longest_gap_s` is the longest time without a pose beyond what could not be seen; `cost_growth`
     is the ratio of the median work per frame in the last fifth of the flight to the second fifth.
     """
@@ -53,6 +56,7 @@ class BenchRow:
     errors: PathErrors | None
     live_ate_m: float | None
     worst_step_m: float | None
+    nees: float | None
     resets: int
     longest_gap_s: float
     coasted: int
@@ -186,7 +190,7 @@ def _row(
     return BenchRow(
         name, fault.name, len(frame_t_ns), round(float(known.mean()), 4) if len(due) else 0.0,
         path_errors(estimate, truth), live_errors.ate_sim3_m if live_errors else None,
-        _worst_step(listener.odometry, truth, stage),
+        _worst_step(listener.odometry, truth, stage), _nees(listener.odometry, truth, stage),
         max((o.reset_counter for o in listener.odometry), default=0),
         _longest_gap_s(due, known),
         sum(o.state is TrackState.COASTING for o in listener.odometry),
@@ -230,6 +234,28 @@ def _longest_gap_s(due_ns: Array, known: NDArray[np.bool_]) -> float:
             since = t_ns if since is None else since
             longest = max(longest, (t_ns - since) * 1e-9)
     return round(longest, 3)
+
+
+def _nees(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
+    """Of the way over ten seconds, in the true attitude's frame at its start."""
+    body_from_camera = stage.camera_from_body.inverse()
+    known = [o for o in odometry if o.world_from_body is not None]
+    times = np.array([o.t_ns for o in known])
+    ratios = []
+    for start in known:
+        j = int(np.searchsorted(times, start.t_ns + NEES_NS))
+        if j >= len(known) or known[j].reset_counter != start.reset_counter:
+            continue
+        poses = []
+        for o in (start, known[j]):
+            assert o.world_from_body is not None
+            poses.append(o.world_from_body @ body_from_camera)
+        m, n = (int(np.abs(truth.t_ns - o.t_ns).argmin()) for o in (start, known[j]))
+        way = poses[0].rotation.T @ (poses[1].translation - poses[0].translation)
+        true = truth.rotations[m].T @ (truth.centres[n] - truth.centres[m])
+        variance = known[j].sigma_position_m ** 2
+        ratios.append(float(((way - true) ** 2).sum()) / (3.0 * variance))
+    return round(float(np.mean(ratios)), 2) if ratios else None
 
 
 def _worst_step(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:

@@ -52,6 +52,7 @@ SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.01, 0.05
 """No rangefinder and no barometer tells the scale better than this."""
 DISAGREE = 3.0
 """Standard deviations by which two scales differ that cannot both be right."""
+MAX_SIGMA_TURN_RAD = np.radians(8.0)
 MAX_PLACES = 400
 
 
@@ -223,6 +224,8 @@ class Georeferencer:
         sigma_scale, sigma_yaw = float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[3, 3]))
         if sigma_scale > self._config.max_sigma_scale:
             return None
+        if level is None and float(np.diag(covariance)[1:4].max()) > float(MAX_SIGMA_TURN_RAD) ** 2:
+            return None  # a straight path does not tell how the map lies about it
         with_velocity = np.isfinite(way[ok, :2]).all(1).sum() > 4
         method = " and ".join(
             [source.value, *(["velocity"] if with_velocity else []),
@@ -343,7 +346,11 @@ def _drift_root(t_s: Array) -> Array:
 
 
 def _fit(
-    t_s: Array, mapped: Array, target: Array, way: Array, level: Array | None,
+    t_s: Array,
+    mapped: Array,
+    target: Array,
+    way: Array,
+    level: Array | None,
     scale: _Scale | None,
 ) -> tuple[Similarity, Array, float] | None:
     """Generalised least squares over (log scale, turn (3), origin (3)); covariance (7, 7).

@@ -159,7 +159,8 @@ class LocalisationStage:
             self._follow_map()
         predicted = self._predicted(frame.t_ns, attitude)
         before = self._tracker.map
-        in_map = None if predicted is None or attitude is None else predicted.rotation
+        tied = predicted is not None and attitude is not None and self._motion.tied
+        in_map = predicted.rotation if predicted is not None and tied else None
         tracked = self._tracker.step(frame, Prior(predicted, attitude, in_map))
         if self._tracker.map is not before or self.state is TrackState.INITIALISING:
             self._motion.reset()

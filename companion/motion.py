@@ -15,6 +15,7 @@ from companion.geometry import (
     Array,
     Pose,
     interpolate_rotation,
+    nearest_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
     vector_from_rotation,
@@ -23,6 +24,8 @@ from companion.messages import AttitudeSample
 
 MAX_GAP_NS = 500_000_000
 MAX_EXTRAPOLATION_NS = 250_000_000
+ACCELERATION, SIGMA_POSITION = 1.5, 0.002
+"""In map units, one of which is about the distance of what is seen: 1.5 a second squared."""
 
 
 class AttitudeHistory:
@@ -98,12 +101,14 @@ class MotionFilter:
         self._t_ns: int | None = None
         self._poses: deque[tuple[int, Pose]] = deque(maxlen=2)
         self._filter: KalmanFilter | None = None
+        self._tied = False
+        """Whether the attitude error is known: how the map's axes lie to the autopilot's."""
         self._disagreement_rad: deque[float] = deque(maxlen=60)
         self.unit = 1.0
 
     def reset(self) -> None:
         """Forget everything but what is known of the autopilot's attitude."""
-        self._t_ns, self._filter = None, None
+        self._t_ns, self._filter, self._tied = None, None, False
         self._poses.clear()
 
     @property
@@ -112,6 +117,11 @@ class MotionFilter:
         if len(self._disagreement_rad) < 20:
             return None
         return float(np.median(self._disagreement_rad))
+
+    @property
+    def tied(self) -> bool:
+        """Whether it is known how the map's axes lie to the autopilot's."""
+        return self._tied
 
     @property
     def velocity(self) -> tuple[Array, float] | None:
@@ -128,7 +138,7 @@ class MotionFilter:
         dt = (t_ns - self._t_ns) * 1e-9
         x = self._filter.x.ravel()
         position = x[:3] + np.clip(dt, 0.0, 1.0) * x[3:6]
-        if ned_from_camera is not None:
+        if ned_from_camera is not None and self._tied:
             return Pose(rotation_from_vector(x[6:9]) @ ned_from_camera, position)
         (t0, a), (t1, b) = self._poses[0], self._poses[-1]
         if t1 == t0 or dt > 1.0:
@@ -139,7 +149,7 @@ class MotionFilter:
         """The map was corrected: the last `map_from_camera` was `before` and is now `after`."""
         if self._filter is None:
             return
-        turn = after.rotation @ before.rotation.T
+        turn = nearest_rotation(after.rotation @ before.rotation.T)
         x = self._filter.x.ravel().copy()
         x[:3] = after.translation + scale * turn @ (x[:3] - before.translation)
         x[3:6] = scale * turn @ x[3:6]
@@ -169,13 +179,14 @@ class MotionFilter:
             error = vector_from_rotation(map_from_camera.rotation @ ned_from_camera.T)
         if self._filter is None or self._t_ns is None or t_ns - self._t_ns > 2_000_000_000:
             self._filter = self._fresh(map_from_camera.translation, error)
+            self._tied = ned_from_camera is not None
         else:
             dt = max((t_ns - self._t_ns) * 1e-9, 1e-3)
             f = self._filter
             f.F = np.eye(9)
             f.F[:3, 3:6] = dt * np.eye(3)
             q = np.zeros((9, 9))
-            accel = 0.3 * self.unit
+            accel = ACCELERATION * self.unit
             q[:3, :3] = np.eye(3) * accel**2 * dt**4 / 4
             q[:3, 3:6] = q[3:6, :3] = np.eye(3) * accel**2 * dt**3 / 2
             q[3:6, 3:6] = np.eye(3) * accel**2 * dt**2
@@ -185,12 +196,15 @@ class MotionFilter:
             rows = 6 if ned_from_camera is not None else 3
             h = np.zeros((rows, 9))
             h[:3, :3] = np.eye(3)
-            r = np.eye(rows) * (0.003 * self.unit) ** 2
+            r = np.eye(rows) * (SIGMA_POSITION * self.unit) ** 2
             z = map_from_camera.translation
             if ned_from_camera is not None:
                 h[3:, 6:] = np.eye(3)
                 r[3:, 3:] = np.eye(3) * np.radians(0.3) ** 2
                 previous = rotation_from_vector(f.x.ravel()[6:9])
+                if not self._tied:  # told for the first time in this map
+                    f.x[6:9, 0], previous = error, rotation_from_vector(error)
+                    self._tied = True
                 turn = vector_from_rotation(
                     map_from_camera.rotation @ ned_from_camera.T @ previous.T
                 )

@@ -25,6 +25,7 @@ from companion.messages import (
     PointChunk,
     PositionSample,
     PositionSource,
+    Reunited,
     Track,
     TrackState,
     Warned,
@@ -102,6 +103,7 @@ class FlightResult:
         self.last_t_ns: int | None = None
         self.warnings: dict[str, WarningCount] = {}
         self.update: MapUpdate | None = None
+        self.reunions: list[Reunited] = []
         self._tracks: dict[int, Track] = {}
         self._chunks: dict[int, PointChunk] = {}
         self._n_points = 0
@@ -122,6 +124,8 @@ class FlightResult:
                 self._tracks[message.seq] = replace(message, keypoints_px=None)
         elif isinstance(message, MapUpdate):
             self.update = message
+        elif isinstance(message, Reunited):
+            self.reunions.append(message)
         elif isinstance(message, PointChunk):
             before = self._chunks.get(message.keyframe_id)
             self._n_points += len(message.points_camera)

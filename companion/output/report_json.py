@@ -32,6 +32,17 @@ def report(
         "tracked_afterwards": sum(track.backfilled for track in result.tracks),
         "segments": sum(span["state"] == TrackState.TRACKING.value for span in spans),
         "keyframes": result.n_keyframes,
+        "reunions": [
+            {
+                "unix_s": exact_seconds(r.t_ns),
+                "keyframe": r.keyframe_id,
+                "same_as": r.other_id,
+                "kind": "loop" if r.same_map else "weld",
+                "moved": _finite(r.moved),
+                "scale": _finite(r.scale),
+            }
+            for r in result.reunions
+        ],
         "depth_maps": result.n_depth_maps,
         "points": len(cloud),
         "unit": result.unit,

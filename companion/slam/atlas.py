@@ -22,6 +22,8 @@ from companion.slam.worker import MapTurn
 MAX_YOUNG_KEYFRAMES = 5
 """A map that is lost again with so few keyframes was not worth keeping."""
 N_LATEST, N_ALIKE = 3, 4
+EXPECTED_SHARE = 0.1
+"""Where a camera is expected, so much of what it should see there is enough."""
 REST = 8
 """Keyframes to wait after a reunion before the next is looked for."""
 MAX_DRIFT_SHARE, MAX_DRIFT = 0.04, 0.3
@@ -93,7 +95,7 @@ class Atlas:
     ) -> Located | None:
         """Where a camera is that most likely sees what a keyframe of the map in use saw."""
         level = level_from_camera if self.map.level else None
-        return self._relocalizer.locate(features, self.map, keyframe, level, seed)
+        return self._relocalizer.locate(features, self.map, keyframe, level, seed, EXPECTED_SHARE)
 
     def use(self, segment: SlamMap) -> None:
         """Use a map that was left behind."""

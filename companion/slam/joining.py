@@ -30,6 +30,7 @@ def weld(here: SlamMap, there: SlamMap, here_from_there: Similarity) -> None:
     ordered = sorted(here.keyframes.items())
     here.keyframes.clear()
     here.keyframes.update(ordered)
+    here.poses_changed()
 
 
 def close_loop(slam_map: SlamMap, reunion: Reunion) -> float:
@@ -90,6 +91,7 @@ def _move(
         slam_map.normals[own] = slam_map.normals[own] @ moved.rotation.T
         scales[own] = moved.scale
     slam_map.base_distance[:n] *= scales
+    slam_map.poses_changed()
 
 
 def _homes(slam_map: SlamMap, keys: Ints) -> Ints:

@@ -12,6 +12,7 @@ from companion.slam.features import Bools, Features, Ints
 from companion.slam.map import SlamMap
 from companion.slam.matching import match_projected
 
+N_NEAREST = 8
 MIN_VIEW_COSINE = 0.5
 """A point is looked for only within 60 degrees of where it was seen from before."""
 
@@ -87,10 +88,7 @@ def local_points(slam_map: SlamMap, near_ids: Ints, centre: Array, n_keyframes: 
     Keyframes near in space but not in time are how a place seen long ago is taken up again.
     """
     chosen = [k for _, k in slam_map.covisible(near_ids, 8)[:n_keyframes]]
-    if len(slam_map.keyframes) > len(chosen):
-        others = [k for k in slam_map.keyframes.values() if k.keyframe_id not in set(chosen)]
-        apart = np.array([float(np.linalg.norm(k.centre - centre)) for k in others])
-        chosen += [others[int(i)].keyframe_id for i in np.argsort(apart, kind="stable")[:8]]
+    chosen += slam_map.nearest(centre, N_NEAREST, set(chosen))
     mask = np.zeros(slam_map.n_points, bool)
     for keyframe_id in chosen:
         mask[slam_map.seen_by(slam_map.keyframes[keyframe_id])[1]] = True

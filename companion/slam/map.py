@@ -15,9 +15,11 @@ from companion.messages import Bytes, Floats
 from companion.slam.features import Bools, Features, Ints
 from companion.slam.patches import STORED, Patches, cut, level_of
 
+RING = 8
+CANDIDATES = 60
 ARRAYS = (
-    "positions", "alive", "descriptors", "normals", "base_distance", "n_visible", "n_found",
-    "n_observers", "born", "first_seen", "first_unproject", "patch_grey", "patch_centre",
+    "observers", "positions", "alive", "descriptors", "normals", "base_distance", "n_visible",
+    "n_found", "n_observers", "born", "first_seen", "first_unproject", "patch_at", "patch_centre",
     "patch_level",
 )  # fmt: skip
 
@@ -72,15 +74,23 @@ class SlamMap:
     n_visible: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     n_found: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     n_observers: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    observers: Ints = field(default_factory=lambda: np.zeros((0, RING), np.int64))
+    """the keyframes that came to see it last, in no order, -1 where fewer; may be out of date"""
     born: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """keyframe id at which the point was made"""
     first_seen: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """keyframe id of the view that the patch is from"""
+    _centres: Array | None = None
+    _ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     first_unproject: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     """derivative of that view's normalised coordinates by its pixels"""
-    patch_grey: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
+    patch_at: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """place of a point's patch in `patch_grey`, for as long as the point lives"""
     patch_centre: Array = field(default_factory=lambda: np.zeros((0, 2)))
     patch_level: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    patch_grey: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
+    _free: list[int] = field(default_factory=list)
+    """places of patches whose points have died"""
 
     def _reserve(self, n: int) -> None:
         size = len(self.alive)
@@ -106,6 +116,7 @@ class SlamMap:
         self.positions[ids] = positions
         self.descriptors[ids] = seen.descriptors[features]
         self.alive[ids] = True
+        self.observers[ids] = -1
         self.n_visible[ids] = 1
         self.n_found[ids] = 1
         self.born[ids] = self.first_seen[ids] = keyframe.keyframe_id
@@ -115,10 +126,30 @@ class SlamMap:
             levels, seen.pixels[features].astype(np.float64),
             level_of(seen.octaves[features], self.scale_factor),
         )  # fmt: skip
-        self.patch_grey[ids], self.patch_centre[ids] = patches.grey, patches.centre
+        self._store(ids, patches.grey)
+        self.patch_centre[ids] = patches.centre
         self.patch_level[ids] = patches.level
         self.n_points += len(positions)
         return ids
+
+    def _store(self, ids: Ints, grey: Bytes) -> None:
+        """Keep the patches of new points, in place of dead ones' where there are any."""
+        missing = len(ids) - len(self._free)
+        if missing > 0:
+            size = len(self.patch_grey)
+            new = max(4096, size // 2, missing)
+            grown = np.zeros((size + new, STORED, STORED), np.uint8)
+            grown[:size] = self.patch_grey
+            self.patch_grey = grown
+            self._free += range(size + new - 1, size - 1, -1)
+        self.patch_at[ids] = [self._free.pop() for _ in range(len(ids))]
+        self.patch_grey[self.patch_at[ids]] = grey
+
+    def bury(self) -> None:
+        """Let go of what dead points held."""
+        dead = np.flatnonzero(~self.alive[: self.n_points] & (self.patch_at[: self.n_points] >= 0))
+        self._free += self.patch_at[dead].tolist()
+        self.patch_at[dead] = self.patch_level[dead] = -1
 
     def take_points(self, other: SlamMap, own_from_other: Similarity) -> int:
         """Take all points of another map; returns what their ids grow by."""
@@ -131,17 +162,24 @@ class SlamMap:
         self.normals[new] = self.normals[new] @ own_from_other.rotation.T
         self.base_distance[new] *= own_from_other.scale
         self.n_points += n
+        held = np.flatnonzero(other.patch_at[:n] >= 0)
+        self._store(offset + held, other.patch_grey[other.patch_at[held]])
         return offset
 
     def patches_of(self, points: Ints) -> Patches:
         """The patches of some points."""
-        return Patches(self.patch_grey[points], self.patch_centre[points], self.patch_level[points])
+        return Patches(
+            self.patch_grey[self.patch_at[points]],
+            self.patch_centre[points],
+            self.patch_level[points],
+        )
 
     def observe(self, keyframe: Keyframe, features: Ints, points: Ints) -> None:
         """Let `keyframe` see `points` with `features`; a feature's earlier point is let go."""
         old = keyframe.point_ids[features]
         np.subtract.at(self.n_observers, old[old >= 0], 1)
         keyframe.point_ids[features] = points
+        self.observers[points, self.n_observers[points] % RING] = keyframe.keyframe_id
         np.add.at(self.n_observers, points, 1)
 
     def forget(self, keyframe: Keyframe, features: Ints) -> None:
@@ -172,34 +210,51 @@ class SlamMap:
         """
         if len(points) == 0:
             return
-        mask = np.zeros(self.n_points, bool)
-        mask[points] = True
-        total = np.zeros((self.n_points, 3))
+        place = np.full(self.n_points, -1, np.int32)
+        place[points] = np.arange(len(points))
+        total = np.zeros((len(points), 3))
         for keyframe in keyframes:
             features, ids = self.seen_by(keyframe)
-            chosen = mask[ids]
+            chosen = place[ids] >= 0
             features, ids = features[chosen], ids[chosen]
             towards = keyframe.centre - self.positions[ids]
             distance = np.linalg.norm(towards, axis=1)
-            total[ids] += towards / np.maximum(distance, 1e-12)[:, None]
+            total[place[ids]] += towards / np.maximum(distance, 1e-12)[:, None]
             self.base_distance[ids] = (
                 distance * self.scale_factor ** keyframe.features.octaves[features]
             )
             self.descriptors[ids] = keyframe.features.descriptors[features]
         norm = np.linalg.norm(total, axis=1)
-        ok = points[norm[points] > 0]
-        self.normals[ok] = total[ok] / norm[ok][:, None]
+        known = norm > 0
+        self.normals[points[known]] = total[known] / norm[known][:, None]
 
     def covisible(self, points: Ints, minimum: int = 15) -> list[tuple[int, int]]:
-        """Keyframes that share living `points`: (count, id), most first, older first on a tie."""
+        """Keyframes that share living `points`: (count, id), most first, older first on a tie.
+
+        Only those are looked at that are among the last to have come to see many of the points.
+        """
+        points = points[self.alive[points]]
         mask = np.zeros(self.n_points + 1, bool)
         mask[points] = True
-        mask[:-1] &= self.alive[: self.n_points]
-        counts = [
-            (int(np.count_nonzero(mask[k.point_ids])), k.keyframe_id)
-            for k in self.keyframes.values()
-        ]
+        seen_by = self.observers[points].ravel()
+        keys, often = np.unique(seen_by[seen_by >= 0], return_counts=True)
+        order = np.lexsort((keys, -often))[:CANDIDATES]
+        near = [self.keyframes[k] for k in keys[order].tolist() if k in self.keyframes]
+        counts = [(int(np.count_nonzero(mask[k.point_ids])), k.keyframe_id) for k in near]
         return sorted((c for c in counts if c[0] >= minimum), key=lambda c: (-c[0], c[1]))
+
+    def poses_changed(self) -> None:
+        """Tell the map that keyframes have come or moved."""
+        self._centres = None
+
+    def nearest(self, centre: Array, n: int, but: set[int]) -> list[int]:
+        """Ids of the `n` keyframes nearest to a place (3,) that are not in `but`."""
+        if self._centres is None:
+            self._centres = np.stack([k.centre for k in self.keyframes.values()])
+            self._ids = np.array(list(self.keyframes))
+        apart = np.linalg.norm(self._centres - centre, axis=1)
+        order = np.argsort(apart, kind="stable")[: n + len(but)]
+        return [k for k in self._ids[order].tolist() if k not in but][:n]
 
     def expected_octaves(self, distance: Array, points: Ints) -> Ints:
         """Pyramid level at which each of `points` is seen from `distance`."""

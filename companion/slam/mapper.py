@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 
 from companion.camera import Camera
@@ -38,8 +40,9 @@ class Mapper:
         """Take a keyframe, whose tracked points are set, into the map."""
         slam_map = self._map
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
-        for old in list(slam_map.keyframes.values())[-IMAGES_KEPT - 2 : -IMAGES_KEPT]:
-            old.grey = None
+        slam_map.poses_changed()
+        for key in islice(reversed(slam_map.keyframes), IMAGES_KEPT, IMAGES_KEPT + 2):
+            slam_map.keyframes[key].grey = None
         _, points = slam_map.seen_by(keyframe)
         neighbours = [
             slam_map.keyframes[k]
@@ -168,15 +171,16 @@ class Mapper:
             if np.any(keyframe.point_ids == keep):
                 keyframe.point_ids[feature] = -1
             else:
-                keyframe.point_ids[feature] = keep
-                slam_map.n_observers[keep] += len(feature)
+                slam_map.observe(keyframe, feature, np.full(len(feature), keep))
         slam_map.alive[drop] = False
         slam_map.n_observers[drop] = 0
         slam_map.n_visible[keep] += slam_map.n_visible[drop]
         slam_map.n_found[keep] += slam_map.n_found[drop]
 
     def _observers(self, point: int) -> list[Keyframe]:
-        return [k for k in self._map.keyframes.values() if np.any(k.point_ids == point)]
+        known = self._map.observers[point]
+        near = [self._map.keyframes.get(k) for k in np.unique(known[known >= 0]).tolist()]
+        return [k for k in near if k is not None and np.any(k.point_ids == point)]
 
     def unite(self, keyframe: Keyframe, other: Keyframe, seen_there: Ints) -> None:
         """Let the two parts of the map around a place seen again know each other's points."""
@@ -265,6 +269,7 @@ class Mapper:
                 result = adjust(bundle, iterations)
         for i, k in enumerate(variable):
             k.camera_from_map = result.poses[i]
+        slam_map.poses_changed()
         slam_map.positions[points] = result.points
         wrong = ~result.inlier
         for i, k in enumerate(cameras):
@@ -283,4 +288,7 @@ class Mapper:
         few = (age >= 2) & (slam_map.n_observers[:n] <= 2)
         doomed = recent & (seldom | few)
         slam_map.alive[:n][doomed] = False
-        slam_map.sweep(list(slam_map.keyframes.values())[-30:])
+        slam_map.sweep(
+            [slam_map.keyframes[key] for key in islice(reversed(slam_map.keyframes), 30)]
+        )
+        slam_map.bury()

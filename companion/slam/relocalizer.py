@@ -25,7 +25,7 @@ MIN_MATCHES = 12
 MIN_INLIERS = 10
 TILT_ERROR_PX = 12.0
 """What an error of the vertical may move a point by."""
-MIN_SEEN, MIN_SEEN_SHARE = 30, 0.35
+MIN_SEEN, MIN_SEEN_SHARE = 30, 0.25
 """Map points that must be seen where a pose predicts them, and as a share of those predicted."""
 N_AROUND = 6
 
@@ -49,11 +49,12 @@ class Relocalizer:
 
     def locate(
         self, features: Features, slam_map: SlamMap, keyframe: Keyframe,
-        level_from_camera: Array | None, seed: int,
+        level_from_camera: Array | None, seed: int, share: float = MIN_SEEN_SHARE,
     ) -> Located | None:  # fmt: skip
         """Put an image into a map by a keyframe that it may resemble; None if unsure.
 
-        `level_from_camera` (3, 3), where the vertical is known, as in `upright_pose`.
+        `level_from_camera` (3, 3), where the vertical is known, as in `upright_pose`; `share` as in
+        `confirm`.
         """
         seen, ids = slam_map.seen_by(keyframe)
         ia, ib = match_descriptors(keyframe.features, features, ratio=0.8)
@@ -73,12 +74,16 @@ class Relocalizer:
         )  # fmt: skip
         if inlier.sum() < MIN_INLIERS:
             return None
-        return self.confirm(features, slam_map, keyframe, pose)
+        return self.confirm(features, slam_map, keyframe, pose, share)
 
     def confirm(
-        self, features: Features, slam_map: SlamMap, keyframe: Keyframe, pose: Pose
-    ) -> Located | None:
-        """Look for what a pose predicts, around a keyframe; None where too little is seen."""
+        self, features: Features, slam_map: SlamMap, keyframe: Keyframe, pose: Pose,
+        share: float = MIN_SEEN_SHARE,
+    ) -> Located | None:  # fmt: skip
+        """Look for what a pose predicts, around a keyframe; None where less than `share` is seen.
+
+        Of an image with few features no more than half of them need be seen.
+        """
         ids = around(slam_map, keyframe)
         points, found = np.zeros(0, np.int64), np.zeros(0, np.int64)
         n_due = 0
@@ -93,7 +98,7 @@ class Relocalizer:
                 features.normalised[found], features.whitening[found],
             )  # fmt: skip
             points, found = points[inlier], found[inlier]
-        if len(points) < max(MIN_SEEN, MIN_SEEN_SHARE * min(n_due, len(features) // 2)):
+        if len(points) < max(MIN_SEEN, share * min(n_due, len(features) // 2)):
             return None
         return Located(pose, points, found, keyframe)
 

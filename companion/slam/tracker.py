@@ -22,13 +22,19 @@ from companion.slam.features import FeatureExtractor, Features, Ints
 from companion.slam.local_map import Projector, local_points
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.patches import image_levels
-from companion.slam.pose_refinement import refine_pose
+from companion.slam.pose_refinement import other_pose, refine_pose, robust_cost
 from companion.slam.refinement import refine_features
 from companion.slam.relocalizer import Located
 from companion.slam.view import View
 from companion.slam.worker import AtOnce, Beside, Done, MappingWorker, MapTurn
 
 MAX_TURN_UNSEEN_RAD = np.radians(15.0)
+MIN_FIRM, MIN_FIRM_SHARE = 25, 0.2
+"""A guess is believed when so many points of the last frame, and this share, are found by it."""
+MIN_DUE_SHARE, ENOUGH = 0.12, 100
+"""What is found is at least this share of what should be seen, or so many."""
+SUSPICIOUS_SHARE = 0.92
+"""With fewer points in agreement, or no attitude, a pose may be in the wrong one of two minima."""
 Told = Track | KeyframeAdded | Reunited
 
 
@@ -138,6 +144,7 @@ class Tracker:
             )
             self.map.first_keyframe_id = first.keyframe_id
             self.map.keyframes[first.keyframe_id] = first
+            self.map.poses_changed()
             self.map.observe(first, start.features_first, ids)
             self.map.observe(second, start.features_second, ids)
             self.map.refresh(ids, [first, second])
@@ -197,11 +204,16 @@ class Tracker:
             guess = prior.map_from_camera.inverse()
             recent = last.point_ids[last.point_ids >= 0]
             recent = recent[self.map.alive[recent]]
-            found = self._match(view, guess, recent, 15.0) or self._match(view, guess, recent, 40.0)
-            if not found:
-                found = self._match(view, guess, self._local, 25.0)
-            if not found and self.state is TrackState.TRACKING and self._reference is not None:
-                found = self._locate_by(view, self._reference)
+            firm = max(MIN_FIRM, int(MIN_FIRM_SHARE * len(recent)))
+            turn_known = prior.ned_from_camera is not None
+            found = self._match(view, guess, recent, 15.0, at_least=firm)
+            if not found and not turn_known:
+                # how far the camera turned is anybody's guess: ask the descriptors first
+                found = self._by_reference(view)
+            found = found or self._match(view, guess, recent, 40.0, at_least=firm)
+            found = found or self._match(view, guess, self._local, 25.0, at_least=firm)
+            if not found and turn_known:
+                found = self._by_reference(view)
         if not found and not self._relocalise(view):
             return False
         self._refresh_local(view)
@@ -223,16 +235,27 @@ class Tracker:
         normalised[index], whitening[index] = finer, white
         refined_for[index] = points
         view.normalised, view.whitening, view.refined_for = normalised, whitening, refined_for
+        positions = self.map.positions[points]
         pose, inlier, information = refine_pose(
-            view.camera_from_map, self.map.positions[points], finer, white, rounds=2
+            view.camera_from_map, positions, finer, white, rounds=2
         )
+        told = view.ned_from_camera is not None
+        if not told or inlier.sum() < SUSPICIOUS_SHARE * len(points):
+            start = other_pose(positions, finer)
+            if start is not None:
+                other, theirs, info = refine_pose(start, positions, finer, white)
+                if robust_cost(other, positions, finer, white) < robust_cost(
+                    pose, positions, finer, white
+                ):
+                    pose, inlier, information = other, theirs, info
         if inlier.sum() >= max(self._config.min_inliers, 0.5 * len(points)):
             view.camera_from_map, view.information = pose, information
             view.point_ids[index[~inlier]] = -1
 
     def _match(
-        self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False
-    ) -> bool:
+        self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False,
+        at_least: int = 0,
+    ) -> bool:  # fmt: skip
         visible = self._projector.visible(self.map, guess, ids)
         points, found = self._projector.search(self.map, visible, view.features, radius_px)
         if len(points) < self._config.min_inliers:
@@ -242,7 +265,9 @@ class Tracker:
             guess, self.map.positions[points], features.normalised[found], features.whitening[found]
         )
         n = int(inlier.sum())
-        if n < self._config.min_inliers or n < 0.3 * len(points):
+        if n < max(self._config.min_inliers, at_least) or n < 0.3 * len(points):
+            return False
+        if count and n < min(MIN_DUE_SHARE * len(visible.ids), ENOUGH):
             return False
         view.camera_from_map, view.information = pose, information
         view.point_ids[:] = -1
@@ -252,6 +277,12 @@ class Tracker:
             self.map.n_visible[visible.ids] += 1
             self.map.n_found[points[inlier]] += 1
         return True
+
+    def _by_reference(self, view: View) -> bool:
+        reference = self._reference
+        if self.state is not TrackState.TRACKING or reference is None:
+            return False
+        return self._locate_by(view, reference)
 
     def _locate_by(self, view: View, keyframe: Keyframe) -> bool:
         """As a lost camera would, by what one keyframe shows."""
