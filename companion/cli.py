@@ -221,7 +221,7 @@ def _depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
     sets = list(arguments.set)
     if arguments.device is not None:
         sets.append(f"opencl.device={arguments.device}")
-    wanted = Wanted(arguments.reference, arguments.frames, *arguments.range)
+    wanted = Wanted(arguments.reference, arguments.frames, arguments.range)
     maps = reconstruct(
         arguments.dataset, arguments.out, load_config(arguments.config, sets), wanted,
         signals.between_frames(progress_on(sys.stderr)),
@@ -427,8 +427,8 @@ def _parser() -> argparse.ArgumentParser:
         help="use frames from A up to, not including, B",
     )  # fmt: skip
     depth.add_argument(
-        "--range", type=_depths, required=True, metavar="NEAR:FAR",
-        help="least and greatest depth that there can be, metres",
+        "--range", type=_depths, metavar="NEAR:FAR",
+        help="least and greatest depth that there can be, metres (default: found out)",
     )  # fmt: skip
     depth.add_argument("--device", metavar="NAME", help="the same as --set opencl.device=NAME")
 

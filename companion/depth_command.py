@@ -10,6 +10,7 @@ import numpy as np
 
 from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
+from companion.depth.depth_range import depth_range
 from companion.depth.device_choice import choose_device
 from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion
@@ -24,18 +25,22 @@ from drivers.posed_images import PosedImages
 from drivers.posed_layouts import open_posed_images
 
 MAX_TURN_RAD = np.radians(35.0)
+RANGE_FRAMES = 60
+"""Images over which points are followed to find the range of depths."""
 MAX_FRAMES = 400
 """Images around one reference that are taken at most."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What of a data set is wanted: one reference or all, frames A to B, depths in metres."""
+    """What of a data set is wanted: one reference or all, frames A to B.
+
+    `range_m` is the least and the greatest depth; None has them found for each reference.
+    """
 
     reference: int | None
     frames: tuple[int | None, int | None]
-    near_m: float
-    far_m: float
+    range_m: tuple[float, float] | None
 
 
 class Reconstruction:
@@ -75,6 +80,15 @@ class Reconstruction:
         assert pose is not None
         return pose
 
+    def found_range(self, reference: int, positions: list[int]) -> tuple[float, float] | None:
+        """Least and greatest depth of a reference, from the images after it, else before it."""
+        later = [p for p in positions if p > reference][:RANGE_FRAMES]
+        earlier = [p for p in reversed(positions) if p < reference][:RANGE_FRAMES]
+        chosen = max(later, earlier, key=len)
+        self.load(sorted([reference, *chosen]))
+        others = ((self.grey(p), self.pose(p).inverse() @ self.pose(reference)) for p in chosen)
+        return depth_range(self.grey(reference), others, self._undistortion.intrinsics)
+
     def depth_map(
         self, reference: int, others: list[int], near_m: float, far_m: float
     ) -> tuple[DepthMap, list[dict[str, float]]]:
@@ -111,7 +125,16 @@ def reconstruct(
     device = choose_device(config.opencl, monotonic_s)
     work = Reconstruction(images, config, device)
     positions = _positions(images, wanted.frames)
-    references = _references(images, positions, wanted, config)
+    first = positions[0] if wanted.reference is None else _position(images, wanted.reference)
+    range_m = wanted.range_m or work.found_range(first, positions)
+    if range_m is None:
+        raise FlightError(
+            f"{path}: too few points of frame {images.numbers[first]} can be followed to tell how "
+            "far away things are: give --range NEAR:FAR"
+        )
+    middle_m = float(np.sqrt(range_m[0] * range_m[1]))
+    alone = wanted.reference is not None
+    references = [first] if alone else _references(images, positions, middle_m, config)
     out.mkdir(parents=True, exist_ok=True)
     fusion = Fusion(config.cloud)
     chunks: list[PointChunk] = []
@@ -123,18 +146,26 @@ def reconstruct(
     progress.start(len(references))
     try:
         for n, reference in enumerate(references, 1):
-            others = _others(images, positions, reference, wanted, config)
+            if wanted.range_m is None and n > 1:
+                range_m = work.found_range(reference, positions) or range_m
+            reach_m = np.inf if alone else config.depth.max_baseline * middle_m
+            others = _others(images, positions, reference, reach_m)
             work.load([reference, *others])
-            depth_map, frames = work.depth_map(reference, others, wanted.near_m, wanted.far_m)
+            depth_map, frames = work.depth_map(reference, others, *range_m)
             write_depth(out, depth_map)
             done.append(depth_map)
-            log.append({"reference": numbers[reference], "frames": frames})
-            if len(references) > 1:
+            log.append(
+                {
+                    "reference": numbers[reference], "range_m": [round(d, 4) for d in range_m],
+                    "searched": work.engine.n_novel, "frames": frames,
+                }
+            )  # fmt: skip
+            if not alone:
                 chunks += fusion.add(depth_map, update)
             progress.update(n, f"frame {numbers[reference]}", sum(len(c.rgb) for c in chunks))
     finally:
         progress.finish()
-    chunks += fusion.flush(update) if len(references) > 1 else _alone(done[0])
+    chunks += _alone(done[0]) if alone else fusion.flush(update)
     write_cloud(out, chunks, places)
     write_log(
         out, device=device.described, layout=images.layout, maps=done, frames=log,
@@ -156,41 +187,37 @@ def _positions(images: PosedImages, frames: tuple[int | None, int | None]) -> li
     return out
 
 
+def _position(images: PosedImages, number: int) -> int:
+    if number not in images.numbers:
+        raise FlightError(f"{images.path}: there is no frame {number}")
+    position = images.numbers.index(number)
+    if images.poses[position] is None:
+        raise FlightError(f"{images.path}: frame {number} has no pose")
+    return position
+
+
 def _references(
-    images: PosedImages, positions: list[int], wanted: Wanted, config: Config
+    images: PosedImages, positions: list[int], middle_m: float, config: Config
 ) -> list[int]:
-    if wanted.reference is not None:
-        if wanted.reference not in images.numbers:
-            raise FlightError(f"{images.path}: there is no frame {wanted.reference}")
-        position = images.numbers.index(wanted.reference)
-        if images.poses[position] is None:
-            raise FlightError(f"{images.path}: frame {wanted.reference} has no pose")
-        return [position]
-    depth = _middle_m(wanted)
     half_view = float(np.arctan(0.5 * images.camera.width / images.camera.fx))
     out = [positions[0]]
     for position in positions[1:]:
         relative = _relative(images, out[-1], position)
-        step = float(np.linalg.norm(relative.translation)) / depth
+        step = float(np.linalg.norm(relative.translation)) / middle_m
         turn = float(np.arccos(np.clip(relative.rotation[2, 2], -1, 1)))
         if step > config.depth.reference_step or turn > 0.35 * half_view:
             out.append(position)
     return out
 
 
-def _others(
-    images: PosedImages, positions: list[int], reference: int, wanted: Wanted, config: Config
-) -> list[int]:
-    """Images that see what the reference sees, the nearest in time first."""
-    if wanted.reference is not None:
-        return sorted((p for p in positions if p != reference), key=lambda p: abs(p - reference))
+def _others(images: PosedImages, positions: list[int], reference: int, reach_m: float) -> list[int]:
+    """Images from near enough that look the same way, the nearest in time first."""
     out = []
-    reach = config.depth.max_baseline * _middle_m(wanted)
     for position in positions:
         relative = _relative(images, reference, position)
         turn = np.arccos(np.clip(relative.rotation[2, 2], -1, 1))
-        near = float(np.linalg.norm(relative.translation)) <= reach
-        if position != reference and near and turn < MAX_TURN_RAD:
+        near = float(np.linalg.norm(relative.translation)) <= reach_m
+        if position != reference and near and (turn < MAX_TURN_RAD or reach_m == np.inf):
             out.append(position)
     return sorted(out, key=lambda p: (abs(p - reference), p))[:MAX_FRAMES]
 
@@ -199,10 +226,6 @@ def _relative(images: PosedImages, a: int, b: int) -> Pose:
     first, second = images.poses[a], images.poses[b]
     assert first is not None and second is not None
     return first.inverse() @ second
-
-
-def _middle_m(wanted: Wanted) -> float:
-    return float(np.sqrt(wanted.near_m * wanted.far_m))
 
 
 def _alone(depth_map: DepthMap) -> list[PointChunk]:
