@@ -9,7 +9,7 @@ import numpy as np
 
 from companion.depth.views import Intrinsics
 from companion.geometry import Array, Pose
-from companion.messages import Bytes
+from companion.messages import Bytes, Floats
 
 MAX_POINTS = 600
 LEAST_POINTS = 20
@@ -37,9 +37,10 @@ def depth_range(
     rho, parallax = np.zeros(len(start)), np.zeros(len(start))
     last = reference
     for grey, pose in others:
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(last, grey, at.reshape(-1, 1, 2), None)
-        at, last = moved.reshape(-1, 2), grey
-        alive &= found.ravel().astype(bool)
+        before = at.reshape(-1, 1, 2)
+        moved, found, _ = cv2.calcOpticalFlowPyrLK(last, grey, before, before.copy())
+        at, last = np.asarray(moved, np.float32).reshape(-1, 2), grey
+        alive &= np.asarray(found).ravel() > 0
         measured, off_px, length_px = _triangulate(start, at, pose, intrinsics)
         alive &= (off_px < OFF_LINE_PX) | (length_px < LEAST_PARALLAX_PX)
         better = alive & (length_px > parallax) & (measured > 0)
@@ -53,7 +54,9 @@ def depth_range(
     return NEARER * float(near), FARTHER * float(far)
 
 
-def _triangulate(start: Array, at: Array, pose: Pose, k: Intrinsics) -> tuple[Array, Array, Array]:
+def _triangulate(
+    start: Floats, at: Floats, pose: Pose, k: Intrinsics
+) -> tuple[Array, Array, Array]:
     """Inverse depth, distance from the epipolar line, and parallax (both pixels) of each point."""
     centre, focal = np.array([k.cx, k.cy]), np.array([k.fx, k.fy])
     rays = np.c_[(start - centre) / focal, np.ones(len(start))] @ pose.rotation.T
