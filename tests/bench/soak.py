@@ -175,6 +175,8 @@ def fly(arguments: argparse.Namespace) -> Soak:
                             laps.writerow(done)
                             laps_file.flush()
                     time.sleep(max(0.05, 1.0 - (time.monotonic() - began_s) % 1.0))
+                autopilot.disarm()  # should the machine have been too busy before
+                time.sleep(0.3)
                 lap += 1
         except KeyboardInterrupt:
             pass  # what was seen so far is told all the same
