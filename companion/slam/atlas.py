@@ -36,11 +36,17 @@ Allowed = Callable[[Keyframe, Keyframe, Reunion], bool]
 
 
 class Atlas:
-    """Owns the maps. The last of `segments` is in use; keyframe ids are unique among all."""
+    """Owns the maps. The last of `segments` is in use; keyframe ids are unique among all.
+
+    With `beside` keyframes come while a reunion is worked in: the whole map is then left to be
+    adjusted when the flight is over.
+    """
 
     def __init__(
-        self, features: FeaturesConfig, mapping: MappingConfig, camera: Camera, turn: MapTurn
-    ) -> None:
+        self, features: FeaturesConfig, mapping: MappingConfig, camera: Camera, turn: MapTurn,
+        beside: bool = False,
+    ) -> None:  # fmt: skip
+        self._beside = beside
         self._features, self._mapping = features, mapping
         self._camera, self._turn = camera, turn
         self._relocalizer = Relocalizer(camera)
@@ -111,9 +117,11 @@ class Atlas:
         self._resting -= 1
         found = None
         if self._resting <= 0 and len(segment.keyframes) > MAX_YOUNG_KEYFRAMES:
-            found = self._finder.find(keyframe, segment, self.segments, self._believed)
+            found = self._finder.find(
+                keyframe, segment, self.segments, self._believed, self._turn.give_way
+            )
         self._places.add(keyframe.keyframe_id, keyframe.features.descriptors)
-        if found is None:
+        if found is None or segment is not self.map:  # meanwhile another may have come into use
             return None
         self._resting = REST
         return self._unite(segment, mapper, found)
@@ -136,7 +144,9 @@ class Atlas:
             moved = close_loop(segment, found)
         self.n_loops += 1
         mapper.unite(keyframe, other, seen_there)
-        if not same or moved:
+        if self._beside:
+            mapper.adjust_locally(other)
+        elif not same or moved:
             mapper.adjust_all(LOOP_ITERATIONS)
         return Reunited(
             keyframe.t_ns, keyframe.keyframe_id, other.keyframe_id, same, moved, tie.scale

@@ -21,6 +21,8 @@ from companion.slam.worker import MapTurn
 
 MIN_PARALLAX_RAD = np.radians(0.8)
 N_NEIGHBOURS = 8
+MOST_TOGETHER, MOST_HOLDING = 500, 80
+"""Keyframes adjusted at once, for which memory grows with the square, and those that hold them."""
 IMAGES_KEPT = 100
 """Images of older keyframes are let go; what they show is then only as fine as its corners are."""
 
@@ -227,12 +229,29 @@ class Mapper:
         self._adjust(variable, fixed, mask)
 
     def adjust_all(self, iterations: int) -> None:
-        """Adjust every keyframe and point; the first two keyframes hold the gauge."""
-        ordered = sorted(self._map.keyframes.values(), key=lambda k: k.keyframe_id)
+        """Adjust every keyframe and point; the first two keyframes hold the gauge.
+
+        A long flight is adjusted part by part, each held by the keyframes around it.
+        """
+        slam_map = self._map
+        ordered = sorted(slam_map.keyframes.values(), key=lambda k: k.keyframe_id)
         if len(ordered) < 3:
             return
-        mask = self._map.alive[: self._map.n_points].copy()
-        self._adjust(ordered[2:], ordered[:2], mask, iterations)
+        if len(ordered) <= MOST_TOGETHER:
+            mask = slam_map.alive[: slam_map.n_points].copy()
+            self._adjust(ordered[2:], ordered[:2], mask, iterations)
+            return
+        for start in range(2, len(ordered), MOST_TOGETHER // 2):
+            part = ordered[start : start + MOST_TOGETHER]
+            mask = np.zeros(slam_map.n_points, bool)
+            for k in part:
+                mask[slam_map.seen_by(k)[1]] = True
+            inside = {k.keyframe_id for k in part}
+            rest = [k for k in ordered if k.keyframe_id not in inside]
+            shared = [int(np.count_nonzero(mask[slam_map.seen_by(k)[1]])) for k in rest]
+            order = np.argsort(-np.array(shared), kind="stable")[:MOST_HOLDING]
+            holding = [rest[int(i)] for i in np.sort(order) if shared[int(i)] >= 3]
+            self._adjust(part, holding or ordered[:2], mask, iterations)
 
     def _adjust(
         self,

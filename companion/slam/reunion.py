@@ -53,12 +53,14 @@ class ReunionFinder:
         self._relocalizer = relocalizer
 
     def find(
-        self, keyframe: Keyframe, here: SlamMap, maps: list[SlamMap], plausible: Plausible
-    ) -> Reunion | None:
-        """A reunion that is certain, or None."""
+        self, keyframe: Keyframe, here: SlamMap, maps: list[SlamMap], plausible: Plausible,
+        between: Callable[[], None] = lambda: None,
+    ) -> Reunion | None:  # fmt: skip
+        """A reunion that is certain, or None. `between` is called before each keyframe tried."""
         _, ids = here.seen_by(keyframe)
         near = {k for _, k in here.covisible(ids, 8)} | set(sorted(here.keyframes)[-RECENT:])
         for key in self._places.alike(keyframe.features.descriptors, N_CANDIDATES, near):
+            between()
             there = next((m for m in maps if key in m.keyframes), None)
             if there is None:
                 continue

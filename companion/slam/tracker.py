@@ -68,7 +68,7 @@ class Tracker:
         self.turn = MapTurn()
         """Taken by whoever else looks at the map."""
         self._worker: MappingWorker = Beside(self.turn) if beside else AtOnce()
-        self.atlas = Atlas(config.features, config.mapping, camera, self.turn)
+        self.atlas = Atlas(config.features, config.mapping, camera, self.turn, beside)
         self.state = TrackState.INITIALISING
         self._bootstrap = Bootstrap(self._config, camera)
         self._lost_since_ns: int | None = None

@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.geometry import Array, Similarity, angle_between
+from companion.config import MappingConfig
+from companion.geometry import Array, Pose, Similarity, angle_between
 from companion.slam.map import SlamMap
+from companion.slam.mapper import Mapper
 from companion.slam.patches import image_levels
 from companion.slam.pose_refinement import other_pose, robust_cost
-from tests.support.made_map import GREY, Ground, flown, mapped
+from companion.slam.worker import MapTurn
+from tests.support.made_map import CAMERA, GREY, Ground, flown, mapped
 
 
 @pytest.fixture
@@ -71,3 +74,22 @@ def test_a_pose_before_a_plane_is_found_from_nowhere() -> None:
     whitening = np.repeat(np.eye(2)[None] / 5e-4, 100, 0)
     assert robust_cost(found, points, seen, whitening) < 130
     assert other_pose(points[:5], seen[:5]) is None
+
+
+def test_a_long_flight_is_adjusted_in_parts(
+    slam_map: SlamMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.slam.mapper.MOST_TOGETHER", 10)
+    rng = np.random.default_rng(11)
+    truth = {key: k.centre.copy() for key, k in slam_map.keyframes.items()}
+    for k in list(slam_map.keyframes.values())[2:]:
+        pose = k.camera_from_map
+        k.camera_from_map = Pose(pose.rotation, pose.translation + rng.normal(scale=0.05, size=3))
+
+    def error() -> float:
+        off = [k.centre - truth[key] for key, k in slam_map.keyframes.items()]
+        return float(np.sqrt(np.square(off).sum(1).mean()))
+
+    before = error()
+    Mapper(MappingConfig(), CAMERA, slam_map, MapTurn()).adjust_all(4)
+    assert error() < 0.4 * before
