@@ -316,12 +316,15 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
 
     imported = commands.add_parser(
-        "import", parents=[configuration, timing], help="write any flight as a flight folder",
-        description="Read a flight of any format and write it as a folder with pictures, their "
-        "times, calibration and telemetry, all on one clock.",
+        "import", parents=[configuration, timing],
+        help="write any flight as a flight folder or a recording",
+        description="Read a flight of any format and write it, all on one clock: as a folder with "
+        "pictures, times, calibration and telemetry, or as FILE.mcap, a recording.",
     )  # fmt: skip
     imported.add_argument("source", type=Path, metavar="SOURCE", help="as FLIGHT of replay")
-    imported.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder")
+    imported.add_argument(
+        "--out", type=Path, required=True, metavar="OUT", help="a new folder, or FILE.mcap"
+    )
 
     export = commands.add_parser(
         "export", parents=[configuration], help="write a replay's results in other formats",

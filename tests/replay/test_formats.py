@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from companion.cli import main
 from tests.support.bags import write_bag
 from tests.support.command import Run, replay
 from tests.support.sequences import (
@@ -87,6 +88,20 @@ def test_bag_with_odometry(flown: Piece, tmp_path: Path) -> None:
     assert len(path) >= 55
     true = np.stack([pose.translation for pose in longer.truth])[-len(path) :]
     assert np.linalg.norm(path - true, axis=1).max() < 1.5
+
+
+def test_imported_flight_gives_the_same_bytes(flown: Piece, tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", "ros1", flown)
+    (tmp_path / "bag").rename(tmp_path / "flown.bag")
+    for name in ("folder", "flight.mcap"):
+        assert main(["import", str(tmp_path / "flown.bag"), "--out", str(tmp_path / name)]) == 0
+    runs = [
+        replay(tmp_path / name, tmp_path / f"out of {name}", *FAST)
+        for name in ("flown.bag", "folder", "flight.mcap")
+    ]
+    assert len(path_of(runs[0])) >= 30
+    first, *others = ((run.out / "trajectory.tum").read_bytes() for run in runs)
+    assert all(other == first for other in others)
 
 
 def test_images_without_times(flown: Piece, tmp_path: Path) -> None:

@@ -102,6 +102,27 @@ def test_euroc_with_a_hole(tmp_path: Path, flown: Piece) -> None:
     np.testing.assert_allclose(truth[3, 1:4], flown.truth[3].translation, atol=1e-6)
 
 
+@pytest.mark.parametrize("origin", [None, GeoOrigin(-35.36, 149.17, 584.0)])
+def test_as_a_recording(tmp_path: Path, flown: Piece, origin: GeoOrigin | None) -> None:
+    write_bag(tmp_path / "bag", "mcap", flown, origin=origin)
+    n = import_flight(tmp_path / "bag", tmp_path / "a.mcap", Config(), NoProgress(), print)
+    flight = open_flight(tmp_path / "a.mcap", CameraConfig())
+    assert format_of(tmp_path / "a.mcap").name == "recording"
+    assert flight.n_frames == n
+    assert_same(flight, open_flight(tmp_path / "bag", CameraConfig()))
+    with pytest.raises(FlightError, match="is there already"):
+        import_flight(tmp_path / "bag", tmp_path / "a.mcap", Config(), NoProgress(), print)
+
+
+def test_recording_that_cannot_be_written(tmp_path: Path, flown: Piece) -> None:
+    write_remode(tmp_path / "flown", flown)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FlightError, match="cannot be written"):
+        import_flight(
+            tmp_path / "flown", tmp_path / "file" / "a.mcap", Config(), NoProgress(), print
+        )
+
+
 def test_sample(tmp_path: Path) -> None:
     """Video and packets of a link: the video as it was, the telemetry on its clock."""
     source = Path(__file__).parents[2] / "sample" / "survey"
@@ -135,8 +156,8 @@ def test_nothing_is_overwritten(tmp_path: Path, flown: Piece) -> None:
     with pytest.raises(FlightError, match="is there already"):
         imported(tmp_path / "flown", tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine"]
-    with pytest.raises(InputError, match="only folders"):
-        imported(tmp_path / "flown", tmp_path / "out.mcap")
+    with pytest.raises(InputError, match=r"ending in \.mcap"):
+        imported(tmp_path / "flown", tmp_path / "out.bag")
 
 
 def test_nothing_is_left_of_an_import_that_fails(tmp_path: Path, flown: Piece) -> None:

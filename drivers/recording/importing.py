@@ -1,0 +1,86 @@
+"""Any flight as a recording: the frames and samples that were read, without loss."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.config import RecorderConfig
+from companion.errors import FlightError
+from companion.messages import Frame, Warned
+from companion.pipeline import in_order_of_time
+from drivers.flight import Flight
+from drivers.recording.camera_document import calibration_bytes, camera_document
+from drivers.recording.content import event_bytes, json_bytes, sample_bytes, sample_topic
+from drivers.recording.growing_file import GrowingFile
+from drivers.recording.mcap_writer import McapWriter
+from drivers.recording.pictures import picture_encoder
+from drivers.recording.recorder import CAMERA_JSON, NOTES
+from drivers.recording.topics import CALIBRATION, EVENTS, HEALTH, PROFILE, open_channels
+
+CHUNK_BYTES = 4_000_000
+RATE_HZ = 30.0
+"""Told to the encoder, which for still pictures does not matter."""
+
+
+def write_recording(flight: Flight, out: Path, told: Callable[[int], None]) -> int:
+    """Write a flight as the recording `out`, which must not be there; return how many frames.
+
+    `told` hears of them on the way. FlightError where it cannot be written, and then nothing is.
+    """
+    if out.exists():
+        raise FlightError(f"{out}: is there already; give another name")
+    part = out.with_name(f".{out.name}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        part.unlink(missing_ok=True)
+        file = GrowingFile(part)
+        try:
+            n = _write(flight, file, told)
+            file.sync()
+            part.rename(out)
+        except BaseException:
+            file.discard()
+            raise
+        file.close()
+    except OSError as error:
+        raise FlightError(f"{out}: cannot be written: {error.strerror}") from error
+    return n
+
+
+def _write(flight: Flight, file: GrowingFile, told: Callable[[int], None]) -> int:
+    log = flight.telemetry()
+    camera, start_ns = flight.camera, flight.start_ns
+    encoder = picture_encoder(RecorderConfig(codec="png"), camera.width, camera.height, RATE_HZ)
+    writer = McapWriter(file.append, PROFILE)
+    channels = open_channels(writer)
+    writer.attach(CAMERA_JSON, "application/json", camera_document(camera), 0)
+    writer.note(NOTES, {"pictures": encoder.name, "imported from": flight.path.name})
+
+    def put(topic: str, t_ns: int, data: bytes, sequence: int | None = None) -> None:
+        writer.add(channels[topic], t_ns, data, t_ns, sequence)
+        if writer.n_waiting_bytes > CHUNK_BYTES:
+            writer.flush()
+
+    known = {
+        "clock": None if log.clock is None else dataclasses.asdict(log.clock),
+        "origin": None if log.origin is None else dataclasses.asdict(log.origin),
+    }
+    put(HEALTH, start_ns, json_bytes(known))
+    put(CALIBRATION, start_ns, calibration_bytes(camera, start_ns))
+    for warned in (*flight.warnings, *log.warnings):
+        put(EVENTS, warned.t_ns, event_bytes(warned))
+    n = 0
+    for message in in_order_of_time(log.samples, flight.frames()):
+        if isinstance(message, Frame):
+            for picture in encoder.encode(message):
+                put(picture.topic, message.t_ns, picture.data, message.seq)
+            n += 1
+            told(n)
+        elif isinstance(message, Warned):
+            put(EVENTS, message.t_ns, event_bytes(message))
+        else:
+            put(sample_topic(message), message.t_ns, sample_bytes(message))  # type: ignore[arg-type]
+    writer.finish()
+    return n
