@@ -71,7 +71,9 @@ def replay(
         sinks.append(recording)
         live: LiveViewer | None = None
         if viewer != "none":
-            live = stack.enter_context(LiveViewer(config.viewer, flight.camera, viewer, origin=log.origin))
+            live = stack.enter_context(
+                LiveViewer(config.viewer, flight.camera, viewer, origin=log.origin)
+            )
             sinks.append(live)
         depth = _depth_stage(config, flight, device, times)
         pipeline = Pipeline(

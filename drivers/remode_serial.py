@@ -76,7 +76,8 @@ def _compile(folder: Path) -> ctypes.CDLL:
     compiler = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
     if compiler is None:
         raise InputError(
-            "the serial reference needs a C compiler: apt install gcc, or leave it out by --no-serial"
+            "the serial reference needs a C compiler: apt install gcc, or leave it out, by "
+            "--no-serial"
         )
     out = folder / "remode_serial.so"
     source = Path(__file__).with_name("remode_serial.c")
