@@ -174,7 +174,7 @@ def _tum_poses(path: Path) -> tuple[Array, list[Pose]]:
 
 
 def _rows(path: Path, n_words: int) -> Iterator[list[str]]:
-    """Lines of a table, split, without comments; FlightError where one is short or there is none."""
+    """Lines of a table, split, without comments; FlightError where one is short or none is."""
     try:
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
