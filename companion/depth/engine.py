@@ -21,7 +21,7 @@ STEP_PX = 0.75
 """From plane to plane, in the image where points move most: nearer ones look the same."""
 LEAST_PLANES = 8
 LEAST_VIEWS = 3
-FIRST_SPREAD, NEXT_SPREAD = 0.05, 1.5
+FIRST_SPREAD, NEXT_SPREAD = 0.07, 2.0
 """A sweep is due when the kept images lie so far apart, as a share of the depth; then whenever they
 lie so many times as far apart as they did."""
 
@@ -111,7 +111,7 @@ class DepthEngine:
     def finish(self, keyframe_id: int, t_ns: int, rgb: Bytes) -> DepthMap:
         """The depth so far, regularised; 0 where nothing is known of it.
 
-        What has not converged is filled in from around it: see `state`.
+        What has not converged is filled in from around it: see `state`, and `measured_only`.
         """
         if self._views.n_novel > self._n_swept:
             self._estimate()

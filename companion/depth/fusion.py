@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ class Fusion:
 
     def add(self, depth_map: DepthMap, update: MapUpdate) -> list[PointChunk]:
         """Take a depth map; chunks of those that have waited long enough."""
-        self._held[depth_map.keyframe_id] = depth_map
+        self._held[depth_map.keyframe_id] = measured_only(depth_map)
         self._open.append(depth_map.keyframe_id)
         out = []
         while len(self._open) > self._wait_for:
@@ -49,21 +50,25 @@ class Fusion:
         place = update.place_of(keyframe_id)
         if place is None:
             return None
-        measured = _measured(depth_map)
-        rows, columns = np.nonzero(measured)
+        rows, columns = np.nonzero(depth_map.depth)
         if len(rows) == 0:
             return None
-        ahead = _smooth(measured)[rows, columns]
+        ahead = _smooth(depth_map.depth)[rows, columns]
         rows, columns = rows[ahead], columns[ahead]
-        z = measured[rows, columns].astype(np.float64)
+        z = depth_map.depth[rows, columns].astype(np.float64)
         fx, fy, cx, cy = depth_map.intrinsics
         points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
         agreeing = np.zeros(len(points), np.int64)
+        further = np.zeros(len(points))
         for other_id, other in self._held.items():
             other_place = update.place_of(other_id)
             if other_id == keyframe_id or other_place is None:
                 continue
-            agreeing += self._agrees(points, other_place.inverse() @ place, other)
+            agrees, off = self._agrees(points, other_place.inverse() @ place, other)
+            agreeing += agrees
+            further += np.where(agrees, off, 0.0)
+        # each map that agrees has the same say in how far away a point is
+        points *= (1.0 + further / (agreeing + 1))[:, None]
         sigma = depth_map.sigma[rows, columns] / np.maximum(z, 1e-9)
         ratio = depth_map.inlier_ratio[rows, columns]
         keep = agreeing >= self._config.min_agreeing
@@ -85,7 +90,10 @@ class Fusion:
             return 0.01 * float(np.median(points[:, 2]))
         return self._config.voxel_m / (update.georeference.world_from_map.scale * place.scale)
 
-    def _agrees(self, points: Array, other_from_here: Similarity, other: DepthMap) -> Mask:
+    def _agrees(
+        self, points: Array, other_from_here: Similarity, other: DepthMap
+    ) -> tuple[Mask, Array]:
+        """Whether the other sees each point where it is, and how much further, in proportion."""
         p = other_from_here.apply(points)
         fx, fy, cx, cy = other.intrinsics
         height, width = other.depth.shape
@@ -95,13 +103,20 @@ class Fusion:
         v = np.rint(fy * p[:, 1] / z + cy)
         inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
         seen = np.zeros(len(points))
-        seen[inside] = _measured(other)[v[inside].astype(int), u[inside].astype(int)]
-        agrees: Mask = (seen > 0) & (np.abs(seen - z) < self._config.agreement * z)
-        return agrees
+        seen[inside] = other.depth[v[inside].astype(int), u[inside].astype(int)]
+        off: Array = seen / z - 1.0
+        agrees: Mask = (seen > 0) & (np.abs(off) < self._config.agreement)
+        return agrees, off
 
 
-def _measured(depth_map: DepthMap) -> Floats:
-    return np.where(depth_map.state == PixelState.CONVERGED.value, depth_map.depth, np.float32(0))
+def measured_only(depth_map: DepthMap) -> DepthMap:
+    """The same without what was filled in: depth only where it has converged."""
+    known = depth_map.state == PixelState.CONVERGED.value
+    nothing = np.float32(0)
+    return replace(
+        depth_map, depth=np.where(known, depth_map.depth, nothing),
+        sigma=np.where(known, depth_map.sigma, nothing),
+    )  # fmt: skip
 
 
 def _smooth(depth: Floats) -> Mask:

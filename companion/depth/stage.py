@@ -15,7 +15,7 @@ from companion.camera import Camera
 from companion.clock import Timer
 from companion.config import CloudConfig, DepthConfig
 from companion.depth.engine import DepthEngine
-from companion.depth.fusion import Fusion
+from companion.depth.fusion import Fusion, measured_only
 from companion.depth.opencl import ComputeDevice
 from companion.depth.undistortion import Undistortion
 from companion.geometry import Pose, Similarity
@@ -130,7 +130,7 @@ class DepthStage:
             self._engine.update(self._held[seq].grey, current_from_reference)
         assert held.rgb is not None
         rgb = self._undistortion.image(held.rgb)
-        depth_map = self._engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb)
+        depth_map = measured_only(self._engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb))
         self._forget(keyframe)
         chunks: list[PointChunk] = self._fusion.add(depth_map, update)
         return [depth_map, *chunks]
