@@ -16,6 +16,8 @@ plots/…, log
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
+
 import numpy as np
 import rerun as rr
 
@@ -129,7 +131,9 @@ class Drawing:
             self._status(item)
         elif isinstance(item, LogItem):
             level = rr.TextLogLevel.WARN if item.is_warning else rr.TextLogLevel.INFO
-            self._rec.log("log", rr.TextLog(item.text, level=level))
+            # in the text, since a column of time leaves no room for it
+            when = datetime.fromtimestamp(item.t_ns * 1e-9, tz=timezone.utc)
+            self._rec.log("log", rr.TextLog(f"{when:%H:%M:%S} {item.text}", level=level))
         elif isinstance(item, DepthItem):
             for kernel, ms in item.kernel_ms.items():
                 self._plot(f"kernels/{kernel.replace(' ', '-')}", ms)

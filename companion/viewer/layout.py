@@ -7,9 +7,11 @@ from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 TIMELINE = "flight"
 PLOTS = {
-    "Flying": ("height", "speed"), "Quality": ("quality", "cpu"), "Rate": ("rate",),
-    "Delay": ("latency",), "Link": ("link",),
+    "Flying": ("height", "speed"), "Quality": ("quality", "cpu"), "Poses": ("rate", "latency"),
+    "Link": ("link",),
 }  # fmt: skip
+SHARES = {"Quality": (0.0, 105.0)}
+"""Plots of a fixed range."""
 """What their numbers are is said by the names of the series; see companion.viewer.drawing."""
 PLOTTED_S = 120.0
 ZOOM = 17.0
@@ -47,7 +49,7 @@ def layout(*, live: bool) -> rrb.Blueprint:
             rrb.Horizontal(
                 *(_plot(title, names, live) for title, names in PLOTS.items()),
                 rrb.TextLogView(origin="log", name="Log", columns=_log_columns()),
-                column_shares=[3] * len(PLOTS) + [9],
+                column_shares=[4] * len(PLOTS) + [9],
             ),
             row_shares=[7, 2],
         ),
@@ -68,6 +70,7 @@ def _plot(title: str, names: tuple[str, ...], live: bool) -> rrb.TimeSeriesView:
         origin="plots",
         contents=[f"+ $origin/{name}" for name in names],
         name=title,
+        axis_y=rrb.ScalarAxis(range=SHARES[title]) if title in SHARES else None,
         plot_legend=rrb.PlotLegend(corner="LeftTop"),
         time_ranges=last if live else None,
     )
@@ -75,6 +78,6 @@ def _plot(title: str, names: tuple[str, ...], live: bool) -> rrb.TimeSeriesView:
 
 def _log_columns() -> rrb.TextLogColumns:
     return rrb.TextLogColumns(
-        timeline_columns=[TimelineColumn(TIMELINE)],
+        timeline_columns=[TimelineColumn(TIMELINE, visible=False)],
         text_log_columns=[TextLogColumn("loglevel"), TextLogColumn("body")],
     )

@@ -171,7 +171,9 @@ def test_images_and_key_points_shrink_together(tmp_path: Path) -> None:
 def test_states_warnings_and_timings_are_there(flight: Rows) -> None:
     levels = [v[0] for _, v in flight["/plots/state", "Scalars:scalars"]]
     assert [levels.count(v) for v in (0, 1)] == [len(flown.LOST), flown.N_INITIALISING]
-    texts = [v[0] for _, v in flight["/log", "TextLog:text"]]
+    lines = [v[0] for _, v in flight["/log", "TextLog:text"]]
+    assert "22:13:20 late telemetry: by 0.3 s" in lines
+    texts = [line[9:] for line in lines]
     assert "late telemetry: by 0.3 s" in texts
     assert [t for t in texts if t.startswith("Tracker")] == [
         "Tracker: initialising", "Tracker: tracking", "Tracker: lost", "Tracker: tracking"
