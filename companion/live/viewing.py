@@ -69,7 +69,7 @@ class Viewing:
         if self._viewer.closed:
             detail += f"; closed: {self._viewer.closed}"
         return StageHealth(
-            "viewers", alive=self._viewer.alive, n=n_viewers, detail=detail,
+            "viewers", alive=self._viewer.alive, detail=detail,
             n_dropped=self.n_dropped + int(report.get("skipped", 0)),
             n_restarted=self._n_restarted,
         )  # fmt: skip

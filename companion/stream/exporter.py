@@ -44,6 +44,8 @@ class Exporter:
         self._selector.register(self._woken, selectors.EVENT_READ)
         self._stopping = threading.Event()
         self.n_refused = 0
+        self._n_skipped_before = 0
+        """By viewers that are forgotten."""
 
     def take(self, item: Item, parts: Sequence[Part]) -> None:
         """Keep and send an item, whose parts are made already."""
@@ -76,11 +78,11 @@ class Exporter:
         """How many viewers there are, what they get, and what they were not given."""
         with self._lock:
             sessions = [c.session for c in self._connections if c.session is not None]
-            skipped = sum(session.n_skipped.total() for session in sessions)
+            skipped = sum(s.n_skipped.total() for s in self._sessions.values())
             return {
                 "viewers": len(sessions),
                 "kbit_s": sum(s.window.rate_bytes_s for s in sessions) / 125,
-                "skipped": skipped + self._store.n_given_up.total(),
+                "skipped": self._n_skipped_before + skipped + self._store.n_given_up.total(),
                 "map_mib": self._store.points_bytes / 2**20,
             }
 
@@ -153,10 +155,13 @@ class Exporter:
             session = Session(self._store)
         self._sessions[connection.viewer] = session
         session.reconnected()
+        session.is_connected = True
         connection.session = session
         idle = [v for v in self._sessions if all(c.viewer != v for c in self._connections)]
         for viewer in idle[: max(0, len(self._sessions) - MOST_REMEMBERED)]:
-            self._store.leave(self._sessions.pop(viewer))
+            gone = self._sessions.pop(viewer)
+            self._n_skipped_before += gone.n_skipped.total()
+            self._store.leave(gone)
 
     def _step(self) -> bool:
         """Send what can be sent; whether more may be to send soon."""
@@ -204,6 +209,8 @@ class Exporter:
     def _forget(self, connection: Connection) -> None:
         if connection in self._connections:
             self._connections.remove(connection)
+            if connection.session is not None:
+                connection.session.is_connected = False
             self._given.pop(connection, None)
             with contextlib.suppress(KeyError):
                 self._selector.unregister(connection.socket)

@@ -62,6 +62,8 @@ class Session:
         self._went_s = dict.fromkeys((*ORDER, None), -1e9)
         self._pictures = Pictures()
         self._credit = 0.0
+        self.is_connected = True
+        """Whether there is somebody for whom what it is not given counts as skipped."""
         self._pose_is_new = False
         self._datagram_s = -1e9
         self.datagrams_work = False
@@ -78,10 +80,10 @@ class Session:
         """There is a new one of a kind."""
         waiting = self._waiting[kind]
         if kind is Kind.POSE:
-            self.n_skipped["poses"] += self._pose_is_new
+            self.n_skipped["poses"] += self._pose_is_new and self.is_connected
             self._pose_is_new = True
         elif kind is Kind.PICTURE:
-            self.n_skipped["pictures"] += key in waiting
+            self.n_skipped["pictures"] += key in waiting and self.is_connected
         waiting.pop(key, None)  # so that the newest is the last
         waiting[key] = None
 

@@ -121,6 +121,10 @@ def test_a_viewer_that_connects_again_is_not_sent_the_map_again() -> None:
         again = [i.keyframe_id for i in viewer.items[n:] if isinstance(i, PointsItem)]
         assert set(again) == {77}
         assert any("is lost" in text for text in viewer.told)
+    before = exporter.report()["skipped"]
+    for t_ns in range(50):
+        tell(exporter, pose(t_ns))
+    assert exporter.report()["skipped"] == before  # nobody looks on
 
 
 def test_a_viewer_that_stands_still_costs_the_others_nothing_and_catches_up() -> None:
