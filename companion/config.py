@@ -329,7 +329,7 @@ class CloudConfig:
     voxel_m: Annotated[float, Range(0.001, 100)] = 0.10
     """One point is kept in each cube of this size; a hundredth of the median depth while there is
     no metric scale."""
-    min_agreeing: Annotated[int, Range(0, 4)] = 1
+    min_agreeing: Annotated[int, Range(0, 4)] = 2
     """Other keyframes whose depth must agree with a point's."""
     agreement: Annotated[float, Range(0.001, 0.2)] = 0.015
     """Relative difference of depth up to which two keyframes agree."""

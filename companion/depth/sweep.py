@@ -9,6 +9,7 @@ import pyopencl as cl
 
 from companion.depth.opencl import ComputeDevice
 from companion.depth.views import MAX_VIEWS
+from companion.errors import DeviceError
 from companion.geometry import Array
 from companion.messages import Bytes
 
@@ -41,6 +42,12 @@ class PlaneSweep:
         self.grid = (-(-width // stride), -(-height // stride))
         self._coarse = (-(-width // (2 * stride)), -(-height // (2 * stride)))
         n = self.grid[0] * self.grid[1]
+        largest = device.device.max_mem_alloc_size
+        if 2 * PLANES[-1] * n > largest:
+            raise DeviceError(
+                f"{device.name}: images of {width} x {height} need a buffer of "
+                f"{2 * PLANES[-1] * n >> 20} MB, it allows {largest >> 20}: raise depth.stride"
+            )
         self._kernels = {n: _kernels(device, n) for n in PLANES}
         self._n_pixels = width * height
         self.reference = device.buffer(self._n_pixels)

@@ -135,6 +135,30 @@ def test_what_shows_nothing_yields_nothing(device: ComputeDevice, name: str) -> 
     assert found < (0.1 if name == "unrelated noise" else 1e-9)
 
 
+@pytest.mark.parametrize("stride", [1, 2, 3])
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (65, 49), (101, 57), (48, 64)])
+def test_any_size_gives_numbers(
+    device: ComputeDevice, width: int, height: int, stride: int
+) -> None:
+    big = texture(np.random.default_rng(5), 256)
+    it = engine(device, width, height, stride=stride)
+    it.begin(big[:height, :width].copy(), 5.0, 30.0)
+    for k in range(1, 5):
+        # the last goes past what it looks at: some depths are behind the camera
+        ahead = np.array([-0.5 * k, 0.3 * k, 0.2 if k < 4 else -6.0])
+        it.update(big[k : height + k, 2 * k : width + 2 * k].copy(), Pose(np.eye(3), ahead))
+    depth_map = it.finish(1, 2, np.zeros((height, width, 3), np.uint8))
+    assert depth_map.depth.shape == (-(-height // stride), -(-width // stride))
+    for array in (depth_map.depth, depth_map.sigma, depth_map.inlier_ratio):
+        assert np.isfinite(array).all()
+    assert depth_map.depth.min() >= 4.99 and depth_map.depth.max() <= 30.01
+
+
+def test_what_no_device_can_hold_is_an_error(device: ComputeDevice) -> None:
+    with pytest.raises(DeviceError, match=r"raise depth\.stride"):
+        engine(device, 100_000, 90_000, stride=1)
+
+
 def test_a_device_is_found_by_number_and_by_name_and_never_replaced() -> None:
     number, name = (
         open_device(OpenclConfig(device="0:0")),
