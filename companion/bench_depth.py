@@ -125,7 +125,7 @@ def bench_depth(
         _run(engine, scene, scene.others)  # compilers and caches are warm from here on
         step("warming up")
         timed, depth_map = _run(engine, scene, scene.others)
-        searched = engine.n_novel
+        searched = engine.n_searched
         after = []
         for n in stops:
             some, at = _run(engine, scene, scene.others[:n])

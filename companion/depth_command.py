@@ -157,7 +157,7 @@ def reconstruct(
             log.append(
                 {
                     "reference": numbers[reference], "range_m": [round(d, 4) for d in range_m],
-                    "searched": work.engine.n_novel, "frames": frames,
+                    "searched": work.engine.n_searched, "frames": frames,
                 }
             )  # fmt: skip
             if not alone:

@@ -13,7 +13,7 @@ from companion.depth.opencl import ComputeDevice, event_ms
 from companion.depth.regularisation import Regularisation, edges
 from companion.depth.sweep import PLANES, PlaneSweep
 from companion.depth.verification import Verification
-from companion.depth.views import Intrinsics, Views
+from companion.depth.views import Intrinsics, View, Views
 from companion.geometry import Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
 
@@ -21,7 +21,7 @@ STEP_PX = 0.75
 """From plane to plane, in the image where points move most: nearer ones look the same."""
 LEAST_PLANES = 8
 LEAST_VIEWS = 3
-FIRST_SPREAD, NEXT_SPREAD = 0.07, 2.0
+FIRST_SPREAD, NEXT_SPREAD = 0.07, 3.0
 """A sweep is due when the kept images lie so far apart, as a share of the depth; then whenever they
 lie so many times as far apart as they did."""
 
@@ -52,6 +52,7 @@ class DepthEngine:
         self._eager = eager
         self.intrinsics = intrinsics
         self._views = Views(intrinsics, width, height)
+        self._searched: set[View] = set()
         self._sweep = PlaneSweep(device, width, height, config.stride)
         self._verification = Verification(device, self._sweep, config)
         self._regularisation = Regularisation(device, self._sweep.grid)
@@ -64,8 +65,13 @@ class DepthEngine:
 
     @property
     def n_novel(self) -> int:
-        """Images of this reference that were worth keeping; the others were passed over."""
+        """Images of this reference that were worth a thought; the others were passed over."""
         return self._views.n_novel
+
+    @property
+    def n_searched(self) -> int:
+        """Images of this reference that depth was looked for in, in any sweep."""
+        return len(self._searched)
 
     @property
     def labels(self) -> Bytes:
@@ -78,6 +84,7 @@ class DepthEngine:
         self._grey = grey
         self._rho = (1.0 / far, 1.0 / near)
         self._views.begin(*self._rho)
+        self._searched = set()
         self._sweep.set_reference(grey, self._run)
         self._labels[:] = PixelState.UPDATING.value
         self._n_taken, self._n_swept, self._due = 0, 0, FIRST_SPREAD
@@ -100,20 +107,21 @@ class DepthEngine:
 
     def _estimate(self) -> None:
         projections = self._views.projections()
+        self._searched.update(self._views.kept)
         wanted = math.ceil(self._views.parallax_px() / STEP_PX) + 1
         n_planes = min(max(wanted, LEAST_PLANES), PLANES[-1])
         step = (self._rho[1] - self._rho[0]) / (n_planes - 1)
         self._sweep.run(projections, self._rho[0], step, n_planes, self._run)
         self._verification.run(projections, step, self._run)
         self._device.read(self._labels, self._verification.label)
-        self._n_swept = self._views.n_novel
+        self._n_swept = self._views.n_kept
 
     def finish(self, keyframe_id: int, t_ns: int, rgb: Bytes) -> DepthMap:
         """The depth so far, regularised; 0 where nothing is known of it.
 
         What has not converged is filled in from around it: see `state`, and `measured_only`.
         """
-        if self._views.n_novel > self._n_swept:
+        if self._views.n_kept > self._n_swept:
             self._estimate()
         stride, k, shape = self._config.stride, self.intrinsics, self._shape
         intrinsics = (k.fx / stride, k.fy / stride, k.cx / stride, k.cy / stride)

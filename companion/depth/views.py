@@ -61,7 +61,9 @@ class Views:
         self._rho, self._range = 1.0, (1.0, 1.0)
         self.kept: list[View] = []
         self.n_novel = 0
-        """Images since `begin` that were worth keeping, whether they still are kept or not."""
+        """Images since `begin` that were worth a thought, whether they were kept or not."""
+        self.n_kept = 0
+        """Of them those that were kept, whether they still are or not."""
         self._seen: list[Array] = []
 
     def begin(self, rho_low: float, rho_high: float) -> None:
@@ -69,7 +71,7 @@ class Views:
         self._rho = 0.5 * (rho_low + rho_high)
         self._range = (rho_high, rho_low)
         self.kept = []
-        self.n_novel = 0
+        self.n_novel = self.n_kept = 0
         self._seen = [np.zeros(3)]
 
     def consider(self, current_from_reference: Pose) -> View | None:
@@ -93,12 +95,14 @@ class Views:
         view = View(len(self.kept), pose, centre)
         if len(self.kept) < MAX_VIEWS:
             self.kept.append(view)
+            self.n_kept += 1
             return view
         out = self._least_needed([*self.kept, view])
         if out == MAX_VIEWS:
             return None
         view = View(self.kept[out].slot, pose, centre)
         self.kept[out] = view
+        self.n_kept += 1
         return view
 
     def _overlaps(self, pose: Pose) -> bool:

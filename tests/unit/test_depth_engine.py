@@ -85,6 +85,8 @@ def test_images_that_say_nothing_new_are_passed_over(device: ComputeDevice) -> N
     it.update(grey, Pose(np.eye(3), np.array([-100.0, 0.0, 0.0])))
     it.update(grey, Pose(np.eye(3), np.array([np.nan, 0.0, 0.0])))
     assert it.n_novel == 1
+    it.finish(1, 2, np.zeros((48, 64, 3), np.uint8))
+    assert it.n_searched == 1
 
 
 def test_two_runs_are_the_same_to_the_last_bit(device: ComputeDevice) -> None:
