@@ -24,8 +24,9 @@ from companion.messages import AttitudeSample
 
 MAX_GAP_NS = 500_000_000
 MAX_EXTRAPOLATION_NS = 250_000_000
-ACCELERATION, SIGMA_POSITION = 1.5, 0.002
-"""In map units, one of which is about the distance of what is seen: 1.5 a second squared."""
+ACCELERATION, SIGMA_POSITION = 0.3, 0.003
+ACCELERATION_UNTOLD, SIGMA_POSITION_UNTOLD = 1.5, 0.002
+"""In map units, one of which is about the distance of what is seen, with and without attitude."""
 
 
 class AttitudeHistory:
@@ -186,7 +187,9 @@ class MotionFilter:
             f.F = np.eye(9)
             f.F[:3, 3:6] = dt * np.eye(3)
             q = np.zeros((9, 9))
-            accel = ACCELERATION * self.unit
+            told = ned_from_camera is not None
+            accel = (ACCELERATION if told else ACCELERATION_UNTOLD) * self.unit
+            sigma = (SIGMA_POSITION if told else SIGMA_POSITION_UNTOLD) * self.unit
             q[:3, :3] = np.eye(3) * accel**2 * dt**4 / 4
             q[:3, 3:6] = q[3:6, :3] = np.eye(3) * accel**2 * dt**3 / 2
             q[3:6, 3:6] = np.eye(3) * accel**2 * dt**2
@@ -196,7 +199,7 @@ class MotionFilter:
             rows = 6 if ned_from_camera is not None else 3
             h = np.zeros((rows, 9))
             h[:3, :3] = np.eye(3)
-            r = np.eye(rows) * (SIGMA_POSITION * self.unit) ** 2
+            r = np.eye(rows) * sigma**2
             z = map_from_camera.translation
             if ned_from_camera is not None:
                 h[3:, 6:] = np.eye(3)

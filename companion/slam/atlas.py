@@ -15,7 +15,7 @@ from companion.slam.joining import close_loop, weld
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.mapper import Mapper
 from companion.slam.places import PlaceIndex
-from companion.slam.relocalizer import Located, Relocalizer, around
+from companion.slam.relocalizer import MIN_SEEN_SHARE, Located, Relocalizer, around
 from companion.slam.reunion import Reunion, ReunionFinder
 from companion.slam.worker import MapTurn
 
@@ -23,7 +23,7 @@ MAX_YOUNG_KEYFRAMES = 5
 """A map that is lost again with so few keyframes was not worth keeping."""
 N_LATEST, N_ALIKE = 3, 4
 EXPECTED_SHARE = 0.1
-"""Where a camera is expected, so much of what it should see there is enough."""
+"""Where a camera without attitude is expected, so much of what it should see is enough."""
 REST = 8
 """Keyframes to wait after a reunion before the next is looked for."""
 MAX_DRIFT_SHARE, MAX_DRIFT = 0.04, 0.3
@@ -101,7 +101,8 @@ class Atlas:
     ) -> Located | None:
         """Where a camera is that most likely sees what a keyframe of the map in use saw."""
         level = level_from_camera if self.map.level else None
-        return self._relocalizer.locate(features, self.map, keyframe, level, seed, EXPECTED_SHARE)
+        share = MIN_SEEN_SHARE if level_from_camera is not None else EXPECTED_SHARE
+        return self._relocalizer.locate(features, self.map, keyframe, level, seed, share)
 
     def use(self, segment: SlamMap) -> None:
         """Use a map that was left behind."""

@@ -25,7 +25,7 @@ MIN_MATCHES = 12
 MIN_INLIERS = 10
 TILT_ERROR_PX = 12.0
 """What an error of the vertical may move a point by."""
-MIN_SEEN, MIN_SEEN_SHARE = 30, 0.25
+MIN_SEEN, MIN_SEEN_SHARE = 30, 0.35
 """Map points that must be seen where a pose predicts them, and as a share of those predicted."""
 N_AROUND = 6
 

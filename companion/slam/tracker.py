@@ -30,11 +30,9 @@ from companion.slam.worker import AtOnce, Beside, Done, MappingWorker, MapTurn
 
 MAX_TURN_UNSEEN_RAD = np.radians(15.0)
 MIN_FIRM, MIN_FIRM_SHARE = 25, 0.2
-"""A guess is believed when so many points of the last frame, and this share, are found by it."""
+"""Without attitude a guess is believed when so many points of the last frame are found by it."""
 MIN_DUE_SHARE, ENOUGH = 0.12, 100
-"""What is found is at least this share of what should be seen, or so many."""
-SUSPICIOUS_SHARE = 0.92
-"""With fewer points in agreement, or no attitude, a pose may be in the wrong one of two minima."""
+"""Without attitude what is found is at least this share of what should be seen, or so many."""
 Told = Track | KeyframeAdded | Reunited
 
 
@@ -204,8 +202,8 @@ class Tracker:
             guess = prior.map_from_camera.inverse()
             recent = last.point_ids[last.point_ids >= 0]
             recent = recent[self.map.alive[recent]]
-            firm = max(MIN_FIRM, int(MIN_FIRM_SHARE * len(recent)))
             turn_known = prior.ned_from_camera is not None
+            firm = 0 if turn_known else max(MIN_FIRM, int(MIN_FIRM_SHARE * len(recent)))
             found = self._match(view, guess, recent, 15.0, at_least=firm)
             if not found and not turn_known:
                 # how far the camera turned is anybody's guess: ask the descriptors first
@@ -240,7 +238,7 @@ class Tracker:
             view.camera_from_map, positions, finer, white, rounds=2
         )
         told = view.ned_from_camera is not None
-        if not told or inlier.sum() < SUSPICIOUS_SHARE * len(points):
+        if not told:
             start = other_pose(positions, finer)
             if start is not None:
                 other, theirs, info = refine_pose(start, positions, finer, white)
@@ -267,7 +265,8 @@ class Tracker:
         n = int(inlier.sum())
         if n < max(self._config.min_inliers, at_least) or n < 0.3 * len(points):
             return False
-        if count and n < min(MIN_DUE_SHARE * len(visible.ids), ENOUGH):
+        told = view.ned_from_camera is not None
+        if count and not told and n < min(MIN_DUE_SHARE * len(visible.ids), ENOUGH):
             return False
         view.camera_from_map, view.information = pose, information
         view.point_ids[:] = -1
