@@ -142,7 +142,7 @@ def free(port: int) -> bool:
 @pytest.mark.skipif(not (free(GRPC_PORT) and free(WEB_PORT)), reason="a viewer runs here")
 def test_the_web_viewer_listens_on_loopback_only_and_ends_with_the_flight() -> None:
     with LiveViewer(ViewerConfig(), CAMERA, "web") as viewer:
-        for seq in range(20):
+        for seq in range(8):
             viewer.take(image(seq))
         with pytest.raises(InputError, match=f"port {GRPC_PORT} is taken"):
             LiveViewer(ViewerConfig(), CAMERA, "web")
