@@ -15,6 +15,8 @@ from companion.voxel import thin_by_voxel
 
 Mask = NDArray[np.bool_]
 N_HELD = 7
+MAX_SIGMA = 0.01
+"""Relative standard deviation of depth that a point of the cloud, or its witness, has at most."""
 MAX_STEP = 0.04
 """Relative step of depth to a neighbour pixel at which a surface ends."""
 
@@ -30,7 +32,7 @@ class Fusion:
 
     def add(self, depth_map: DepthMap, update: MapUpdate) -> list[PointChunk]:
         """Take a depth map; chunks of those that have waited long enough."""
-        self._held[depth_map.keyframe_id] = measured_only(depth_map)
+        self._held[depth_map.keyframe_id] = measured_only(depth_map, MAX_SIGMA)
         self._open.append(depth_map.keyframe_id)
         out = []
         while len(self._open) > self._wait_for:
@@ -109,9 +111,11 @@ class Fusion:
         return agrees, off
 
 
-def measured_only(depth_map: DepthMap) -> DepthMap:
-    """The same without what was filled in: depth only where it has converged."""
+def measured_only(depth_map: DepthMap, max_sigma: float = np.inf) -> DepthMap:
+    """The same without what was filled in, or has a larger relative standard deviation."""
     known = depth_map.state == PixelState.CONVERGED.value
+    if np.isfinite(max_sigma):
+        known &= depth_map.sigma <= max_sigma * depth_map.depth
     nothing = np.float32(0)
     return replace(
         depth_map, depth=np.where(known, depth_map.depth, nothing),
