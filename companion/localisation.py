@@ -155,13 +155,13 @@ class LocalisationStage:
     def _frame(self, frame: Frame) -> Iterator[Message]:
         self._t_ns = frame.t_ns
         attitude = self._ned_from_camera(frame.t_ns)
-        with self._tracker.turn.tracking():
+        with self._tracker.turn.tracking():  # all of it: beside mapping each would slow the other
             self._follow_map()
-        predicted = self._predicted(frame.t_ns, attitude)
-        before = self._tracker.map
-        tied = predicted is not None and attitude is not None and self._motion.tied
-        in_map = predicted.rotation if predicted is not None and tied else None
-        tracked = self._tracker.step(frame, Prior(predicted, attitude, in_map))
+            predicted = self._predicted(frame.t_ns, attitude)
+            before = self._tracker.map
+            tied = predicted is not None and attitude is not None and self._motion.tied
+            in_map = predicted.rotation if predicted is not None and tied else None
+            tracked = self._tracker.step(frame, Prior(predicted, attitude, in_map))
         if self._tracker.map is not before or self.state is TrackState.INITIALISING:
             self._motion.reset()
             self._mounting.forget()

@@ -62,7 +62,7 @@ def _cost(residual: Array, depth: Array) -> float:
 def adjust(
     bundle: Bundle, iterations: int = 6, between: Callable[[], None] = lambda: None
 ) -> Adjusted:
-    """Adjust; the input is left as it is. `between` is called before each iteration."""
+    """Adjust; the input is left as it is. `between` is called every few milliseconds."""
     b = bundle
     n_var, n_points = b.n_variable, len(b.points)
     rotation = np.stack([p.rotation for p in b.poses])
@@ -86,20 +86,25 @@ def adjust(
             weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-9)) * (p[:, 2] > 0)
             root = np.sqrt(weight)[:, None, None]
             jc, jp = jc[moving] * root[moving], jp * root
+            between()
             r = (residual * root[:, :, 0])[..., None]
             jpt, jct = jp.transpose(0, 2, 1), jc.transpose(0, 2, 1)
             hpp = _sum_by(b.point, np.matmul(jpt, jp), n_points)
             gp = _sum_by(b.point, np.matmul(jpt, r)[..., 0], n_points)
+            between()
             hcc = _sum_by(cam, np.matmul(jct, jc), n_var)
             gc = _sum_by(cam, np.matmul(jct, r[moving])[..., 0], n_var)
             hcp = np.matmul(jct, jp[moving])
             cross = bsr_matrix((hcp, pt, rows), shape=shape, blocksize=(6, 3))
+        between()
         damped = hpp + (damping * np.einsum("nii->ni", hpp) + 1e-9)[..., None] * np.eye(3)
         inverse = np.linalg.inv(damped)
         eliminated = bsr_matrix(
             (np.matmul(hcp, inverse[pt]), pt, rows), shape=shape, blocksize=(6, 3)
         )
+        between()
         schur = -(eliminated @ cross.T).toarray()
+        between()
         for k in range(n_var):
             block = schur[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
             block += hcc[k] + np.diag(damping * np.diag(hcc[k]) + 1e-9)
@@ -112,6 +117,7 @@ def adjust(
             continue
         back = -gp - (cross.T @ dc).reshape(n_points, 3)
         dp = np.matmul(inverse, back[..., None])[..., 0]
+        between()
         turns = np.stack([rotation_from_vector(d[:3]) for d in dc.reshape(-1, 6)])
         new_rotation, new_translation = rotation.copy(), translation.copy()
         new_rotation[:n_var] = turns @ rotation[:n_var]

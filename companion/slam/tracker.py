@@ -28,6 +28,8 @@ from companion.slam.relocalizer import Located
 from companion.slam.view import View
 from companion.slam.worker import AtOnce, Beside, Done, MappingWorker, MapTurn
 
+MOST_REFINED = 150
+"""Points laid over each image by their patches: no pose needs more of them, and they take time."""
 MAX_TURN_UNSEEN_RAD = np.radians(15.0)
 MIN_FIRM, MIN_FIRM_SHARE = 25, 0.2
 """Without attitude a guess is believed when so many points of the last frame are found by it."""
@@ -89,12 +91,10 @@ class Tracker:
         self._local: Ints = np.zeros(0, np.int64)
 
     def step(self, frame: Frame, prior: Prior) -> list[Told]:
-        """Take one frame; frames come in order of time."""
+        """Take one frame, while it is the tracker's turn; frames come in order of time."""
         with self._times("features"):
             features = self._extractor.extract(frame.grey)
-        with self.turn.tracking():
-            out = self._place_frame(frame, features, prior)
-        return out + self._worker.done()
+        return self._place_frame(frame, features, prior) + self._worker.done()
 
     def set_effort(self, share: float) -> None:
         """Look for this share of the features from now on."""
@@ -227,11 +227,14 @@ class Tracker:
         refined_for = np.full(len(features), -1)
         index = np.flatnonzero(view.point_ids >= 0)
         points = view.point_ids[index]
-        finer, white, _ = refine_features(
-            self.map, view.camera_from_map, features, index, points, image_levels(view.grey)
-        )
+        some = np.arange(0, len(index), max(1, -(-len(index) // MOST_REFINED)))
+        finer, white = normalised[index], whitening[index]
+        finer[some], white[some], _ = refine_features(
+            self.map, view.camera_from_map, features, index[some], points[some],
+            image_levels(view.grey),
+        )  # fmt: skip
         normalised[index], whitening[index] = finer, white
-        refined_for[index] = points
+        refined_for[index[some]] = points[some]
         view.normalised, view.whitening, view.refined_for = normalised, whitening, refined_for
         positions = self.map.positions[points]
         pose, inlier, information = refine_pose(
@@ -260,8 +263,9 @@ class Tracker:
             return False
         features = view.features
         pose, inlier, information = refine_pose(
-            guess, self.map.positions[points], features.normalised[found], features.whitening[found]
-        )
+            guess, self.map.positions[points], features.normalised[found],
+            features.whitening[found], rounds=2 if count else 4,  # counted from where it is found
+        )  # fmt: skip
         n = int(inlier.sum())
         if n < max(self._config.min_inliers, at_least) or n < 0.3 * len(points):
             return False
