@@ -263,9 +263,8 @@ class Tracker:
             return False
         features = view.features
         pose, inlier, information = refine_pose(
-            guess, self.map.positions[points], features.normalised[found],
-            features.whitening[found], rounds=2 if count else 4,  # counted from where it is found
-        )  # fmt: skip
+            guess, self.map.positions[points], features.normalised[found], features.whitening[found]
+        )
         n = int(inlier.sum())
         if n < max(self._config.min_inliers, at_least) or n < 0.3 * len(points):
             return False
