@@ -263,8 +263,9 @@ class Tracker:
             return False
         features = view.features
         pose, inlier, information = refine_pose(
-            guess, self.map.positions[points], features.normalised[found], features.whitening[found]
-        )
+            guess, self.map.positions[points], features.normalised[found],
+            features.whitening[found], rounds=4 if count else 2,  # at first roughly
+        )  # fmt: skip
         n = int(inlier.sum())
         if n < max(self._config.min_inliers, at_least) or n < 0.3 * len(points):
             return False
