@@ -26,6 +26,8 @@ COOLER_C = 5.0
 """So much below the limit is cool again."""
 SEVERE_C = 7.0
 """So much above the limit is about where processors slow themselves down."""
+PRESSING_S = 1.0
+"""So long on end: a second in which a map begins or a viewer joins is no reason."""
 SETTLE_S = 2.0
 SETTLE_HEAT_S = 15.0
 SETTLE_SEVERE_S = 1.0
@@ -84,6 +86,7 @@ class Governor:
         self._lowered_ns: int | None = None
         self._easy_since_ns: int | None = None
         self._calm_s = CALM_S
+        self._pressing_since_ns: int | None = None
 
     @property
     def degraded(self) -> str:
@@ -95,7 +98,12 @@ class Governor:
         why, settle_s = self._pressing(pressure)
         if why:
             self._easy_since_ns = None
+            if self._pressing_since_ns is None:
+                self._pressing_since_ns = t_ns
+            if t_ns - self._pressing_since_ns < PRESSING_S * 1e9:
+                return False
             return self._raise(t_ns, why, settle_s)
+        self._pressing_since_ns = None
         if not self._easy(pressure):
             self._easy_since_ns = None
             return False

@@ -46,7 +46,7 @@ class MavlinkPort(Protocol):
         """Times that something came which was refused: damaged, or not signed as it should be."""
 
     def clients(self) -> list[ClientCounts]:
-        """How those do who share the link."""
+        """How those do who share the link; who has left is in it once more."""
 
     def set_tap(self, tap: Tap | None) -> None:
         """Have all bytes told to it, as they come from the wire and go on it; whoever sent them."""

@@ -25,6 +25,7 @@ CLIENT_BYTES_PER_S, CLIENT_BURST = 50e3, 20e3
 INBOX_BYTES = 8000
 CLIENT_READ_SIZE = 4096
 MOST_GARBAGE = 64_000
+MOST_DEPARTED = 16
 CLIENTS_SHARE, OWN_SHARE = 0.85, 0.8
 """Clients get what we leave of the link, and a twentieth of it at least."""
 BURST_S, LEAST_BURST = 0.05, 600
@@ -116,6 +117,7 @@ class Router:
         self._recent: dict[bytes, tuple[RouterClient | None, int]] = {}
         self._budget = RateLimit(1.0, 1.0)
         self._turns: deque[RouterClient] = deque()
+        self._departed: deque[ClientCounts] = deque(maxlen=MOST_DEPARTED)
         self._pump_later: asyncio.TimerHandle | None = None
         for url in config.clients:
             endpoint = client_endpoint(url)
@@ -138,6 +140,12 @@ class Router:
     def counts(self) -> list[ClientCounts]:
         """Of the clients that there are now."""
         return [client.counts() for client in self._clients]
+
+    def take_departed(self) -> list[ClientCounts]:
+        """Of the newest of those that have left since the last call: each is told once."""
+        departed = list(self._departed)
+        self._departed.clear()
+        return departed
 
     @property
     def n_turned_away(self) -> int:
@@ -249,6 +257,7 @@ class Router:
 
     def _leave(self, client: RouterClient) -> None:
         self._clients.remove(client)
+        self._departed.append(client.counts())
         client.inbox.clear()
         if client in self._turns:
             self._turns.remove(client)

@@ -93,8 +93,8 @@ class PymavlinkPort:
         return self._stream.n_bad_bytes
 
     def clients(self) -> list[ClientCounts]:
-        """How those do who share the link."""
-        return self.router.counts()
+        """See `MavlinkPort`."""
+        return self.router.take_departed() + self.router.counts()
 
     def set_tap(self, tap: Tap | None) -> None:
         """See `MavlinkPort`."""

@@ -34,6 +34,7 @@ class RrdFiles:
         self._n_looked += 1
         if not self._each or self._n_looked % LOOK_EVERY:
             return False
+        self.recording.flush()  # what waits for the disk counts too
         return self._paths[-1].stat().st_size >= self._each
 
     def next(self) -> rr.RecordingStream:

@@ -6,13 +6,16 @@ first. Twice in a second or so all of it is written as a chunk and synced.
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import os
+import tempfile
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 from companion.config import RecorderConfig
 from companion.errors import FlightError
@@ -27,6 +30,8 @@ PICTURES_SHARE = 0.8
 """Of the buffer, so that there is room for what is small and matters more."""
 LOOK_S = 2.0
 """The room on the disk is looked at so often."""
+RESERVE_BYTES = 1 << 20
+"""For the end of the file: a disk may fill up between two looks."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 FULL, PRUNED = "the disk is full: the flight is no longer recorded", "an old flight was deleted"
@@ -66,6 +71,7 @@ class DiskWriter:
         """Messages turned away, by what they are."""
         self.slowest_s = 0.0
         """What the disk took for one chunk at most."""
+        self._reserve = _reserved(flight)
         self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
         self._thread.start()
 
@@ -115,6 +121,7 @@ class DiskWriter:
         except BaseException as fault:  # handed to the thread that records, which raises it
             self._fault = fault
         finally:
+            self._reserve.close()
             self._mcap.close()
             self._tlog.close()
 
@@ -191,7 +198,7 @@ class DiskWriter:
         return False
 
     def _end(self, what: str = "", detail: str = "") -> None:
-        """No more is written; what is there becomes whole, if there is room for that."""
+        """No more is written; what is there becomes whole, in the room that was kept for that."""
         with self._changed:
             self._ended = True
             self.n_dropped["messages"] += len(self._entries)
@@ -199,6 +206,7 @@ class DiskWriter:
         if what:
             self.n_dropped["messages"] += self._writer.drop_waiting()
             self._tell_once(what, detail)
+        self._reserve.close()
         try:
             self._writer.finish()
             self._mcap.sync()
@@ -209,3 +217,11 @@ class DiskWriter:
         if what not in self._told:
             self._told.add(what)
             self._warn(Warned(self._now_ns(), what, detail))
+
+
+def _reserved(folder: Path) -> IO[bytes]:
+    """A file without a name that takes up room; closed, the room is free."""
+    reserve = tempfile.TemporaryFile(dir=folder)
+    with contextlib.suppress(OSError):  # the disk is full now: the first look says so
+        os.posix_fallocate(reserve.fileno(), 0, RESERVE_BYTES)
+    return reserve

@@ -15,6 +15,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import ConfigError
+from drivers.mavlink_router import MOST_GARBAGE
 from drivers.mavlink_stream import MavlinkStream, Packet
 from drivers.mavlink_tcp_door import MOST_CONNECTIONS
 from drivers.pymavlink_port import PymavlinkPort
@@ -236,6 +237,9 @@ def test_garbage_never_reaches_the_autopilot_and_ends_the_connection() -> None:
                     bad.send(noise.randbytes(1000))
                     await asyncio.sleep(0.005)
             await until(lambda: len(scene.port.router.counts()) == 2)  # `good` and the UDP place
+            told = [each for each in scene.port.clients() if not each.connected]
+            assert max(each.n_bad_bytes for each in told) > MOST_GARBAGE  # after it has gone
+            assert len(scene.port.clients()) == 2
             assert [each.raw for each in scene.autopilot.hear()] == [packet, later]
 
     asyncio.run(play())
