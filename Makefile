@@ -1,4 +1,5 @@
 # make demo: install and replay the sample flight. make test: everything that CI checks.
+# make deb: a package for Debian or Ubuntu, for this machine's architecture.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -6,7 +7,7 @@ BIN := $(VENV)/bin
 FLIGHT ?= sample/survey
 OUT ?= out/demo
 
-.PHONY: demo test lint clean reference regression
+.PHONY: demo test lint clean reference regression deb system-test
 
 demo: $(VENV)/.installed
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
@@ -30,6 +31,13 @@ reference: $(VENV)/.installed
 	$(BIN)/companion replay sample/survey --out out/reference --set cloud.voxel_m=0.5
 	mkdir -p sample/reference
 	cp out/reference/trajectory.tum out/reference/cloud.ply out/reference/report.json sample/reference
+
+deb:
+	sh packaging/build_deb.sh
+
+# The package on a booted Debian; what it needs is said in tests/system/test_service.py.
+system-test: $(VENV)/.installed-dev
+	$(BIN)/pytest -s tests/system
 
 # A stamp beside the environment: reinstalled only when the dependencies may have changed.
 $(VENV)/.installed: pyproject.toml | $(BIN)/python

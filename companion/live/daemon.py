@@ -25,7 +25,7 @@ from companion.live.journal import ERROR, INFO, WARNING, Journal
 from companion.live.link_watch import LinkWatch
 from companion.live.loop_delay import measure_loop_delay
 from companion.live.missing import Missing
-from companion.live.pose_sender import make_pose_sender
+from companion.live.pose_sender import PoseSender
 from companion.live.reload import reloaded
 from companion.live.tape_notes import TapeNotes
 from companion.live.vehicle_reports import VehicleReports
@@ -51,9 +51,11 @@ from drivers.service_manager import ServiceManager
 from drivers.status_socket import StatusSocket, own_socket_path
 
 WATCH_S = 0.2
-READY_AFTER_S = 5.0
+START_S = 180.0
+"""Stages have so long to come up once nothing is missing any more; the first time they compile."""
 FAULT, BAD_INPUT = 1, 2
 """Exit statuses."""
+NO_PROGRESS = "frames come and no pose, whatever is tried: left to the service manager's watchdog"
 SPARE_AGAIN_S = 1.0
 END_S = 2.6
 """A stop takes little longer, whatever hangs."""
@@ -73,6 +75,7 @@ class Daemon:
         self._camera: Camera | None = None
         self._armed = False
         self._service = ServiceManager()
+        self._is_ready = False
         self._loop_delay = LatencyMeter()
         self._feed = CameraFeed(
             camera_source(config.camera), clock, config.camera, self._on_frame, self._on_warned
@@ -85,7 +88,9 @@ class Daemon:
             self._link = AutopilotLink(
                 config.link, port, clock, self._on_telemetry, self._on_warned
             )
-        self._sender = make_pose_sender(config.feedback, self._link, clock)
+        self._sender: PoseSender | None = None
+        if self._link is not None:
+            self._sender = PoseSender(config.feedback, self._link, clock)
         self._flights = Flights(
             clock, self._journal, self._listener,
             lambda flight: facts_of(flight, self._config, self._link),
@@ -127,7 +132,11 @@ class Daemon:
         if self._link is not None and self._sender is not None:
             work.append(self._sender.run())
             if config.feedback.set_origin:
-                work.append(OriginKeeper(config.feedback, self._link, self._journal.say).run())
+                keeper = OriginKeeper(
+                    config.feedback, self._link, self._journal.say,
+                    lambda: self._config.feedback.mode != "off",
+                )  # fmt: skip
+                work.append(keeper.run())
         if self._reports is not None:
             work.append(self._reports.run())
         tasks = [loop.create_task(each) for each in work]
@@ -263,7 +272,7 @@ class Daemon:
 
     async def _run_watch(self) -> None:
         began_ns = self._clock.now_ns()
-        is_ready = False
+        progress = True
         while True:
             await asyncio.sleep(WATCH_S)
             if self._link_watch is not None:
@@ -273,13 +282,18 @@ class Daemon:
                 origin = self._link.origin if self._link is not None else None
                 self._flights.current.tell(health, origin)
             now_s = (self._clock.now_ns() - began_ns) * 1e-9
-            if not is_ready and (self._watch.pipeline_up or now_s > READY_AFTER_S):
-                is_ready = True
+            if not self._is_ready and self._watch.up:
+                self._is_ready = True
                 self._service.ready(health.tracker)
-            if self._watch.pose_loop_alive:
-                self._service.alive()
-            else:
+            elif not self._is_ready and any(each.state == "missing" for each in health.sources):
+                self._service.extend_timeout(START_S)
+            if not self._watch.pose_loop_alive:
                 self._watch.kill_stuck()
+            if progress and not self._watch.progress:
+                self._journal.say(NO_PROGRESS, ERROR)
+            progress = self._watch.progress
+            if progress:
+                self._service.alive()
             line = self._watch.line_due()
             if line:
                 self._journal.say(line)
@@ -292,7 +306,8 @@ class Daemon:
 
     def _reload(self) -> None:
         """SIGHUP: take over what can be changed while running, and say what cannot."""
-        self._service.reloading()
+        if self._is_ready:
+            self._service.reloading()
         try:
             config, cannot = reloaded(self._config, self._load())
         except CompanionError as error:
@@ -308,7 +323,8 @@ class Daemon:
                 self._begin_if_due()
             text = f"; these need a restart: {', '.join(cannot)}" if cannot else ""
             self._journal.say(f"configuration read again{text}", WARNING if cannot else INFO)
-        self._service.ready()
+        if self._is_ready:
+            self._service.ready()
 
     def _give_up(self, why: str, status: int = FAULT) -> None:
         if self._status == 0:

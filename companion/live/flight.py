@@ -101,6 +101,15 @@ class LiveFlight:
         """Whether frames are worked on as they come."""
         return self.folder is not None and self.stages["localisation"].progress is not None
 
+    @property
+    def stages_up(self) -> bool:
+        """Whether every stage that can be has begun its work, or has tried and will again."""
+        return all(
+            stage.progress is not None or self.n_restarted.get(kind, 0)
+            for kind, stage in list(self.stages.items())
+            if self.folder is not None or kind not in IN_FOLDER
+        )
+
     def begin(self, folder: Path) -> None:
         """The flight begins, and leaves its results there."""
         self.folder, self._began_s = folder, monotonic_s()

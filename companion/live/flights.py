@@ -33,6 +33,12 @@ class Flights:
         self._spare: LiveFlight | None = None
         self._ending: dict[LiveFlight, threading.Thread] = {}
 
+    @property
+    def stages_up(self) -> bool:
+        """Whether the flight that goes on, or else the one that waits, can take frames."""
+        flight = self.current or self._spare
+        return flight is not None and flight.stages_up
+
     def prepare(self, config: Config, camera: Camera) -> None:
         """Have processes at hand for the next flight."""
         if self._spare is None:

@@ -38,6 +38,8 @@ BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
 """unless it works: then the computer has too much else to do, and it is given longer."""
 START_S = 30.0
 """A localisation that is not ready by then never will be."""
+PATIENCE_NS = 20_000_000_000
+"""Frames come, localisation was started again, and still no track: nothing here will help."""
 NO_SIGN_S = 10.0
 """A stage from which nothing is heard for so long, while frames come, is not well."""
 SETTLE_NS = 3_000_000_000
@@ -80,6 +82,7 @@ class HealthWatch:
         self._frames_since_s = 0.0
         self._odometry: Odometry | None = None
         self._odometry_ns = 0
+        self._progress_ns = self._began_ns
         self._scale = ""
         self._recent = LatencyMeter(1.0)
         self._pose = StageMeter("localisation")
@@ -113,7 +116,7 @@ class HealthWatch:
         now_ns = self._clock.now_ns()
         if odometry.state is not TrackState.TRACKING:
             self._settled_ns = now_ns + SETTLE_NS
-        self._odometry, self._odometry_ns = odometry, now_ns
+        self._odometry, self._odometry_ns, self._progress_ns = odometry, now_ns, now_ns
         self._pose.done(now_ns, odometry.t_ns)
         self._recent.add(now_ns, (now_ns - odometry.t_ns) * 1e-6)
 
@@ -126,9 +129,19 @@ class HealthWatch:
             self._scale = found.method if found is not None else ""
 
     @property
-    def pipeline_up(self) -> bool:
-        """Whether frames are worked on as they come."""
-        return self._flights.current is not None and self._flights.current.ready
+    def up(self) -> bool:
+        """Whether the stages are ready for frames, and the way to the autopilot is open."""
+        link_open = self._link is None or self._link.health.state != "missing"
+        return link_open and self._flights.stages_up
+
+    @property
+    def progress(self) -> bool:
+        """False where frames come but no pose has for long; to be asked often."""
+        now_ns = self._clock.now_ns()
+        frames_come = now_ns - self._last_frame_ns < GOVERN_NS
+        if self._flights.current is None or not frames_come:
+            self._progress_ns = now_ns
+        return now_ns - self._progress_ns < PATIENCE_NS
 
     @property
     def pose_loop_alive(self) -> bool:

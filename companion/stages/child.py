@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import resource
 import signal
 import sys
 
@@ -44,6 +45,8 @@ def main() -> int:
     """Serve one stage until told to finish, or until the daemon is gone."""
     kind, nice, pipe_fd, ring_fd = sys.argv[1], *map(int, sys.argv[2:5])
     os.nice(min(nice, LOWEST_NICE))
+    if kind == "localisation":
+        _take_real_time()
     if nice > LOWEST_NICE:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     sys.setswitchinterval(SWITCH_S)
@@ -117,6 +120,19 @@ def _serve(
             n_dropped = inbox.n_dropped + n_overwritten + work.n_turned_away
             send(Progress(n_done, n_dropped, work.times.summary(), work.device))
     send(Finished(work.times.summary(), work.device))
+
+
+def _take_real_time() -> None:
+    """The pose before all else, where the service's LimitRTPRIO allows it and a core is left over.
+
+    Only what takes a frame to its pose: threads that this one starts have the usual policy again.
+    """
+    if resource.getrlimit(resource.RLIMIT_RTPRIO)[0] == 0 or len(os.sched_getaffinity(0)) < 2:
+        return
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except OSError as error:  # some kernels let no group of processes have it
+        print(f"companion: no real-time policy for the pose: {error.strerror}", file=sys.stderr)
 
 
 def _sender(pipe: Connection[Any, Any]) -> Callable[[Any], None]:
