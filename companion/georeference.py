@@ -9,7 +9,7 @@ the path does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -70,23 +70,36 @@ class Place:
     ground_units: float | None = None
 
 
-@dataclass(slots=True)
 class _Series:
     """Samples over time, not closer together than needed."""
 
-    times: list[int] = field(default_factory=list)
-    values: list[Array] = field(default_factory=list)
+    def __init__(self) -> None:
+        self._n = 0
+        self._times: NDArray[np.int64] = np.zeros(256, np.int64)
+        self._values: Array = np.zeros(0)
+
+    @property
+    def newest(self) -> tuple[int, Array] | None:
+        """Time and value of the last sample."""
+        last = self._n - 1
+        return (int(self._times[last]), self._values[last]) if self._n else None
 
     def add(self, t_ns: int, value: Array, horizontal_only: bool = False) -> None:
         known = value[..., :2] if horizontal_only else value
-        if np.isfinite(known).all() and (not self.times or t_ns - self.times[-1] >= MIN_SPACING_NS):
-            self.times.append(t_ns)
-            self.values.append(value)
+        early = self._n > 0 and t_ns - self._times[self._n - 1] < MIN_SPACING_NS
+        if early or not np.isfinite(known).all():
+            return
+        if not self._n:
+            self._values = np.zeros((len(self._times), *value.shape))
+        elif self._n == len(self._times):
+            self._times = np.concatenate([self._times, np.zeros_like(self._times)])
+            self._values = np.concatenate([self._values, np.zeros_like(self._values)])
+        self._times[self._n], self._values[self._n] = t_ns, value
+        self._n += 1
 
     def at(self, t_ns: Array) -> tuple[Array, Bools]:
         """Interpolated values, and where samples on both sides are near enough."""
-        times = np.array(self.times)
-        values = np.stack(self.values)
+        times, values = self._times[: self._n], self._values[: self._n]
         i = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)
         span = times[i] - times[i - 1]
         f = ((t_ns - times[i - 1]) / np.maximum(span, 1)).reshape(-1, *([1] * (values.ndim - 1)))
@@ -96,7 +109,7 @@ class _Series:
         return values[i - 1] * (1 - f) + values[i] * f, inside
 
     def __len__(self) -> int:
-        return len(self.times)
+        return self._n
 
 
 class _Scale(NamedTuple):
@@ -142,11 +155,11 @@ class Georeferencer:
 
     def _integrate(self, series: _Series, t_ns: int, velocity: Array) -> None:
         # rows: velocity, and the way travelled so far by it; a GPS may not tell the vertical part
-        if not series.times:
+        if series.newest is None:
             series.add(t_ns, np.stack([velocity, 0.0 * velocity]), horizontal_only=True)
             return
-        previous, way = series.values[-1]
-        dt = (t_ns - series.times[-1]) * 1e-9
+        before_ns, (previous, way) = series.newest
+        dt = (t_ns - before_ns) * 1e-9
         travelled = way + 0.5 * (previous + velocity) * dt
         series.add(t_ns, np.stack([velocity, travelled]), horizontal_only=True)
 
@@ -166,9 +179,9 @@ class Georeferencer:
         """
         for source in self._sources:
             series = self._travel[source]
-            if len(series) < 2:
+            if len(series) < 2 or series.newest is None:
                 continue
-            newest_ns = series.times[-1]
+            newest_ns, _ = series.newest
             end_ns = min(to_ns, newest_ns)
             if to_ns - newest_ns > MAX_HELD_NS or from_ns > end_ns:
                 continue
