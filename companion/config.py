@@ -274,6 +274,8 @@ class MappingConfig:
     iterations: Annotated[int, Range(1, 100)] = 6
     final_iterations: Annotated[int, Range(1, 100)] = 8
     """Of the adjustment of the whole map when the flight is over."""
+    keyframe_spacing_deg: Annotated[float, Range(0, 45)] = 2.0
+    """One that is nearer to another, seen from its points, goes if three show the same; 0: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,6 +335,8 @@ class CloudConfig:
     """Other keyframes whose depth must agree with a point's."""
     agreement: Annotated[float, Range(0.001, 0.2)] = 0.015
     """Relative difference of depth up to which two keyframes agree."""
+    memory_mb: Annotated[int, Range(1, 100000)] = 64
+    """Points of a flight kept in memory; others lie in the run's folder until it is over."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,12 +13,12 @@ from companion.config import Config
 from companion.depth.depth_range import depth_range
 from companion.depth.device_choice import choose_device
 from companion.depth.engine import DepthEngine
-from companion.depth.fusion import Fusion
+from companion.depth.fusion import Fusion, chunk_alone
 from companion.depth.opencl import ComputeDevice
 from companion.depth.undistortion import Undistortion
 from companion.errors import FlightError
-from companion.geometry import Array, Pose
-from companion.messages import Bytes, DepthMap, MapUpdate, PixelState, PointChunk
+from companion.geometry import Pose
+from companion.messages import Bytes, DepthMap, MapUpdate, PointChunk
 from companion.output.depth_files import write_cloud, write_depth, write_log
 from companion.progress import Progress
 from drivers.posed_images import PosedImages
@@ -165,7 +165,7 @@ def reconstruct(
             progress.update(n, f"frame {numbers[reference]}", sum(len(c.rgb) for c in chunks))
     finally:
         progress.finish()
-    chunks += _alone(done[0]) if alone else fusion.flush(update)
+    chunks += [chunk_alone(done[0])] if alone else fusion.flush(update)
     write_cloud(out, chunks, places)
     write_log(
         out, device=device.described, layout=images.layout, maps=done, frames=log,
@@ -226,18 +226,3 @@ def _relative(images: PosedImages, a: int, b: int) -> Pose:
     first, second = images.poses[a], images.poses[b]
     assert first is not None and second is not None
     return first.inverse() @ second
-
-
-def _alone(depth_map: DepthMap) -> list[PointChunk]:
-    """All points of the only reference: no other can agree or disagree."""
-    rows, columns = np.nonzero(depth_map.state == PixelState.CONVERGED.value)
-    fx, fy, cx, cy = depth_map.intrinsics
-    z: Array = depth_map.depth[rows, columns].astype(np.float64)
-    points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
-    return [
-        PointChunk(
-            depth_map.keyframe_id, depth_map.t_ns, points.astype(np.float32),
-            np.ascontiguousarray(depth_map.rgb[rows, columns]),
-            depth_map.inlier_ratio[rows, columns],
-        )
-    ]  # fmt: skip

@@ -221,7 +221,8 @@ class MapUpdate:
 
     `unit_of` holds, for keyframes of segments with a scale of their own, how many map units one
     unit of the keyframe's camera frame is; all others are 1. A keyframe that is missing here has no
-    known place, and what hangs on it has none either.
+    known place, and what hangs on it has none either. `n_retired` of them have left the map, their
+    neighbours showing all that they showed, and move with those.
     """
 
     revision: int
@@ -230,6 +231,12 @@ class MapUpdate:
     points_map: Array
     georeference: Georeference | None
     unit_of: Mapping[int, float] = field(default_factory=dict)
+    n_retired: int = 0
+
+    @property
+    def n_keyframes(self) -> int:
+        """Keyframes that the map is made of."""
+        return len(self.map_from_camera) - self.n_retired
 
     def place_of(self, keyframe_id: int) -> Similarity | None:
         """The transform `map_from_camera` of a keyframe, unit included; None if not known."""
@@ -273,8 +280,10 @@ class DepthMap:
 class PointChunk:
     """Fused points of one keyframe, in its camera frame and map units.
 
-    `points_camera` (N, 3) f32, `rgb` (N, 3) u8, `confidence` (N,) f32 in 0..1. A moved keyframe
-    moves its chunk: nothing here changes.
+    `points_camera` (N, 3) f32, `rgb` (N, 3) u8, `confidence` (N,) f32 in 0..1; `normals_camera`
+    (N, 3) f32 unit vectors towards the camera, zero where not known; `sigma` (N,) f32 one standard
+    deviation along the line of sight, map units. A moved keyframe moves its chunk: nothing here
+    changes.
     """
 
     keyframe_id: int
@@ -282,6 +291,8 @@ class PointChunk:
     points_camera: Floats
     rgb: Bytes
     confidence: Floats
+    normals_camera: Floats
+    sigma: Floats
 
 
 @dataclass(frozen=True, slots=True)

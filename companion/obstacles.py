@@ -138,6 +138,8 @@ class RecentCloud:
             chunk.points_camera[::step],
             chunk.rgb[::step],
             chunk.confidence[::step],
+            chunk.normals_camera[::step],
+            chunk.sigma[::step],
         )
         self._chunks.pop(chunk.keyframe_id, None)
         self._chunks[chunk.keyframe_id] = thinned

@@ -59,7 +59,7 @@ def replay(
     device = choose_device(config.opencl, monotonic_s) if config.depth.enabled else None
     out.mkdir(parents=True, exist_ok=True)
     times = StageTimes()
-    result = FlightResult()
+    result = FlightResult(out, config.cloud.memory_mb)
     began_s = monotonic_s()
     completed = False
     dropped: dict[str, int] = {}
@@ -100,6 +100,7 @@ def replay(
                 completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
             )  # fmt: skip
             write_results(out, result, facts, config.cloud.voxel_m)
+            result.close()
     return result
 
 

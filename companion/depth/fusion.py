@@ -3,22 +3,41 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.config import CloudConfig
+from companion.depth.normals import MAX_STEP, normals
 from companion.geometry import Array, Similarity
 from companion.messages import DepthMap, Floats, MapUpdate, PixelState, PointChunk
 from companion.voxel import thin_by_voxel
 
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.int64]
 N_HELD = 7
 MAX_SIGMA = 0.01
 """Relative standard deviation of depth that a point of the cloud, or its witness, has at most."""
-MAX_STEP = 0.04
-"""Relative step of depth to a neighbour pixel at which a surface ends."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Held:
+    map: DepthMap
+    normals: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Witness:
+    """What another map says of points: which it agrees with; of these only the rest.
+
+    How much further away they are and how sure it is, both in proportion; their normals, turned.
+    """
+
+    agrees: Mask
+    off: Array
+    sigma: Array
+    normals: Array
 
 
 class Fusion:
@@ -27,12 +46,13 @@ class Fusion:
     def __init__(self, config: CloudConfig, wait_for: int = 2) -> None:
         self._config = config
         self._wait_for = wait_for
-        self._held: OrderedDict[int, DepthMap] = OrderedDict()
+        self._held: OrderedDict[int, _Held] = OrderedDict()
         self._open: list[int] = []
 
     def add(self, depth_map: DepthMap, update: MapUpdate) -> list[PointChunk]:
         """Take a depth map; chunks of those that have waited long enough."""
-        self._held[depth_map.keyframe_id] = measured_only(depth_map, MAX_SIGMA)
+        sure = measured_only(depth_map, MAX_SIGMA)
+        self._held[depth_map.keyframe_id] = _Held(sure, normals(sure.depth, sure.intrinsics))
         self._open.append(depth_map.keyframe_id)
         out = []
         while len(self._open) > self._wait_for:
@@ -48,42 +68,47 @@ class Fusion:
         return [chunk for chunk in out if chunk is not None]
 
     def _fuse(self, keyframe_id: int, update: MapUpdate) -> PointChunk | None:
-        depth_map = self._held[keyframe_id]
+        depth_map, facing = self._held[keyframe_id].map, self._held[keyframe_id].normals
         place = update.place_of(keyframe_id)
         if place is None:
             return None
-        rows, columns = np.nonzero(depth_map.depth)
+        rows, columns = np.nonzero(_smooth(depth_map.depth))
         if len(rows) == 0:
             return None
-        ahead = _smooth(depth_map.depth)[rows, columns]
-        rows, columns = rows[ahead], columns[ahead]
-        z = depth_map.depth[rows, columns].astype(np.float64)
-        fx, fy, cx, cy = depth_map.intrinsics
-        points = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
-        agreeing = np.zeros(len(points), np.int64)
-        further = np.zeros(len(points))
+        points = points_of(depth_map, rows, columns)
+        sigma = (depth_map.sigma[rows, columns] / points[:, 2]).astype(np.float64)
+        n_maps = np.ones(len(points), np.int64)
+        further, scatter, variance = np.zeros(len(points)), np.zeros(len(points)), sigma**2
+        normal: Array = facing[rows, columns].astype(np.float64)
         for other_id, other in self._held.items():
             other_place = update.place_of(other_id)
             if other_id == keyframe_id or other_place is None:
                 continue
-            agrees, off = self._agrees(points, other_place.inverse() @ place, other)
-            agreeing += agrees
-            further += np.where(agrees, off, 0.0)
-        # each map that agrees has the same say in how far away a point is
-        points *= (1.0 + further / (agreeing + 1))[:, None]
-        sigma = depth_map.sigma[rows, columns] / np.maximum(z, 1e-9)
-        ratio = depth_map.inlier_ratio[rows, columns]
-        keep = agreeing >= self._config.min_agreeing
-        points, agreeing, sigma, ratio = points[keep], agreeing[keep], sigma[keep], ratio[keep]
-        rows, columns = rows[keep], columns[keep]
-        if len(points) == 0:
+            witness = self._witness(points, other_place.inverse() @ place, other)
+            n_maps += witness.agrees
+            further[witness.agrees] += witness.off
+            scatter[witness.agrees] += witness.off**2
+            variance[witness.agrees] += witness.sigma**2
+            normal[witness.agrees] += witness.normals
+        keep = n_maps > self._config.min_agreeing
+        if not keep.any():
             return None
-        confidence = ratio * (1.0 - 0.5 ** (agreeing + 1)) / (1.0 + (sigma / 0.01) ** 2)
-        kept = thin_by_voxel(points, confidence, self._voxel(points, place, update))
+        # each map that agrees has the same say in how far away a point is
+        further /= n_maps
+        points *= (1.0 + further)[:, None]
+        scatter = np.maximum(scatter / n_maps - further**2, 0.0)
+        ratio = depth_map.inlier_ratio[rows, columns]
+        confidence = ratio * (1.0 - 0.5**n_maps) / (1.0 + (sigma / 0.01) ** 2)
+        # the maps share images, so that their errors are not independent
+        fused = np.sqrt(variance / n_maps / 2 + scatter / n_maps) * points[:, 2]
+        kept = np.flatnonzero(keep)
+        voxel = self._voxel(points[kept], place, update)
+        kept = kept[thin_by_voxel(points[kept], confidence[kept], voxel)]
         return PointChunk(
             keyframe_id, depth_map.t_ns, points[kept].astype(np.float32),
             np.ascontiguousarray(depth_map.rgb[rows[kept], columns[kept]]),
-            confidence[kept].astype(np.float32),
+            confidence[kept].astype(np.float32), _unit(normal[kept]).astype(np.float32),
+            fused[kept].astype(np.float32),
         )  # fmt: skip
 
     def _voxel(self, points: Array, place: Similarity, update: MapUpdate) -> float:
@@ -92,23 +117,44 @@ class Fusion:
             return 0.01 * float(np.median(points[:, 2]))
         return self._config.voxel_m / (update.georeference.world_from_map.scale * place.scale)
 
-    def _agrees(
-        self, points: Array, other_from_here: Similarity, other: DepthMap
-    ) -> tuple[Mask, Array]:
-        """Whether the other sees each point where it is, and how much further, in proportion."""
+    def _witness(self, points: Array, other_from_here: Similarity, other: _Held) -> _Witness:
+        """What the other sees of points (N, 3)."""
         p = other_from_here.apply(points)
-        fx, fy, cx, cy = other.intrinsics
-        height, width = other.depth.shape
+        fx, fy, cx, cy = other.map.intrinsics
+        height, width = other.map.depth.shape
         front = p[:, 2] > 1e-6
         z = np.where(front, p[:, 2], 1.0)
         u = np.rint(fx * p[:, 0] / z + cx)
         v = np.rint(fy * p[:, 1] / z + cy)
         inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        seen = np.zeros(len(points))
-        seen[inside] = other.depth[v[inside].astype(int), u[inside].astype(int)]
+        row, column = (np.where(inside, x, 0).astype(np.int64) for x in (v, u))
+        seen = np.where(inside, other.map.depth[row, column], 0.0)
         off: Array = seen / z - 1.0
         agrees: Mask = (seen > 0) & (np.abs(off) < self._config.agreement)
-        return agrees, off
+        row, column = row[agrees], column[agrees]
+        return _Witness(
+            agrees, off[agrees], other.map.sigma[row, column] / seen[agrees],
+            other.normals[row, column] @ other_from_here.rotation,
+        )  # fmt: skip
+
+
+def points_of(depth_map: DepthMap, rows: Indices, columns: Indices) -> Array:
+    """Points (N, 3) of pixels in the camera frame, map units."""
+    fx, fy, cx, cy = depth_map.intrinsics
+    z = depth_map.depth[rows, columns].astype(np.float64)
+    return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
+
+
+def chunk_alone(depth_map: DepthMap) -> PointChunk:
+    """All that has converged of the only map there is: no other can agree or disagree."""
+    known = measured_only(depth_map)
+    rows, columns = np.nonzero(known.depth)
+    return PointChunk(
+        depth_map.keyframe_id, depth_map.t_ns,
+        points_of(depth_map, rows, columns).astype(np.float32),
+        np.ascontiguousarray(depth_map.rgb[rows, columns]), depth_map.inlier_ratio[rows, columns],
+        normals(known.depth, known.intrinsics)[rows, columns], known.sigma[rows, columns],
+    )  # fmt: skip
 
 
 def measured_only(depth_map: DepthMap, max_sigma: float = np.inf) -> DepthMap:
@@ -123,8 +169,13 @@ def measured_only(depth_map: DepthMap, max_sigma: float = np.inf) -> DepthMap:
     )  # fmt: skip
 
 
+def _unit(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=1)
+    return np.asarray(vectors / np.where(length > 0, length, 1.0)[:, None])
+
+
 def _smooth(depth: Floats) -> Mask:
-    """Pixels that have a neighbour on the same surface, and none where a nearer surface ends."""
+    """Pixels with depth that have a neighbour on the same surface, and none on another."""
     ok = np.zeros(depth.shape, bool)
     edge = np.zeros(depth.shape, bool)
     for axis in (0, 1):

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.output.flight_result import Cloud
+from companion.output.cloud import Cloud
 from companion.output.map_frame import MapFrame
 
-POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("confidence", "<f4")])
+POINT = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"),
+        ("normal_x", "<f4"), ("normal_y", "<f4"), ("normal_z", "<f4"),
+        ("confidence", "<f4"), ("sigma", "<f4"),
+    ]
+)  # fmt: skip
 
 
 def cloud_pcd(cloud: Cloud, frame: MapFrame) -> bytes:
@@ -22,13 +28,18 @@ def cloud_pcd(cloud: Cloud, frame: MapFrame) -> bytes:
         points[name] = coordinates[:, axis] - shift[axis]
     red, green, blue = cloud.rgb.astype(np.uint32).T
     points["rgb"] = red << 16 | green << 8 | blue
-    points["confidence"] = cloud.confidence
+    facing = frame.directions(cloud.normals, cloud.points)
+    for axis, name in enumerate(("normal_x", "normal_y", "normal_z")):
+        points[name] = facing[:, axis]
+    points["confidence"], points["sigma"] = cloud.confidence, cloud.sigma
+    names = POINT.names or ()
     head = [
         "# .PCD v0.7 - Point Cloud Data file format",
         f"# {frame.name}" + (f", EPSG:{frame.epsg}" if frame.epsg else ""),
         "# add to x y z: " + " ".join(f"{v:.0f}" for v in shift),
-        "VERSION 0.7", "FIELDS x y z rgb confidence", "SIZE 4 4 4 4 4", "TYPE F F F U F",
-        "COUNT 1 1 1 1 1", f"WIDTH {len(cloud)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0",
+        "VERSION 0.7", " ".join(["FIELDS", *names]), "SIZE" + " 4" * len(names),
+        " ".join(["TYPE", *(POINT[name].kind.upper() for name in names)]),
+        "COUNT" + " 1" * len(names), f"WIDTH {len(cloud)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0",
         f"POINTS {len(cloud)}", "DATA binary",
     ]  # fmt: skip
     return ("\n".join(head) + "\n").encode("ascii") + points.tobytes()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from companion.geometry import Array
 from companion.messages import Bytes
-from companion.output.flight_result import Cloud
+from companion.output.cloud import Cloud
 
 WIDTH_PX = 1100
 FINER = 2

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from companion.geometry import Array
-from companion.output.flight_result import Cloud
+from companion.output.cloud import Cloud
 from companion.output.run_folder import FinishedRun
 from companion.trajectory_error import align
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from companion.geometry import Pose
+from companion.geometry import Pose, Similarity
 from companion.messages import DepthMap, PixelState, PointChunk
 from companion.output.atomic_file import write_atomically
-from companion.output.cloud_ply import cloud_ply
-from companion.output.flight_result import Cloud
+from companion.output.cloud import joined, placed
+from companion.output.cloud_ply import ply_parts
 
 
 def write_depth(out: Path, depth_map: DepthMap) -> None:
@@ -37,13 +37,10 @@ def write_depth(out: Path, depth_map: DepthMap) -> None:
 
 def write_cloud(out: Path, chunks: Sequence[PointChunk], places: Mapping[int, Pose]) -> None:
     """Write cloud.ply, in the frame and unit of the poses."""
-    points = [places[c.keyframe_id].apply(c.points_camera.astype(np.float64)) for c in chunks]
-    cloud = Cloud(
-        np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32),
-        np.concatenate([np.zeros((0, 3), np.uint8), *(c.rgb for c in chunks)]),
-        np.concatenate([np.zeros(0, np.float32), *(c.confidence for c in chunks)]),
-    )
-    write_atomically(out / "cloud.ply", cloud_ply(cloud, "unknown", None))
+    poses = [places[chunk.keyframe_id] for chunk in chunks]
+    at = [Similarity(1.0, pose.rotation, pose.translation) for pose in poses]
+    cloud = joined([placed(c, place) for c, place in zip(chunks, at, strict=True)])
+    write_atomically(out / "cloud.ply", ply_parts(cloud, "unknown", None))
 
 
 def write_log(

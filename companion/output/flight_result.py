@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from companion.camera import Camera
 from companion.clock import StageTimes
-from companion.geometry import Array, Pose
+from companion.geometry import Array, Pose, Similarity
 from companion.messages import (
-    Bytes,
     ClockReport,
     DepthMap,
-    Floats,
     Frame,
     GeoOrigin,
     Georeference,
@@ -30,12 +29,15 @@ from companion.messages import (
     TrackState,
     Warned,
 )
+from companion.output.chunk_store import ChunkStore
+from companion.output.cloud import Cloud, no_cloud, placed
 from companion.output.depth_pictures import DepthPicture, DepthPictures
-from companion.voxel import thin_by_voxel
+from companion.output.voxel_cloud import VoxelCloud
 
 POSITION_STEP_NS = 100_000_000
 VOXEL_PER_DEPTH = 0.01
 """Side of a voxel over the median depth, while there is no metre."""
+GIVEN_UP = "points were given up, as the disk does not take them"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,18 +71,6 @@ class WorldPose(NamedTuple):
     world_from_camera: Pose
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
-    """Points (N, 3) f32 in the world, their colours (N, 3) u8 and confidences (N,) f32, 0..1."""
-
-    points: Floats
-    rgb: Bytes
-    confidence: Floats
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-
 @dataclass(slots=True)
 class WarningCount:
     """How often one thing was warned of, and what the first said."""
@@ -93,11 +83,12 @@ class WarningCount:
 class FlightResult:
     """A sink that keeps what the results are made of.
 
-    It holds one track for each frame, one chunk of points for each keyframe, a dozen small pictures
-    and the autopilot's path at 10 Hz at most.
+    It holds one track for each frame, a dozen small pictures and the autopilot's path at 10 Hz at
+    most. Of the points of all keyframes it holds `memory_mb` at most, if `folder` can take the
+    others.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path | None = None, memory_mb: float = np.inf) -> None:
         self.n_frames = 0
         self.first_t_ns: int | None = None
         self.last_t_ns: int | None = None
@@ -105,8 +96,8 @@ class FlightResult:
         self.update: MapUpdate | None = None
         self.reunions: list[Reunited] = []
         self._tracks: dict[int, Track] = {}
-        self._chunks: dict[int, PointChunk] = {}
-        self._n_points = 0
+        self._chunks = ChunkStore(folder, memory_mb)
+        self._median_depths: dict[int, float] = {}
         self._kernel_ms: defaultdict[str, list[float]] = defaultdict(list)
         self._positions: dict[PositionSource, list[tuple[int, Array]]] = {}
         self._pictures = DepthPictures()
@@ -127,10 +118,7 @@ class FlightResult:
         elif isinstance(message, Reunited):
             self.reunions.append(message)
         elif isinstance(message, PointChunk):
-            before = self._chunks.get(message.keyframe_id)
-            self._n_points += len(message.points_camera)
-            self._n_points -= len(before.points_camera) if before is not None else 0
-            self._chunks[message.keyframe_id] = message
+            self._take_points(message)
         elif isinstance(message, DepthMap):
             self._pictures.take(message)
             for name, ms in message.kernel_ms.items():
@@ -140,11 +128,27 @@ class FlightResult:
             if not path or message.t_ns - path[-1][0] >= POSITION_STEP_NS:
                 path.append((message.t_ns, message.position_ned_m))
         elif isinstance(message, Warned) and not message.good:
-            warnings = self.warnings.get(message.what)
-            if warnings is None:
-                self.warnings[message.what] = WarningCount(1, message.t_ns, message.detail)
-            else:
-                warnings.count += 1
+            self._warn(message)
+
+    def _take_points(self, chunk: PointChunk) -> None:
+        given_up = self._chunks.n_given_up
+        self._chunks.put(chunk)
+        if len(chunk.points_camera):
+            depth = float(np.median(chunk.points_camera[:, 2]))
+            self._median_depths[chunk.keyframe_id] = depth
+        if self._chunks.n_given_up > given_up:
+            self._warn(Warned(chunk.t_ns, GIVEN_UP))
+
+    def _warn(self, message: Warned) -> None:
+        warnings = self.warnings.get(message.what)
+        if warnings is None:
+            self.warnings[message.what] = WarningCount(1, message.t_ns, message.detail)
+        else:
+            warnings.count += 1
+
+    def close(self) -> None:
+        """Let go of the points, and of the file that holds them."""
+        self._chunks.close()
 
     @property
     def georeference(self) -> Georeference | None:
@@ -159,12 +163,12 @@ class FlightResult:
     @property
     def n_keyframes(self) -> int:
         """Keyframes of the map as it ended."""
-        return len(self.update.map_from_camera) if self.update is not None else 0
+        return self.update.n_keyframes if self.update is not None else 0
 
     @property
     def n_points(self) -> int:
         """Points of all keyframes, before they are thinned together."""
-        return self._n_points
+        return self._chunks.n_points
 
     @property
     def n_depth_maps(self) -> int:
@@ -205,32 +209,22 @@ class FlightResult:
         Without a scale the cube is a hundredth of the median depth. The result does not depend on
         the order in which chunks came.
         """
-        points, rgb, confidence, depths = [], [], [], []
-        for keyframe_id in sorted(self._chunks):
+        places: dict[int, Similarity] = {}
+        for keyframe_id in self._chunks.keyframe_ids:
             place = self.update.place_of(keyframe_id) if self.update is not None else None
-            chunk = self._chunks[keyframe_id]
-            if place is None or len(chunk.points_camera) == 0:
+            if place is None or keyframe_id not in self._median_depths:
                 continue
             if self.georeference is not None:
                 place = self.georeference.world_from_map @ place
-            points.append(place.apply(chunk.points_camera.astype(np.float64)))
-            rgb.append(chunk.rgb)
-            confidence.append(chunk.confidence)
-            depths.append(place.scale * float(np.median(chunk.points_camera[:, 2])))
-        if not points:
-            nowhere = np.zeros((0, 3))
-            return Cloud(
-                nowhere.astype(np.float32), nowhere.astype(np.uint8), np.zeros(0, np.float32)
-            )
-        everywhere, sure = np.concatenate(points), np.concatenate(confidence)
+            places[keyframe_id] = place
+        if not places:
+            return no_cloud()
         metric = self.georeference is not None
-        voxel = voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths))
-        kept = thin_by_voxel(everywhere, sure, voxel)
-        return Cloud(
-            everywhere[kept].astype(np.float32),
-            np.concatenate(rgb)[kept],
-            sure[kept].astype(np.float32),
-        )
+        depths = [place.scale * self._median_depths[key] for key, place in places.items()]
+        thinned = VoxelCloud(voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths)))
+        for keyframe_id, place in places.items():
+            thinned.add(placed(self._chunks.get(keyframe_id), place))
+        return thinned.finish()
 
     def autopilot_path(self) -> tuple[PositionSource, Array, Array] | None:
         """The autopilot's own path from its best source: t_ns (N,), NED metres (N, 3)."""

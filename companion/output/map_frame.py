@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.errors import InputError
 from companion.geodesy import geodetic_from_ned
-from companion.geometry import Array
+from companion.geometry import Array, nearest_rotation
 from companion.messages import GeoOrigin
 from companion.utm import UtmZone, utm_from_geodetic, utm_zone
 
@@ -49,6 +50,18 @@ class MapFrame:
         if not (self.wkt and self.above_sea):
             return self.wkt
         return f'COMPD_CS["{self.name} + EGM96 height",{self.wkt},{EGM96}]'
+
+    def directions(self, vectors_ned: NDArray[np.floating], about: NDArray[np.floating]) -> Array:
+        """Unit vectors (N, 3) in local NED, or zeros, in this frame.
+
+        Grid north is not true north: they are turned as in the middle of points `about` (N, 3).
+        """
+        if len(vectors_ned) == 0:
+            return np.zeros((0, 3))
+        middle = about.astype(np.float64).mean(0)
+        there = self.coordinates(middle + np.vstack([np.zeros(3), 10.0 * np.eye(3)]))
+        turned = vectors_ned.astype(np.float64) @ nearest_rotation((there[1:] - there[0]) / 10.0)
+        return np.asarray(turned)
 
 
 def map_frame(

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from companion.messages import Track, TrackState
-from companion.output.flight_result import Cloud, FlightResult, RunFacts, WorldPose
+from companion.output.cloud import Cloud
+from companion.output.flight_result import FlightResult, RunFacts, WorldPose
 from companion.output.trajectory import exact_seconds
 
 

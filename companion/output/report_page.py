@@ -14,8 +14,9 @@ from markupsafe import Markup
 
 from companion.geometry import Array
 from companion.output import plots
+from companion.output.cloud import Cloud
 from companion.output.cloud_views import CloudView, cloud_views
-from companion.output.flight_result import Cloud, FlightResult, RunFacts, WorldPose
+from companion.output.flight_result import FlightResult, RunFacts, WorldPose
 
 N_DEPTH_PICTURES = 6
 LAST_CENTURY_NS = 946_684_800 * 10**9

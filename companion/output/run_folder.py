@@ -13,10 +13,14 @@ import numpy as np
 from companion.errors import InputError
 from companion.geometry import Pose, rotation_from_quaternion
 from companion.messages import GeoOrigin
+from companion.output.cloud import Cloud
 from companion.output.cloud_ply import KINDS, VERTEX
-from companion.output.flight_result import Cloud, WorldPose
+from companion.output.flight_result import WorldPose
 
+FORMER_NAMES = ("x", "y", "z", "red", "green", "blue", "confidence")
 MAX_HEAD = 4096
+FORMER_VERTEX = np.dtype([(name, VERTEX[name]) for name in FORMER_NAMES])
+"""As runs of earlier versions wrote it, without normals and standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,16 +108,24 @@ def _cloud(path: Path) -> Cloud:
     data = _bytes(path)
     end = data[:MAX_HEAD].find(b"end_header\n")
     lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
-    wanted = [f"property {KINDS[VERTEX[name].kind]} {name}" for name in VERTEX.names or ()]
+    said = [line for line in lines if line.startswith("property")]
     counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
-    if [line for line in lines if line.startswith("property")] != wanted or len(counts) != 1:
+    layout = next((v for v in (VERTEX, FORMER_VERTEX) if said == _properties(v)), None)
+    if layout is None or len(counts) != 1:
         raise InputError(f"{path}: not a cloud as a run writes it")
     body = data[end + len(b"end_header\n") :]
-    if not counts[0].isdigit() or len(body) != int(counts[0]) * VERTEX.itemsize:
+    if not counts[0].isdigit() or len(body) != int(counts[0]) * layout.itemsize:
         raise InputError(f"{path}: cut short, or longer than it says: {counts[0]} points")
-    vertices = np.frombuffer(body, VERTEX)
-    return Cloud(
-        np.stack([vertices[axis] for axis in "xyz"], 1),
-        np.stack([vertices[channel] for channel in ("red", "green", "blue")], 1),
-        vertices["confidence"].copy(),
-    )
+    vertices = np.frombuffer(body, layout)
+    points = np.stack([vertices[axis] for axis in "xyz"], 1)
+    rgb = np.stack([vertices[channel] for channel in ("red", "green", "blue")], 1)
+    if layout is FORMER_VERTEX:
+        normals, sigma = np.zeros_like(points), np.full(len(points), np.nan, np.float32)
+    else:
+        normals = np.stack([vertices[axis] for axis in ("nx", "ny", "nz")], 1)
+        sigma = vertices["sigma"].copy()
+    return Cloud(points, rgb, vertices["confidence"].copy(), normals, sigma)
+
+
+def _properties(layout: np.dtype[Any]) -> list[str]:
+    return [f"property {KINDS[layout[name].kind]} {name}" for name in layout.names or ()]

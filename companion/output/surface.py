@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from companion.errors import InputError
 from companion.geometry import Array
 from companion.messages import Bytes, Floats
-from companion.output.flight_result import Cloud
+from companion.output.cloud import Cloud
 from companion.output.map_frame import MapFrame
 
 UPPER_SHARE = 0.75

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from companion.output.atomic_file import write_atomically
-from companion.output.cloud_ply import cloud_ply
+from companion.output.cloud_ply import ply_parts
 from companion.output.flight_result import FlightResult, RunFacts
 from companion.output.report_json import report, report_json
 from companion.output.report_page import report_page
@@ -25,7 +25,7 @@ def write_results(
     origin, unit = facts.origin, result.unit
     numbers = report(result, facts, poses, cloud)
     write_atomically(out / "trajectory.tum", trajectory_tum(poses, unit, origin))
-    write_atomically(out / "cloud.ply", cloud_ply(cloud, unit, origin))
+    write_atomically(out / "cloud.ply", ply_parts(cloud, unit, origin))
     write_atomically(out / "report.json", report_json(numbers))
     if page:
         html = report_page(result, facts, poses, cloud, numbers)

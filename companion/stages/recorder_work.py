@@ -21,9 +21,9 @@ class _Recorder(Work):
         if setup.folder is None:
             raise StageError("a recorder needs a folder")
         self._folder, self._voxel_m = setup.folder, setup.config.cloud.voxel_m
-        self._result = FlightResult()
         self._open = ExitStack()
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._result = FlightResult(self._folder, setup.config.cloud.memory_mb)
         self._recording = self._open.enter_context(
             FileViewer(setup.config.viewer, setup.camera, self._folder / "flight.rrd")
         )
@@ -39,6 +39,7 @@ class _Recorder(Work):
             write_results(
                 self._folder, self._result, finish.facts, self._voxel_m, page=not finish.hurry
             )
+        self._result.close()
         return []
 
 

@@ -110,10 +110,13 @@ def chunk(keyframe_id: int, n: int = 4000) -> PointChunk:
     points, rgb = ground_m(n, keyframe_id)
     camera_from_map = map_from_camera(keyframe_id * PER_KEYFRAME).inverse()
     confidence = np.random.default_rng(keyframe_id).uniform(0, 1, n)
+    up_camera = camera_from_map.rotation @ WORLD_FROM_MAP.rotation.T @ [0, 0, -1]
     return PointChunk(
         keyframe_id, time_ns(keyframe_id * PER_KEYFRAME),
         camera_from_map.apply(WORLD_FROM_MAP.inverse().apply(points)).astype(np.float32),
         rgb.astype(np.uint8), confidence.astype(np.float32),
+        np.tile(up_camera, (n, 1)).astype(np.float32),
+        (0.02 * (1 - confidence) / METRES_PER_UNIT).astype(np.float32),
     )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +31,7 @@ def run(folder: Path, shift: float = 0.0, n_missing: int = 0, **changes: object)
             )  # fmt: skip
         if isinstance(message, PointChunk):
             points = message.points_camera + np.float32(shift)
-            message = PointChunk(
-                message.keyframe_id, message.t_ns, points, message.rgb, message.confidence
-            )
+            message = replace(message, points_camera=points)
         result.take(message)
     write_results(folder, result, facts(**changes), 0.1, page=False)
     return folder

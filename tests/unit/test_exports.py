@@ -22,9 +22,10 @@ from companion.config import ExportConfig
 from companion.errors import InputError
 from companion.geometry import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import GeoOrigin
-from companion.output.cloud_ply import cloud_ply
+from companion.output.cloud import Cloud
+from companion.output.cloud_ply import VERTEX, cloud_ply
 from companion.output.exports import PRODUCTS, export_run
-from companion.output.flight_result import Cloud, WorldPose
+from companion.output.flight_result import WorldPose
 from companion.output.run_folder import FinishedRun, read_run
 from companion.output.trajectory import trajectory_tum
 
@@ -44,7 +45,11 @@ def ground() -> Cloud:
     rgb[-1] = [250, 20, 5]
     confidence = np.full(len(points), 0.5, np.float32)
     confidence[-1] = 0.875
-    return Cloud(points, rgb, confidence)
+    normals = np.tile(np.array([0, 0, -1], np.float32), (len(points), 1))
+    normals[-1] = [0.6, 0.8, 0]
+    sigma = np.full(len(points), 0.25, np.float32)
+    sigma[-1] = 0.125
+    return Cloud(points, rgb, confidence, normals, sigma)
 
 
 def poses() -> list[WorldPose]:
@@ -101,11 +106,31 @@ def test_run_reads_back(run: FinishedRun) -> None:
     assert run.origin == ORIGIN
     assert (run.cloud.rgb[-1] == [250, 20, 5]).all()
     assert (run.cloud.points == ground().points).all()
+    assert (run.cloud.normals == ground().normals).all()
+    assert (run.cloud.sigma == ground().sigma).all()
     assert [pose.t_ns for pose in run.poses] == [pose.t_ns for pose in poses()]
     for one, other in zip(run.poses, poses(), strict=True):
         np.testing.assert_allclose(
             one.world_from_camera.matrix(), other.world_from_camera.matrix(), atol=1e-6
         )
+
+
+def test_a_cloud_of_an_earlier_version_reads_too(run: FinishedRun) -> None:
+    names = ["x", "y", "z", "red", "green", "blue", "confidence"]
+    vertices = np.frombuffer(cloud_ply(ground(), "m", ORIGIN).split(b"end_header\n", 1)[1], VERTEX)
+    former = np.zeros(len(vertices), [(name, VERTEX[name]) for name in names])
+    for name in names:
+        former[name] = vertices[name]
+    kinds = ["float"] * 3 + ["uchar"] * 3 + ["float"]
+    properties = [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=True)]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(former)}"]
+    lines = "\n".join([*head, *properties, "end_header\n"])
+    (run.path / "cloud.ply").write_bytes(lines.encode() + former.tobytes())
+    cloud = read_run(run.path).cloud
+    assert (cloud.points == ground().points).all()
+    assert (cloud.confidence == ground().confidence).all()
+    assert not cloud.normals.any()
+    assert np.isnan(cloud.sigma).all()
 
 
 @pytest.mark.parametrize("kind", ["las", "laz"])
@@ -126,6 +151,14 @@ def test_cloud_lies_at_its_place_on_earth(run: FinishedRun, tmp_path: Path, kind
     assert las.z[red] == pytest.approx(true_height, abs=1e-3)
     assert (las.red[red], las.green[red], las.blue[red]) == (250 * 257, 20 * 257, 5 * 257)
     assert las.confidence[red] == 0.875
+    assert las.sigma[red] == 0.125
+    # 0.6 north, 0.8 east, where grid north is turned from true north by half a degree
+    facing = [float(v[red]) for v in (las.normal_x, las.normal_y, las.normal_z)]
+    latitude_rad = math.radians(ORIGIN.latitude_deg)
+    meridian = math.radians((ORIGIN.longitude_deg - 9) * math.sin(latitude_rad))
+    c, s = math.cos(meridian), math.sin(meridian)
+    wanted = [0.8 * c - 0.6 * s, 0.6 * c + 0.8 * s, 0]
+    np.testing.assert_allclose(facing, wanted, atol=2e-4)
     assert len(las.x) == len(run.cloud)
     assert path.read_bytes()[:4] == b"LASF"
 
@@ -165,8 +198,11 @@ def test_wkt_is_the_registrys() -> None:
 
 def read_pcd(path: Path) -> tuple[list[str], Any]:
     head, _, body = path.read_bytes().partition(b"DATA binary\n")
-    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("confidence", "<f4")]
-    return head.decode().splitlines(), np.frombuffer(body, np.dtype(kinds))
+    lines = head.decode().splitlines()
+    fields, kinds = ([*line.split()[1:]] for line in lines if line.startswith(("FIELDS", "TYPE")))
+    kind = {"F": "<f4", "U": "<u4"}
+    layout = np.dtype([(name, kind[k]) for name, k in zip(fields, kinds, strict=True)])
+    return lines, np.frombuffer(body, layout)
 
 
 def test_pcd(run: FinishedRun, tmp_path: Path) -> None:
@@ -177,6 +213,9 @@ def test_pcd(run: FinishedRun, tmp_path: Path) -> None:
     here = np.array([points["x"][-1], points["y"][-1], points["z"][-1]], np.float64) + shift
     np.testing.assert_allclose(here, [las.x[-1], las.y[-1], las.z[-1]], atol=1.5e-3)
     assert points["rgb"][-1] == 250 << 16 | 20 << 8 | 5
+    assert points["sigma"][-1] == 0.125
+    facing = [points[f"normal_{axis}"][-1] for axis in "xyz"]
+    np.testing.assert_allclose(facing, [las.normal_x[-1], las.normal_y[-1], las.normal_z[-1]])
     assert f"POINTS {len(points)}" in head
 
 

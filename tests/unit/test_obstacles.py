@@ -160,6 +160,8 @@ def chunk(keyframe_id: int, t_s: float, points: Array) -> PointChunk:
         points.astype(np.float32),
         np.zeros((n, 3), np.uint8),
         np.ones(n, np.float32),
+        np.zeros((n, 3), np.float32),
+        np.ones(n, np.float32),
     )
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from companion.geometry import Array
 from companion.messages import Bytes
+from companion.output.cloud import Cloud
 from companion.output.cloud_views import (
     CloudView,
     cloud_views,
@@ -15,14 +16,15 @@ from companion.output.cloud_views import (
     splat,
     view_axes,
 )
-from companion.output.flight_result import Cloud
 
 NORTH, EAST, UP = np.eye(3)[0], np.eye(3)[1], -np.eye(3)[2]
 RED, GREEN, BLUE = (200, 20, 20), (20, 200, 20), (20, 20, 200)
 
 
 def cloud(points: Array, rgb: Bytes) -> Cloud:
-    return Cloud(points.astype(np.float32), rgb, np.ones(len(points), np.float32))
+    nothing = np.zeros((len(points), 3), np.float32)
+    ones = np.ones(len(points), np.float32)
+    return Cloud(points.astype(np.float32), rgb, ones, nothing, ones)
 
 
 def plate() -> Cloud:

@@ -10,8 +10,9 @@ import pytest
 from companion.geometry import angle_between, rotation_from_quaternion
 from companion.messages import TrackState
 from companion.output.atomic_file import write_atomically
+from companion.output.cloud import no_cloud
 from companion.output.cloud_ply import cloud_ply
-from companion.output.flight_result import Cloud, FlightResult
+from companion.output.flight_result import FlightResult
 from companion.output.report_json import report, report_json, state_spans
 from companion.output.trajectory import exact_seconds, trajectory_tum
 from companion.output.write import write_results
@@ -72,18 +73,19 @@ def test_cloud_reads_back_as_it_was(tmp_path: Path, result: FlightResult) -> Non
     path = tmp_path / "cloud.ply"
     path.write_bytes(cloud_ply(cloud, "m", flown.facts().origin))
     read = read_ply(path)
-    assert read.dtype.names == ("x", "y", "z", "red", "green", "blue", "confidence")
+    assert read.dtype.names == (
+        "x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "confidence", "sigma"
+    )  # fmt: skip
+    assert np.array_equal(np.stack([read["n" + a] for a in "xyz"], 1), cloud.normals)
+    assert np.array_equal(read["sigma"], cloud.sigma)
     assert np.array_equal(np.stack([read[a] for a in "xyz"], 1), cloud.points)
     assert np.array_equal(np.stack([read[c] for c in ("red", "green", "blue")], 1), cloud.rgb)
     assert np.array_equal(read["confidence"], cloud.confidence)
 
 
 def test_an_empty_cloud_is_a_file_too(tmp_path: Path) -> None:
-    nothing = Cloud(
-        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32)
-    )
     path = tmp_path / "cloud.ply"
-    path.write_bytes(cloud_ply(nothing, "map units", None))
+    path.write_bytes(cloud_ply(no_cloud(), "map units", None))
     assert len(read_ply(path)) == 0
 
 
