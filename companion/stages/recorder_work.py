@@ -34,11 +34,13 @@ class _Recorder(Work):
         return []
 
     def finish(self, finish: Finish) -> Iterable[Message]:
-        self._open.close()
-        if finish.facts is not None:
-            write_results(
-                self._folder, self._result, finish.facts, self._voxel_m, page=not finish.hurry
-            )
+        try:
+            self._open.close()
+        finally:  # a recording that cannot be written is no reason to lose the results
+            if finish.facts is not None:
+                write_results(
+                    self._folder, self._result, finish.facts, self._voxel_m, page=not finish.hurry
+                )
         self._result.close()
         return []
 

@@ -30,11 +30,17 @@ class RrdFiles:
         self.recording = self._begin()
 
     def is_full(self) -> bool:
-        """Whether it is time for the next file; looks at the disk now and then only."""
+        """Whether it is time for the next file; looks at the disk now and then only.
+
+        OSError where what was recorded cannot be written.
+        """
         self._n_looked += 1
         if not self._each or self._n_looked % LOOK_EVERY:
             return False
-        self.recording.flush()  # what waits for the disk counts too
+        try:
+            self.recording.flush()  # what waits for the disk counts too
+        except RuntimeError as error:  # its thread ends with the first thing it cannot write
+            raise OSError(f"{self._paths[-1]}: cannot be written: {error}") from None
         return self._paths[-1].stat().st_size >= self._each
 
     def next(self) -> rr.RecordingStream:
