@@ -90,6 +90,14 @@ class PoseGate:
         self._periods_ns.clear()
         self._newest_ns = 0
 
+    def reconfigure(self, config: FeedbackConfig) -> None:
+        """Take over other limits; what is believed and what was sent stay as they are."""
+        self._config = config
+
+    def withhold(self, why_not: str) -> None:
+        """Send nothing more until belief has held anew."""
+        self._stop(why_not)
+
     def take_attitude(self, sample: AttitudeSample) -> None:
         """Take the autopilot's attitude, on which predictions turn."""
         self._attitude.add(sample)

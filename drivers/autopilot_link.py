@@ -26,7 +26,7 @@ from drivers.mavlink_port import MavlinkPort
 from drivers.mavlink_samples import SAMPLE_OF
 from drivers.mavlink_wire import run_together
 from drivers.message_rates import MessageRates, wanted
-from drivers.status_text import StatusTexts
+from drivers.status_text import StatusTexts, TextLimit
 from drivers.timesync_message import TimesyncMessage, timesync_target
 from drivers.vehicle import Vehicle, is_autopilot, vehicle_of
 from drivers.within import within
@@ -72,6 +72,11 @@ class AutopilotLink:
         self._wanted = MessageRates(wanted(config))
         self._commands = Commands(self.send)
         self._texts = StatusTexts()
+        self._text_limit = TextLimit()
+        self.system_status: int = mavlink.MAV_STATE_BOOT
+        """What our HEARTBEAT states: a MAV_STATE."""
+        self.on_request: Take | None = None
+        """Takes what anybody sends, for who answers what is asked of us."""
         self._takers: defaultdict[int, list[Take]] = defaultdict(list)
         self._heard_ns = 0
         self._armed: bool | None = None
@@ -145,10 +150,19 @@ class AutopilotLink:
         """Send a message as our component; never waits, never fails."""
         self.port.send(message)
 
-    def say(self, severity: int, text: str) -> None:
-        """Tell the pilot, by STATUSTEXT; MAV_SEVERITY."""
-        for message in self._texts.messages(severity, text):
+    def heartbeat(self) -> Any:
+        """Our HEARTBEAT as it is now."""
+        return mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
+            self.system_status, 3,
+        )  # fmt: skip
+
+    def say(self, severity: int, text: str) -> bool:
+        """Tell the pilot, by STATUSTEXT; MAV_SEVERITY. False for what comes too soon: not told."""
+        said = self._text_limit.passed(severity, text, self._clock.now_ns())
+        for message in self._texts.messages(severity, said) if said else ():
             self.send(message)
+        return bool(said)
 
     async def command(
         self, command: int, *params: float, timeout_s: float = ANSWER_S, tries: int = TRIES
@@ -207,6 +221,8 @@ class AutopilotLink:
     def _take(self, message: Any, receive_ns: int) -> None:
         system, component = message.get_srcSystem(), message.get_srcComponent()
         kind = message.get_msgId()
+        if self.on_request is not None:
+            self.on_request(message, receive_ns)
         if kind == mavlink.MAVLINK_MSG_ID_HEARTBEAT and is_autopilot(message):
             if not self._is_ours(system, receive_ns):
                 return
@@ -297,12 +313,7 @@ class AutopilotLink:
                 said_as = None
             elif said_as != self.port.identity or now_ns >= due_ns:
                 said_as, due_ns = self.port.identity, now_ns + HEARTBEAT_NS
-                self.send(
-                    mavlink.MAVLink_heartbeat_message(
-                        mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
-                        mavlink.MAV_STATE_ACTIVE, 3,
-                    )
-                )  # fmt: skip
+                self.send(self.heartbeat())
             await asyncio.sleep(HEARTBEAT_TICK_S)
 
     async def _compare_clocks(self) -> None:

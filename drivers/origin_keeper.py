@@ -28,9 +28,10 @@ class OriginKeeper:
     """Sees to it that the autopilot has an origin; the link itself asks for the one it has."""
 
     def __init__(
-        self, config: FeedbackConfig, link: AutopilotLink, say: Callable[[str], None]
-    ) -> None:
-        self._link, self._say = link, say
+        self, config: FeedbackConfig, link: AutopilotLink, say: Callable[[str], None],
+        is_wanted: Callable[[], bool] = lambda: True,
+    ) -> None:  # fmt: skip
+        self._link, self._say, self._is_wanted = link, say, is_wanted
         self._place = GeoOrigin(
             config.origin_latitude_deg, config.origin_longitude_deg, config.origin_altitude_m
         )
@@ -40,7 +41,11 @@ class OriginKeeper:
         n_without = 0
         while True:
             await asyncio.sleep(LOOK_EVERY_S)
-            without = self._link.alive and self._link.samples.places.origin is None
+            without = (
+                self._is_wanted()
+                and self._link.alive
+                and self._link.samples.places.origin is None
+            )
             n_without = n_without + 1 if without else 0
             if n_without >= PATIENCE:
                 await self._set()

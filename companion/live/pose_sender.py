@@ -19,10 +19,11 @@ TICK_S = 0.005
 IDLE_TICK_S = 0.05
 INFO, WARNING = 6, 4
 UNHEARD = "the autopilot is silent"
+SWITCHED_OFF = "switched off"
 
 
 class PoseSender:
-    """Odometry of the newest flight in; ODOMETRY or VISION_POSITION_ESTIMATE out."""
+    """Odometry of the newest flight in; ODOMETRY or VISION_POSITION_ESTIMATE out, or nothing."""
 
     def __init__(self, config: FeedbackConfig, link: AutopilotLink, clock: FlightClock) -> None:
         self._config, self._link, self._clock = config, link, clock
@@ -36,9 +37,12 @@ class PoseSender:
         self._gate.restart()
 
     def reconfigure(self, config: FeedbackConfig) -> None:
-        """Take over other limits; belief must then hold anew."""
-        n_resets = self._gate.n_resets
-        self._config, self._gate = config, PoseGate(config, n_resets)
+        """Take over other limits, which hold for the next pose, or another way of sending."""
+        self._config = config
+        self._gate.reconfigure(config)
+        if config.mode == "off":
+            self._gate.withhold(SWITCHED_OFF)
+            self._tell()
 
     def take_attitude(self, sample: AttitudeSample) -> None:
         """Take the autopilot's attitude."""
@@ -46,6 +50,8 @@ class PoseSender:
 
     def take(self, odometry: Odometry) -> None:
         """Take the odometry of a frame, and send it if it may be sent."""
+        if self._config.mode == "off":
+            return
         self._send(self._gate.take(odometry, self._clock.now_ns()))
         self._tell()
 
@@ -53,11 +59,14 @@ class PoseSender:
         """Send predicted poses when they are due, and say when poses cease."""
         while True:
             await asyncio.sleep(TICK_S if self._gate.sending else IDLE_TICK_S)
-            self._send(self._gate.due(self._clock.now_ns()))
-            self._tell()
+            if self._config.mode != "off" or self._told == "":
+                self._send(self._gate.due(self._clock.now_ns()))
+                self._tell()
 
     def health(self) -> FeedbackHealth:
         """As it stands now."""
+        if self._config.mode == "off":
+            return FeedbackHealth(n_resets=self._gate.n_resets)
         now_ns = self._clock.now_ns()
         p95_ms = self._latency.percentile_ms(95, now_ns)
         return FeedbackHealth(
@@ -89,18 +98,10 @@ class PoseSender:
         """The pilot hears when poses begin and cease."""
         state = "" if self._gate.sending else self._gate.why_not
         if self._gate.sending and self._told != "":
-            self._link.say(INFO, "Companion: vision pose on")
+            told = self._link.say(INFO, "Companion: vision pose on")
         elif not self._gate.sending and self._told == "":
-            self._link.say(WARNING, f"Companion: vision pose off: {state}")
+            told = self._link.say(WARNING, f"Companion: vision pose off: {state}")
         else:
             return
-        self._told = state
-
-
-def make_pose_sender(
-    config: FeedbackConfig, link: AutopilotLink | None, clock: FlightClock
-) -> PoseSender | None:
-    """What sends poses; None where none are to be sent."""
-    if link is None or config.mode == "off":
-        return None
-    return PoseSender(config, link, clock)
+        if told:  # else it is tried again
+            self._told = state

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 from companion.camera import Camera
 from companion.config import Config
@@ -36,6 +37,7 @@ class Viewing:
         self, config: Config, camera: Camera, name: str, warn: Callable[[str, str], None]
     ) -> None:
         self._config, self._camera, self._name, self._warn = config, camera, name, warn
+        self._stream = config.stream
         self.pictures = True
         """Whether it is given pictures."""
         self._n_dropped = self._n_seen = self._n_restarted = 0
@@ -66,6 +68,8 @@ class Viewing:
         detail = f"{n_viewers} viewer{plural}"
         if n_viewers:
             detail += f", {report['kbit_s']:.0f} kbit/s"
+        if report.get("budget_kbit_s"):
+            detail += f", budget {report['budget_kbit_s']:.0f} kbit/s"
         if self._viewer.closed:
             detail += f"; closed: {self._viewer.closed}"
         return StageHealth(
@@ -79,6 +83,11 @@ class Viewing:
         if self.pictures or not isinstance(message, Frame):
             self._viewer.take(message)
 
+    def set_budget(self, kbit_s: float) -> None:
+        """All viewers together get no more from now on; 0 for no limit."""
+        self._stream = replace(self._stream, budget_kbit_s=kbit_s)
+        self._viewer.set_budget(kbit_s)
+
     def close(self, hurry: bool) -> None:
         """The flight is over; what viewers have not got by then they never will."""
         self._patience_s = HURRIED_S if hurry else PATIENCE_S
@@ -87,7 +96,7 @@ class Viewing:
 
     def _open(self) -> LiveViewer:
         return LiveViewer(
-            self._config.viewer, self._camera, name=self._name, stream=self._config.stream
+            self._config.viewer, self._camera, name=self._name, stream=self._stream
         )
 
     def _run(self) -> None:

@@ -45,6 +45,13 @@ class ExportSetup:
     """Viewers of this machine that are sure to come."""
 
 
+@dataclass(frozen=True, slots=True)
+class SetBudget:
+    """All viewers together get no more from now on; 0 for no limit."""
+
+    kbit_s: float
+
+
 def main() -> int:
     """Export one flight; the exit status."""
     # No session of its own, between which the scheduler would share before it looks at priorities.
@@ -87,7 +94,11 @@ def _take_in(exporter: Exporter, flight: FlightItem, ended: threading.Event) -> 
     try:
         _give(exporter, [flight])
         while True:
-            _give(exporter, story.take(pickle.load(sys.stdin.buffer)))
+            message = pickle.load(sys.stdin.buffer)
+            if isinstance(message, SetBudget):
+                exporter.set_budget(message.kbit_s)
+            else:
+                _give(exporter, story.take(message))
     except (EOFError, OSError):  # the flight is over
         _give(exporter, story.close())
     finally:

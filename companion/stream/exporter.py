@@ -62,6 +62,11 @@ class Exporter:
             self._datagrams.append(datagrams)
             self._selector.register(datagrams.socket, selectors.EVENT_READ)
 
+    def set_budget(self, kbit_s: float) -> None:
+        """What all viewers together get from now on; 0 for no limit. From any thread."""
+        self._budget.set_rate(kbit_s)
+        self._rouse()
+
     def stop(self) -> None:
         """End `run`; from any thread."""
         self._stopping.set()
@@ -82,6 +87,7 @@ class Exporter:
             return {
                 "viewers": len(sessions),
                 "kbit_s": sum(s.window.rate_bytes_s for s in sessions) / 125,
+                "budget_kbit_s": self._budget.bytes_s / 125,
                 "skipped": self._n_skipped_before + skipped + self._store.n_given_up.total(),
                 "map_mib": self._store.points_bytes / 2**20,
             }

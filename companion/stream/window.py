@@ -128,6 +128,10 @@ class Budget:
         self._held = 0.0
         self._t_s: float | None = None
 
+    def set_rate(self, kbit_s: float) -> None:
+        """Fill at another rate from now on."""
+        self.bytes_s = kbit_s * 125.0
+
     def room_bytes(self, now_s: float) -> int:
         """So much may be sent now."""
         if self.bytes_s <= 0:

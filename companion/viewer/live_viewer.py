@@ -20,7 +20,7 @@ from companion.camera import Camera
 from companion.config import StreamConfig, ViewerConfig
 from companion.errors import InputError
 from companion.messages import Frame, GeoOrigin
-from companion.stream.export_process import ExportSetup
+from companion.stream.export_process import ExportSetup, SetBudget
 from companion.stream.items import FlightItem
 from companion.stream.story import Watched
 from companion.viewer.inbox import Inbox
@@ -54,6 +54,8 @@ class LiveViewer:
         """Why nobody can connect, if so."""
         self._config, self._width = config, min(config.image_width, camera.width)
         self._inbox = Inbox(ROOM_BYTES)
+        self._budget: SetBudget | None = None
+        """To be told to the exporter."""
         self._frame_ns = -(2**63)
         self._port = 0
         self._has_port = threading.Event()
@@ -88,6 +90,10 @@ class LiveViewer:
             self._frame_ns = message.t_ns
         if not self._inbox.offer(message):
             self.n_dropped += 1
+
+    def set_budget(self, kbit_s: float) -> None:
+        """Have all viewers together get no more, from the next message on; 0 for no limit."""
+        self._budget = SetBudget(kbit_s)
 
     def look(self, where: str) -> None:
         """Show it at `web`, `native`, or the rerun+http address of a viewer that runs.
@@ -155,6 +161,9 @@ class LiveViewer:
         try:
             self._send(setup)
             while (message := self._inbox.get()) is not None:
+                budget, self._budget = self._budget, None
+                if budget is not None:
+                    self._send(budget)
                 self._send(reduced(message, self._width))
         except OSError:  # the exporter is gone; the flight goes on, and what follows is counted
             self.n_dropped += 1
