@@ -355,6 +355,28 @@ class StreamConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class DistributedConfig:
+    """Stages on several machines, joined by topics over Zenoh; see docs/topics.md."""
+
+    enabled: bool = False
+    """Publish the topics. Needs the extra of the same name."""
+    stages: tuple[str, ...] = ("tracking", "depth", "cloud")
+    """What this node runs: all, tracking alone, or depth and cloud."""
+    vehicle: str = "drone"
+    """Name of the drone in keys; nodes of one drone have the same."""
+    listen: tuple[str, ...] = ()
+    """Where others join, as tcp/0.0.0.0:7447; none: loopback, if tracking runs here."""
+    connect: tuple[str, ...] = ()
+    """Nodes to join, as tcp/192.168.1.20:7447."""
+    budget_kbit_s: Annotated[float, Range(0, 1e6)] = 8000.0
+    """What depth needs of the flight takes no more of the link; 0 is no limit."""
+    jpeg_quality: Annotated[int, Range(30, 100)] = 90
+    """Of frames that depth is made of."""
+    backlog_mb: Annotated[int, Range(1, 4096)] = 64
+    """Frames kept for a node that is away or comes late; the oldest are given up."""
+
+
+@dataclass(frozen=True, slots=True)
 class ViewerConfig:
     """The recording and the live viewer."""
 
@@ -399,5 +421,6 @@ class Config:
     depth: DepthConfig = field(default_factory=DepthConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
+    distributed: DistributedConfig = field(default_factory=DistributedConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
     export: ExportConfig = field(default_factory=ExportConfig)

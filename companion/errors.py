@@ -6,7 +6,7 @@ CompanionError            one clear line for the user: what, where, what to do
 │   ├── FlightError       a flight folder, video, calibration or log that cannot be read
 │   └── DeviceError       no OpenCL device, or not the one asked for
 ├── SourceError           a camera or a link is not there, or has gone; it may come back
-├── StreamError           what came over the link to a viewer is not what companion sends
+├── StreamError           what came over a link to a viewer or a node is not what companion sends
 └── StageError            a stage failed on input that it should have handled; exit status 1
 """
 

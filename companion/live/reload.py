@@ -8,7 +8,7 @@ from typing import Any
 from companion.config import Config
 from companion.config_file import dump
 
-FIXED_SECTIONS = frozenset({"camera", "mount", "link", "router"})
+FIXED_SECTIONS = frozenset({"camera", "mount", "link", "router", "distributed"})
 FIXED_KEYS = frozenset({
     "daemon.socket", "daemon.prometheus_port", "feedback.mode", "feedback.obstacle_distance",
 })  # fmt: skip

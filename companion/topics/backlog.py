@@ -1,0 +1,99 @@
+"""Bundles that wait to be fetched, whoever comes and whenever: the oldest go when room is short.
+
+Whoever fetches says what they have; nothing here knows them, so that they may vanish, come back,
+and begin anew.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.messages import MapUpdate
+from companion.topics.bundle import Bundle, MapChange
+from companion.topics.envelope import Envelope
+
+SAVED_S = 2.0
+"""Of a budget that was not used, so much is kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    number: int
+    data: bytes
+
+
+class Backlog:
+    """To be used by several threads. A budget of 0 is no limit."""
+
+    def __init__(self, run: str, room_bytes: int, budget_bytes_s: float) -> None:
+        self._run, self._room_bytes, self._budget_bytes_s = run, room_bytes, budget_bytes_s
+        self._held: deque[_Held] = deque()
+        self._n_bytes = 0
+        self._map: MapUpdate | None = None
+        self._lock = threading.Lock()
+        self._allowed_bytes, self._allowed_s = 0.0, 0.0
+        self.n_given_up = 0
+        """Bundles that had to go before anybody had fetched them."""
+        self.fetched = -1
+        """The newest that was fetched."""
+        self.newest = -1
+        self.fetched_s = float("-inf")
+        """When somebody last asked."""
+
+    def put(self, bundle: Bundle, update: MapUpdate | None) -> None:
+        """Add a bundle; `update` is the whole map after it."""
+        held = _Held(bundle.number, bundle.pack())
+        with self._lock:
+            self._held.append(held)
+            self._n_bytes += len(held.data)
+            self.newest = held.number
+            self._map = update
+            while self._n_bytes > self._room_bytes and len(self._held) > 1:
+                oldest = self._held.popleft()
+                self._n_bytes -= len(oldest.data)
+                self.n_given_up += oldest.number > self.fetched
+
+    def after(self, run: str, number: int, now_s: float) -> bytes:
+        """What follows bundle `number` of a run, as bytes: a bundle, or `wait` where none may go.
+
+        Where bundles between are gone, the whole map comes first. Another run's number counts for
+        nothing: then the oldest follows.
+        """
+        with self._lock:
+            self.fetched_s = now_s
+            if run != self._run:
+                number = -1
+            self.fetched = max(self.fetched, number)
+            found = next((held for held in self._held if held.number > number), None)
+            if found is None or not self._may(now_s):
+                return self._wait()
+            if found.number > number + 1 and self._map is not None:
+                whole = MapChange(_without_points(self._map), (), True)
+                data = Bundle(self._run, found.number - 1, change=whole).pack()
+            else:
+                data = found.data
+            self._allowed_bytes -= len(data)
+            return data
+
+    def _may(self, now_s: float) -> bool:
+        if not self._budget_bytes_s:
+            return True
+        passed_s = min(now_s - self._allowed_s, SAVED_S) if self._allowed_s else SAVED_S
+        most = SAVED_S * self._budget_bytes_s
+        self._allowed_bytes = min(self._allowed_bytes + passed_s * self._budget_bytes_s, most)
+        self._allowed_s = now_s
+        return self._allowed_bytes > 0
+
+    def _wait(self) -> bytes:
+        return Envelope("wait", {"run": self._run, "newest": self.newest}, {}).pack()
+
+
+def _without_points(update: MapUpdate) -> MapUpdate:
+    return MapUpdate(
+        update.revision, update.t_ns, update.map_from_camera, np.zeros((0, 3)),
+        update.georeference, update.unit_of, update.n_retired,
+    )  # fmt: skip

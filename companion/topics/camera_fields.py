@@ -1,0 +1,58 @@
+"""A camera as fields, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from companion.camera import Camera, Distortion
+from companion.errors import StreamError
+from companion.topics.envelope import Envelope
+from companion.topics.places import POSE_NUMBERS, pose_of, pose_row
+
+LEAST_SIDE, MOST_SIDE = 16, 8192
+MOST_PIXELS = 20_000_000
+MOST_FOCAL_PX = 1e6
+N_COEFFICIENTS = {Distortion.NONE: 0, Distortion.RADTAN: 5, Distortion.EQUIDISTANT: 4}
+
+
+def camera_fields(camera: Camera) -> dict[str, Any]:
+    """What the JSON object `camera` has."""
+    body = camera.body_from_camera
+    return {
+        "width": camera.width, "height": camera.height,
+        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        "distortion": camera.distortion.value, "coefficients": list(camera.coefficients),
+        "body_from_camera": pose_row(body) if body is not None else None,
+        "assumed": camera.assumed,
+    }  # fmt: skip
+
+
+def camera_of(part: Envelope) -> Camera:
+    """The camera of such an object; StreamError for what is none."""
+    width = part.integer("width", LEAST_SIDE, MOST_SIDE)
+    height = part.integer("height", LEAST_SIDE, MOST_SIDE)
+    if width * height > MOST_PIXELS:
+        raise StreamError(f"a camera of {width} x {height} pixels")
+    focal = [part.number(name, 1.0, MOST_FOCAL_PX) for name in ("fx", "fy")]
+    centre = [part.number(name, -MOST_FOCAL_PX, MOST_FOCAL_PX) for name in ("cx", "cy")]
+    try:
+        distortion = Distortion(part.text("distortion"))
+    except ValueError as error:
+        raise StreamError(f"{part.kind}: {error}") from error
+    coefficients = _numbers(part, "coefficients", N_COEFFICIENTS[distortion])
+    body = None
+    if part.known("body_from_camera"):
+        body = pose_of(_numbers(part, "body_from_camera", POSE_NUMBERS))
+    return Camera(
+        width, height, focal[0], focal[1], centre[0], centre[1], distortion,
+        tuple(coefficients), body, part.flag("assumed"),
+    )  # fmt: skip
+
+
+def _numbers(part: Envelope, name: str, n: int) -> list[float]:
+    values = part.fields.get(name)
+    if not isinstance(values, list) or len(values) != n:
+        raise StreamError(f"{part.kind}: {name} is not a list of {n} numbers")
+    if not all(type(v) in (int, float) and abs(v) < MOST_FOCAL_PX for v in values):
+        raise StreamError(f"{part.kind}: {name} has what is no number")
+    return [float(v) for v in values]

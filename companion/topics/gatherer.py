@@ -1,0 +1,152 @@
+"""Frames, tracks, keyframes and the map, gathered into bundles: only what depth can use.
+
+Of the frames between two keyframes those are taken that lie far enough apart to tell depth, and
+no more than the budget allows: a keyframe that could not have enough of them gets none, so that
+the next one has all that it needs. Until a keyframe tells which frames are wanted they wait as
+JPEG.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+
+from companion.messages import Frame, KeyframeAdded, MapUpdate, Track
+from companion.topics.bundle import Bundle, MapChange, MapChanges, Picture
+from companion.topics.jpeg import jpeg_of, without_colour
+
+MOST_WAITING, MOST_WAITING_BYTES = 240, 24 << 20
+MOST_PICTURES = 48
+MOST_TRACKS = 1000
+LEAST_STEP = 0.01
+"""Of the median depth: frames that lie nearer to each other tell the same."""
+LEAST_FRAMES = 4
+"""Beside its own that a keyframe needs to get depth."""
+SAVED_NS = 3_000_000_000
+"""Budget that was not used is kept for so long."""
+FIRST_GREY_BYTES = 40_000
+
+
+class Gatherer:
+    """Gives a bundle whenever the map was told; `budget_bytes_s` of 0 is no limit."""
+
+    def __init__(self, run: str, budget_bytes_s: float, jpeg_quality: int) -> None:
+        self._run, self._budget_bytes_s, self._quality = run, budget_bytes_s, jpeg_quality
+        self.n_dropped = 0
+        """Frames that depth could have used, but for the budget or the room to wait in."""
+        self._frames: OrderedDict[int, tuple[int, bytes]] = OrderedDict()
+        self._frame_bytes = 0
+        self._tracks: list[Track] = []
+        self._keyframes: list[KeyframeAdded] = []
+        self._tracked: dict[int, Track] = {}
+        self._changes = MapChanges()
+        self._number = 0
+        self._room_bytes, self._room_ns = 0.0, 0
+        self._grey_bytes = float(FIRST_GREY_BYTES)
+        self._last_place: tuple[float, ...] | None = None
+        self.keyframe_jpegs: dict[int, bytes] = {}
+        """Pictures of the keyframes of the last bundle, by number of keyframe."""
+
+    def take(self, message: Frame | Track | KeyframeAdded | MapUpdate) -> Bundle | None:
+        """Take one message, in the order in which localisation gives it."""
+        if isinstance(message, Frame):
+            self._wait(message)
+        elif isinstance(message, Track):
+            self._tracks.append(message)
+            if len(self._tracks) >= MOST_TRACKS:  # none is lost while there are no keyframes
+                return self._bundle(None)
+        elif isinstance(message, KeyframeAdded):
+            self._keyframes.append(message)
+        else:
+            return self._bundle(self._changes.since_last(message))
+        return None
+
+    def last(self) -> Bundle:
+        """What is left when the flight is over."""
+        return self._bundle(None, over=True)
+
+    def _wait(self, frame: Frame) -> None:
+        jpeg = jpeg_of(frame.rgb, self._quality)
+        self._frames[frame.seq] = (frame.t_ns, jpeg)
+        self._frame_bytes += len(jpeg)
+        if self._room_ns:
+            self._room_bytes += max(frame.t_ns - self._room_ns, 0) * 1e-9 * self._budget_bytes_s
+        self._room_bytes = min(self._room_bytes, SAVED_NS * 1e-9 * self._budget_bytes_s)
+        self._room_ns = frame.t_ns
+        while len(self._frames) > MOST_WAITING or self._frame_bytes > MOST_WAITING_BYTES:
+            seq = next(iter(self._frames))
+            self._forget(seq)
+            self.n_dropped += seq in self._tracked
+
+    def _bundle(self, change: MapChange | None, over: bool = False) -> Bundle:
+        for track in self._tracks:
+            if track.map_from_camera is not None and track.keyframe_from_camera is not None:
+                self._tracked[track.seq] = track
+        pictures = self._pictures() if self._keyframes else []
+        bundle = Bundle(
+            self._run, self._number, pictures, self._tracks, self._keyframes, change, over
+        )
+        self._number += 1
+        self._tracks, self._keyframes = [], []
+        return bundle
+
+    def _pictures(self) -> list[Picture]:
+        """Frames up to the newest keyframe; older ones are decided on and wait no more."""
+        newest = max(keyframe.seq for keyframe in self._keyframes)
+        owners = {k.seq: k.keyframe_id for k in self._keyframes if k.seq in self._frames}
+        self.keyframe_jpegs = {i: self._frames[seq][1] for seq, i in owners.items()}
+        useful = self._spread(sorted(s for s in self._frames if s <= newest), set(owners))
+        chosen = self._affordable(useful, set(owners))
+        out = []
+        for seq in chosen:
+            t_ns, jpeg = self._frames[seq]
+            if seq not in owners:
+                jpeg = without_colour(jpeg, self._quality)
+                self._grey_bytes += 0.2 * (len(jpeg) - self._grey_bytes)
+            out.append(Picture(seq, t_ns, jpeg, seq in owners))
+            self._room_bytes -= len(jpeg)
+        self.n_dropped += len(useful) - len(chosen)
+        for seq in [s for s in self._frames if s <= newest]:
+            self._forget(seq)
+        self._tracked = {s: t for s, t in self._tracked.items() if s > newest}
+        return out
+
+    def _spread(self, seqs: Sequence[int], keyframes: set[int]) -> list[int]:
+        """Frames of which each shows something else than the one before; keyframes always."""
+        depths = np.concatenate([k.points_camera[:, 2] for k in self._keyframes])
+        step = LEAST_STEP * float(np.median(depths)) if len(depths) else 0.0
+        out = []
+        for seq in seqs:
+            track = self._tracked.get(seq)
+            if track is None or track.map_from_camera is None:
+                if seq in keyframes:
+                    out.append(seq)
+                continue
+            place = tuple(map(float, track.map_from_camera.translation))
+            if (
+                seq in keyframes or self._last_place is None
+                or float(np.linalg.norm(np.subtract(place, self._last_place))) >= step
+            ):  # fmt: skip
+                out.append(seq)
+                self._last_place = place
+        return out
+
+    def _affordable(self, seqs: list[int], keyframes: set[int]) -> list[int]:
+        """Those that the budget has room for, evenly spread."""
+        others = [seq for seq in seqs if seq not in keyframes]
+        room = MOST_PICTURES - len(keyframes)
+        if self._budget_bytes_s:
+            own_bytes = sum(len(self._frames[seq][1]) for seq in keyframes)
+            room = min(room, int((self._room_bytes - own_bytes) / self._grey_bytes))
+            if room < min(LEAST_FRAMES, len(others)):
+                return []
+        if len(others) > room:
+            kept = np.unique(np.linspace(0, len(others) - 1, max(room, 0)).astype(int))
+            others = [others[k] for k in kept]
+        return sorted([*others, *keyframes])
+
+    def _forget(self, seq: int) -> None:
+        _, jpeg = self._frames.pop(seq)
+        self._frame_bytes -= len(jpeg)

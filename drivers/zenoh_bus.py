@@ -1,0 +1,146 @@
+"""Topics over Zenoh: the only place that knows it. Reached by what is configured, and nobody else.
+
+No multicast, no gossip: a node listens and connects where it is told to. Each node routes, so that
+what two others tell each other may pass through it, and connects again by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from typing import Any
+
+from companion.config import DistributedConfig
+from companion.errors import InputError
+
+LOOPBACK = "tcp/127.0.0.1:7447"
+MOST_MESSAGE_BYTES = 64 << 20
+LISTEN_MS = 15_000
+"""A port that the process before still holds is waited for."""
+NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/\S+:\d{1,5}(#\S*|\?\S*)?")
+PRIORITIES = ("INTERACTIVE_HIGH", "DATA", "BACKGROUND")
+URGENT, USUAL, LAST = PRIORITIES
+
+
+class ZenohBus:
+    """A session. Raises InputError where it cannot be had as configured."""
+
+    def __init__(self, config: DistributedConfig) -> None:
+        self._prefix = key_prefix(config)
+        self._zenoh = _library()
+        self._publishers: dict[str, Any] = {}
+        self._declared: list[Any] = []
+        settings = _settings(config)
+        try:
+            chosen = self._zenoh.Config()
+            for name, value in settings.items():
+                chosen.insert_json5(name, json.dumps(value))
+            self._session = self._zenoh.open(chosen)
+        except self._zenoh.ZError as error:
+            where = ", ".join([*settings["listen/endpoints"], *settings["connect/endpoints"]])
+            raise InputError(f"[distributed]: {where}: {_brief(error)}") from error
+
+    def announce(self, topic: str, priority: str) -> None:
+        """Be about to publish on a topic."""
+        self._publishers[topic] = self._session.declare_publisher(
+            f"{self._prefix}/{topic}",
+            priority=getattr(self._zenoh.Priority, priority),
+            congestion_control=self._zenoh.CongestionControl.DROP,
+        )
+
+    def is_wanted(self, topic: str) -> bool:
+        """Whether anybody has subscribed to a topic that was announced."""
+        return bool(self._publishers[topic].matching_status.matching)
+
+    def publish(self, topic: str, data: bytes) -> None:
+        """Send to all who have subscribed; what the network does not take is given up."""
+        self._publishers[topic].put(data)
+
+    def serve(self, topic: str, answer: Callable[[bytes], bytes | None]) -> None:
+        """Answer whoever asks; called in a thread of its own, None for no answer."""
+        key = f"{self._prefix}/{topic}"
+
+        def take(query: Any) -> None:
+            with query:
+                payload = query.payload
+                answered = answer(payload.to_bytes() if payload is not None else b"")
+                if answered is not None:
+                    query.reply(key, answered)
+
+        self._declared.append(self._session.declare_queryable(key, take))
+
+    def subscribe(self, topic: str, take: Callable[[bytes], None]) -> None:
+        """Have what is published on a topic; called in a thread of its own."""
+        self._declared.append(
+            self._session.declare_subscriber(
+                f"{self._prefix}/{topic}", lambda sample: take(sample.payload.to_bytes())
+            )
+        )
+
+    def ask(self, topic: str, data: bytes, timeout_s: float) -> bytes | None:
+        """The first answer; None where nobody is there who gives one."""
+        replies = self._session.get(
+            f"{self._prefix}/{topic}", payload=data, timeout=timeout_s,
+            priority=self._zenoh.Priority.BACKGROUND,
+        )  # fmt: skip
+        for reply in replies:
+            if reply.ok is not None:
+                found: bytes = reply.ok.payload.to_bytes()
+                return found
+        return None
+
+    def close(self) -> None:
+        """Leave."""
+        self._session.close()
+
+
+def key_prefix(config: DistributedConfig) -> str:
+    """What all keys of a vehicle begin with; InputError for a name that cannot be in one."""
+    if not NAME.fullmatch(config.vehicle):
+        raise InputError(
+            f"distributed.vehicle = {config.vehicle!r}: wanted letters, digits, _ . - only"
+        )
+    return f"companion/{config.vehicle}"
+
+
+def _settings(config: DistributedConfig) -> dict[str, Any]:
+    listen = list(config.listen)
+    if not listen and "tracking" in config.stages:
+        listen = [LOOPBACK]
+    for key, endpoints in (("listen", listen), ("connect", config.connect)):
+        for endpoint in endpoints:
+            if not ENDPOINT.fullmatch(endpoint):
+                raise InputError(
+                    f"distributed.{key}: {endpoint!r}: wanted tcp/HOST:PORT, or udp, tls, quic, ws"
+                )
+    return {
+        "mode": "router",
+        "listen/endpoints": listen,
+        "listen/timeout_ms": LISTEN_MS,
+        "listen/exit_on_failure": True,
+        "connect/endpoints": list(config.connect),
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry/period_init_ms": 500,
+        "connect/retry/period_max_ms": 2000,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
+    }
+
+
+def _library() -> Any:
+    try:
+        import zenoh
+    except ImportError as error:
+        raise InputError(
+            "[distributed] needs Zenoh: pip install 'companion[distributed]' (eclipse-zenoh)"
+        ) from error
+    return zenoh
+
+
+def _brief(error: Exception) -> str:
+    """What Zenoh says, without where in its source it says so."""
+    return re.sub(r" at /\S+", "", str(error)).split("\n")[0].rstrip(".")
