@@ -18,8 +18,9 @@ from companion.depth.opencl import ComputeDevice
 from companion.depth.undistortion import Undistortion
 from companion.errors import FlightError
 from companion.geometry import Pose
-from companion.messages import Bytes, DepthMap, MapUpdate, PointChunk
-from companion.output.depth_files import write_cloud, write_depth, write_log
+from companion.messages import Bytes, DepthMap, MapUpdate, PixelState, PointChunk
+from companion.output.depth_files import write_cloud, write_depth
+from companion.output.depth_log import ReferenceLog, Spent, UpdateLog, write_log
 from companion.progress import Progress
 from drivers.posed_images import PosedImages
 from drivers.posed_layouts import open_posed_images
@@ -91,30 +92,45 @@ class Reconstruction:
 
     def depth_map(
         self, reference: int, others: list[int], near_m: float, far_m: float
-    ) -> tuple[DepthMap, list[dict[str, float]]]:
-        """Depth of one reference from other images in this order, and what each update took."""
+    ) -> tuple[DepthMap, list[UpdateLog], Spent]:
+        """Depth of one reference from images in this order; what each took, and all."""
+        engine, begun_ms = self.engine, self._wall_ms()
         with self.times("begin"):
-            self.engine.begin(self.grey(reference), near_m, far_m)
-        log = []
+            engine.begin(self.grey(reference), near_m, far_m)
+        updates = []
         for position in others:
             grey = self.grey(position)
             current_from_reference = self.pose(position).inverse() @ self.pose(reference)
-            before = self.times.total_ms("update")
+            first, before = engine.n_commands(), self.times.total_ms("update")
             with self.times("update"):
-                n_worked = self.engine.update(grey, current_from_reference)
-            log.append(
-                {
-                    "frame": self.images.numbers[position],
-                    "ms": round(self.times.total_ms("update") - before, 3),
-                    "pixels_worked_on": n_worked,
-                }
-            )
+                n_worked = engine.update(grey, current_from_reference)
+            updates.append((position, n_worked, self._labels(), first, before))
+        ends = [*(u[3] for u in updates[1:]), engine.n_commands()]
+        ends_ms = [*(u[4] for u in updates[1:]), self.times.total_ms("update")]
         with self.times("finish"):
-            out = self.engine.finish(
+            out = engine.finish(
                 self.images.numbers[reference], self.images.numbers[reference],
                 self.picture(reference),
             )  # fmt: skip
-        return out, log
+        log = [
+            UpdateLog(
+                self.images.numbers[position], n_worked, *labels,
+                Spent.of(end_ms - before, engine.device_ms(first, end)),
+            )
+            for (position, n_worked, labels, first, before), end, end_ms in zip(
+                updates, ends, ends_ms, strict=True
+            )
+        ]  # fmt: skip
+        return out, log, Spent.of(self._wall_ms() - begun_ms, engine.device_ms())
+
+    def _wall_ms(self) -> float:
+        return sum(self.times.total_ms(name) for name in ("begin", "update", "finish"))
+
+    def _labels(self) -> tuple[int, int]:
+        labels = self.engine.labels
+        return tuple(
+            int((labels == s.value).sum()) for s in (PixelState.CONVERGED, PixelState.DIVERGED)
+        )  # type: ignore[return-value]
 
 
 def reconstruct(
@@ -151,15 +167,14 @@ def reconstruct(
             reach_m = np.inf if alone else config.depth.max_baseline * middle_m
             others = _others(images, positions, reference, reach_m)
             work.load([reference, *others])
-            depth_map, frames = work.depth_map(reference, others, *range_m)
+            depth_map, updates, spent = work.depth_map(reference, others, *range_m)
             write_depth(out, depth_map)
             done.append(depth_map)
             log.append(
-                {
-                    "reference": numbers[reference], "range_m": [round(d, 4) for d in range_m],
-                    "searched": work.engine.n_searched, "frames": frames,
-                }
-            )  # fmt: skip
+                ReferenceLog(
+                    numbers[reference], range_m, work.engine.n_searched, tuple(updates), spent
+                )
+            )
             if not alone:
                 chunks += fusion.add(depth_map, update)
             progress.update(n, f"frame {numbers[reference]}", sum(len(c.rgb) for c in chunks))
@@ -168,7 +183,7 @@ def reconstruct(
     chunks += [chunk_alone(done[0])] if alone else fusion.flush(update)
     write_cloud(out, chunks, places)
     write_log(
-        out, device=device.described, layout=images.layout, maps=done, frames=log,
+        out, device=device.described, layout=images.layout, maps=done, log=log,
         stages=work.times.summary(),
     )  # fmt: skip
     return done

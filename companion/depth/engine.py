@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 
 from companion.config import DepthConfig
-from companion.depth.opencl import ComputeDevice, event_ms
+from companion.depth.opencl import COPY, READ_BACK, UPLOAD, ComputeDevice, event_ms
 from companion.depth.regularisation import Regularisation, edges
 from companion.depth.sweep import PLANES, PlaneSweep
 from companion.depth.verification import Verification
@@ -81,6 +81,7 @@ class DepthEngine:
     def begin(self, grey: Bytes, near: float, far: float) -> None:
         """Start on an image (H, W) whose depths lie between `near` and `far` (map units)."""
         self._events = []
+        self._device.copies.clear()
         self._grey = grey
         self._rho = (1.0 / far, 1.0 / near)
         self._views.begin(*self._rho)
@@ -172,8 +173,23 @@ class DepthEngine:
         event = cl.enqueue_nd_range_kernel(self._device.queue, kernel, whole, group)
         self._events.append((name, event))
 
-    def _kernel_ms(self) -> dict[str, float]:
+    def n_commands(self) -> int:
+        """Commands given to the device since `begin`, copies included."""
+        self._events.extend(self._device.copies)
+        self._device.copies.clear()
+        return len(self._events)
+
+    def device_ms(self, first: int = 0, beyond: int | None = None) -> dict[str, float]:
+        """What commands took on the device, by the kernel's name, or `UPLOAD`, `READ_BACK`, `COPY`.
+
+        `first` and `beyond` are what `n_commands` was; waits until all is done.
+        """
+        self.n_commands()
         out: dict[str, float] = {}
-        for name, event in self._events:
+        for name, event in self._events[first:beyond]:
             out[name] = out.get(name, 0.0) + event_ms(event)
         return out
+
+    def _kernel_ms(self) -> dict[str, float]:
+        every = self.device_ms()
+        return {name: ms for name, ms in every.items() if name not in (UPLOAD, READ_BACK, COPY)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections import deque
 from importlib import resources
 from typing import Any
 
@@ -17,6 +18,8 @@ WANT = (
     "install PoCL (pip install 'companion[cpu]' on x86-64, apt install pocl-opencl-icd elsewhere),"
     " or set depth.enabled=false"
 )
+UPLOAD, READ_BACK, COPY = "upload", "read-back", "copy"
+MAX_COPIES = 4096
 
 
 class ComputeDevice:
@@ -31,6 +34,8 @@ class ComputeDevice:
         self.queue = cl.CommandQueue(
             self.context, properties=cl.command_queue_properties.PROFILING_ENABLE
         )
+        self.copies: deque[tuple[str, cl.Event]] = deque(maxlen=MAX_COPIES)
+        """The last ones, as `UPLOAD`, `READ_BACK` or `COPY`, for who wants to know their times."""
 
     @property
     def described(self) -> str:
@@ -55,15 +60,20 @@ class ComputeDevice:
 
     def write(self, buffer: cl.Buffer, array: NDArray[Any]) -> cl.Event:
         """Copy a contiguous array to a buffer and wait."""
-        return cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
+        event = cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
+        self.copies.append((UPLOAD, event))
+        return event
 
     def copy(self, to: cl.Buffer, source: cl.Buffer, offset: int, n_bytes: int) -> None:
         """Copy the first bytes of a buffer into another, from an offset on."""
-        cl.enqueue_copy(self.queue, to, source, dst_offset=offset, byte_count=n_bytes)
+        event = cl.enqueue_copy(self.queue, to, source, dst_offset=offset, byte_count=n_bytes)
+        self.copies.append((COPY, event))
 
     def read(self, array: NDArray[Any], buffer: cl.Buffer) -> None:
         """Copy a buffer to a contiguous array and wait."""
-        cl.enqueue_copy(self.queue, array, buffer, is_blocking=True)
+        self.copies.append(
+            (READ_BACK, cl.enqueue_copy(self.queue, array, buffer, is_blocking=True))
+        )
 
 
 def event_ms(event: cl.Event) -> float:

@@ -110,24 +110,24 @@ class PlaneSweep:
         small, large = int(SMALL * counted), int(LARGE * counted)
         level = "coarse" if coarse else "fine"
         run(
-            f"costs {level}", kernels["costs"], grid, (16, 1), self._words_r, self._words,
+            f"costs-{level}", kernels["costs"], grid, (16, 1), self._words_r, self._words,
             width, height, self._views, np.int32(n), np.int32(dropped), np.float32(rho_low),
             np.float32(step), self._blocks, np.int32(UNLOOKED * counted), self._cost, *grid, stride,
         )  # fmt: skip
         for k, (dx, dy) in enumerate(COARSE_PATHS if coarse else PATHS):
             run(
-                f"aggregate {level}", kernels["aggregate"], (grid[0] if dy else grid[1],),
+                f"aggregate-{level}", kernels["aggregate"], (grid[0] if dy else grid[1],),
                 (8,), self._cost, self._sum, self.reference, width, *grid, stride, np.int32(dx),
                 np.int32(dy), np.int32(small), np.int32(large), np.int32(SOFT_GREY),
                 np.int32(k == 0),
             )  # fmt: skip
         n_cells = grid[0] * grid[1]
         run(
-            f"winner {level}", kernels["winner"], (n_cells,), (64,), self._sum, n_cells,
+            f"winner-{level}", kernels["winner"], (n_cells,), (64,), self._sum, n_cells,
             np.float32(rho_low), np.float32(step), self._winner, self.margin,
         )  # fmt: skip
         run(
-            f"median {level}",
+            f"median-{level}",
             kernels["median"],
             grid,
             (64, 1),

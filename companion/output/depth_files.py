@@ -1,17 +1,15 @@
-"""What `companion depth` writes: a depth map per reference, the cloud, and a log of the times."""
+"""What `companion depth` writes: a depth map per reference, and the cloud."""
 
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from companion.geometry import Pose, Similarity
-from companion.messages import DepthMap, PixelState, PointChunk
+from companion.messages import DepthMap, PointChunk
 from companion.output.atomic_file import write_atomically
 from companion.output.cloud import joined, placed
 from companion.output.cloud_ply import ply_parts
@@ -41,24 +39,3 @@ def write_cloud(out: Path, chunks: Sequence[PointChunk], places: Mapping[int, Po
     at = [Similarity(1.0, pose.rotation, pose.translation) for pose in poses]
     cloud = joined([placed(c, place) for c, place in zip(chunks, at, strict=True)])
     write_atomically(out / "cloud.ply", ply_parts(cloud, "unknown", None))
-
-
-def write_log(
-    out: Path, *, device: str, layout: str, maps: Sequence[DepthMap],
-    frames: Sequence[Mapping[str, Any]], stages: Mapping[str, Any],
-) -> None:  # fmt: skip
-    """Write depth.json."""
-    references = [
-        {
-            **log,
-            "kernel_ms": {name: round(ms, 3) for name, ms in depth_map.kernel_ms.items()},
-            "pixels": {
-                state.name.lower(): int((depth_map.state == state.value).sum())
-                for state in PixelState
-            },
-            "pixels_with_depth": int((depth_map.depth > 0).sum()),
-        }
-        for log, depth_map in zip(frames, maps, strict=True)
-    ]
-    content = {"device": device, "layout": layout, "host_ms": stages, "references": references}
-    write_atomically(out / "depth.json", json.dumps(content, indent=1, allow_nan=False).encode())
