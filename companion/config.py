@@ -170,6 +170,16 @@ class FeedbackConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ControlConfig:
+    """What a ground station may ask and change over MAVLink; see docs/control.md."""
+
+    enabled: bool = True
+    keep: str = ""
+    """A TOML file that keeps what the ground has set; read at the start, after all else. "" keeps
+    nothing."""
+
+
+@dataclass(frozen=True, slots=True)
 class DaemonConfig:
     """The long-running program."""
 
@@ -410,6 +420,7 @@ class Config:
     link: LinkConfig = field(default_factory=LinkConfig)
     router: RouterConfig = field(default_factory=RouterConfig)
     feedback: FeedbackConfig = field(default_factory=FeedbackConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
     daemon: DaemonConfig = field(default_factory=DaemonConfig)
     recorder: RecorderConfig = field(default_factory=RecorderConfig)
     telemetry: TelemetryConfig = field(default_factory=TelemetryConfig)

@@ -53,14 +53,26 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
         where = f"--set {override}"
         wanted = _key(section, key, where)
         changed[section][key] = _checked(section, key, _parse(text, wanted.kind), where)
-    config = Config()
-    return dataclasses.replace(
-        config,
-        **{
-            section: dataclasses.replace(getattr(config, section), **values)
-            for section, values in changed.items()
-        },
-    )
+    return _changed(Config(), changed)
+
+
+def changed_by(config: Config, path: Path) -> Config:
+    """A configuration changed by a TOML file."""
+    changed: dict[str, dict[str, Any]] = {section: {} for section in _sections()}
+    for name, value in _read(path).items():
+        _take(changed, name, value, str(path))
+    return _changed(config, changed)
+
+
+def with_value(config: Config, section: str, key: str, value: Any, where: str) -> Config:
+    """A configuration with one value changed, checked as one of a file; `where` it comes from."""
+    return _changed(config, {section: {key: _checked(section, key, value, where)}})
+
+
+def words_of(section: str, key: str) -> tuple[str, ...]:
+    """The words that a key may be; none where it is not one of a few."""
+    limits = _key(section, key, "words_of").limits
+    return next((limit.words for limit in limits if isinstance(limit, OneOf)), ())
 
 
 def dump(config: Config) -> dict[str, dict[str, Any]]:
@@ -95,6 +107,16 @@ def toml_value(value: Any) -> str:
     if isinstance(value, float):
         return repr(value)
     return json.dumps(value, ensure_ascii=False)
+
+
+def _changed(config: Config, changed: Mapping[str, Mapping[str, Any]]) -> Config:
+    return dataclasses.replace(
+        config,
+        **{
+            section: dataclasses.replace(getattr(config, section), **values)
+            for section, values in changed.items()
+        },
+    )
 
 
 @cache

@@ -111,6 +111,8 @@ class CommandServer:
             self._running[number] = _Running(asker, given, outcome, now_ns, now_ns)
             answers = [_answer(asker, number, IN_PROGRESS, outcome.percent)]
         else:
+            if to_all and outcome.result != ACCEPTED:
+                return []
             given = _Given(packed, now_ns, outcome.result)
             answers = [_answer(asker, number, outcome.result), *outcome.messages]
         self._remember(asker, number, given)

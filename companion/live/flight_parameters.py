@@ -1,0 +1,113 @@
+"""Which keys of the configuration are parameters that a ground station can read and set.
+
+As MAVLink has it every value is a float: true is 1, one of a few words is its place among them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from companion.config import Config
+from companion.config_file import words_of
+from companion.errors import ConfigError
+
+DIGITS = 7
+"""More a float of four bytes does not hold."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlightParameter:
+    """A key under a name of at most 16 characters.
+
+    `stricter` is 1 where more of it, -1 where less of it makes poses harder to believe; 0 where it
+    has no say in that.
+    """
+
+    name: str
+    section: str
+    key: str
+    stricter: int = 0
+    at_once: bool = False
+    """Else it counts from the next map on."""
+
+    @property
+    def full_key(self) -> str:
+        """As the configuration names it."""
+        return f"{self.section}.{self.key}"
+
+
+def _table() -> dict[str, FlightParameter]:
+    found = (
+        FlightParameter("FB_MODE", "feedback", "mode", at_once=True),
+        FlightParameter("FB_RATE_HZ", "feedback", "rate_hz", at_once=True),
+        FlightParameter("FB_MAX_SIGMA_M", "feedback", "max_sigma_m", -1, at_once=True),
+        FlightParameter("FB_MIN_QUALITY", "feedback", "min_quality", 1, at_once=True),
+        FlightParameter("FB_MAX_GAP_MS", "feedback", "max_gap_ms", -1, at_once=True),
+        FlightParameter("FB_RESUME_S", "feedback", "resume_after_s", 1, at_once=True),
+        FlightParameter("FB_MAX_JUMP_M", "feedback", "max_jump_m"),
+        FlightParameter("MAP_DENSE", "depth", "enabled", at_once=True),
+        FlightParameter("MAP_STRIDE", "depth", "stride"),
+        FlightParameter("MAP_MIN_ZNCC", "depth", "min_zncc"),
+        FlightParameter("MAP_MIN_INLIERS", "depth", "min_inlier_ratio"),
+        FlightParameter("MAP_SIGMA", "depth", "converged_sigma"),
+        FlightParameter("MAP_VOXEL_M", "cloud", "voxel_m"),
+        FlightParameter("MAP_AGREEING", "cloud", "min_agreeing"),
+        FlightParameter("MAP_AGREEMENT", "cloud", "agreement"),
+        FlightParameter("TRK_MIN_INLIERS", "tracking", "min_inliers"),
+        FlightParameter("TRK_RESTART_S", "tracking", "restart_after_s"),
+        FlightParameter("TRK_FEATURES", "features", "n_features"),
+        FlightParameter("GEO_MIN_TRAVEL_M", "georeference", "min_travel_m"),
+        FlightParameter("GEO_MAX_SIGMA", "georeference", "max_sigma_scale"),
+        FlightParameter("STR_KBIT_S", "stream", "budget_kbit_s", at_once=True),
+        FlightParameter("VIEW_JPEG", "viewer", "jpeg_quality"),
+        FlightParameter("REC_ENABLED", "recorder", "enabled"),
+        FlightParameter("REC_CLOUD", "recorder", "point_cloud"),
+        FlightParameter("REC_JPEG", "recorder", "jpeg_quality"),
+        FlightParameter("REC_LEAST_MB", "recorder", "least_free_mb"),
+        FlightParameter("DMN_HOT_C", "daemon", "hot_c", at_once=True),
+        FlightParameter("DMN_STATUS_S", "daemon", "status_every_s", at_once=True),
+    )
+    return {parameter.name: parameter for parameter in found}
+
+
+PARAMETERS = _table()
+
+
+def number_of(config: Config, parameter: FlightParameter) -> float:
+    """A key's value as a parameter's."""
+    value: Any = getattr(getattr(config, parameter.section), parameter.key)
+    if isinstance(value, str):
+        return float(words_of(parameter.section, parameter.key).index(value))
+    return float(value)
+
+
+def value_of(config: Config, parameter: FlightParameter, number: float) -> Any:
+    """A parameter's value as the key's; ConfigError where it is none of its kind.
+
+    Whether it is in the key's range is not looked at here.
+    """
+    now: Any = getattr(getattr(config, parameter.section), parameter.key)
+    if not math.isfinite(number):
+        raise ConfigError(f"{parameter.full_key} wants a finite number, given is {number}")
+    if isinstance(now, str):
+        words = words_of(parameter.section, parameter.key)
+        if number not in range(len(words)):
+            listed = ", ".join(f"{place} ({word})" for place, word in enumerate(words))
+            raise ConfigError(f"{parameter.full_key} wants {listed}, given is {number:g}")
+        return words[int(number)]
+    if isinstance(now, bool):
+        if number not in (0.0, 1.0):
+            raise ConfigError(f"{parameter.full_key} wants 0 or 1, given is {number:g}")
+        return bool(number)
+    if isinstance(now, int):
+        if not number.is_integer():
+            raise ConfigError(f"{parameter.full_key} wants a whole number, given is {number:g}")
+        return int(number)
+    return float(f"{number:.{DIGITS}g}")
+
+
+def is_looser(parameter: FlightParameter, now: float, number: float) -> bool:
+    """Whether poses would be easier to believe by this value than by the one that is."""
+    return parameter.stricter * (number - now) < 0
