@@ -60,6 +60,9 @@ class ChunkStore:
                 self.n_points -= len(oldest.rgb)
                 self.n_given_up += len(oldest.rgb)
 
+    def __contains__(self, keyframe_id: int) -> bool:
+        return keyframe_id in self._held or keyframe_id in self._stored
+
     @property
     def keyframe_ids(self) -> list[int]:
         """Of which there is a chunk, ascending."""

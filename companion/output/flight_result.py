@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -209,6 +209,19 @@ class FlightResult:
         Without a scale the cube is a hundredth of the median depth. The result does not depend on
         the order in which chunks came.
         """
+        gathering = self.gather_cloud(voxel_m)
+        while True:
+            try:
+                next(gathering)
+            except StopIteration as over:
+                cloud: Cloud = over.value
+                return cloud
+
+    def gather_cloud(self, voxel_m: float) -> Generator[float, None, Cloud]:
+        """The same a chunk at a time, for who has other things to do: how far it is, 0 to 1.
+
+        Places are those of when it began; chunks that come meanwhile are left out.
+        """
         places: dict[int, Similarity] = {}
         for keyframe_id in self._chunks.keyframe_ids:
             place = self.update.place_of(keyframe_id) if self.update is not None else None
@@ -222,8 +235,10 @@ class FlightResult:
         metric = self.georeference is not None
         depths = [place.scale * self._median_depths[key] for key, place in places.items()]
         thinned = VoxelCloud(voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths)))
-        for keyframe_id, place in places.items():
-            thinned.add(placed(self._chunks.get(keyframe_id), place))
+        for n, (keyframe_id, place) in enumerate(places.items()):
+            if keyframe_id in self._chunks:  # else the disk was full meanwhile
+                thinned.add(placed(self._chunks.get(keyframe_id), place))
+            yield (n + 1) / len(places)
         return thinned.finish()
 
     def autopilot_path(self) -> tuple[PositionSource, Array, Array] | None:

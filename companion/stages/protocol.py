@@ -8,6 +8,7 @@ from pathlib import Path
 
 from companion.camera import Camera
 from companion.config import Config
+from companion.messages import GeoOrigin
 from companion.output.flight_result import RunFacts
 
 
@@ -36,6 +37,25 @@ class SetShare:
     """How much of its work a stage is to do, 0 to 1; see companion.governor."""
 
     share: float
+
+
+@dataclass(frozen=True, slots=True)
+class TakeSnapshot:
+    """Have the recorder write the cloud as it is now; `origin` where the world has a known one."""
+
+    number: int
+    origin: GeoOrigin | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """How far a snapshot is; it is over when it has a `path`, or `why_not` says that it failed."""
+
+    number: int
+    percent: int = 0
+    path: str = ""
+    n_points: int = 0
+    why_not: str = ""
 
 
 @dataclass(frozen=True, slots=True)

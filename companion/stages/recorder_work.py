@@ -10,7 +10,8 @@ from companion.errors import StageError
 from companion.messages import Message
 from companion.output.flight_result import FlightResult
 from companion.output.write import write_results
-from companion.stages.protocol import Finish, Setup
+from companion.stages.cloud_snapshots import CloudSnapshots
+from companion.stages.protocol import Finish, Setup, Snapshot, TakeSnapshot
 from companion.stages.work import Work
 from companion.viewer import FileViewer
 
@@ -24,14 +25,18 @@ class _Recorder(Work):
         self._open = ExitStack()
         self._folder.mkdir(parents=True, exist_ok=True)
         self._result = FlightResult(self._folder, setup.config.cloud.memory_mb)
+        self._snapshots = CloudSnapshots(self._folder, self._result, self._voxel_m)
         self._recording = self._open.enter_context(
             FileViewer(setup.config.viewer, setup.camera, self._folder / "flight.rrd")
         )
 
-    def step(self, message: Any) -> Iterable[Message]:
+    def step(self, message: Any) -> Iterable[Message | Snapshot]:
+        if isinstance(message, TakeSnapshot):
+            self._snapshots.begin(message)
+            return self._snapshots.step()
         self._result.take(message)
         self._recording.take(message)
-        return []
+        return self._snapshots.step()
 
     def finish(self, finish: Finish) -> Iterable[Message]:
         try:

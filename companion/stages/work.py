@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from companion.clock import StageTimes
 from companion.messages import Message
 from companion.stages.frame_ring import FrameInRing
-from companion.stages.protocol import Finish, Setup
+from companion.stages.protocol import Finish, Setup, Snapshot
 
 MOST_HELD = 32
 
@@ -42,11 +42,11 @@ class Work:
         """Whether a message gives way to a newer one of its kind."""
         return self.latest_only and isinstance(message, FrameInRing)
 
-    def step(self, message: Any) -> Iterable[Message]:
+    def step(self, message: Any) -> Iterable[Message | Snapshot]:
         """Take one message."""
         raise NotImplementedError
 
-    def finish(self, finish: Finish) -> Iterable[Message]:
+    def finish(self, finish: Finish) -> Iterable[Message | Snapshot]:
         """Give what is left."""
         raise NotImplementedError
 
