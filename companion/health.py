@@ -143,6 +143,8 @@ class Health:
     loop_delay_p99_ms: float | None = None
     n_warnings: Mapping[str, int] = field(default_factory=dict)
     """How often each thing was warned of since the start."""
+    set_by_ground: Mapping[str, Any] = field(default_factory=dict)
+    """Keys of the configuration that were set over MAVLink, and to what."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain types only; what is not a finite number is null."""

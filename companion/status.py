@@ -76,11 +76,18 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         ("feedback", _feedback(document.get("feedback") or {})),
         ("flight", document.get("flight") or "none"),
         ("reduced", document.get("degraded") or "nothing"),
+        ("set", _settings(document.get("set_by_ground") or {})),
         ("computer", ", ".join(computer)),
         ("event loop", f"{_number(document.get('loop_delay_p99_ms'), ' ms', 1)} late (p99)"),
         ("running for", _number(document.get("uptime_s"), " s")),
     ]
     return [f"{name:12}{value}" for name, value in rows]
+
+
+def _settings(settings: Mapping[str, Any]) -> str:
+    """What the ground has set."""
+    parts = [f"{key} = {value}" for key, value in sorted(settings.items())]
+    return ", ".join(parts) + " (by the ground)" if parts else "nothing by the ground"
 
 
 def _feedback(feedback: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
     frames, telemetry -> localisation -> depth -> recorder, viewer
     all that comes in, poses, warnings -> tape
+    frames, all that stages give -> topics, if nodes elsewhere are to have it
 
 Whoever calls `frame` or `telemetry` never waits. A stage that dies takes nothing with it but its
 own state: depth and recorder begin again within the flight, localisation ends it.
@@ -21,6 +22,7 @@ from companion.config import Config
 from companion.health import Health
 from companion.live.viewing import Viewing
 from companion.messages import (
+    DepthMap,
     Frame,
     GeoOrigin,
     KeyframeAdded,
@@ -34,17 +36,23 @@ from companion.messages import (
 )
 from companion.output.flight_result import RunFacts
 from companion.stages.frame_ring import FrameRing
-from companion.stages.protocol import Finish, SetShare, Setup
+from companion.stages.protocol import Finish, SetShare, Setup, Snapshot, TakeSnapshot
 from companion.stages.stage_process import StageProcess
 from companion.viewer import Watched
 from drivers.recording.content import HealthNote, LinkBytes
 
-NICE = {"localisation": 0, "tape": 5, "recorder": 10, "depth": 20}
+NICE = {"localisation": 0, "tape": 5, "topics": 10, "recorder": 10, "depth": 20}
 """The pose comes first; the others take what is left over."""
-PATIENCE_S = {"localisation": 120.0, "depth": 60.0, "tape": 60.0, "recorder": 180.0}
-HURRIED_S = {"localisation": 0.7, "depth": 0.2, "tape": 0.3, "recorder": 1.6}
+PATIENCE_S = {
+    "localisation": 120.0, "depth": 60.0, "tape": 60.0, "recorder": 180.0, "topics": 15.0,
+}  # fmt: skip
+HURRIED_S = {"localisation": 0.7, "depth": 0.2, "tape": 0.3, "recorder": 1.6, "topics": 0.2}
 IN_FOLDER = ("tape", "recorder")
 """Stages that leave something in the flight's folder."""
+WITH_FLIGHT = (*IN_FOLDER, "topics")
+"""Stages that cannot begin before the flight does."""
+PUBLISHED = (Odometry, Track, KeyframeAdded, MapUpdate, DepthMap, PointChunk)
+"""What the topics are told, beside frames."""
 RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
@@ -63,6 +71,7 @@ class Listener:
     localisation_died: Callable[[], None]
     unusable: Callable[[str], None]
     """A stage has never come up, since what the user gave cannot be used."""
+    snapshot: Callable[[Snapshot], None] = lambda _: None
 
 
 class LiveFlight:
@@ -80,7 +89,7 @@ class LiveFlight:
         self._listener = listener(self)
         self.folder: Path | None = None
         """Where the results go; None until it has begun."""
-        self.n_restarted = {"depth": 0, "recorder": 0, "tape": 0}
+        self.n_restarted = {"depth": 0, "recorder": 0, "tape": 0, "topics": 0}
         self._ring = FrameRing(camera.width, camera.height)
         self._lock = threading.Lock()
         self._over = threading.Event()
@@ -90,8 +99,13 @@ class LiveFlight:
         self._last_map: MapUpdate | None = None
         self._told_ns = 0
         self._origin: GeoOrigin | None = None
+        self._dense = config.depth.enabled
+        self._dense_share = 1.0
+        self._began_later: set[str] = set()
+        """Stages that were not wanted at first."""
         kinds = ["localisation", "recorder"]
-        kinds += ["tape"] * config.recorder.enabled + ["depth"] * config.depth.enabled
+        kinds += ["tape"] * config.recorder.enabled + ["depth"] * _makes_depth(config)
+        kinds += ["topics"] * config.distributed.enabled
         self.stages = {kind: self._start(kind) for kind in kinds}
         for kind in kinds:
             self._set_up(kind)
@@ -107,13 +121,13 @@ class LiveFlight:
         return all(
             stage.progress is not None or self.n_restarted.get(kind, 0)
             for kind, stage in list(self.stages.items())
-            if self.folder is not None or kind not in IN_FOLDER
+            if self.folder is not None or kind not in WITH_FLIGHT
         )
 
     def begin(self, folder: Path) -> None:
         """The flight begins, and leaves its results there."""
         self.folder, self._began_s = folder, monotonic_s()
-        for kind in IN_FOLDER:
+        for kind in WITH_FLIGHT:
             if kind in self.stages:
                 self._set_up(kind)
         if self._config.daemon.viewer != "none" or self._config.stream.listen:
@@ -125,8 +139,9 @@ class LiveFlight:
             return
         self.n_frames += 1
         place = self._ring.put(frame)
-        for stage in list(self.stages.values()):
-            stage.offer(place)
+        for kind, stage in list(self.stages.items()):
+            if kind != "depth" or self._dense:
+                stage.offer(place)
         self._show(frame)
 
     def take(self, message: Telemetry | Warned) -> None:
@@ -163,8 +178,38 @@ class LiveFlight:
         if self._viewing is not None:
             self._viewing.pictures = viewer
         self.stages["localisation"].offer(SetShare(features))
+        self._dense_share = dense
         if "depth" in self.stages:
             self.stages["depth"].offer(SetShare(dense))
+
+    @property
+    def dense(self) -> bool:
+        """Whether the dense map is made."""
+        return self._dense
+
+    def set_dense(self, dense: bool) -> None:
+        """Make the dense map from now on, or leave it; what there is of it stays."""
+        with self._lock:
+            if dense == self._dense or self._over.is_set():
+                return
+            if dense and "depth" not in self.stages:
+                self._began_later.add("depth")
+                self.stages["depth"] = self._start("depth")
+                self._set_up("depth")
+            self._dense = dense
+        if not dense:
+            return
+        self.stages["depth"].heard_s = monotonic_s()  # it was not asked anything
+        self._take_up("depth")
+
+    def set_budget(self, kbit_s: float) -> None:
+        """All viewers together get no more from now on; 0 for no limit."""
+        if self._viewing is not None:
+            self._viewing.set_budget(kbit_s)
+
+    def take_snapshot(self, number: int, origin: GeoOrigin | None) -> None:
+        """Have the cloud written as it is now; the listener hears how far that is."""
+        self.stages["recorder"].offer(TakeSnapshot(number, origin))
 
     @property
     def has_origin(self) -> bool:
@@ -193,8 +238,10 @@ class LiveFlight:
             for kind in ("localisation", "depth"):
                 self._finish(kind)
             self._ask("tape")
+            self._ask("topics")
             self._finish("recorder", facts(self))
             self._wait("tape")
+            self._wait("topics")
         for stage in self.stages.values():
             stage.kill()
         if self._viewing is not None:
@@ -235,10 +282,10 @@ class LiveFlight:
 
     def _set_up(self, kind: str) -> None:
         folder = self.folder
-        if kind in IN_FOLDER:
+        if kind in WITH_FLIGHT:
             if folder is None:
                 return  # what it records is yet to begin
-            if self.n_restarted[kind]:
+            if kind in IN_FOLDER and self.n_restarted[kind]:
                 folder = folder / f"part-{self.n_restarted[kind] + 1}"
         self.stages[kind].begin(Setup(self._config, self.camera, folder))
 
@@ -257,7 +304,8 @@ class LiveFlight:
             return
         self._warn(RESTARTED, f"{kind}: {why}")
         gone, n_before = self.stages[kind], self.n_restarted[kind]
-        if gone.failed is not None and gone.failed.by_input and not n_before + bool(gone.progress):
+        never_up = not n_before and gone.progress is None and kind not in self._began_later
+        if gone.failed is not None and gone.failed.by_input and never_up:
             self._listener.unusable(why)
         if n_before and self._over.wait(min(2.0 ** (n_before - 1), LONGEST_WAIT_S)):
             return
@@ -268,17 +316,28 @@ class LiveFlight:
             self.stages[kind] = self._start(kind)
             gone.kill()
             self._set_up(kind)
+        self._take_up(kind)
+
+    def _take_up(self, kind: str) -> None:
+        """A stage begins in mid-flight: it has to know what the others do."""
+        if kind == "depth":
+            self.stages[kind].offer(SetShare(self._dense_share))
         if self._last_map is not None:
             self.stages[kind].offer(self._last_map)
 
-    def _deliver(self, message: Message) -> None:
+    def _deliver(self, message: Message | Snapshot) -> None:
         """What a stage gives goes to whom it is for; called from the stages' threads."""
+        if "topics" in self.stages and isinstance(message, PUBLISHED):
+            self.stages["topics"].offer(message)
+        if isinstance(message, Snapshot):
+            self._listener.snapshot(message)
+            return
         if isinstance(message, Odometry):
             self._listener.odometry(message)
             self._show(message)
             self.keep(message)
             return
-        if isinstance(message, (Track, KeyframeAdded, MapUpdate)) and "depth" in self.stages:
+        if isinstance(message, (Track, KeyframeAdded, MapUpdate)) and self._dense:
             self.stages["depth"].offer(message)
         if isinstance(message, MapUpdate):
             self._last_map = message
@@ -308,3 +367,8 @@ class LiveFlight:
         if self._viewing is not None:
             counts["viewer messages"] = self._viewing.n_dropped
         return counts
+
+
+def _makes_depth(config: Config) -> bool:
+    elsewhere = config.distributed.enabled and "depth" not in config.distributed.stages
+    return config.depth.enabled and not elsewhere

@@ -39,6 +39,11 @@ class Flights:
         flight = self.current or self._spare
         return flight is not None and flight.stages_up
 
+    @property
+    def spare(self) -> LiveFlight | None:
+        """The one that waits for its beginning, if any."""
+        return self._spare
+
     def prepare(self, config: Config, camera: Camera) -> None:
         """Have processes at hand for the next flight."""
         if self._spare is None:

@@ -6,6 +6,7 @@ The governor's levels go to the flight from here, and a pose loop that hangs is 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,7 @@ class HealthWatch:
         self._feed, self._link, self._sender = feed, link, sender
         self._loop_delay = loop_delay
         self._began_ns = clock.now_ns()
+        self._config = config.daemon
         self._governor = Governor(config.daemon.hot_c)
         self._lines = StatusLines(config.daemon.status_every_s)
         self._load_reader = SystemLoad(Path(config.daemon.flights))
@@ -85,6 +87,8 @@ class HealthWatch:
         self._progress_ns = self._began_ns
         self._scale = ""
         self._recent = LatencyMeter(1.0)
+        self.set_by_ground: Mapping[str, Any] = {}
+        """Keys of the configuration, and what they were set to in flight."""
         self._pose = StageMeter("localisation")
         self._depth = StageMeter("depth")
 
@@ -95,7 +99,12 @@ class HealthWatch:
 
     def reconfigure(self, config: Config) -> None:
         """Take over what has changed."""
-        self._governor = Governor(config.daemon.hot_c)
+        if config.daemon == self._config:
+            return
+        if config.daemon.hot_c != self._config.hot_c:
+            self._governor = Governor(config.daemon.hot_c)
+            self._apply()
+        self._config = config.daemon
         self._lines = StatusLines(config.daemon.status_every_s)
 
     def restart(self) -> None:
@@ -234,6 +243,7 @@ class HealthWatch:
             degraded=self._governor.degraded,
             loop_delay_p99_ms=self._loop_delay.percentile_ms(99, now_ns),
             n_warnings=dict(self._journal.n_warnings),
+            set_by_ground=dict(self.set_by_ground),
         )
 
     def _tracker(self) -> str:
@@ -258,7 +268,10 @@ class HealthWatch:
             said = stage.progress
             detail = said.device if said is not None else "starting"
             no_sign_s = now_s - max(stage.heard_s, self._frames_since_s)
-            hangs = frames_come and said is not None and no_sign_s > NO_SIGN_S
+            is_off = kind == "depth" and not flight.dense
+            hangs = frames_come and said is not None and no_sign_s > NO_SIGN_S and not is_off
+            if is_off:
+                detail = "switched off"
             out.append(
                 replace(
                     measured,
