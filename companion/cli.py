@@ -40,9 +40,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.live.nodes import with_stages
+
+    def load() -> Config:
+        config = load_config(arguments.config, arguments.set)
+        return with_stages(config, arguments.stages, arguments.join)
+
+    if "tracking" not in load().distributed.stages:
+        from companion.live.depth_node import run_depth_node
+
+        signals.defer()
+        return run_depth_node(load(), lambda: signals.received is not None)
     from companion.live.daemon import run
 
-    return run(lambda: load_config(arguments.config, arguments.set))
+    return run(load)
 
 
 def _with_telemetry(arguments: argparse.Namespace) -> Config:
@@ -109,6 +120,10 @@ def _export(arguments: argparse.Namespace, signals: StopSignals) -> int:
         raise InputError("nothing to export: --as las,gpx,… says what")
     _export_into(arguments.run, arguments.out or arguments.run, settings)
     return 0
+
+
+def _stages(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _formats(text: str) -> tuple[str, ...]:
@@ -274,10 +289,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    commands.add_parser(
+    run = commands.add_parser(
         "run", parents=[configuration], help="fly: camera, autopilot, map and pose, until stopped",
         description="The daemon on the drone. SIGTERM ends it, SIGHUP has it read its "
-        "configuration again.",
+        "configuration again. With --stages depth,cloud it is a node on another machine, which "
+        "makes the map of a drone that runs --stages tracking.",
+    )  # fmt: skip
+    run.add_argument(
+        "--stages", type=_stages, metavar="LIST",
+        help="what runs here, joined with other nodes over Zenoh: tracking, or depth,cloud, or all",
+    )  # fmt: skip
+    run.add_argument(
+        "--join", action="append", default=[], metavar="ENDPOINT",
+        help="a node to join, as tcp/HOST:7447; can be given again",
     )  # fmt: skip
 
     timing = argparse.ArgumentParser(add_help=False)

@@ -84,6 +84,7 @@ class ZenohBus:
         replies = self._session.get(
             f"{self._prefix}/{topic}", payload=data, timeout=timeout_s,
             priority=self._zenoh.Priority.BACKGROUND,
+            congestion_control=self._zenoh.CongestionControl.BLOCK,
         )  # fmt: skip
         for reply in replies:
             if reply.ok is not None:
@@ -123,8 +124,7 @@ def _settings(config: DistributedConfig) -> dict[str, Any]:
         "connect/endpoints": list(config.connect),
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
-        "connect/retry/period_init_ms": 500,
-        "connect/retry/period_max_ms": 2000,
+        "connect/retry": {"period_init_ms": 500, "period_max_ms": 2000},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,

@@ -99,12 +99,12 @@ class LiveFlight:
         self._last_map: MapUpdate | None = None
         self._told_ns = 0
         self._origin: GeoOrigin | None = None
-        self._dense = config.depth.enabled
+        self._dense = _makes_depth(config)
         self._dense_share = 1.0
         self._began_later: set[str] = set()
         """Stages that were not wanted at first."""
         kinds = ["localisation", "recorder"]
-        kinds += ["tape"] * config.recorder.enabled + ["depth"] * _makes_depth(config)
+        kinds += ["tape"] * config.recorder.enabled + ["depth"] * self._dense
         kinds += ["topics"] * config.distributed.enabled
         self.stages = {kind: self._start(kind) for kind in kinds}
         for kind in kinds:

@@ -57,11 +57,11 @@ class Backlog:
                 self._n_bytes -= len(oldest.data)
                 self.n_given_up += oldest.number > self.fetched
 
-    def after(self, run: str, number: int, now_s: float) -> bytes:
+    def after(self, run: str, number: int, now_s: float, whole: bool = False) -> bytes:
         """What follows bundle `number` of a run, as bytes: a bundle, or `wait` where none may go.
 
-        Where bundles between are gone, the whole map comes first. Another run's number counts for
-        nothing: then the oldest follows.
+        Where bundles between are gone, or with `whole`, the whole map comes first, in a bundle that
+        has the number before. Another run's number counts for nothing: then the oldest follows.
         """
         with self._lock:
             self.fetched_s = now_s
@@ -71,9 +71,9 @@ class Backlog:
             found = next((held for held in self._held if held.number > number), None)
             if found is None or not self._may(now_s):
                 return self._wait()
-            if found.number > number + 1 and self._map is not None:
-                whole = MapChange(_without_points(self._map), (), True)
-                data = Bundle(self._run, found.number - 1, change=whole).pack()
+            if self._map is not None and (whole or found.number > number + 1):
+                change = MapChange(_without_points(self._map), (), True)
+                data = Bundle(self._run, found.number - 1, change=change).pack()
             else:
                 data = found.data
             self._allowed_bytes -= len(data)

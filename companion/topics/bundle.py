@@ -98,7 +98,7 @@ def bundle_of(envelope: Envelope) -> Bundle:
         )  # fmt: skip
         change = MapChange(update, removed, part.flag("whole"))
     return Bundle(
-        envelope.text("run"), envelope.integer("number"), _pictures_of(envelope),
+        envelope.text("run"), envelope.integer("number", -1), _pictures_of(envelope),
         _tracks_of(envelope), _keyframes_of(envelope), change, envelope.flag("over"),
     )  # fmt: skip
 

@@ -1,0 +1,146 @@
+"""A flight whose depth and cloud are made here, while it is flown and tracked elsewhere."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.camera import Camera
+from companion.clock import StageTimes, monotonic_s
+from companion.config import Config
+from companion.config_file import shown, without_passwords
+from companion.depth.opencl import ComputeDevice
+from companion.depth.stage import DepthStage
+from companion.live.journal import WARNING, Journal
+from companion.live.kept_chunks import KeptChunks
+from companion.live.viewing import Viewing
+from companion.messages import DepthMap, MapUpdate, Message, PointChunk
+from companion.output.flight_result import FlightResult, RunFacts
+from companion.output.surroundings import peak_memory_mb, versions
+from companion.output.write import write_results
+from companion.topics.bundle import Bundle, MapMirror, frame_of
+from companion.topics.encoding import cloud_envelope, depth_envelope
+from companion.topics.envelope import Envelope
+from companion.viewer import FileViewer
+
+Publish = Callable[[str, Callable[[], Envelope]], None]
+"""Given a topic, and what makes an envelope of it."""
+MOST_NUMBERS = 200
+"""Keyframes of which it is known with which bundle they came."""
+
+
+class RemoteFlight:
+    """Bundles in; depth maps and points to files, viewers and topics.
+
+    A folder in which there is a cloud of the same flight already is gone on with.
+    """
+
+    def __init__(
+        self, config: Config, flight: str, camera: Camera, device: ComputeDevice, folder: Path,
+        publish: Publish, journal: Journal,
+    ) -> None:  # fmt: skip
+        self.flight, self.camera, self.folder = flight, camera, folder
+        self.n_missed = 0
+        """Bundles that were gone before they could be fetched."""
+        self._config, self._device, self._publish, self._journal = config, device, publish, journal
+        folder.mkdir(parents=True, exist_ok=True)
+        self.kept = KeptChunks(folder)
+        self._times = StageTimes()
+        self._began_s = monotonic_s()
+        self._depth = DepthStage(config.depth, config.cloud, camera, device, self._times)
+        self._result = FlightResult(folder, config.cloud.memory_mb)
+        self._mirror = MapMirror()
+        self._update: MapUpdate | None = None
+        self._numbers: OrderedDict[int, tuple[str, int]] = OrderedDict()
+        self._recording = FileViewer(config.viewer, camera, _free(folder))
+        self._recording.__enter__()
+        self._viewing: Viewing | None = None
+        if config.stream.listen or config.daemon.viewer != "none":
+            self._viewing = Viewing(config, camera, flight, self._warn)
+        for kept in self.kept.found:
+            self._show(kept.chunk)
+
+    @property
+    def n_points(self) -> int:
+        """Points so far."""
+        return self._result.n_points
+
+    @property
+    def n_depth_maps(self) -> int:
+        """Depth maps made by this process."""
+        return self._result.n_depth_maps
+
+    def take(self, bundle: Bundle) -> None:
+        """Work on a bundle. StreamError for pictures that are none; the rest of it counts."""
+        for keyframe in bundle.keyframes:
+            self._numbers[keyframe.keyframe_id] = (bundle.run, bundle.number)
+        while len(self._numbers) > MOST_NUMBERS:
+            self._numbers.popitem(last=False)
+        frames = [frame_of(picture, self.camera) for picture in bundle.pictures]
+        for picture, frame in zip(bundle.pictures, frames, strict=True):
+            self._step(frame)
+            self._result.take(frame)
+            if picture.in_colour:
+                self._look(frame)
+        told: list[Message] = [*bundle.tracks, *bundle.keyframes]
+        for message in told:
+            self._step(message)
+            self._show(message)
+        if bundle.change is not None:
+            self._update = self._mirror.take(bundle.change)
+            self._show(self._update)
+            self._step(self._update)
+
+    def close(self, hurry: bool) -> None:
+        """Make what is still open, and write all results; the page not in a hurry."""
+        for out in self._depth.flush():
+            self._give(out)
+        self.kept.close()
+        self._recording.__exit__(None, None, None)
+        if self._viewing is not None:
+            self._viewing.close(hurry)
+        facts = RunFacts(
+            stage_times=self._times.summary(), wall_s=monotonic_s() - self._began_s, clock=None,
+            origin=None, device=self._device.described, config=shown(self._config),
+            versions=versions(), command=without_passwords(shlex.join(sys.argv)),
+            peak_memory_mb=peak_memory_mb(), camera=self.camera,
+            n_frames_total=self._result.n_frames, completed=True,
+            dropped={"bundles": self.n_missed},
+        )  # fmt: skip
+        write_results(self.folder, self._result, facts, self._config.cloud.voxel_m, page=not hurry)
+        self._result.close()
+
+    def _step(self, message: Message) -> None:
+        for out in self._depth.step(message):
+            self._give(out)
+
+    def _give(self, message: Message) -> None:
+        if isinstance(message, PointChunk):
+            run, number = self._numbers.get(message.keyframe_id, ("", -1))
+            if not self.kept.put(self.flight, message, run, number):
+                return
+            self._publish("cloud", lambda: cloud_envelope(self.flight, message, self._update))
+        elif isinstance(message, DepthMap):
+            self._publish("depth", lambda: depth_envelope(self.flight, message, self._update))
+        self._show(message)
+
+    def _show(self, message: Message) -> None:
+        self._result.take(message)
+        self._look(message)
+
+    def _look(self, message: Message) -> None:
+        self._recording.take(message)
+        if self._viewing is not None:
+            self._viewing.take(message)
+
+    def _warn(self, what: str, detail: str) -> None:
+        self._journal.say(f"warning: {what}: {detail}", WARNING)
+
+
+def _free(folder: Path) -> Path:
+    """A recording that does not exist yet."""
+    names = ["flight.rrd", *(f"flight-{n}.rrd" for n in range(2, 1000))]
+    return next(folder / name for name in names if not (folder / name).exists())

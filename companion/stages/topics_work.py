@@ -1,0 +1,153 @@
+"""What nodes elsewhere and other programs are told of a flight, as a process: topics over Zenoh.
+
+The flight's other stages neither wait for this one nor miss it.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
+
+from companion.clock import monotonic_s, wait_s
+from companion.errors import StageError, StreamError
+from companion.messages import (
+    DepthMap,
+    Frame,
+    KeyframeAdded,
+    MapUpdate,
+    Message,
+    Odometry,
+    PointChunk,
+    Track,
+    Warned,
+)
+from companion.stages.protocol import Finish, Setup
+from companion.stages.work import Work
+from companion.topics.backlog import Backlog
+from companion.topics.bundle import Bundle
+from companion.topics.camera_fields import camera_fields
+from companion.topics.encoding import (
+    cloud_envelope,
+    depth_envelope,
+    keyframe_envelope,
+    map_envelope,
+    pose_envelope,
+)
+from companion.topics.envelope import Envelope, unpack
+from companion.topics.gatherer import Gatherer
+from drivers.zenoh_bus import LAST, URGENT, USUAL, ZenohBus
+
+TOPICS = {"pose": URGENT, "keyframe": USUAL, "map": USUAL, "depth": LAST, "cloud": LAST}
+BYTES_S_PER_KBIT_S = 125.0
+NEW_SHARE = 0.75
+"""Of the budget for what is new; the rest is for making up what was missed."""
+GONE_S = 5.0
+LINGER_S = 10.0
+"""After a flight so long for who still fetches it."""
+STEP_S = 0.1
+TAKEN, NOT_TAKEN = "a node elsewhere makes the depth", "no node elsewhere makes depth any more"
+
+
+class _Topics(Work):
+    def __init__(self, setup: Setup) -> None:
+        super().__init__()
+        if setup.folder is None:
+            raise StageError("topics need the name of the flight")
+        config = setup.config.distributed
+        bytes_s = BYTES_S_PER_KBIT_S * config.budget_kbit_s
+        self._flight, self._run = setup.folder.name, os.urandom(8).hex()
+        self._gatherer = Gatherer(self._run, NEW_SHARE * bytes_s, config.jpeg_quality)
+        self._backlog = Backlog(self._run, config.backlog_mb << 20, bytes_s)
+        self._update: MapUpdate | None = None
+        self._is_fetched = False
+        self._about = Envelope(
+            "flight",
+            {"flight": self._flight, "run": self._run, "camera": camera_fields(setup.camera)},
+            {},
+        ).pack()
+        self._bus = ZenohBus(config)
+        for topic, priority in TOPICS.items():
+            self._bus.announce(topic, priority)
+        self._bus.serve("flight", lambda asked: self._about)
+        self._bus.serve("map", lambda asked: self._map())
+        self._bus.serve("depth_input", self._depth_input)
+        self.device = "nobody fetches"
+
+    @property
+    def n_turned_away(self) -> int:
+        """Frames that the budget had no room for, and bundles that nobody came for in time."""
+        return self._gatherer.n_dropped + self._backlog.n_given_up
+
+    def step(self, message: Any) -> Iterable[Message]:
+        if isinstance(message, (Frame, Track, KeyframeAdded, MapUpdate)):
+            if isinstance(message, MapUpdate):
+                self._update = message
+            with self.times("topics"):
+                bundle = self._gatherer.take(message)
+                if bundle is not None:
+                    self._take_bundle(bundle)
+        if isinstance(message, Odometry):
+            self._publish("pose", partial(pose_envelope, self._flight, message))
+        elif isinstance(message, DepthMap):
+            self._publish("depth", partial(depth_envelope, self._flight, message, self._update))
+        elif isinstance(message, PointChunk):
+            self._publish("cloud", partial(cloud_envelope, self._flight, message, self._update))
+        return self._changes(message.t_ns) if isinstance(message, Frame) else []
+
+    def finish(self, finish: Finish) -> Iterable[Message]:
+        self._take_bundle(self._gatherer.last())
+        until_s = monotonic_s() + (0.0 if finish.hurry else LINGER_S)
+        while self._fetches() and self._backlog.fetched < self._backlog.newest:
+            if monotonic_s() > until_s:
+                break
+            wait_s(threading.Event(), STEP_S)
+        self._bus.close()
+        return []
+
+    def _take_bundle(self, bundle: Bundle) -> None:
+        self._backlog.put(bundle, self._update)
+        update = self._update
+        for keyframe in bundle.keyframes:
+            jpeg = self._gatherer.keyframe_jpegs.get(keyframe.keyframe_id)
+            if jpeg is not None:
+                made = partial(keyframe_envelope, self._flight, keyframe, update, jpeg)
+                self._publish("keyframe", made)
+        if bundle.change is not None and update is not None:
+            self._publish("map", partial(map_envelope, self._flight, update))
+
+    def _publish(self, topic: str, envelope: Callable[[], Envelope]) -> None:
+        """Send what somebody has subscribed to; else it is not even made."""
+        if self._bus.is_wanted(topic):
+            self._bus.publish(topic, envelope().pack())
+
+    def _map(self) -> bytes | None:
+        update = self._update
+        return map_envelope(self._flight, update).pack() if update is not None else None
+
+    def _depth_input(self, asked: bytes) -> bytes | None:
+        """Called in a thread of the bus; what cannot be read gets no answer."""
+        try:
+            request = unpack(asked)
+            run, after = request.text("run"), request.integer("after", -1)
+            whole = request.flag("whole")
+        except StreamError:
+            return None
+        return self._backlog.after(run, after, monotonic_s(), whole)
+
+    def _fetches(self) -> bool:
+        return monotonic_s() - self._backlog.fetched_s < GONE_S
+
+    def _changes(self, t_ns: int) -> Iterator[Message]:
+        fetches = self._fetches()
+        if fetches != self._is_fetched:
+            self._is_fetched = fetches
+            self.device = "fetched" if fetches else "nobody fetches"
+            yield Warned(t_ns, TAKEN if fetches else NOT_TAKEN, good=fetches)
+
+
+def work(setup: Setup) -> Work:
+    """The stage that a setup asks for."""
+    return _Topics(setup)
