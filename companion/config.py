@@ -284,7 +284,7 @@ class MappingConfig:
     iterations: Annotated[int, Range(1, 100)] = 6
     final_iterations: Annotated[int, Range(1, 100)] = 8
     """Of the adjustment of the whole map when the flight is over."""
-    keyframe_spacing_deg: Annotated[float, Range(0, 45)] = 2.0
+    keyframe_spacing_deg: Annotated[float, Range(0, 45)] = 1.0
     """One that is nearer to another, seen from its points, goes if three show the same; 0: none."""
 
 

@@ -114,7 +114,8 @@ class Atlas:
     def extend(self, segment: SlamMap, keyframe: Keyframe) -> Reunited | None:
         """Take a keyframe into a map, and whatever it shows to be the same place."""
         mapper = self.mapper_of(segment)
-        mapper.add(keyframe)
+        for gone in mapper.add(keyframe):
+            self._places.remove(gone)
         self._resting -= 1
         found = None
         if self._resting <= 0 and len(segment.keyframes) > MAX_YOUNG_KEYFRAMES:

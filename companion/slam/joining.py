@@ -26,6 +26,9 @@ def weld(here: SlamMap, there: SlamMap, here_from_there: Similarity) -> None:
         keyframe.point_ids = np.where(keyframe.point_ids >= 0, keyframe.point_ids + offset, -1)
         here.keyframes[key] = keyframe
         here.unit_of[key] = there.unit_of.get(key, 1.0) * here_from_there.scale
+    for key, retired in there.retired.items():
+        here.retired[key] = retired.scaled(here_from_there.scale)
+        here.unit_of[key] = there.unit_of.get(key, 1.0) * here_from_there.scale
     here.level = here.level and there.level
     ordered = sorted(here.keyframes.items())
     here.keyframes.clear()
@@ -81,6 +84,7 @@ def _move(
     homes = _homes(slam_map, np.array(keys))
     n = slam_map.n_points
     scales: Array = np.ones(n)
+    index = {key: place for place, key in enumerate(keys)}
     for place, (key, old, new) in enumerate(zip(keys, before, after, strict=True)):
         moved = new @ old.inverse()
         keyframe = slam_map.keyframes[key]
@@ -90,11 +94,21 @@ def _move(
         slam_map.positions[own] = moved.apply(slam_map.positions[own])
         slam_map.normals[own] = slam_map.normals[own] @ moved.rotation.T
         scales[own] = moved.scale
+    for key, retired in slam_map.retired.items():
+        scale = after[index[retired.beside_id]].scale
+        slam_map.retired[key] = retired.scaled(scale)
+        slam_map.unit_of[key] = slam_map.unit_of.get(key, 1.0) * scale
     slam_map.base_distance[:n] *= scales
     slam_map.poses_changed()
 
 
 def _homes(slam_map: SlamMap, keys: Ints) -> Ints:
-    """Place in `keys` of the keyframe that each point moves with: the one it was first seen by."""
-    first = slam_map.first_seen[: slam_map.n_points]
+    """Place in `keys` of the keyframe that each point moves with: the one it was first seen by.
+
+    Or, where that went, the one beside it.
+    """
+    seen, which = np.unique(slam_map.first_seen[: slam_map.n_points], return_inverse=True)
+    retired = slam_map.retired
+    stays = [retired[k].beside_id if k in retired else k for k in seen.tolist()]
+    first = np.array(stays, np.int64)[which]
     return np.asarray(np.clip(np.searchsorted(keys, first), 0, len(keys) - 1), np.int64)

@@ -1,7 +1,7 @@
 """The sparse map: keyframes, points, and who sees what. One owner, no locks.
 
 Points live in growing arrays so that a frame's work is a few vector operations; a point's index is
-its identity for as long as it lives and is not used again.
+its identity for as long as it lives, and is not used again before nobody can still know of it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,10 @@ from companion.slam.features import Bools, Features, Ints
 from companion.slam.patches import STORED, Patches, cut, level_of
 
 RING = 8
+REST_KEYFRAMES = 40
+"""The index of a point that died is not used again for at least as many."""
+MANY_POINTS = 60_000
+"""Arrays shorter than this cost nothing: they may as well grow."""
 CANDIDATES = 60
 ARRAYS = (
     "observers", "positions", "alive", "descriptors", "normals", "base_distance", "n_visible",
@@ -49,6 +53,19 @@ class Keyframe:
         return out
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Retired:
+    """Where a keyframe that went is: beside one that stayed, in map units."""
+
+    beside_id: int
+    beside_from_camera: Pose
+
+    def scaled(self, scale: float) -> Retired:
+        """The same where the map's unit is another."""
+        pose = self.beside_from_camera
+        return Retired(self.beside_id, Pose(pose.rotation, scale * pose.translation))
+
+
 @dataclass(slots=True, eq=False)
 class SlamMap:
     """All keyframes and points. Arrays are over-allocated; `n_points` of each are in use."""
@@ -61,6 +78,8 @@ class SlamMap:
     """Whether the z axis is known to point down."""
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     """In order of their ids."""
+    retired: dict[int, Retired] = field(default_factory=dict)
+    """Keyframes that went, by their ids; frames and parts of the cloud may still hang on them."""
     unit_of: dict[int, float] = field(default_factory=dict)
     """Map units to one unit of what was said of a keyframe when it was made, where not 1."""
     n_points: int = 0
@@ -91,6 +110,10 @@ class SlamMap:
     patch_grey: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
     _free: list[int] = field(default_factory=list)
     """places of patches whose points have died"""
+    _free_ids: list[int] = field(default_factory=list)
+    """indices to use again, the lowest last"""
+    _resting_ids: list[int] = field(default_factory=list)
+    _rests: int = 0
 
     def _reserve(self, n: int) -> None:
         size = len(self.alive)
@@ -111,8 +134,12 @@ class SlamMap:
         Returns their ids; observations are added apart.
         """
         seen = keyframe.features
-        ids = np.arange(self.n_points, self.n_points + len(positions))
-        self._reserve(self.n_points + len(positions))
+        again = [self._free_ids.pop() for _ in range(min(len(positions), len(self._free_ids)))]
+        n_more = len(positions) - len(again)
+        fresh = np.arange(self.n_points, self.n_points + n_more)
+        ids: Ints = np.concatenate([np.array(again, np.int64), fresh])
+        self._reserve(self.n_points + n_more)
+        self.n_observers[ids] = 0
         self.positions[ids] = positions
         self.descriptors[ids] = seen.descriptors[features]
         self.alive[ids] = True
@@ -129,7 +156,7 @@ class SlamMap:
         self._store(ids, patches.grey)
         self.patch_centre[ids] = patches.centre
         self.patch_level[ids] = patches.level
-        self.n_points += len(positions)
+        self.n_points += n_more
         return ids
 
     def _store(self, ids: Ints, grey: Bytes) -> None:
@@ -150,6 +177,22 @@ class SlamMap:
         dead = np.flatnonzero(~self.alive[: self.n_points] & (self.patch_at[: self.n_points] >= 0))
         self._free += self.patch_at[dead].tolist()
         self.patch_at[dead] = self.patch_level[dead] = -1
+
+    def reclaim(self) -> None:
+        """Let indices of points that died long ago be used again; called for each keyframe."""
+        self._rests += 1
+        if self._rests < REST_KEYFRAMES or self.n_points < MANY_POINTS:
+            return
+        self._rests = 0
+        n = self.n_points
+        known = self.alive[:n].copy()
+        known[self._free_ids + self._resting_ids] = True
+        dead = np.r_[~known, False]
+        for keyframe in self.keyframes.values():
+            for ids in (keyframe.point_ids, keyframe.refined_for):
+                ids[dead[ids]] = -1
+        self._free_ids = sorted(self._free_ids + self._resting_ids, reverse=True)
+        self._resting_ids = np.flatnonzero(~known).tolist()
 
     def take_points(self, other: SlamMap, own_from_other: Similarity) -> int:
         """Take all points of another map; returns what their ids grow by."""
@@ -242,6 +285,17 @@ class SlamMap:
         near = [self.keyframes[k] for k in keys[order].tolist() if k in self.keyframes]
         counts = [(int(np.count_nonzero(mask[k.point_ids])), k.keyframe_id) for k in near]
         return sorted((c for c in counts if c[0] >= minimum), key=lambda c: (-c[0], c[1]))
+
+    def pose_of(self, keyframe_id: int) -> Pose | None:
+        """`camera_from_map` of a keyframe, be it one that went; None where there is no such."""
+        keyframe = self.keyframes.get(keyframe_id)
+        if keyframe is not None:
+            return keyframe.camera_from_map
+        retired = self.retired.get(keyframe_id)
+        if retired is None:
+            return None
+        beside = self.keyframes[retired.beside_id].camera_from_map
+        return retired.beside_from_camera.inverse() @ beside
 
     def poses_changed(self) -> None:
         """Tell the map that keyframes have come or moved."""

@@ -10,6 +10,7 @@ from companion.camera import Camera
 from companion.config import MappingConfig
 from companion.messages import Floats
 from companion.slam.bundle import Bundle, adjust
+from companion.slam.culling import cull_keyframes
 from companion.slam.features import Bools, Ints
 from companion.slam.local_map import Projector
 from companion.slam.map import Keyframe, SlamMap
@@ -38,8 +39,8 @@ class Mapper:
         self._map = slam_map
         self._projector = Projector(camera)
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Take a keyframe, whose tracked points are set, into the map."""
+    def add(self, keyframe: Keyframe) -> list[int]:
+        """Take a keyframe, whose tracked points are set, into the map; which ones went for it."""
         slam_map = self._map
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
         slam_map.poses_changed()
@@ -58,6 +59,9 @@ class Mapper:
         self._refine([keyframe, *neighbours])
         self.adjust_locally(keyframe)
         self._cull(keyframe)
+        slam_map.reclaim()
+        self._turn.give_way()
+        return cull_keyframes(slam_map, keyframe, self._config.keyframe_spacing_deg)
 
     def _refine(self, keyframes: list[Keyframe]) -> None:
         """Make positions finer that were not yet, by the points' patches."""

@@ -46,28 +46,50 @@ class PlaceIndex:
 
     def __init__(self) -> None:
         self._keys: list[int] = []
+        """-1 where one was removed and none has come in its place"""
+        self._block_of: list[_Block] = []
         self._blocks: list[_Block] = []
+        self._free: list[int] = []
 
     def __len__(self) -> int:
-        return len(self._keys)
+        return len(self._keys) - len(self._free)
 
     def add(self, key: int, descriptors: Bytes) -> None:
         """Take a keyframe's descriptors (N, 32)."""
-        if not self._blocks or self._blocks[-1].n_keys == BLOCK:
-            self._blocks.append(_Block())
-        block, words = self._blocks[-1], words_of(descriptors)
+        block = next((b for b in self._blocks if b.n_keys < BLOCK), None)
+        if block is None:
+            block = _Block()
+            self._blocks.append(block)
+        if self._free:
+            place = self._free.pop()
+            self._keys[place], self._block_of[place] = key, block
+        else:
+            place = len(self._keys)
+            self._keys.append(key)
+            self._block_of.append(block)
+        words = words_of(descriptors)
         at = np.searchsorted(block.words, words)
         block.words = np.insert(block.words, at, words)
-        block.owners = np.insert(block.owners, at, np.full(len(words), len(self._keys)))
+        block.owners = np.insert(block.owners, at, np.full(len(words), place))
         block.n_keys += 1
-        self._keys.append(key)
+
+    def remove(self, key: int) -> None:
+        """Forget a keyframe."""
+        place = self._keys.index(key)
+        block = self._block_of[place]
+        others = block.owners != place
+        block.words, block.owners = block.words[others], block.owners[others]
+        block.n_keys -= 1
+        self._keys[place] = -1
+        self._free.append(place)
 
     def alike(self, descriptors: Bytes, n: int, but: set[int] | None = None) -> list[int]:
         """At most `n` keys that stand out as like these descriptors, the likest first.
 
         Keys in `but` are not among them.
         """
-        scores = self._scores(words_of(descriptors))
+        keys = np.array(self._keys, np.int64)
+        scores, keys = self._scores(words_of(descriptors))[keys >= 0], keys[keys >= 0]
         if not len(scores):
             return []
         usual = float(np.median(scores))
@@ -75,9 +97,9 @@ class PlaceIndex:
         order = np.argsort(-scores, kind="stable")
         stands_out = scores[order] > usual + 2.0 * spread if len(scores) > 20 else scores[order] > 0
         out: list[int] = []
-        for place in order[stands_out].tolist():
-            if but is None or self._keys[place] not in but:
-                out.append(self._keys[place])
+        for key in keys[order[stands_out]].tolist():
+            if but is None or key not in but:
+                out.append(key)
             if len(out) == n:
                 break
         return out
@@ -98,7 +120,7 @@ class PlaceIndex:
             )
         if not found:
             return np.zeros(0)
-        rarity = np.log1p(len(self._keys) / (1.0 + sizes))
+        rarity = np.log1p(len(self) / (1.0 + sizes))
         which = np.concatenate([f[0] for f in found])
         owners = np.concatenate([f[1] for f in found])
         return np.asarray(np.bincount(owners, rarity[which], len(self._keys)), np.float64)

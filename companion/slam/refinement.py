@@ -47,13 +47,13 @@ def _warps(slam_map: SlamMap, camera_from_map: Pose, points: Ints, jacobian: Arr
     first_ids, which = np.unique(slam_map.first_seen[points], return_inverse=True)
     out = np.full((len(points), 2, 2), np.nan)
     for k, first_id in enumerate(first_ids.tolist()):
-        first = slam_map.keyframes.get(first_id)
+        first = slam_map.pose_of(first_id)
         if first is None:
             continue
         here = np.flatnonzero(which == k)
         ids = points[here]
-        depth = first.camera_from_map.apply(slam_map.positions[ids])[:, 2]
-        turn = camera_from_map.rotation @ first.camera_from_map.rotation.T
+        depth = first.apply(slam_map.positions[ids])[:, 2]
+        turn = camera_from_map.rotation @ first.rotation.T
         seen = camera_from_map.apply(slam_map.positions[ids])
         z = np.where(np.abs(seen[:, 2]) < 1e-9, 1e-9, seen[:, 2])
         # of a plane through the point, facing the first view

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -63,11 +65,12 @@ def flown(place: Array, yaw_rad: float = 0.0) -> Pose:
 
 def mapped(
     ground: Ground, path: list[Pose], map_from_world: Similarity, first_id: int = 0,
-    memory: int = 1000,
+    memory: int = 1000, after_each: Callable[[SlamMap, Keyframe], object] = lambda m, k: None,
 ) -> SlamMap:  # fmt: skip
     """The map that cameras along a path would make, with its own axes and unit.
 
-    A point that so many keyframes ago was seen first is not known again.
+    A point that so many keyframes ago was seen first is not known again. `after_each` may look at
+    the map when a keyframe has come.
     """
     slam_map = SlamMap(SCALE_FACTOR, N_LEVELS, level=True)
     slam_map.first_keyframe_id = first_id
@@ -82,7 +85,10 @@ def mapped(
             np.full(len(features), -1),
         )  # fmt: skip
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
-        known = {i: p for i, p in known.items() if slam_map.born[p] >= first_id + k - memory}
+        oldest = first_id + k - memory
+        known = {
+            i: p for i, p in known.items() if slam_map.born[p] >= oldest and slam_map.alive[p]
+        }
         fresh = np.array([i not in known for i in index.tolist()])
         new = np.flatnonzero(fresh)
         ids = slam_map.add_points(
@@ -92,4 +98,6 @@ def mapped(
         points = np.array([known[i] for i in index.tolist()])
         slam_map.observe(keyframe, np.arange(len(features)), points)
         slam_map.refresh(points, [keyframe])
+        slam_map.poses_changed()
+        after_each(slam_map, keyframe)
     return slam_map
