@@ -194,7 +194,7 @@ def _row(
         max((o.reset_counter for o in listener.odometry), default=0),
         _longest_gap_s(due, known),
         sum(o.state is TrackState.COASTING for o in listener.odometry),
-        len(update.map_from_camera) if update is not None else 0, stage.n_segments, stage.n_loops,
+        update.n_keyframes if update is not None else 0, stage.n_segments, stage.n_loops,
         found.method if found is not None else "none",
         round(float(np.median(cost.frame_ms)), 2),
         round(float(np.percentile(cost.frame_ms, 95)), 2),
