@@ -18,7 +18,7 @@ from companion.slam.patches import STORED, Patches, cut, level_of
 RING = 8
 REST_KEYFRAMES = 40
 """The index of a point that died is not used again for at least as many."""
-MANY_POINTS = 60_000
+MANY_POINTS = 200_000
 """Arrays shorter than this cost nothing: they may as well grow."""
 CANDIDATES = 60
 ARRAYS = (
