@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from companion import __version__, cli_recordings
+from companion import __version__, cli_recordings, cli_service
 from companion.config import Config, ExportConfig
 from companion.config_file import load_config, to_toml
 from companion.errors import CompanionError, InputError
@@ -91,7 +91,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         viewer=arguments.viewer,
         paced=arguments.paced,
         progress=signals.between_frames(progress_on(sys.stderr)),
-        told=lambda remark: print(f"telemetry: {remark}"),
+        told=print,
     )
     if config.export.formats:
         _export_into(arguments.out, arguments.out, config.export)
@@ -269,6 +269,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StopSignals], int]] = {
     "bench": _bench,
     "check-config": _check_config,
     **cli_recordings.COMMANDS,
+    **cli_service.COMMANDS,
 }
 
 
@@ -477,6 +478,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     cli_recordings.add_parsers(commands, configuration, _seconds)
+    cli_service.add_parsers(commands)
     dense = benches.add_parser(
         "depth", parents=[configuration, as_json], help="time and accuracy of dense depth",
         description="Reconstruct one reference of a data set with true depth, its range taken from "

@@ -47,7 +47,7 @@ def replay(
 ) -> FlightResult:
     """Replay a flight into the folder `out`; InputError when it cannot begin.
 
-    `told` hears of how the telemetry was read.
+    `told` hears how the telemetry was read, and where a viewer shows it.
 
     What was done so far is written also when it is interrupted or fails on the way.
     """
@@ -55,7 +55,7 @@ def replay(
     start_ns, stop_ns = _span(flight, start_s, stop_s)
     log = flight.telemetry()
     for remark in log.remarks:
-        told(remark)
+        told(f"telemetry: {remark}")
     device = choose_device(config.opencl, monotonic_s) if config.depth.enabled else None
     out.mkdir(parents=True, exist_ok=True)
     times = StageTimes()
@@ -75,6 +75,8 @@ def replay(
                 LiveViewer(config.viewer, flight.camera, viewer, origin=log.origin)
             )
             sinks.append(live)
+            if live.page:
+                told(f"viewer: open {live.page}")
         depth = _depth_stage(config, flight, device, times)
         pipeline = Pipeline(
             LocalisationStage(config, flight.camera, times, beside=paced), depth, sinks,

@@ -357,8 +357,8 @@ class LiveFlight:
         if self._viewing is not None:
             self._viewing.take(message)
 
-    def _warn(self, what: str, detail: str) -> None:
-        warning = Warned(self._clock.now_ns(), what, detail)
+    def _warn(self, what: str, detail: str, good: bool = False) -> None:
+        warning = Warned(self._clock.now_ns(), what, detail, good)
         self._listener.warned(warning)
 
     def dropped(self) -> dict[str, int]:

@@ -136,8 +136,11 @@ class RemoteFlight:
         if self._viewing is not None:
             self._viewing.take(message)
 
-    def _warn(self, what: str, detail: str) -> None:
-        self._journal.say(f"warning: {what}: {detail}", WARNING)
+    def _warn(self, what: str, detail: str, good: bool) -> None:
+        if good:
+            self._journal.say(f"{what}: {detail}")
+        else:
+            self._journal.say(f"warning: {what}: {detail}", WARNING)
 
 
 def _free(folder: Path) -> Path:

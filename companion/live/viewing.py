@@ -24,6 +24,7 @@ PATIENCE_S, HURRIED_S = 3.0, 0.2
 MANY = 50
 """So many messages given up between two looks are an exporter that hangs."""
 NOWHERE = "none"
+SHOWN = "the flight can be seen"
 NO_VIEWER = "the viewer cannot be shown"
 GONE = "the viewer has gone"
 BEHIND = "the viewer does not keep up"
@@ -31,10 +32,13 @@ CLOSED = "viewers cannot connect"
 
 
 class Viewing:
-    """Exports to `stream.listen` and keeps `daemon.viewer` shown until `close`."""
+    """Exports to `stream.listen` and keeps `daemon.viewer` shown until `close`.
+
+    `warn` takes what, a detail, and whether it is good.
+    """
 
     def __init__(
-        self, config: Config, camera: Camera, name: str, warn: Callable[[str, str], None]
+        self, config: Config, camera: Camera, name: str, warn: Callable[[str, str, bool], None]
     ) -> None:
         self._config, self._camera, self._name, self._warn = config, camera, name, warn
         self._stream = config.stream
@@ -127,6 +131,8 @@ class Viewing:
             self._tell(NO_VIEWER, str(error))
             return AGAIN_S
         self._was_shown, self._told = True, ""
+        if self._viewer.page:
+            self._warn(SHOWN, f"open {self._viewer.page}", True)
         return LOOK_S
 
     def _look(self) -> None:
@@ -146,4 +152,4 @@ class Viewing:
         """Say it, but not again as long as nothing else is to be said."""
         if what != self._told:
             self._told = what
-            self._warn(what, detail)
+            self._warn(what, detail, False)

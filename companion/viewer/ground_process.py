@@ -29,7 +29,7 @@ def main() -> int:
     except InputError as error:
         _say(str(error).encode() + b"\n")
         return 1
-    _say(READY)
+    _say(READY + b" " + screen.page.encode() + b"\n")
     link = GroundLink(LOOPBACK, port, lambda text: None, again=False)
     show(link, screen, colours, threading.Event())
     screen.close()

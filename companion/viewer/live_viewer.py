@@ -29,7 +29,8 @@ from companion.viewer.reduced import SHOWN, reduced
 ROOM_BYTES = 32 << 20
 PATIENCE_S = 3.0
 START_S = 30.0
-READY = b"ready\n"
+READY = b"ready"
+"""Said by what shows it here, and what to open in a browser if that is to be done."""
 EXPORTER, GROUND = "companion.stream.export_process", "companion.viewer.ground_process"
 NOWHERE = "none"
 FRAME_EVERY_NS = 60_000_000
@@ -52,6 +53,8 @@ class LiveViewer:
         """What the exporter last said of itself."""
         self.closed = ""
         """Why nobody can connect, if so."""
+        self.page = ""
+        """What to open in a browser; "" for a window."""
         self._config, self._width = config, min(config.image_width, camera.width)
         self._inbox = Inbox(ROOM_BYTES)
         self._budget: SetBudget | None = None
@@ -105,13 +108,14 @@ class LiveViewer:
         child = _child(GROUND, where, str(self._port), self._config.colours, self._bind)
         assert child.stdout is not None
         answer = child.stdout.readline()
-        if answer != READY:
+        ready, _, page = answer.partition(b" ")
+        if ready != READY:
             _end(child)
             said = answer.decode(errors="replace").strip() or "its process ended"
             raise InputError(f"--viewer {where}: {said}")
         if self._ground is not None:
             _end(self._ground)
-        self._ground = child
+        self._ground, self.page = child, page.decode().strip()
 
     @property
     def pid(self) -> int:

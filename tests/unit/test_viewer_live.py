@@ -144,6 +144,7 @@ def test_the_web_viewer_listens_on_loopback_only_and_ends_with_the_flight() -> N
     with LiveViewer(ViewerConfig(), CAMERA, "web") as viewer:
         for seq in range(8):
             viewer.take(image(seq))
+        assert viewer.page.startswith(f"http://127.0.0.1:{WEB_PORT}/?url=")
         with pytest.raises(InputError, match=f"port {GRPC_PORT} is taken"):
             LiveViewer(ViewerConfig(), CAMERA, "web")
         listening = {
