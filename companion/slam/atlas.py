@@ -38,8 +38,8 @@ Allowed = Callable[[Keyframe, Keyframe, Reunion], bool]
 class Atlas:
     """Owns the maps. The last of `segments` is in use; keyframe ids are unique among all.
 
-    With `beside` keyframes come while a reunion is worked in: the whole map is then left to be
-    adjusted when the flight is over.
+    With `beside` keyframes come while a reunion is worked in: the whole map is then adjusted when
+    there is time, by `catch_up`.
     """
 
     def __init__(
@@ -53,6 +53,7 @@ class Atlas:
         self._places = PlaceIndex()
         self._finder = ReunionFinder(self._places, self._relocalizer)
         self._resting = 0
+        self._due: SlamMap | None = None
         self.segments: list[SlamMap] = []
         self.allowed: Allowed = lambda keyframe, other, reunion: True
         """What is known beside the images has a say in whether a reunion is believed."""
@@ -148,11 +149,23 @@ class Atlas:
         mapper.unite(keyframe, other, seen_there)
         if self._beside:
             mapper.adjust_locally(other)
+            self._due = segment if not same or moved else self._due
         elif not same or moved:
             mapper.adjust_all(LOOP_ITERATIONS)
         return Reunited(
             keyframe.t_ns, keyframe.keyframe_id, other.keyframe_id, same, moved, tie.scale
         )
+
+    def catch_up(self, meanwhile: Callable[[], None]) -> None:
+        """Adjust all of a map in which a loop was closed, while it goes on; see `Spare`."""
+        while self._due is not None:
+            segment, self._due = self._due, None
+            n_loops = self.n_loops
+
+            def still(segment: SlamMap = segment, n_loops: int = n_loops) -> bool:
+                return self.n_loops == n_loops and segment in self.segments
+
+            self.mapper_of(segment).adjust_all_later(LOOP_ITERATIONS, meanwhile, still)
 
     def _believed(self, found: Reunion, same: bool) -> bool:
         if same and not _drift_explains(found):

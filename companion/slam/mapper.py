@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import islice
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from companion.camera import Camera
 from companion.config import MappingConfig
 from companion.messages import Floats
-from companion.slam.bundle import Bundle, adjust
+from companion.slam.bundle import adjust
 from companion.slam.culling import cull_keyframes
 from companion.slam.features import Bools, Ints
 from companion.slam.local_map import Projector
@@ -18,12 +19,11 @@ from companion.slam.matching import match_epipolar
 from companion.slam.patches import image_levels
 from companion.slam.refinement import refine_features
 from companion.slam.triangulation import consistent, triangulate
+from companion.slam.whole_map import parts_of, put_back, put_back_later, take
 from companion.slam.worker import MapTurn
 
 MIN_PARALLAX_RAD = np.radians(0.8)
 N_NEIGHBOURS = 8
-MOST_TOGETHER, MOST_HOLDING = 500, 80
-"""Keyframes adjusted at once, for which memory grows with the square, and those that hold them."""
 IMAGES_KEPT = 100
 """Images of older keyframes are let go; what they show is then only as fine as its corners are."""
 
@@ -233,29 +233,34 @@ class Mapper:
         self._adjust(variable, fixed, mask)
 
     def adjust_all(self, iterations: int) -> None:
-        """Adjust every keyframe and point; the first two keyframes hold the gauge.
+        """Adjust every keyframe and point, a long flight part by part."""
+        for variable, fixed, mask in parts_of(self._map):
+            self._adjust(variable, fixed, mask, iterations)
 
-        A long flight is adjusted part by part, each held by the keyframes around it.
+    def adjust_all_later(
+        self, iterations: int, meanwhile: Callable[[], None], still: Callable[[], bool]
+    ) -> None:
+        """Adjust every keyframe and point while the map goes on; comes without the map in hand.
+
+        `meanwhile` is called every few milliseconds, and may change the map; what was adjusted is
+        put back where `still` holds.
         """
-        slam_map = self._map
-        ordered = sorted(slam_map.keyframes.values(), key=lambda k: k.keyframe_id)
-        if len(ordered) < 3:
-            return
-        if len(ordered) <= MOST_TOGETHER:
-            mask = slam_map.alive[: slam_map.n_points].copy()
-            self._adjust(ordered[2:], ordered[:2], mask, iterations)
-            return
-        for start in range(2, len(ordered), MOST_TOGETHER // 2):
-            part = ordered[start : start + MOST_TOGETHER]
-            mask = np.zeros(slam_map.n_points, bool)
-            for k in part:
-                mask[slam_map.seen_by(k)[1]] = True
-            inside = {k.keyframe_id for k in part}
-            rest = [k for k in ordered if k.keyframe_id not in inside]
-            shared = [int(np.count_nonzero(mask[slam_map.seen_by(k)[1]])) for k in rest]
-            order = np.argsort(-np.array(shared), kind="stable")[:MOST_HOLDING]
-            holding = [rest[int(i)] for i in np.sort(order) if shared[int(i)] >= 3]
-            self._adjust(part, holding or ordered[:2], mask, iterations)
+        with self._turn.mapping():
+            parts = list(parts_of(self._map))
+        for variable, fixed, mask in parts:
+            with self._turn.mapping():
+                stayed = self._map.keyframes.keys()
+                variable = [k for k in variable if k.keyframe_id in stayed]
+                fixed = [k for k in fixed if k.keyframe_id in stayed]
+                mask = np.r_[mask, np.zeros(self._map.n_points - len(mask), bool)]
+                taken = take(self._map, variable, fixed, mask) if variable and fixed else None
+            if taken is None:
+                continue
+            result = adjust(taken.bundle, iterations, meanwhile)
+            with self._turn.mapping():
+                if not still():
+                    return
+                put_back_later(self._map, taken, result)
 
     def _adjust(
         self,
@@ -264,42 +269,15 @@ class Mapper:
         mask: Bools,
         iterations: int | None = None,
     ) -> None:
-        slam_map = self._map
-        cameras, obs_cam, obs_feat, obs_id = [*variable, *fixed], [], [], []
-        for i, k in enumerate(cameras):
-            features, ids = slam_map.seen_by(k)
-            wanted = mask[ids]
-            obs_feat.append(features[wanted])
-            obs_id.append(ids[wanted])
-            obs_cam.append(np.full(int(wanted.sum()), i))
-        ids = np.concatenate(obs_id)
-        counts = np.bincount(ids, minlength=slam_map.n_points)
-        keep = counts[ids] >= 2
-        cam, feat, ids = np.concatenate(obs_cam)[keep], np.concatenate(obs_feat)[keep], ids[keep]
-        if len(ids) < 30:
+        taken = take(self._map, variable, fixed, mask)
+        if taken is None:
             return
-        points, index = np.unique(ids, return_inverse=True)
-        bundle = Bundle(
-            [k.camera_from_map for k in cameras], len(variable), slam_map.positions[points],
-            cam, index,
-            np.concatenate([k.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
-            np.concatenate([k.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
-        )  # fmt: skip
         if iterations is None:
-            result = adjust(bundle, self._config.iterations, self._turn.give_way)
+            result = adjust(taken.bundle, self._config.iterations, self._turn.give_way)
         else:  # it takes long, and works on copies
             with self._turn.away():
-                result = adjust(bundle, iterations)
-        for i, k in enumerate(variable):
-            k.camera_from_map = result.poses[i]
-        slam_map.poses_changed()
-        slam_map.positions[points] = result.points
-        wrong = ~result.inlier
-        for i, k in enumerate(cameras):
-            bad = feat[wrong & (cam == i)]
-            if len(bad):
-                slam_map.forget(k, bad)
-        slam_map.sweep(cameras)
+                result = adjust(taken.bundle, iterations)
+        put_back(self._map, taken, result)
 
     def _cull(self, keyframe: Keyframe) -> None:
         """Remove recent points that are seldom found where they should be, or seen by too few."""

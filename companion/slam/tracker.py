@@ -67,8 +67,10 @@ class Tracker:
         self._next_keyframe_id = 0
         self.turn = MapTurn()
         """Taken by whoever else looks at the map."""
-        self._worker: MappingWorker = Beside(self.turn) if beside else AtOnce()
         self.atlas = Atlas(config.features, config.mapping, camera, self.turn, beside)
+        self._worker: MappingWorker = (
+            Beside(self.turn, self.atlas.catch_up) if beside else AtOnce()
+        )
         self.state = TrackState.INITIALISING
         self._bootstrap = Bootstrap(self._config, camera)
         self._lost_since_ns: int | None = None

@@ -12,6 +12,8 @@ from companion.messages import KeyframeAdded, Reunited
 
 Done = list[KeyframeAdded | Reunited]
 Job = Callable[[], Done]
+Spare = Callable[[Callable[[], None]], None]
+"""Work for when there is no other; it calls what it is given every few milliseconds."""
 MAX_WAITING = 2
 
 
@@ -73,6 +75,12 @@ class MapTurn:
         finally:
             self._take()
 
+    def pause(self) -> None:
+        """Wait while a frame has the map; for who has nothing of it in hand."""
+        if self._wanted or self._tracking:
+            with self._changed:
+                self._changed.wait_for(lambda: not (self._wanted or self._tracking))
+
     def _take(self) -> None:
         with self._changed:
             self._changed.wait_for(lambda: not (self._wanted or self._tracking))
@@ -117,11 +125,15 @@ class AtOnce:
         """Nothing waits."""
 
 
-class Beside:
-    """Does the jobs in a thread of its own, in the tracker's pauses."""
+class _ClosingError(Exception):
+    """Spare work is given up for the end."""
 
-    def __init__(self, turn: MapTurn) -> None:
-        self._turn = turn
+
+class Beside:
+    """Does the jobs in a thread of its own, in the tracker's pauses, and `spare` between them."""
+
+    def __init__(self, turn: MapTurn, spare: Spare = lambda meanwhile: None) -> None:
+        self._turn, self._spare = turn, spare
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._finished: queue.SimpleQueue[Done] = queue.SimpleQueue()
         self._fault: BaseException | None = None
@@ -155,10 +167,25 @@ class Beside:
         self._thread.join()
 
     def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            try:
-                with self._turn.mapping():
-                    self._finished.put(job())
-            except BaseException as fault:  # handed to the tracker's thread, which raises it
-                self._fault = fault
-                return
+        try:
+            while (job := self._jobs.get()) is not None:
+                self._do(job)
+                self._spare(self._meanwhile)
+        except _ClosingError:
+            return
+        except BaseException as fault:  # handed to the tracker's thread, which raises it
+            self._fault = fault
+
+    def _do(self, job: Job) -> None:
+        with self._turn.mapping():
+            self._finished.put(job())
+
+    def _meanwhile(self) -> None:
+        """Let frames and jobs go before spare work, which touches nothing of the map now."""
+        self._turn.pause()
+        while not self._jobs.empty():
+            job = self._jobs.get()
+            if job is None:
+                raise _ClosingError
+            self._do(job)
+            self._turn.pause()

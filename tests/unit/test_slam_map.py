@@ -79,7 +79,7 @@ def test_a_pose_before_a_plane_is_found_from_nowhere() -> None:
 def test_a_long_flight_is_adjusted_in_parts(
     slam_map: SlamMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("companion.slam.mapper.MOST_TOGETHER", 10)
+    monkeypatch.setattr("companion.slam.whole_map.MOST_TOGETHER", 10)
     rng = np.random.default_rng(11)
     for k in list(slam_map.keyframes.values())[2:]:
         pose = k.camera_from_map
