@@ -29,7 +29,10 @@ def devices(as_json: bool) -> str:
     if not found_cameras:
         lines.append("  none")
     lines.append('Serial ports (link.url = "serial:PORT:auto")')
-    lines += [_port(port) for port in found_ports] or ["  none"]
+    for port in found_ports:
+        lines += _port(port)
+    if not found_ports:
+        lines.append("  none")
     lines.append("OpenCL devices (opencl.device)")
     lines += [_compute(device) for device in compute] or ["  none"]
     return "\n".join(lines)
@@ -72,8 +75,9 @@ def _control(control: CameraControl) -> str:
     return f"{control.name} = {value}, {limits}, default {control.default}"
 
 
-def _port(port: SerialDevice) -> str:
+def _port(port: SerialDevice) -> list[str]:
     about = [port.name, port.path if port.stable_path else "", port.usb_id]
     text = ", ".join(part for part in about if part and part != port.path)
     shown = port.stable_path or port.path
-    return f"  {shown}" + (f"  {text}" if text else "")
+    lines = [f"  {shown}" + (f"  {text}" if text else "")]
+    return [*lines, f"    {port.problem}"] if port.problem else lines

@@ -18,6 +18,7 @@ from companion.advice import FIRMWARES, Finding, advise, advise_on_line, names_t
 from companion.config import Config, LinkConfig
 from companion.errors import ConfigError, InputError, SourceError
 from drivers.asking_link import asking_link
+from drivers.login_console import login_console_on
 from drivers.mavlink_url import LOOPBACK, client_endpoint, link_endpoint
 from drivers.parameters import Parameters
 from drivers.status_socket import ask_status, found_socket_path
@@ -80,6 +81,10 @@ def doctor(
             "link.url: is empty; it says where the autopilot is, as in "
             "--set link.url=serial:/dev/ttyACM0:auto"
         )
+    where = link_endpoint(config.link.url)
+    console = login_console_on(where.device) if where.kind == "serial" else None
+    if console is not None:  # which, first of all, keeps the autopilot from being understood
+        raise SourceError(console.what)
     daemon = _running_daemon(config)
     link = replace(config.link, url=_url_to_ask_at(config, daemon))
     decide: Ask = (lambda question: True) if yes else ask

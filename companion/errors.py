@@ -6,6 +6,7 @@ CompanionError            one clear line for the user: what, where, what to do
 │   ├── FlightError       a flight folder, video, calibration or log that cannot be read
 │   └── DeviceError       no OpenCL device, or not the one asked for
 ├── SourceError           a camera or a link is not there, or has gone; it may come back
+├── InstallError          the service cannot be set up or taken away on this computer
 ├── StreamError           what came over a link to a viewer or a node is not what companion sends
 └── StageError            a stage failed on input that it should have handled; exit status 1
 """
@@ -35,6 +36,10 @@ class DeviceError(InputError):
 
 class SourceError(CompanionError):
     """A camera or an autopilot's link cannot be opened now, or has gone; it may come back."""
+
+
+class InstallError(CompanionError):
+    """The service cannot be set up or taken away on this computer."""
 
 
 class StreamError(CompanionError):

@@ -23,8 +23,8 @@ architecture=$(dpkg --print-architecture)
 version=$(sed -n 's/^__version__ = "\(.*\)"$/\1/p' companion/__init__.py | sed 's/\.\{0,1\}\(dev\|rc\|a\|b\)/~\1/')
 [ -n "$version" ] || fail "companion/__init__.py states no __version__"
 case $architecture in
-  amd64) extras='[cpu]' recommends='ocl-icd-libopencl1' ;;
-  *) extras='' recommends='pocl-opencl-icd | opencl-icd' ;;
+  amd64) extras='[cpu]' needs='binutils, ' recommends='' ;; # PoCL links its kernels with ld
+  *) extras='' needs='' recommends='pocl-opencl-icd | opencl-icd' ;;
 esac
 
 root=$(mktemp -d "${TMPDIR:-/tmp}/companion-deb.XXXXXX")
@@ -51,7 +51,7 @@ mkdir -p "$root/usr/bin" "$root/DEBIAN"
 ln -s /opt/companion/bin/companion "$root/usr/bin/companion"
 
 sed -e "s/@VERSION@/$version/" -e "s/@ARCHITECTURE@/$architecture/" -e "s/@PYTHON@/$minor/" \
-  -e "s/@RECOMMENDS@/$recommends/" -e "s/@INSTALLED_KB@/$(du -sk "$root" | cut -f1)/" \
+  -e "s/@NEEDS@/$needs/" -e "s/@RECOMMENDS@/$recommends/" -e "/^Recommends: \$/d" -e "s/@INSTALLED_KB@/$(du -sk "$root" | cut -f1)/" \
   packaging/deb/control >"$root/DEBIAN/control"
 install -m 644 packaging/deb/conffiles "$root/DEBIAN/conffiles"
 install -m 755 packaging/deb/postinst packaging/deb/prerm packaging/deb/postrm "$root/DEBIAN"

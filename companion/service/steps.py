@@ -1,0 +1,120 @@
+"""What is done to a computer, step by step: told, left out where it is done, undone on failure."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.errors import InstallError
+
+PATIENCE_S = 900.0
+"""A command may take so long: an environment is filled over a slow network."""
+
+
+def nothing() -> None:
+    """Leave all as it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """`do` raises OSError or InstallError where it cannot; `undo` is only called after `do`."""
+
+    what: str
+    is_done: Callable[[], bool]
+    do: Callable[[], None]
+    undo: Callable[[], None] = nothing
+
+
+def carry_out(steps: Sequence[Step], told: Callable[[str], None], dry_run: bool) -> None:
+    """Do what is not done yet; InstallError where that fails, with all as it was before."""
+    begun: list[Step] = []
+    for step in steps:
+        if step.is_done():
+            told(f"already there: {step.what}")
+            continue
+        if dry_run:
+            told(f"would do: {step.what}")
+            continue
+        begun.append(step)
+        try:
+            step.do()
+        except BaseException as error:
+            left = _undo(begun)
+            if not isinstance(error, (OSError, InstallError)):
+                raise
+            after = f"; not undone: {', '.join(left)}" if left else "; nothing is left of it"
+            raise InstallError(f"{step.what}: {error}{after}") from None
+        told(f"done: {step.what}")
+
+
+def _undo(begun: list[Step]) -> list[str]:
+    left = []
+    for step in reversed(begun):
+        try:
+            step.undo()
+        except (OSError, InstallError):
+            left.append(step.what)
+    return left
+
+
+def command(*words: str | Path) -> None:
+    """Run a command; InstallError with the last thing it said where it fails."""
+    text = " ".join(map(str, words))
+    try:
+        done = subprocess.run(
+            [*map(str, words)], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, errors="replace", timeout=PATIENCE_S, check=False,
+        )  # fmt: skip
+    except FileNotFoundError:
+        raise InstallError(f"{words[0]} is not on this computer") from None
+    except subprocess.TimeoutExpired:
+        raise InstallError(f"`{text}` did not end within {PATIENCE_S:g} s") from None
+    if done.returncode:
+        said = done.stdout.strip().splitlines() or ["said nothing"]
+        raise InstallError(f"`{text}` ended with status {done.returncode}: {said[-1].strip()}")
+
+
+def file_written(path: Path, content: bytes, mode: int = 0o644) -> Step:
+    """A file with this content; folders above it are made."""
+    before: list[bytes] = []
+    made: list[Path] = []
+
+    def is_done() -> bool:
+        return path.is_file() and path.read_bytes() == content
+
+    def do() -> None:
+        if path.exists():
+            before.append(path.read_bytes())
+        made.extend(parent for parent in path.parents if not parent.exists())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{path.name}.part")
+        part.write_bytes(content)
+        part.chmod(mode)
+        os.replace(part, path)
+
+    def undo() -> None:
+        path.with_name(f".{path.name}.part").unlink(missing_ok=True)
+        if before:
+            path.write_bytes(before[0])
+            return
+        path.unlink(missing_ok=True)
+        for parent in made:
+            parent.rmdir()
+
+    return Step(str(path), is_done, do, undo)
+
+
+def removed(path: Path) -> Step:
+    """A file or a folder that is no longer there."""
+
+    def do() -> None:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+
+    return Step(f"{path} removed", lambda: not path.exists() and not path.is_symlink(), do)
