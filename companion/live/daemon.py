@@ -17,11 +17,14 @@ from companion.clock import FlightClock
 from companion.config import Config
 from companion.errors import CompanionError
 from companion.health import LatencyMeter
+from companion.live.component_state import POWEROFF, component_state
 from companion.live.flight import Listener, LiveFlight
 from companion.live.flight_facts import facts_of
 from companion.live.flights import Flights
+from companion.live.ground_control import GroundControl
 from companion.live.health_watch import HealthWatch
 from companion.live.journal import ERROR, INFO, WARNING, Journal
+from companion.live.kept_settings import kept_over
 from companion.live.link_watch import LinkWatch
 from companion.live.loop_delay import measure_loop_delay
 from companion.live.missing import Missing
@@ -40,6 +43,7 @@ from companion.messages import (
     Track,
     Warned,
 )
+from companion.stages.protocol import Snapshot
 from drivers.autopilot_link import AutopilotLink
 from drivers.calibration import live_camera
 from drivers.camera_feed import CameraFeed
@@ -66,7 +70,8 @@ class Daemon:
 
     def __init__(self, load: Callable[[], Config]) -> None:
         self._load = load
-        self._config = config = load()
+        self._config, kept = kept_over(load)
+        config = self._config
         self._clock = clock = FlightClock()
         self._journal = Journal()
         self._loop = asyncio.get_running_loop()
@@ -106,6 +111,14 @@ class Daemon:
                 self._link, clock, self._watch, config.feedback.obstacle_distance
             )
         self._missing = Missing(config.daemon.missing_device_s)
+        self._spare_later: asyncio.TimerHandle | None = None
+        self._watch.set_by_ground = kept
+        self._ground: GroundControl | None = None
+        if self._link is not None and self._reports is not None and config.control.enabled:
+            self._ground = GroundControl(
+                self, self._link, clock, self._journal, self._flights,
+                self._reports.questions(lambda: self._config.feedback), kept, self._on_warned,
+            )  # fmt: skip
 
     async def run(self) -> int:
         """Run until told to stop or unable to go on; the exit status."""
@@ -139,6 +152,8 @@ class Daemon:
                 work.append(keeper.run())
         if self._reports is not None:
             work.append(self._reports.run())
+        if self._ground is not None:
+            work.append(self._ground.run())
         tasks = [loop.create_task(each) for each in work]
         stopped: asyncio.Task[Any] = loop.create_task(self._stop.wait())
         try:
@@ -148,6 +163,9 @@ class Daemon:
                     raise task.exception() or AssertionError
         finally:
             self._service.stopping()
+            if self._link is not None:
+                self._link.system_status = POWEROFF
+                self._link.send(self._link.heartbeat())
             tasks[0].cancel()  # what is watched is being taken apart
             feed_closed = loop.run_in_executor(None, self._feed.stop)
             await self._flights.close(END_S)
@@ -202,6 +220,7 @@ class Daemon:
             self._on_warned,
             lambda: self._soon(self._localisation_died, flight),
             lambda why: self._soon(self._unusable, why),
+            current(self._on_snapshot),
         )
 
     def _on_odometry(self, odometry: Odometry) -> None:
@@ -213,6 +232,10 @@ class Daemon:
         self._watch.take_mapped(message)
         if self._reports is not None:
             self._reports.take(message)
+
+    def _on_snapshot(self, snapshot: Snapshot) -> None:
+        if self._ground is not None:
+            self._ground.snapshot_told(snapshot)
 
     # -- flights --------------------------------------------------------------------------------
 
@@ -234,7 +257,7 @@ class Daemon:
         return self._config.daemon.flight == "always" or self._link is None
 
     def _begin_if_due(self) -> None:
-        if self._camera is None or self._flights.current is not None:
+        if self._camera is None or self._flights.current is not None or self._stop.is_set():
             return
         if self._always or self._armed:
             if self._sender is not None:
@@ -278,6 +301,8 @@ class Daemon:
             if self._link_watch is not None:
                 self._link_watch.step(self._clock.now_ns())
             health = self._watch.health()
+            if self._link is not None:
+                self._link.system_status = component_state(health)
             if self._flights.current is not None:
                 origin = self._link.origin if self._link is not None else None
                 self._flights.current.tell(health, origin)
@@ -309,22 +334,63 @@ class Daemon:
         if self._is_ready:
             self._service.reloading()
         try:
-            config, cannot = reloaded(self._config, self._load())
+            read, kept = kept_over(self._load)
         except CompanionError as error:
             self._journal.say(f"configuration not taken over: {error}", ERROR)
         else:
-            self._config = config
-            self._missing = Missing(config.daemon.missing_device_s)
-            self._watch.reconfigure(config)
-            if self._sender is not None:
-                self._sender.reconfigure(config.feedback)
-            if self._flights.current is None:
-                self._flights.discard_spare()
-                self._begin_if_due()
+            config, cannot = reloaded(self._config, read)
+            self._watch.set_by_ground = kept
+            if self._ground is not None:
+                self._ground.changed = kept
+            self.take_over(config)
             text = f"; these need a restart: {', '.join(cannot)}" if cannot else ""
             self._journal.say(f"configuration read again{text}", WARNING if cannot else INFO)
         if self._is_ready:
             self._service.ready()
+
+    # -- as the ground has a say, see GroundControl ----------------------------------------------
+
+    @property
+    def config(self) -> Config:
+        """What counts now."""
+        return self._config
+
+    @property
+    def armed(self) -> bool:
+        """Whether the motors are."""
+        return self._armed
+
+    @property
+    def sending(self) -> bool:
+        """Whether the autopilot is given poses."""
+        return self._sender is not None and self._sender.health().sending
+
+    def take_over(self, config: Config) -> None:
+        """Go on with another configuration: at once where that can be, else with the next map."""
+        old, self._config = self._config, config
+        if config.daemon != old.daemon:
+            self._missing = Missing(config.daemon.missing_device_s)
+        self._watch.reconfigure(config)
+        if self._sender is not None:
+            self._sender.reconfigure(config.feedback)
+        flight = self._flights.current
+        if flight is not None:
+            flight.set_dense(config.depth.enabled)
+            flight.set_budget(config.stream.budget_kbit_s)
+            return
+        self._flights.discard_spare()
+        if self._spare_later is not None:
+            self._spare_later.cancel()
+        self._spare_later = self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+
+    def prepare(self) -> None:
+        """Have a flight at hand beside the one that goes on."""
+        if self._camera is not None:
+            self._flights.prepare(self._config, self._camera)
+
+    def begin_flight(self) -> None:
+        """Begin one, where one is due."""
+        self._begin_if_due()
 
     def _give_up(self, why: str, status: int = FAULT) -> None:
         if self._status == 0:

@@ -89,22 +89,25 @@ def value_of(config: Config, parameter: FlightParameter, number: float) -> Any:
     Whether it is in the key's range is not looked at here.
     """
     now: Any = getattr(getattr(config, parameter.section), parameter.key)
+    wants = ""
     if not math.isfinite(number):
-        raise ConfigError(f"{parameter.full_key} wants a finite number, given is {number}")
-    if isinstance(now, str):
+        wants = "a finite number"
+    elif isinstance(now, str):
         words = words_of(parameter.section, parameter.key)
-        if number not in range(len(words)):
-            listed = ", ".join(f"{place} ({word})" for place, word in enumerate(words))
-            raise ConfigError(f"{parameter.full_key} wants {listed}, given is {number:g}")
-        return words[int(number)]
-    if isinstance(now, bool):
-        if number not in (0.0, 1.0):
-            raise ConfigError(f"{parameter.full_key} wants 0 or 1, given is {number:g}")
-        return bool(number)
-    if isinstance(now, int):
-        if not number.is_integer():
-            raise ConfigError(f"{parameter.full_key} wants a whole number, given is {number:g}")
-        return int(number)
+        if number in range(len(words)):
+            return words[int(number)]
+        wants = ", ".join(f"{place} ({word})" for place, word in enumerate(words))
+    elif isinstance(now, bool):
+        if number in (0.0, 1.0):
+            return bool(number)
+        wants = "0 or 1"
+    elif isinstance(now, int):
+        if number.is_integer():
+            return int(number)
+        wants = "a whole number"
+    if wants:
+        where = f"{parameter.name}: {parameter.full_key}"
+        raise ConfigError(f"{where} wants {wants}, given is {number:g}")
     return float(f"{number:.{DIGITS}g}")
 
 

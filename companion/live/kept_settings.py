@@ -9,7 +9,7 @@ from typing import Any
 from companion.config import Config
 from companion.config_file import changed_by, dump, toml_value, with_value
 from companion.errors import ConfigError
-from companion.live.flight_parameters import PARAMETERS
+from companion.live.flight_parameters import PARAMETERS, FlightParameter
 from companion.output.atomic_file import write_atomically
 
 HEAD = "# What the ground has set over MAVLink; control.keep names this file.\n"
@@ -49,6 +49,6 @@ def keep(path: Path, changed: Mapping[str, Any]) -> None:
     write_atomically(path, (HEAD + "\n".join(lines) + "\n").encode())
 
 
-def checked(config: Config, section: str, key: str, value: Any) -> Config:
+def checked(config: Config, parameter: FlightParameter, value: Any) -> Config:
     """The configuration with a value from the ground, checked as one of a file."""
-    return with_value(config, section, key, value, "from the ground")
+    return with_value(config, parameter.section, parameter.key, value, parameter.name)

@@ -1,0 +1,222 @@
+"""What a ground station may have the companion do, and when not; docs/control.md tells it to users.
+
+Everything here runs in the event loop. How MAVLink asks and is answered the drivers know.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from companion.clock import FlightClock
+from companion.config import Config
+from companion.errors import ConfigError
+from companion.live import kept_settings
+from companion.live.flight_parameters import (
+    PARAMETERS,
+    FlightParameter,
+    is_looser,
+    number_of,
+    value_of,
+)
+from companion.live.flights import Flights
+from companion.live.journal import INFO, WARNING, Journal
+from companion.live.new_map import NewMap
+from companion.live.snapshots import Snapshots
+from companion.messages import Warned
+from companion.stages.protocol import Snapshot
+from drivers.autopilot_link import AutopilotLink
+from drivers.command_server import ACCEPTED, BUSY, DENIED, Command, CommandServer, Done, Job
+from drivers.ground_requests import GroundRequests
+from drivers.mavlink_queue import RateLimit
+from drivers.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, ParameterServer
+
+MAPPING, NEW_MAP, SNAPSHOT, BUDGET = 31010, 31011, 31012, 31013
+"""MAV_CMD_USER_1 to MAV_CMD_USER_4."""
+STEP_S = 0.05
+CHANGES_HZ, CHANGES_AT_ONCE = 2.0, 40.0
+"""As many as there are parameters may be set in a row; afterwards so many a second."""
+NO_FLIGHT = "there is no flight"
+POSES_SENT = "the autopilot flies on these poses; param1 = 1 does it all the same"
+NOT_ARMED = "while armed it can be switched off only"
+TOO_OFTEN = "it is set too often"
+NOT_LOOSER = "while armed it can be made stricter only"
+
+
+class Controlled(Protocol):
+    """The daemon, as far as the ground has a say."""
+
+    @property
+    def config(self) -> Config:
+        """What counts now."""
+
+    @property
+    def armed(self) -> bool:
+        """Whether the motors are."""
+
+    @property
+    def sending(self) -> bool:
+        """Whether the autopilot is given poses."""
+
+    def take_over(self, config: Config) -> None:
+        """Go on with another configuration."""
+
+    def prepare(self) -> None:
+        """Have a flight at hand beside the one that goes on."""
+
+    def begin_flight(self) -> None:
+        """Begin one, where one is due."""
+
+
+class GroundControl:
+    """Commands and parameters of our component; `changed` is by key what the ground has set."""
+
+    def __init__(
+        self,
+        daemon: Controlled,
+        link: AutopilotLink,
+        clock: FlightClock,
+        journal: Journal,
+        flights: Flights,
+        questions: Mapping[int, Command],
+        changed: dict[str, Any],
+        warn: Callable[[Warned], None],
+    ) -> None:
+        self._daemon, self._link, self._journal = daemon, link, journal
+        self._clock, self._changes = clock, RateLimit(CHANGES_HZ, CHANGES_AT_ONCE)
+        self._flights, self.changed = flights, changed
+        self._new_map = NewMap(flights, daemon.prepare, daemon.begin_flight)
+        self._snapshots = Snapshots(flights, self._tell)
+        commands = {
+            MAPPING: Command(self._switch_mapping),
+            NEW_MAP: Command(self._begin_new_map),
+            SNAPSHOT: Command(self._take_snapshot),
+            BUDGET: Command(self._set_budget),
+            **questions,
+        }
+        self._requests = GroundRequests(
+            link.port, clock, CommandServer(commands), ParameterServer(self), warn
+        )
+        link.on_request = self._requests.take
+
+    async def run(self) -> None:
+        """Answer, and carry out what takes long; until cancelled."""
+        answering = asyncio.ensure_future(self._requests.run())
+        try:
+            while not answering.done():
+                await asyncio.sleep(STEP_S)
+                self._new_map.step()
+                self._snapshots.step()
+            answering.result()
+        finally:
+            answering.cancel()
+
+    def snapshot_told(self, snapshot: Snapshot) -> None:
+        """The recorder says how far a snapshot is."""
+        self._snapshots.take(snapshot)
+
+    # -- parameters, as drivers.parameter_server wants them --------------------------------------
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of all parameters, in the order of their numbers."""
+        return tuple(PARAMETERS)
+
+    def value(self, name: str) -> float:
+        """As it counts now."""
+        return number_of(self._daemon.config, PARAMETERS[name])
+
+    def set(self, name: str, value: float) -> int:
+        """Set one, if it may be now; SET or a MAV_PARAM_ERROR."""
+        parameter, config = PARAMETERS[name], self._daemon.config
+        try:
+            wanted = value_of(config, parameter, value)
+            changed = kept_settings.checked(config, parameter, wanted)
+        except ConfigError as error:
+            self._tell(f"not set: {error}", False)
+            return OUT_OF_RANGE
+        if changed == config:
+            return SET
+        why_not = self._forbidden(parameter, number_of(config, parameter), value)
+        if why_not:
+            self._tell(f"not set: {name}: {why_not}", False)
+            return NOT_NOW
+        when = "" if parameter.at_once else ", from the next map on"
+        self._tell(f"{parameter.full_key} = {_shown(wanted)}{when}", True)
+        self._take_over(parameter, wanted, changed)
+        return SET
+
+    def _forbidden(self, parameter: FlightParameter, now: float, value: float) -> str:
+        """Why it must not be so now; "" if it may."""
+        self._changes.refill(self._clock.now_ns())
+        if self._changes.left < 1.0:
+            return TOO_OFTEN
+        if not self._daemon.armed:
+            return ""
+        if parameter.full_key == "feedback.mode" and value != 0:
+            return NOT_ARMED
+        return NOT_LOOSER if is_looser(parameter, now, value) else ""
+
+    def _take_over(self, parameter: FlightParameter, value: Any, config: Config) -> None:
+        self._changes.take(1.0)
+        was_off = self._daemon.config.feedback.mode == "off"
+        self.changed[parameter.full_key] = value
+        self._daemon.take_over(config)
+        if was_off and config.feedback.mode != "off" and self._flights.current is not None:
+            self._flights.end()  # a map whose scale is the autopilot's own is none to fly on
+            self._daemon.begin_flight()
+        if config.control.keep:
+            try:
+                kept_settings.keep(Path(config.control.keep), self.changed)
+            except OSError as error:
+                self._tell(f"{config.control.keep}: not kept: {error.strerror}", False)
+
+    # -- commands --------------------------------------------------------------------------------
+
+    def _switch_mapping(self, parameters: Sequence[float]) -> Done:
+        return self._by_parameter("MAP_DENSE", parameters[0])
+
+    def _set_budget(self, parameters: Sequence[float]) -> Done:
+        return self._by_parameter("STR_KBIT_S", parameters[0])
+
+    def _by_parameter(self, name: str, value: float) -> Done:
+        return Done(ACCEPTED if self.set(name, value) == SET else DENIED)
+
+    def _begin_new_map(self, parameters: Sequence[float]) -> Done | Job:
+        all_the_same = parameters[0]
+        if all_the_same not in (0.0, 1.0) and not math.isnan(all_the_same):
+            return Done(DENIED)
+        if self._flights.current is None:
+            return self._refused("no new map", NO_FLIGHT, BUSY)
+        if self._daemon.armed and self._daemon.sending and all_the_same != 1.0:
+            return self._refused("no new map", POSES_SENT, DENIED)
+        self._tell("a new map begins", True)
+        job = Job()
+        self._new_map.start(job)
+        return job
+
+    def _take_snapshot(self, _parameters: Sequence[float]) -> Done | Job:
+        flight = self._flights.current
+        if flight is None:
+            return self._refused("no cloud was written", NO_FLIGHT, BUSY)
+        job = Job()
+        self._snapshots.start(flight, self._link.origin, job)
+        return job
+
+    def _refused(self, what: str, why_not: str, result: int) -> Done:
+        self._tell(f"{what}: {why_not}", False)
+        return Done(result)
+
+    def _tell(self, text: str, good: bool) -> None:
+        priority = INFO if good else WARNING
+        if self._link.say(priority, f"Companion: {text}") or good:
+            self._journal.say(f"ground: {text}", priority)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f"{value:g}" if isinstance(value, float) else str(value)

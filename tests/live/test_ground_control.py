@@ -1,0 +1,197 @@
+"""A ground station at the router's port has the companion do what docs/control.md says."""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.live.flight_parameters import PARAMETERS
+from companion.live.ground_control import BUDGET, MAPPING, NEW_MAP, SNAPSHOT
+from tests.support.fake_wire import free_port
+from tests.support.flying import Flying
+from tests.support.ground import OURS, GroundStation
+from tests.support.scoring import read_ply
+
+ACCEPTED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
+FAILED, IN_PROGRESS = mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_IN_PROGRESS
+BUSY, UNSUPPORTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_UNSUPPORTED
+REQUEST_MESSAGE, SET_INTERVAL = (
+    mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+)  # fmt: skip
+PORT, VIEWERS = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM)
+MAP_S = 90.0
+"""A first piece of the dense map on a processor that others use too."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("ground")
+
+
+@pytest.fixture(scope="module")
+def flying(folder: Path) -> Iterator[Flying]:
+    settings = (
+        f'router.clients=["tcpin:127.0.0.1:{PORT}"]', f"stream.listen=127.0.0.1:{VIEWERS}",
+        f"control.keep={folder}/kept.toml", "depth.enabled=true", "depth.stride=8",
+        "feedback.min_quality=15",
+    )  # fmt: skip
+    with Flying(folder, *settings) as begun:
+        begun.until_source("camera", "running")
+        begun.until_source("autopilot", "running")
+        yield begun
+
+
+@pytest.fixture
+def ground(flying: Flying) -> Iterator[GroundStation]:
+    with GroundStation(PORT) as connected:
+        connected.heard("HEARTBEAT", 5)
+        yield connected
+
+
+def test_before_take_off(flying: Flying, ground: GroundStation) -> None:
+    standby = mavlink.MAV_STATE_STANDBY
+    ground.heard("HEARTBEAT", 10, lambda beat: beat.system_status == standby)
+    found = ground.parameters()
+    assert list(found) == list(PARAMETERS)
+    assert (found["FB_MODE"], found["FB_MIN_QUALITY"], found["MAP_STRIDE"]) == (1.0, 15.0, 8.0)
+    assert ground.set("FB_MIN_QUALITY", 20.0) == 20.0
+    health = flying.daemon.until(
+        lambda health: health["set_by_ground"] == {"feedback.min_quality": 20}, 5
+    )
+    assert health["feedback"]["mode"] == "odometry"
+    table = subprocess.run(
+        [sys.executable, "-m", "companion", "status",
+         "--set", f"daemon.socket={flying.daemon.socket}"],
+        capture_output=True, text=True, check=True, timeout=30,
+    ).stdout  # fmt: skip
+    assert "feedback.min_quality = 20 (by the ground)" in table
+    flying.daemon.line("ground: feedback.min_quality = 20", 5)
+    assert "min_quality = 20" in (flying.daemon.folder / "kept.toml").read_text()
+    assert ground.set("FB_MIN_QUALITY", 1000.0) == 20.0
+    assert ground.command(NEW_MAP) == ground.command(SNAPSHOT) == [BUSY]
+
+
+def test_what_ground_stations_ask_of_every_component(ground: GroundStation) -> None:
+    assert ground.command(REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == [ACCEPTED]
+    version = ground.heard("AUTOPILOT_VERSION", 5)
+    assert version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    assert ground.command(mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION, 1.0) == [ACCEPTED]
+    assert ground.command(REQUEST_MESSAGE, 259.0) == [UNSUPPORTED]  # of a camera
+    assert ground.command(REQUEST_MESSAGE, float("nan")) == [DENIED]
+    assert ground.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == [UNSUPPORTED]
+    status = mavlink.MAVLINK_MSG_ID_ONBOARD_COMPUTER_STATUS
+    assert ground.command(SET_INTERVAL, status, 200_000.0) == [ACCEPTED]
+    assert ground.command(REQUEST_MESSAGE, 244.0, status) == [ACCEPTED]
+    assert ground.heard("MESSAGE_INTERVAL", 5).interval_us == 200_000
+    assert ground.command(SET_INTERVAL, status, 1000.0) == [DENIED]
+    assert ground.command(SET_INTERVAL, status, 0.0) == [ACCEPTED]
+
+
+def test_mapping_is_left_and_taken_up(flying: Flying, ground: GroundStation) -> None:
+    flying.take_off()
+    flying.until_stage("depth", lambda found: found["n"] > 0, MAP_S)
+    assert ground.command(MAPPING, 0.0) == [ACCEPTED]
+    flying.until_stage("depth", lambda found: found["detail"] == "switched off", 5)
+    time.sleep(1.5)
+    n_done = flying.until_stage("depth", lambda found: True)["n"]
+    time.sleep(1.0)
+    assert flying.until_stage("depth", lambda found: True)["n"] <= n_done + 5
+    assert ground.command(MAPPING, 1.0) == [ACCEPTED]
+    flying.until_stage("depth", lambda found: found["n"] > n_done + 5, MAP_S)
+    assert ground.command(MAPPING, 0.5) == [DENIED]
+
+
+def test_the_cloud_is_written_now(flying: Flying, ground: GroundStation) -> None:
+    until_s = time.monotonic() + MAP_S
+    results = [FAILED]
+    while results[-1] == FAILED and time.monotonic() < until_s:  # there are no points yet
+        time.sleep(1.0)
+        results = ground.command(SNAPSHOT)
+    assert results == [IN_PROGRESS, ACCEPTED]
+    (flight,) = flying.daemon.flown()
+    (path,) = flight.glob("snapshot-*.ply")
+    assert len(read_ply(path)) > 100
+    assert path.name in flying.daemon.line("cloud written", 5).text
+    flying.until_told(path.name, 0)
+
+
+def test_viewers_have_a_budget(flying: Flying, ground: GroundStation) -> None:
+    assert ground.command(BUDGET, 300.0) == [ACCEPTED]
+    flying.until_stage("viewers", lambda found: "budget 300 kbit/s" in found["detail"], 10)
+    assert ground.command(BUDGET, -5.0) == [DENIED]
+    assert flying.daemon.status()["set_by_ground"]["stream.budget_kbit_s"] == 300.0
+
+
+def test_while_armed_the_pose_cannot_be_made_easier(flying: Flying, ground: GroundStation) -> None:
+    flying.until_sending()
+    began_ns = time.monotonic_ns()
+    assert ground.set("FB_MIN_QUALITY", 5.0) == 20.0
+    assert ground.set("FB_MODE", 2.0) == 1.0
+    assert ground.set("FB_MIN_QUALITY", 21.0) == 21.0
+    time.sleep(1.0)
+    flying.assert_went_on(began_ns)  # a stricter limit takes no pose away that keeps it
+
+
+def test_a_storm_of_requests_delays_no_pose(flying: Flying) -> None:
+    """All kinds, for us, from one and from many; and what is no request at all."""
+    flying.until_sending()
+    rng, codec, began_ns = random.Random(3), mavlink.MAVLink(None, 255, 190), time.monotonic_ns()
+    messages = [
+        mavlink.MAVLink_param_request_list_message(*OURS),
+        mavlink.MAVLink_param_request_read_message(*OURS, b"FB_MODE", -1),
+        mavlink.MAVLink_param_set_message(*OURS, b"FB_RATE_HZ", 1e9, 9),
+        mavlink.MAVLink_command_long_message(*OURS, 512, 0, 148, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_command_long_message(*OURS, 7777, 0, 1, 0, 0, 0, 0, 0, 0),
+    ]
+    with GroundStation(PORT) as ground:
+        ground._socket.setblocking(False)
+        while time.monotonic_ns() - began_ns < 3e9:
+            codec.srcSystem = rng.choice((255, 254, rng.randrange(2, 255)))
+            data = b"".join(rng.choice(messages).pack(codec) for _ in range(50))
+            try:
+                ground._socket.send(data + rng.randbytes(20))
+                ground._socket.recv(1 << 16)
+            except BlockingIOError:
+                pass
+            time.sleep(0.005)
+    flying.assert_went_on(began_ns)
+    flying.daemon.line("more is asked of the companion", 5, began_ns)
+
+
+def test_a_new_map_raises_the_reset_counter(flying: Flying, ground: GroundStation) -> None:
+    flying.until_sending()
+    n_resets, flight = flying.poses.resets[-1], flying.daemon.status()["flight"]
+    assert ground.command(NEW_MAP) == [DENIED]  # the autopilot flies on these poses
+    began_ns = time.monotonic_ns()
+    assert ground.command(NEW_MAP, 1.0, timeout_s=60) == [IN_PROGRESS, ACCEPTED]
+    flying.daemon.until(lambda health: health["flight"] not in ("", flight), 10)
+    flying.until_sending(90)
+    assert flying.poses.resets[-1] == n_resets + 1
+    flying.until_told("a new map begins", began_ns)
+    flying.daemon.line("flight over", 60, began_ns)
+    report = json.loads((flying.daemon.flights / flight / "report.json").read_text())
+    assert report["n_points"] if "n_points" in report else report
+
+
+def test_the_pose_is_switched_off(flying: Flying, ground: GroundStation) -> None:
+    flying.until_sending()
+    began_ns = time.monotonic_ns()
+    assert ground.set("FB_MODE", 0.0) == 0.0
+    flying.assert_ceased(began_ns)
+    flying.until_told("vision pose off: switched off", began_ns)
+    assert flying.daemon.status()["feedback"]["mode"] == "off"
+    assert ground.set("FB_MODE", 1.0) == 0.0  # until it has landed
+    flying.autopilot.disarm()
+    flying.daemon.line("disarmed", 10, began_ns)
+    assert ground.set("FB_MODE", 1.0) == 1.0
+    assert not flying.daemon.said("Traceback")
+    flying.assert_stops()
