@@ -26,7 +26,8 @@ LEAST_FRAMES = 4
 """Beside its own that a keyframe needs to get depth."""
 SAVED_NS = 3_000_000_000
 """Budget that was not used is kept for so long."""
-FIRST_GREY_BYTES = 40_000
+GREY_SHARE = 0.9
+"""Of the bytes of a picture in colour, what it takes in grey."""
 
 
 class Gatherer:
@@ -43,8 +44,7 @@ class Gatherer:
         self._tracked: dict[int, Track] = {}
         self._changes = MapChanges()
         self._number = 0
-        self._room_bytes, self._room_ns = 0.0, 0
-        self._grey_bytes = float(FIRST_GREY_BYTES)
+        self._room_bytes, self._room_ns = SAVED_NS * 1e-9 * budget_bytes_s, 0
         self._last_place: tuple[float, ...] | None = None
         self.keyframe_jpegs: dict[int, bytes] = {}
         """Pictures of the keyframes of the last bundle, by number of keyframe."""
@@ -104,7 +104,6 @@ class Gatherer:
             t_ns, jpeg = self._frames[seq]
             if seq not in owners:
                 jpeg = without_colour(jpeg, self._quality)
-                self._grey_bytes += 0.2 * (len(jpeg) - self._grey_bytes)
             out.append(Picture(seq, t_ns, jpeg, seq in owners))
             self._room_bytes -= len(jpeg)
         self.n_dropped += len(useful) - len(chosen)
@@ -137,9 +136,10 @@ class Gatherer:
         """Those that the budget has room for, evenly spread."""
         others = [seq for seq in seqs if seq not in keyframes]
         room = MOST_PICTURES - len(keyframes)
-        if self._budget_bytes_s:
+        if self._budget_bytes_s and others:
             own_bytes = sum(len(self._frames[seq][1]) for seq in keyframes)
-            room = min(room, int((self._room_bytes - own_bytes) / self._grey_bytes))
+            each_bytes = GREY_SHARE * float(np.mean([len(self._frames[s][1]) for s in others]))
+            room = min(room, int((self._room_bytes - own_bytes) / each_bytes))
             if room < min(LEAST_FRAMES, len(others)):
                 return []
         if len(others) > room:

@@ -43,7 +43,7 @@ def pose_of(row: NDArray[Any] | Sequence[float]) -> Pose | None:
     numbers = np.asarray(row, np.float64)
     if np.isnan(numbers).all():
         return None
-    if not np.isfinite(numbers).all() or np.abs(numbers[:3]).max() > FURTHEST:
+    if not np.isfinite(numbers).all() or np.abs(numbers).max() > FURTHEST:
         raise StreamError("a pose that is not finite")
     if not LEAST_NORM < np.linalg.norm(numbers[3:]) < 1 / LEAST_NORM:
         raise StreamError("a quaternion of no length")
