@@ -82,28 +82,32 @@ def file_written(path: Path, content: bytes, mode: int = 0o644) -> Step:
     """A file with this content; folders above it are made."""
     before: list[bytes] = []
     made: list[Path] = []
+    part = path.with_name(f".{path.name}.part")
+    replaced = False
 
     def is_done() -> bool:
         return path.is_file() and path.read_bytes() == content
 
     def do() -> None:
+        nonlocal replaced
         if path.exists():
             before.append(path.read_bytes())
         made.extend(parent for parent in path.parents if not parent.exists())
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.part")
         part.write_bytes(content)
         part.chmod(mode)
         os.replace(part, path)
+        replaced = True
 
     def undo() -> None:
-        path.with_name(f".{path.name}.part").unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
         if before:
             path.write_bytes(before[0])
-            return
-        path.unlink(missing_ok=True)
+        elif replaced:
+            path.unlink(missing_ok=True)
         for parent in made:
-            parent.rmdir()
+            if parent.exists():
+                parent.rmdir()
 
     return Step(str(path), is_done, do, undo)
 

@@ -200,3 +200,41 @@ def test_removed_it_leaves_what_is_the_owners_purged_nothing(container: Containe
     assert not (container.root / "etc/companion").exists()
     assert not (container.root / "var/lib/companion").exists()
     assert "companion:" not in (container.root / "etc/passwd").read_text()
+
+
+def test_install_does_without_the_package(container: Container) -> None:
+    """From an environment of its own, copied from the package's; a failure leaves nothing."""
+    own, root = "/opt/own/bin/companion", container.root
+    bin_folder = root / "opt/own/bin"
+    for script in (bin_folder / "companion", root / "etc/systemd/system/autopilot.service"):
+        script.write_text(script.read_text().replace("/opt/companion/", "/opt/own/"))
+    (root / "usr/local/bin/companion").symlink_to(own)
+    container.run("systemctl", "daemon-reload")
+    container.run("systemctl", "restart", "autopilot")
+    given, unit = root / "srv/own.toml", root / "etc/systemd/system/companion.service"
+    given.write_text(CONFIG)
+    rules = root / "etc/udev/rules.d/99-companion.rules"
+    rules.mkdir()  # in the way
+    said = container.run(own, "install", "--config", "/srv/own.toml", check=False)
+    told(said.splitlines()[-1])
+    assert "nothing is left of it" in said.splitlines()[-1]
+    assert not unit.exists() and not (root / "etc/companion").exists()
+    assert "companion:" not in (root / "etc/passwd").read_text()
+    rules.rmdir()
+
+    said = container.run(own, "install", "--config", "/srv/own.toml", "--now", "--dry-run")
+    assert "would do: user companion" in said and not unit.exists()
+    container.run(own, "install", "--config", "/srv/own.toml", "--now")
+    assert f"ExecStart={own} run" in unit.read_text()
+    until_flying(container)
+    said = container.run(own, "install")
+    assert {line for line in said.splitlines() if line.startswith("done:")} <= {
+        "done: units read", "done: rules for devices read",
+    }, said  # fmt: skip
+    container.run(own, "uninstall")
+    assert shown(container, "ActiveState") == "inactive" and not unit.exists()
+    assert (root / "etc/companion/companion.toml").read_text() == CONFIG
+    assert recordings(container)
+    container.run(own, "uninstall", "--purge")
+    assert not (root / "var/lib/companion").exists()
+    assert "companion:" not in (root / "etc/passwd").read_text()
