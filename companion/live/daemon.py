@@ -360,11 +360,6 @@ class Daemon:
         """Whether the motors are."""
         return self._armed
 
-    @property
-    def sending(self) -> bool:
-        """Whether the autopilot is given poses."""
-        return self._sender is not None and self._sender.health().sending
-
     def take_over(self, config: Config) -> None:
         """Go on with another configuration: at once where that can be, else with the next map."""
         old, self._config = self._config, config

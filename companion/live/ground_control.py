@@ -40,7 +40,7 @@ STEP_S = 0.05
 CHANGES_HZ, CHANGES_AT_ONCE = 2.0, 40.0
 """As many as there are parameters may be set in a row; afterwards so many a second."""
 NO_FLIGHT = "there is no flight"
-POSES_SENT = "the autopilot flies on these poses; param1 = 1 does it all the same"
+POSES_SENT = "the autopilot may fly on these poses; param1 = 1 does it all the same"
 NOT_ARMED = "while armed it can be switched off only"
 TOO_OFTEN = "it is set too often"
 NOT_LOOSER = "while armed it can be made stricter only"
@@ -56,10 +56,6 @@ class Controlled(Protocol):
     @property
     def armed(self) -> bool:
         """Whether the motors are."""
-
-    @property
-    def sending(self) -> bool:
-        """Whether the autopilot is given poses."""
 
     def take_over(self, config: Config) -> None:
         """Go on with another configuration."""
@@ -191,7 +187,8 @@ class GroundControl:
             return Done(DENIED)
         if self._flights.current is None:
             return self._refused("no new map", NO_FLIGHT, BUSY)
-        if self._daemon.armed and self._daemon.sending and all_the_same != 1.0:
+        is_fed = self._daemon.config.feedback.mode != "off"
+        if self._daemon.armed and is_fed and all_the_same != 1.0:
             return self._refused("no new map", POSES_SENT, DENIED)
         self._tell("a new map begins", True)
         job = Job()

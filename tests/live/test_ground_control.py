@@ -133,7 +133,7 @@ def test_viewers_have_a_budget(flying: Flying, ground: GroundStation) -> None:
 
 
 def test_while_armed_the_pose_cannot_be_made_easier(flying: Flying, ground: GroundStation) -> None:
-    flying.until_sending()
+    flying.take_off()
     began_ns = time.monotonic_ns()
     assert ground.set("FB_MIN_QUALITY", 5.0) == 20.0
     assert ground.set("FB_MODE", 2.0) == 1.0
@@ -144,7 +144,7 @@ def test_while_armed_the_pose_cannot_be_made_easier(flying: Flying, ground: Grou
 
 def test_a_storm_of_requests_delays_no_pose(flying: Flying) -> None:
     """All kinds, for us, from one and from many; and what is no request at all."""
-    flying.until_sending()
+    flying.take_off()
     rng, codec, began_ns = random.Random(3), mavlink.MAVLink(None, 255, 190), time.monotonic_ns()
     messages = [
         mavlink.MAVLink_param_request_list_message(*OURS),
@@ -169,7 +169,7 @@ def test_a_storm_of_requests_delays_no_pose(flying: Flying) -> None:
 
 
 def test_a_new_map_raises_the_reset_counter(flying: Flying, ground: GroundStation) -> None:
-    flying.until_sending()
+    flying.take_off()
     n_resets, flight = flying.poses.resets[-1], flying.daemon.status()["flight"]
     assert ground.command(NEW_MAP) == [DENIED]  # the autopilot flies on these poses
     began_ns = time.monotonic_ns()
@@ -183,7 +183,7 @@ def test_a_new_map_raises_the_reset_counter(flying: Flying, ground: GroundStatio
 
 
 def test_the_pose_is_switched_off(flying: Flying, ground: GroundStation) -> None:
-    flying.until_sending()
+    flying.take_off()
     began_ns = time.monotonic_ns()
     assert ground.set("FB_MODE", 0.0) == 0.0
     flying.assert_ceased(began_ns)

@@ -39,7 +39,7 @@ class Controlled:
     """A daemon of which only the configuration counts."""
 
     def __init__(self, config: Config) -> None:
-        self.config, self.armed, self.sending = config, False, False
+        self.config, self.armed = config, False
 
     def take_over(self, config: Config) -> None:
         self.config = config
