@@ -8,6 +8,7 @@ it was, and what was learned is worked in as slowly as an autopilot can follow.
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,10 +25,21 @@ WAY_KEPT_NS = 10_000_000_000
 SIGMA_COASTING_M_S = 0.3
 """Of the velocity by which a pose is carried on where nothing is recognised."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
+SIGMA_DRIFT = 0.005
+"""Of the way: what a map that is not adjusted yet may be off by."""
 SIGMAS_BEYOND_NOISE = 3.0
 """How much more matches of one image err together than each by itself says."""
 FULL_COUNT = 150
 GRID = 4
+
+
+class _Waypoint(NamedTuple):
+    """Where the body was, how far it had flown, and what had been worked into its pose by then."""
+
+    t_ns: int
+    place: Array
+    flown_m: float
+    worked_in: Array
 
 
 class SmoothOdometry:
@@ -47,7 +59,8 @@ class SmoothOdometry:
         self._velocity = np.zeros(3)
         self._n_doubted = 0
         self._coasting = False
-        self._way: deque[tuple[int, Array]] = deque()
+        self._way: deque[_Waypoint] = deque()
+        self._worked_in = np.zeros(3)
         self.reset_counter = 0
 
     def step(
@@ -95,18 +108,33 @@ class SmoothOdometry:
             )
             sigma_velocity = velocity_map[1] * to_world.scale
         self._last = (track.t_ns, pose, placed)
-        self._way.append((track.t_ns, placed.translation))
-        while self._way[0][0] < track.t_ns - WAY_KEPT_NS:
-            self._way.popleft()
-        way_m = float(np.linalg.norm(placed.translation - self._way[0][1]))
         noise_m = SIGMAS_BEYOND_NOISE * track.sigma_position * georeference.world_from_map.scale
+        way_sigma_m = self._way_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter, self._quality(track), placed,
             self._velocity.copy(),
-            float(np.linalg.norm([FLOOR_M, noise_m, georeference.sigma_scale * way_m])),
+            float(np.linalg.norm([FLOOR_M, noise_m, way_sigma_m])),
             sigma_velocity,
             float(np.hypot(FLOOR_RAD, SIGMAS_BEYOND_NOISE * track.sigma_rotation_rad)),
         )  # fmt: skip
+
+    def _way_sigma_m(self, t_ns: int, place: Array, sigma_scale: float) -> float:
+        """What the way of the last seconds is off by, along each axis.
+
+        Its scale, drift, and what was worked in, which moved the pose and not the body.
+        """
+        flown_m = 0.0
+        if self._way:
+            flown_m = self._way[-1].flown_m + float(np.linalg.norm(place - self._way[-1].place))
+        self._way.append(_Waypoint(t_ns, place, flown_m, self._worked_in))
+        while self._way[0].t_ns < t_ns - WAY_KEPT_NS:
+            self._way.popleft()
+        since = self._way[0]
+        return float(np.linalg.norm([
+            sigma_scale * float(np.linalg.norm(place - since.place)),
+            SIGMA_DRIFT * (flown_m - since.flown_m),
+            float(np.linalg.norm(self._worked_in - since.worked_in)) / np.sqrt(3.0),
+        ]))  # fmt: skip
 
     def _coast(self, track: Track, raw: Pose) -> Odometry:
         """Carried on without seeing: of the lowest quality, and ever less certain."""
@@ -194,6 +222,7 @@ class SmoothOdometry:
         far = float(np.linalg.norm(away))
         kept = max(far - MAX_WORKED_IN_M_S * dt_s, 0.0) / max(far, 1e-12)
         at = raw.translation + kept * away
+        self._worked_in = self._worked_in + at - here.translation
         self._odometry_from_world = Pose(turn, at - turn @ raw.translation)
 
     def _believable(self, placed: Pose, t_ns: int) -> bool:

@@ -51,6 +51,19 @@ def test_a_corrected_map_moves_the_pose_slowly() -> None:
     assert north(after[-1]) == pytest.approx(2 * (39.9 + 1.5), abs=0.01)
 
 
+def test_what_is_worked_in_is_no_way_flown_and_says_so() -> None:
+    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    before = [give(odometry, track(k)) for k in range(200)][-1].sigma_position_m
+    last = track(199, off=1.5).map_from_camera
+    assert last is not None
+    odometry.map_moved(last)
+    after = [give(odometry, track(k, off=1.5)).sigma_position_m for k in range(200, 600)]
+    # three metres at 0.15 m/s: for twenty seconds each ten have 1.5 m of it
+    assert max(after) == pytest.approx(np.hypot(before, 1.5 / np.sqrt(3)), rel=0.02)
+    assert after[150] > 0.85 * max(after)
+    assert after[-1] == pytest.approx(before, rel=0.02)
+
+
 def test_a_jump_that_no_correction_explains_is_a_reset() -> None:
     odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
     for k in range(10):
