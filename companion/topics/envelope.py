@@ -98,7 +98,7 @@ class Envelope:
 
 
 def unpack(data: bytes) -> Envelope:
-    """Read an envelope; StreamError for what is none. The arrays are views of `data`."""
+    """Read an envelope; StreamError for what is none. The arrays may be views of `data`."""
     try:
         return _unpack(data)
     except (ValueError, TypeError, RecursionError, struct.error) as error:
@@ -128,7 +128,9 @@ def _unpack(data: bytes) -> Envelope:
         n_bytes = n * np.dtype(dtype).itemsize
         if at + n_bytes > len(data):
             raise ValueError("it ends early")
-        arrays[name] = np.frombuffer(data, dtype, n, at).reshape(shape)
+        # where it lies need not be where its type may lie, which not every library minds
+        found = np.frombuffer(data, dtype, n, at).reshape(shape)
+        arrays[name] = np.require(found, requirements="A")
         at += n_bytes
     if at != len(data):
         raise ValueError("it does not end where it should")

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from companion.camera import Camera, Distortion
 from companion.errors import StreamError
@@ -27,7 +29,9 @@ from tests.support import flown, topic_flight
 
 
 def test_an_envelope_is_as_it_was() -> None:
-    arrays = {"a": np.arange(6, dtype=np.float64).reshape(2, 3), "none": np.zeros((0, 3), np.uint8)}
+    arrays: dict[str, NDArray[Any]] = {
+        "a": np.arange(6, dtype=np.float64).reshape(2, 3), "none": np.zeros((0, 3), np.uint8),
+    }  # fmt: skip
     back = unpack(Envelope("kind", {"t_ns": 1_700_000_000_123_456_789, "x": None}, arrays).pack())
     assert back.kind == "kind" and back.fields["t_ns"] == 1_700_000_000_123_456_789
     assert np.array_equal(back.arrays["a"], arrays["a"]) and back.arrays["none"].shape == (0, 3)

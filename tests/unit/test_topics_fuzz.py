@@ -18,7 +18,7 @@ from companion.depth.device_choice import choose_device
 from companion.depth.stage import DepthStage
 from companion.errors import StreamError
 from companion.live.kept_chunks import NAME, KeptChunks
-from companion.messages import Odometry, TrackState
+from companion.messages import Message, Odometry, TrackState
 from companion.topics.bundle import MapMirror, bundle_of, frame_of
 from companion.topics.camera_fields import camera_fields, camera_of
 from companion.topics.encoding import (
@@ -126,7 +126,8 @@ def test_what_is_well_formed_but_wrong_does_not_bring_the_depth_stage_down() -> 
         except StreamError:
             continue
         n_taken += 1
-        for message in (*frames, *bundle.tracks, *bundle.keyframes):
+        told: list[Message] = [*frames, *bundle.tracks, *bundle.keyframes]
+        for message in told:
             stage.step(message)
         if bundle.change is not None:
             n_maps += len(stage.step(mirror.take(bundle.change)))
