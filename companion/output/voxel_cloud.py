@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.geometry import Array
 from companion.output.cloud import Cloud, joined, no_cloud
@@ -45,10 +49,15 @@ class VoxelCloud:
 
     def finish(self) -> Cloud:
         """All of it, tile by tile; nothing is left here."""
-        out = []
+        arrays: dict[str, list[NDArray[Any]]] = {f.name: [] for f in fields(Cloud)}
         for tile in sorted(self._tiles):
-            out.append(self._thinned(self._tiles.pop(tile)))
-        return joined(out)
+            thinned = self._thinned(self._tiles.pop(tile))
+            for name, parts in arrays.items():
+                parts.append(getattr(thinned, name))
+        if not arrays["points"]:
+            return no_cloud()
+        # each kind by itself, so that not all of it is there twice
+        return Cloud(**{name: np.concatenate(arrays.pop(name)) for name in list(arrays)})
 
     def _thinned(self, parts: list[Cloud]) -> Cloud:
         together = joined(parts)
