@@ -169,17 +169,19 @@ def test_a_storm_of_requests_delays_no_pose(flying: Flying) -> None:
 
 
 def test_a_new_map_raises_the_reset_counter(flying: Flying, ground: GroundStation) -> None:
-    flying.take_off()
-    n_resets, flight = flying.poses.resets[-1], flying.daemon.status()["flight"]
-    assert ground.command(NEW_MAP) == [DENIED]  # the autopilot flies on these poses
+    flying.autopilot.arm()
+    before = flying.daemon.until(lambda health: health["quality"] > 0, 60, "it finds its way")
+    assert ground.command(NEW_MAP) == [DENIED]  # the autopilot may fly on these poses
     began_ns = time.monotonic_ns()
     assert ground.command(NEW_MAP, 1.0, timeout_s=60) == [IN_PROGRESS, ACCEPTED]
-    flying.daemon.until(lambda health: health["flight"] not in ("", flight), 10)
-    flying.until_sending(90)
-    assert flying.poses.resets[-1] == n_resets + 1
+    after = flying.daemon.until(lambda health: health["flight"] not in ("", before["flight"]), 10)
+    assert after["feedback"]["n_resets"] == before["feedback"]["n_resets"] + 1
     flying.until_told("a new map begins", began_ns)
-    flying.daemon.line("flight over", 60, began_ns)
-    assert json.loads((flying.daemon.flights / flight / "report.json").read_text())
+    flying.daemon.line("flight over", 90, began_ns)
+    assert json.loads((flying.daemon.flights / before["flight"] / "report.json").read_text())
+    assert all((path / "flight.mcap").exists() for path in flying.daemon.flown())
+    flying.until_sending(MAP_S)
+    assert flying.poses.resets[-1] >= after["feedback"]["n_resets"]
 
 
 def test_the_pose_is_switched_off(flying: Flying, ground: GroundStation) -> None:
