@@ -1,0 +1,25 @@
+"""Whether the smooth pose is off by as much as it says, on a flight whose truth is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from companion.bench_slam import bench_slam
+from companion.config import Config
+from companion.progress import NoProgress
+
+SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    """Mean square error of ten seconds' way over the stated variance: 1 would be exact.
+
+    An autopilot that is told of a smaller error than there is will trust a wrong pose: not above
+    1.5. Below 0.1 the pose would be worth less to it than it is.
+    """
+    (row,) = bench_slam(
+        [SAMPLE], Config(), None, faults=False, above_m=None, progress=NoProgress()
+    )
+    assert row.nees is not None
+    assert 0.1 < row.nees < 1.5
+    assert row.resets == 0
