@@ -23,7 +23,7 @@ architecture=$(dpkg --print-architecture)
 version=$(sed -n 's/^__version__ = "\(.*\)"$/\1/p' companion/__init__.py | sed 's/\.\{0,1\}\(dev\|rc\|a\|b\)/~\1/')
 [ -n "$version" ] || fail "companion/__init__.py states no __version__"
 case $architecture in
-  amd64) extras='[cpu]' needs='binutils, ' recommends='' ;; # PoCL links its kernels with ld
+  amd64) extras='[cpu]' needs='gcc, libc6-dev, ' recommends='' ;; # PoCL links kernels with them
   *) extras='' needs='' recommends='pocl-opencl-icd | opencl-icd' ;;
 esac
 
