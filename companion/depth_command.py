@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import numpy as np
 
 from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
+from companion.depth.consensus import Consensus
 from companion.depth.depth_range import depth_range
 from companion.depth.device_choice import choose_device
 from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion, chunk_alone
 from companion.depth.opencl import ComputeDevice
 from companion.depth.undistortion import Undistortion
+from companion.depth.views import LONGEST_BASELINE
 from companion.errors import FlightError
 from companion.geometry import Pose
 from companion.messages import Bytes, DepthMap, MapUpdate, PixelState, PointChunk
@@ -152,7 +155,8 @@ def reconstruct(
     alone = wanted.reference is not None
     references = [first] if alone else _references(images, positions, middle_m, config)
     out.mkdir(parents=True, exist_ok=True)
-    fusion = Fusion(config.cloud)
+    fusion, consensus = Fusion(config.cloud), Consensus(config.depth.converged_sigma)
+    n_written = 0
     chunks: list[PointChunk] = []
     done: list[DepthMap] = []
     log = []
@@ -164,12 +168,11 @@ def reconstruct(
         for n, reference in enumerate(references, 1):
             if wanted.range_m is None and n > 1:
                 range_m = work.found_range(reference, positions) or range_m
-            reach_m = np.inf if alone else config.depth.max_baseline * middle_m
+            reach_m = np.inf if alone else LONGEST_BASELINE * math.sqrt(range_m[0] * range_m[1])
             others = _others(images, positions, reference, reach_m)
             work.load([reference, *others])
             depth_map, updates, spent = work.depth_map(reference, others, *range_m)
-            write_depth(out, depth_map)
-            done.append(depth_map)
+            done += [depth_map] if alone else consensus.add(depth_map, work.pose(reference))
             log.append(
                 ReferenceLog(
                     numbers[reference], range_m, work.engine.n_searched, tuple(updates), spent
@@ -177,9 +180,15 @@ def reconstruct(
             )
             if not alone:
                 chunks += fusion.add(depth_map, update)
+            for it in done[n_written:]:
+                write_depth(out, it)
+            n_written = len(done)
             progress.update(n, f"frame {numbers[reference]}", sum(len(c.rgb) for c in chunks))
     finally:
         progress.finish()
+    done += consensus.flush()
+    for it in done[n_written:]:
+        write_depth(out, it)
     chunks += [chunk_alone(done[0])] if alone else fusion.flush(update)
     write_cloud(out, chunks, places)
     write_log(
