@@ -1,4 +1,4 @@
-"""Who is listened to at the router's port: who signs where there is a key, and nobody under our name."""
+"""Who is listened to at the router's port: who signs where there is a key, nobody in our name."""
 
 from __future__ import annotations
 
