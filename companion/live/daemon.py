@@ -18,7 +18,7 @@ from companion.config import Config
 from companion.errors import CompanionError
 from companion.health import LatencyMeter
 from companion.live.component_state import POWEROFF, component_state
-from companion.live.flight import Listener, LiveFlight
+from companion.live.flight import Listener, LiveFlight, makes_depth
 from companion.live.flight_facts import facts_of
 from companion.live.flights import Flights
 from companion.live.ground_control import GroundControl
@@ -370,7 +370,7 @@ class Daemon:
             self._sender.reconfigure(config.feedback)
         flight = self._flights.current
         if flight is not None:
-            flight.set_dense(config.depth.enabled)
+            flight.set_dense(makes_depth(config))
             flight.set_budget(config.stream.budget_kbit_s)
             return
         self._flights.discard_spare()

@@ -99,7 +99,7 @@ class LiveFlight:
         self._last_map: MapUpdate | None = None
         self._told_ns = 0
         self._origin: GeoOrigin | None = None
-        self._dense = _makes_depth(config)
+        self._dense = makes_depth(config)
         self._dense_share = 1.0
         self._began_later: set[str] = set()
         """Stages that were not wanted at first."""
@@ -369,6 +369,11 @@ class LiveFlight:
         return counts
 
 
-def _makes_depth(config: Config) -> bool:
-    elsewhere = config.distributed.enabled and "depth" not in config.distributed.stages
-    return config.depth.enabled and not elsewhere
+def depth_elsewhere(config: Config) -> bool:
+    """Whether another machine makes the dense map, if any does."""
+    return config.distributed.enabled and "depth" not in config.distributed.stages
+
+
+def makes_depth(config: Config) -> bool:
+    """Whether the dense map is made here."""
+    return config.depth.enabled and not depth_elsewhere(config)

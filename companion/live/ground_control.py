@@ -15,6 +15,7 @@ from companion.clock import FlightClock
 from companion.config import Config
 from companion.errors import ConfigError
 from companion.live import kept_settings
+from companion.live.flight import depth_elsewhere
 from companion.live.flight_parameters import (
     PARAMETERS,
     FlightParameter,
@@ -42,6 +43,7 @@ CHANGES_HZ, CHANGES_AT_ONCE = 2.0, 40.0
 NO_FLIGHT = "there is no flight"
 POSES_SENT = "the autopilot may fly on these poses; param1 = 1 does it all the same"
 NOT_ARMED = "while armed it can be switched off only"
+ELSEWHERE = "another machine makes the dense map"
 TOO_OFTEN = "it is set too often"
 NOT_LOOSER = "while armed it can be made stricter only"
 
@@ -150,6 +152,8 @@ class GroundControl:
         self._changes.refill(self._clock.now_ns())
         if self._changes.left < 1.0:
             return TOO_OFTEN
+        if parameter.full_key == "depth.enabled" and depth_elsewhere(self._daemon.config):
+            return ELSEWHERE
         if not self._daemon.armed:
             return ""
         if parameter.full_key == "feedback.mode" and value != 0:

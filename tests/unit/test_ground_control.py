@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from companion.clock import FlightClock
-from companion.config import Config, ControlConfig, LinkConfig
+from companion.config import Config, ControlConfig, DistributedConfig, LinkConfig
 from companion.config_file import to_toml
 from companion.errors import ConfigError
 from companion.health import Health, SourceHealth, StageHealth
@@ -129,6 +129,13 @@ def test_while_armed_feedback_can_be_switched_off_only() -> None:
     assert control.set("FB_MODE", 0.0) == SET
     assert control.set("FB_MODE", 1.0) == NOT_NOW
     assert daemon.config.feedback.mode == "off"
+
+
+def test_a_dense_map_that_another_machine_makes_is_not_ours_to_switch() -> None:
+    elsewhere = DistributedConfig(enabled=True, stages=("tracking",))
+    control, daemon, _ = control_of(Config(distributed=elsewhere))
+    assert control.set("MAP_DENSE", 0.0) == NOT_NOW
+    assert daemon.config.depth.enabled
 
 
 def test_settings_that_flutter_are_held() -> None:
