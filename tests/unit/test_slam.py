@@ -67,11 +67,10 @@ def positions(tracker: Tracker, tracks: dict[int, Track]) -> tuple[Array, Array]
     estimated, truth = [], []
     for seq, track in sorted(tracks.items()):
         assert track.keyframe_id is not None
-        keyframe = tracker.map.keyframes[track.keyframe_id]
+        camera_from_map = tracker.map.pose_of(track.keyframe_id)
+        assert camera_from_map is not None
         assert track.keyframe_from_camera is not None
-        estimated.append(
-            (keyframe.camera_from_map.inverse() @ track.keyframe_from_camera).translation
-        )
+        estimated.append((camera_from_map.inverse() @ track.keyframe_from_camera).translation)
         truth.append(path(seq).translation)
     return np.array(estimated), np.array(truth)
 

@@ -4,21 +4,35 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
-from companion.config import MappingConfig
-from companion.geometry import Pose, Similarity
-from companion.slam.bundle import adjust
+from companion.camera import Camera
+from companion.config import Config, MappingConfig
+from companion.geometry import Pose, Similarity, rotation_from_vector
+from companion.messages import Frame, Reunited, Track
+from companion.slam import whole_map
+from companion.slam.atlas import Atlas
+from companion.slam.bundle import Adjusted, adjust
 from companion.slam.culling import retire
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.mapper import Mapper
-from companion.slam.whole_map import parts_of, put_back, put_back_later, take
+from companion.slam.tracker import Prior, Tracker
+from companion.slam.whole_map import Taken, parts_of, put_back, put_back_later, take
 from companion.slam.worker import Beside, Done, MapTurn
 from tests.support.made_map import CAMERA, Ground, flown, mapped
+from tests.support.scene import DOWN_LOOKING, PlaneWorld, aligned_error
 
 N = 14
+SMALL = Camera(320, 240, 260.0, 258.0, 161.0, 118.0)
+
+
+def path(k: int) -> Pose:
+    """Eastward at 12 m with some roll, pitch and yaw."""
+    wobble = rotation_from_vector(np.array([0.03 * np.sin(k / 5), 0.04 * np.cos(k / 7), 0.01 * k]))
+    return Pose(wobble @ DOWN_LOOKING, np.array([0.1 * k - 3, 0.25 * k - 5, -12.0]))
 
 
 def disturbed() -> SlamMap:
@@ -159,3 +173,50 @@ def test_the_end_does_not_wait_for_spare_work() -> None:
     assert begun.wait(5)
     worker.close()
     assert worker.done() == []
+
+
+def test_a_live_flight_is_tracked_while_its_map_is_adjusted_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As if a loop were closed at each keyframe; frames come as fast as they are tracked."""
+    extend, put = Atlas.extend, whole_map.put_back_later
+    n_adjusted = 0
+
+    def extended(self: Atlas, segment: SlamMap, keyframe: Keyframe) -> Reunited | None:
+        self._due = segment
+        return extend(self, segment, keyframe)
+
+    def counted(slam_map: SlamMap, taken: Taken, result: Adjusted) -> None:
+        nonlocal n_adjusted
+        n_adjusted += 1
+        put(slam_map, taken, result)
+
+    monkeypatch.setattr(Atlas, "extend", extended)
+    monkeypatch.setattr("companion.slam.mapper.put_back_later", counted)
+    world = PlaneWorld(np.random.default_rng(7))
+    tracker = Tracker(Config(), SMALL, lambda _: nullcontext(), beside=True)
+    tracks: dict[int, Track] = {}
+    pose: Pose | None = None
+    for k in range(40):
+        grey, _ = world.render(SMALL, path(k))
+        frame = Frame(k, k * 100_000_000, grey, np.zeros((1, 1, 3), np.uint8))
+        with tracker.turn.tracking():
+            told = tracker.step(frame, Prior(pose, path(k).rotation))
+        for message in told:
+            if isinstance(message, Track) and message.map_from_camera is not None:
+                tracks[message.seq] = message
+                pose = message.map_from_camera
+    tracker.close()
+    assert sorted(tracks) == list(range(40))
+    assert n_adjusted > 0
+    estimated = []
+    for _, track in sorted(tracks.items()):
+        assert track.keyframe_id is not None
+        assert track.keyframe_from_camera is not None
+        camera_from_map = tracker.map.pose_of(track.keyframe_id)
+        assert camera_from_map is not None
+        place = camera_from_map.inverse() @ track.keyframe_from_camera
+        estimated.append(place.translation)
+    truth = np.array([path(k).translation for k in range(40)])
+    error, _ = aligned_error(np.array(estimated), truth)
+    assert error < 0.25  # metres; a pixel is 0.046 m
