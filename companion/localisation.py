@@ -195,13 +195,13 @@ class LocalisationStage:
         last, segment = self._last, self._tracker.map
         if last is None or last.keyframe_id is None or last.map_from_camera is None:
             return
-        keyframe = segment.keyframes.get(last.keyframe_id)
+        camera_from_map = segment.pose_of(last.keyframe_id)
         relative = last.keyframe_from_camera
-        if keyframe is None or relative is None:
+        if camera_from_map is None or relative is None:
             return
         unit = segment.unit_of.get(last.keyframe_id, 1.0)
         inside = Pose(relative.rotation, unit * relative.translation)
-        now = keyframe.camera_from_map.inverse() @ inside
+        now = camera_from_map.inverse() @ inside
         if np.array_equal(now.translation, last.map_from_camera.translation):
             return
         self._motion.map_moved(last.map_from_camera, now)
@@ -322,6 +322,7 @@ class LocalisationStage:
         poses: dict[int, Pose] = {}
         scales: dict[int, float] = {}
         points: list[Array] = []
+        n_retired = 0
         for segment in segments:
             own = self._georeferences.get(segment.first_keyframe_id)
             if segment is main:
@@ -332,14 +333,17 @@ class LocalisationStage:
                 continue  # nothing says how this segment lies to the main one
             if segment is segments[-1]:
                 self._main_from_newest = main_from_own
-            for key, keyframe in segment.keyframes.items():
-                poses[key] = main_from_own.apply_to_pose(keyframe.camera_from_map.inverse())
+            n_retired += len(segment.retired)
+            for key in (*segment.keyframes, *segment.retired):
+                camera_from_map = segment.pose_of(key)
+                assert camera_from_map is not None
+                poses[key] = main_from_own.apply_to_pose(camera_from_map.inverse())
                 unit = main_from_own.scale * segment.unit_of.get(key, 1.0)
                 if unit != 1.0:
                     scales[key] = unit
             points.append(main_from_own.apply(segment.living_positions()))
         return MapUpdate(
-            self._revision, self._t_ns, poses, np.concatenate(points), anchor, scales,
+            self._revision, self._t_ns, poses, np.concatenate(points), anchor, scales, n_retired,
         )  # fmt: skip
 
     def _allowed(self, keyframe: Keyframe, other: Keyframe, found: Reunion) -> bool:

@@ -16,8 +16,8 @@ MIN_SHARE, MIN_OTHERS = 0.9, 3
 COARSER = 1
 """Pyramid levels by which another view may be the coarser one."""
 N_TRIED, N_OTHERS = 12, 20
-NEWEST_KEPT, OLDEST_KEPT = 4, 2
-"""Tracking works with the newest ones; the oldest two hold position, attitude and scale."""
+NEWEST_KEPT, OLDEST_KEPT = 4, 5
+"""Tracking works with the newest ones; the oldest hold position, attitude and scale."""
 MIN_SHARED = 30
 
 
