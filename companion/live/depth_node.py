@@ -27,6 +27,8 @@ ASK_S = 10.0
 """What an answer may take over a thin link."""
 AGAIN_S, NOBODY_S = 0.15, 0.5
 """Until it asks again: where there is nothing new, and where nobody answers."""
+MOST_IN_A_ROW = 10
+"""Answers that cannot be read, before the next bundle is asked for."""
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,79}")
 
 
@@ -57,7 +59,7 @@ class DepthNode:
         self._is_heard = False
         self._over = ""
         """The flight that has ended."""
-        self._n_malformed = 0
+        self._n_malformed = self._n_in_a_row = 0
         self._told_s = monotonic_s()
         self._never = threading.Event()
         where = ", ".join(config.distributed.connect) or "who joins"
@@ -132,7 +134,11 @@ class DepthNode:
             bundle = bundle_of(envelope)
         except StreamError as error:
             self._malformed(error)
+            self._n_in_a_row += 1
+            if self._n_in_a_row >= MOST_IN_A_ROW:  # it is not the link: go on without it
+                self._after, self._n_in_a_row = self._after + 1, 0
             return False
+        self._n_in_a_row = 0
         self._work(flight, bundle)
         return True
 

@@ -95,13 +95,21 @@ class RemoteFlight:
             self._step(self._update)
 
     def close(self, hurry: bool) -> None:
-        """Make what is still open, and write all results; the page not in a hurry."""
+        """Make what is still open, and write all results; the page not in a hurry.
+
+        Where no map has come, nothing is known of where points lie: what is there stays.
+        """
         for out in self._depth.flush():
             self._give(out)
         self.kept.close()
         self._recording.__exit__(None, None, None)
         if self._viewing is not None:
             self._viewing.close(hurry)
+        if self._update is not None:
+            self._write(page=not hurry)
+        self._result.close()
+
+    def _write(self, page: bool) -> None:
         facts = RunFacts(
             stage_times=self._times.summary(), wall_s=monotonic_s() - self._began_s, clock=None,
             origin=None, device=self._device.described, config=shown(self._config),
@@ -110,8 +118,7 @@ class RemoteFlight:
             n_frames_total=self._result.n_frames, completed=True,
             dropped={"bundles": self.n_missed},
         )  # fmt: skip
-        write_results(self.folder, self._result, facts, self._config.cloud.voxel_m, page=not hurry)
-        self._result.close()
+        write_results(self.folder, self._result, facts, self._config.cloud.voxel_m, page=page)
 
     def _step(self, message: Message) -> None:
         for out in self._depth.step(message):

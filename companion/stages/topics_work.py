@@ -51,7 +51,9 @@ STEP_S = 0.1
 TAKEN, NOT_TAKEN = "a node elsewhere makes the depth", "no node elsewhere makes depth any more"
 
 
-class _Topics(Work):
+class Topics(Work):
+    """Gathers what nodes fetch, and publishes; InputError where Zenoh cannot be had."""
+
     def __init__(self, setup: Setup) -> None:
         super().__init__()
         if setup.folder is None:
@@ -63,17 +65,17 @@ class _Topics(Work):
         self._backlog = Backlog(self._run, config.backlog_mb << 20, bytes_s)
         self._update: MapUpdate | None = None
         self._is_fetched = False
-        self._about = Envelope(
+        self.about = Envelope(
             "flight",
             {"flight": self._flight, "run": self._run, "camera": camera_fields(setup.camera)},
             {},
         ).pack()
-        self._bus = ZenohBus(config)
+        self.bus = ZenohBus(config)
         for topic, priority in TOPICS.items():
-            self._bus.announce(topic, priority)
-        self._bus.serve("flight", lambda asked: self._about)
-        self._bus.serve("map", lambda asked: self._map())
-        self._bus.serve("depth_input", self._depth_input)
+            self.bus.announce(topic, priority)
+        self.bus.serve("flight", lambda asked: self.about)
+        self.bus.serve("map", lambda asked: self._map())
+        self.bus.serve("depth_input", self._depth_input)
         self.device = "nobody fetches"
 
     @property
@@ -82,6 +84,7 @@ class _Topics(Work):
         return self._gatherer.n_dropped + self._backlog.n_given_up
 
     def step(self, message: Any) -> Iterable[Message]:
+        """Take one message; says when somebody begins or ceases to fetch."""
         if isinstance(message, (Frame, Track, KeyframeAdded, MapUpdate)):
             if isinstance(message, MapUpdate):
                 self._update = message
@@ -98,13 +101,14 @@ class _Topics(Work):
         return self._changes(message.t_ns) if isinstance(message, Frame) else []
 
     def finish(self, finish: Finish) -> Iterable[Message]:
+        """Leave, if not in a hurry once the last is fetched by who has fetched so far."""
         self._take_bundle(self._gatherer.last())
         until_s = monotonic_s() + (0.0 if finish.hurry else LINGER_S)
         while self._fetches() and self._backlog.fetched < self._backlog.newest:
             if monotonic_s() > until_s:
                 break
             wait_s(threading.Event(), STEP_S)
-        self._bus.close()
+        self.bus.close()
         return []
 
     def _take_bundle(self, bundle: Bundle) -> None:
@@ -120,8 +124,8 @@ class _Topics(Work):
 
     def _publish(self, topic: str, envelope: Callable[[], Envelope]) -> None:
         """Send what somebody has subscribed to; else it is not even made."""
-        if self._bus.is_wanted(topic):
-            self._bus.publish(topic, envelope().pack())
+        if self.bus.is_wanted(topic):
+            self.bus.publish(topic, envelope().pack())
 
     def _map(self) -> bytes | None:
         update = self._update
@@ -150,4 +154,4 @@ class _Topics(Work):
 
 def work(setup: Setup) -> Work:
     """The stage that a setup asks for."""
-    return _Topics(setup)
+    return Topics(setup)

@@ -1,0 +1,169 @@
+"""A drone that tracks and a ground that makes the map, joined over Zenoh: in two namespaces."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+from companion.errors import SourceError
+from companion.live.kept_chunks import NAME
+from companion.stages.protocol import Finish
+from drivers.status_socket import ask_status
+from tests.support import topic_flight
+from tests.support.bus import Ground, free_endpoint, ground_config, topics_of
+from tests.support.two_namespaces import TwoNamespaces, why_not
+
+FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
+KBIT_S, DELAY_MS = 20_000, 10
+PORT = 7447
+RUN = (sys.executable, "-m", "companion", "run")
+
+
+def points_in(folder: Path) -> int:
+    """Points of a finished run."""
+    head = (folder / "cloud.ply").read_bytes()[:600].decode("ascii", "ignore")
+    found = re.search(r"element vertex (\d+)", head)
+    assert found is not None
+    return int(found[1])
+
+
+def until(such: Callable[[], bool], timeout_s: float, what: str) -> float:
+    """Wait for something; how long it took."""
+    began_s = time.monotonic()
+    while not such():
+        assert time.monotonic() - began_s < timeout_s, f"not within {timeout_s:g} s: {what}"
+        time.sleep(0.2)
+    return time.monotonic() - began_s
+
+
+@pytest.fixture
+def closing() -> Iterator[ExitStack]:
+    """Closes what a test has opened, however it ends."""
+    with ExitStack() as stack:
+        yield stack
+
+
+def test_a_node_goes_on_with_its_map_after_a_restart(tmp_path: Path, closing: ExitStack) -> None:
+    endpoint = free_endpoint()
+    messages = list(topic_flight.messages(130))
+    first = Ground(ground_config(endpoint, tmp_path))  # before the drone is there
+    closing.callback(first.stop)
+    drone = closing.enter_context(topics_of(endpoint, tmp_path))
+    for message in messages[: len(messages) // 2]:
+        drone.step(message)
+    folder = tmp_path / "ground" / "drone-a-flight"
+    kept = folder / NAME
+    until(lambda: kept.exists() and kept.stat().st_size > 2000, 60, "a cloud")
+    first.stop()
+    n_first, n_kept = points_in(folder), kept.stat().st_size
+    assert n_first > 50
+    for message in messages[len(messages) // 2 :]:
+        drone.step(message)  # nobody is there, and it takes no notice
+    second = Ground(ground_config(endpoint, tmp_path))
+    closing.callback(second.stop)
+    second.stop()  # before it has heard of the drone: what is there stays
+    assert points_in(folder) == n_first
+    third = Ground(ground_config(endpoint, tmp_path))
+    closing.callback(third.stop)
+    until(lambda: kept.stat().st_size > n_kept, 60, "more cloud")
+    drone.finish(Finish(hurry=False))  # waits for who fetches
+    third.stop()
+    assert points_in(folder) > 1.3 * n_first
+    assert kept.stat().st_size > n_kept
+
+
+class Nodes:
+    """Both programs as their users run them, each in a namespace."""
+
+    def __init__(self, air: TwoNamespaces, folder: Path) -> None:
+        self._air, self.folder, self.socket = air, folder, folder / "drone.sock"
+        self._log: IO[bytes] = (folder / "log").open("wb")
+        self._running: list[subprocess.Popen[bytes]] = []
+
+    def drone(self) -> subprocess.Popen[bytes]:
+        return self._start(
+            self._air.in_drone, "--stages", "tracking", "--set",
+            f'distributed.listen=["tcp/{self._air.DRONE}:{PORT}"]', "--set", "camera.source=file",
+            "--set", f"camera.path={FLIGHT}", "--set", f"camera.calibration={FLIGHT}/camera.json",
+            "--set", f"daemon.socket={self.socket}", "--set", "recorder.enabled=false",
+            "--set", f"daemon.flights={self.folder}/drone",
+        )  # fmt: skip
+
+    def ground(self) -> subprocess.Popen[bytes]:
+        return self._start(
+            self._air.in_ground, "--stages", "depth,cloud", "--join",
+            f"tcp/{self._air.DRONE}:{PORT}", "--set", f"daemon.flights={self.folder}/ground",
+        )  # fmt: skip
+
+    def pose_n(self) -> int:
+        """Poses that the drone has given so far."""
+        with contextlib.suppress(SourceError):
+            stages = ask_status(self.socket)["stages"]
+            return next((int(s["n"]) for s in stages if s["name"] == "localisation"), 0)
+        return 0
+
+    def kept_bytes(self) -> int:
+        """Of the cloud on the ground."""
+        return sum(p.stat().st_size for p in self.folder.glob(f"ground/*/{NAME}"))
+
+    def close(self) -> None:
+        for process in self._running:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        self._log.close()
+        print((self.folder / "log").read_text("utf-8", "replace"))
+
+    def _start(self, namespace: list[str], *options: str) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen(
+            [*namespace, *RUN, *options, "--set", "stream.listen="],
+            stdout=self._log, stderr=self._log,
+        )  # fmt: skip
+        self._running.append(process)
+        return process
+
+
+@pytest.fixture
+def nodes(tmp_path: Path) -> Iterator[Nodes]:
+    reason = why_not()
+    if reason and "namespaces" in os.environ.get("COMPANION_REQUIRE", ""):
+        pytest.fail(reason)
+    if reason:
+        pytest.skip(reason)
+    with TwoNamespaces(KBIT_S, DELAY_MS) as air:
+        both = Nodes(air, tmp_path)
+        try:
+            yield both
+        finally:
+            both.close()
+
+
+def test_the_ground_is_killed_and_restarted_and_its_map_grows_on(nodes: Nodes) -> None:
+    ground, drone = nodes.ground(), nodes.drone()
+    until(lambda: nodes.kept_bytes() > 0, 100, "a cloud on the ground")
+    ground.kill()
+    ground.wait()
+    n_bytes, n_poses = nodes.kept_bytes(), nodes.pose_n()
+    until(lambda: nodes.pose_n() > n_poses + 30, 30, "poses without the ground")
+    assert nodes.kept_bytes() == n_bytes
+    again = nodes.ground()
+    until(lambda: nodes.kept_bytes() > n_bytes + 1000, 100, "more cloud on the ground")
+    again.send_signal(signal.SIGTERM)
+    assert again.wait(60) == 0
+    (folder,) = nodes.folder.glob("ground/*")
+    assert points_in(folder) * 20 < nodes.kept_bytes() < 2000 * points_in(folder)
+    assert (folder / "report.json").exists() and (folder / "flight-2.rrd").exists()
+    assert drone.poll() is None
+    drone.send_signal(signal.SIGTERM)
+    assert drone.wait(20) == 0
