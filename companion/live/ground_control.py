@@ -38,6 +38,8 @@ from drivers.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, ParameterServer
 MAPPING, NEW_MAP, SNAPSHOT, BUDGET = 31010, 31011, 31012, 31013
 """MAV_CMD_USER_1 to MAV_CMD_USER_4."""
 STEP_S = 0.05
+TEXTS_HZ, TEXTS_AT_ONCE = 0.3, 5.0
+"""What comes of requests must not keep back what a pilot has to know."""
 CHANGES_HZ, CHANGES_AT_ONCE = 2.0, 40.0
 """As many as there are parameters may be set in a row; afterwards so many a second."""
 NO_FLIGHT = "there is no flight"
@@ -85,6 +87,7 @@ class GroundControl:
     ) -> None:
         self._daemon, self._link, self._journal = daemon, link, journal
         self._clock, self._changes = clock, RateLimit(CHANGES_HZ, CHANGES_AT_ONCE)
+        self._texts = RateLimit(TEXTS_HZ, TEXTS_AT_ONCE)
         self._flights, self.changed = flights, changed
         self._new_map = NewMap(flights, daemon.prepare, daemon.begin_flight)
         self._snapshots = Snapshots(flights, self._tell)
@@ -213,7 +216,12 @@ class GroundControl:
 
     def _tell(self, text: str, good: bool) -> None:
         priority = INFO if good else WARNING
-        if self._link.say(priority, f"Companion: {text}") or good:
+        self._texts.refill(self._clock.now_ns())
+        told = self._texts.left >= 1.0
+        if told:
+            self._texts.take(1.0)
+            self._link.say(priority, f"Companion: {text}")
+        if told or good:
             self._journal.say(f"ground: {text}", priority)
 
 

@@ -25,8 +25,8 @@ from companion.live.component_state import (
 )
 from companion.live.flight_parameters import PARAMETERS, number_of, value_of
 from companion.live.flights import Flights
-from companion.live.ground_control import CHANGES_AT_ONCE, GroundControl
-from companion.live.journal import Journal
+from companion.live.ground_control import CHANGES_AT_ONCE, TEXTS_AT_ONCE, GroundControl
+from companion.live.journal import WARNING, Journal
 from companion.live.kept_settings import kept_over
 from companion.live.reload import FIXED_KEYS, FIXED_SECTIONS
 from drivers.autopilot_link import AutopilotLink
@@ -143,6 +143,14 @@ def test_settings_that_flutter_are_held() -> None:
     results = [control.set("MAP_DENSE", float(n % 2)) for n in range(200)]
     assert CHANGES_AT_ONCE - 2 <= results.count(SET) / 2 <= CHANGES_AT_ONCE + 70
     assert NOT_NOW in results
+
+
+def test_refusals_do_not_keep_back_what_a_pilot_has_to_know() -> None:
+    control, _, port = control_of(Config())
+    for _ in range(100):
+        control.set("MAP_DENSE", 7.0)
+    assert 1 <= len(port.of("STATUSTEXT")) <= 3 * TEXTS_AT_ONCE  # of three pieces each at most
+    assert control._link.say(WARNING, "vision pose off")
 
 
 def test_without_a_flight_there_is_nothing_to_map() -> None:
