@@ -121,11 +121,17 @@ def recordings(container: Container) -> list[str]:
     return sorted(path.parent.name for path in flights.glob("*/flight.mcap"))
 
 
-def assert_whole(container: Container, names: list[str]) -> None:
-    """Every recording that is over reads back, with its checksums."""
-    folder = "/var/lib/companion/flights"
+def assert_readable(container: Container, names: list[str]) -> None:
+    """Every recording reads back, with its checksums, up to its last byte.
+
+    Of a killed daemon's the end is missing, since systemd kills the rest of the service at once.
+    """
     for name in names:
-        told(container.run("companion", "flights", "verify", f"{folder}/{name}").strip())
+        folder = f"/var/lib/companion/flights/{name}"
+        said = container.run("companion", "flights", "verify", folder, check=False).strip()
+        told(said.partition("flights/")[2])
+        cut = "cut short" in said and ", 0 bytes cannot be read" in said
+        assert " whole " in said or cut, said
 
 
 def test_unit_and_rules_are_well_formed(container: Container) -> None:
@@ -157,7 +163,7 @@ def test_killed_it_comes_back(container: Container) -> None:
     until(lambda: shown(container, "NRestarts") == "1", 30, "another start")
     until_flying(container)
     assert set(recordings(container)) > set(before)
-    assert_whole(container, before)
+    assert_readable(container, before)
 
 
 def test_a_wedged_pose_loop_is_ended_by_the_watchdog(container: Container) -> None:
@@ -170,7 +176,7 @@ def test_a_wedged_pose_loop_is_ended_by_the_watchdog(container: Container) -> No
     told(f"watchdog after {time.monotonic() - began_s:.0f} s")
     until(lambda: int(shown(container, "NRestarts")) > n_before, 60, "another start")
     until_flying(container)
-    assert_whole(container, before)
+    assert_readable(container, before)
 
 
 def test_it_and_its_recordings_survive_a_reboot(container: Container) -> None:
@@ -178,8 +184,10 @@ def test_it_and_its_recordings_survive_a_reboot(container: Container) -> None:
     container.reboot()
     until_flying(container)
     assert shown(container, "NRestarts") == "0"
+    last = f"/var/lib/companion/flights/{before[-1]}"
+    assert " whole " in container.run("companion", "flights", "verify", last)
     assert set(recordings(container)) > set(before)
-    assert_whole(container, before)
+    assert_readable(container, before)
 
 
 def test_an_upgrade_keeps_the_configuration(container: Container) -> None:
