@@ -334,10 +334,8 @@ class LocalisationStage:
             if segment is segments[-1]:
                 self._main_from_newest = main_from_own
             n_retired += len(segment.retired)
-            for key in (*segment.keyframes, *segment.retired):
-                camera_from_map = segment.pose_of(key)
-                assert camera_from_map is not None
-                poses[key] = main_from_own.apply_to_pose(camera_from_map.inverse())
+            for key, map_from_camera in segment.places():
+                poses[key] = main_from_own.apply_to_pose(map_from_camera)
                 unit = main_from_own.scale * segment.unit_of.get(key, 1.0)
                 if unit != 1.0:
                     scales[key] = unit

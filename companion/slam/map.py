@@ -6,6 +6,7 @@ its identity for as long as it lives, and is not used again before nobody can st
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -296,6 +297,13 @@ class SlamMap:
             return None
         beside = self.keyframes[retired.beside_id].camera_from_map
         return retired.beside_from_camera.inverse() @ beside
+
+    def places(self) -> Iterator[tuple[int, Pose]]:
+        """Every keyframe's id and `map_from_camera`, those that went among them."""
+        living = {key: k.camera_from_map.inverse() for key, k in self.keyframes.items()}
+        yield from living.items()
+        for key, retired in self.retired.items():
+            yield key, living[retired.beside_id] @ retired.beside_from_camera
 
     def poses_changed(self) -> None:
         """Tell the map that keyframes have come or moved."""

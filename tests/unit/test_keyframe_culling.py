@@ -81,6 +81,12 @@ def test_what_hung_on_a_keyframe_moves_with_the_one_beside_it() -> None:
         assert pose.inverse().translation == pytest.approx(wanted.translation, abs=1e-9)
         assert angle_between(pose.inverse().rotation, wanted.rotation) < 1e-9
     assert slam_map.pose_of(99) is None
+    places = dict(slam_map.places())
+    assert sorted(places) == list(range(9))
+    for key, place in places.items():
+        pose = slam_map.pose_of(key)
+        assert pose is not None
+        assert place.matrix() == pytest.approx(pose.inverse().matrix(), abs=1e-9)
 
 
 def test_a_loop_and_a_weld_take_those_along_that_went() -> None:
