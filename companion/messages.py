@@ -215,6 +215,10 @@ class Georeference:
     """False where only the scale is known: the world then begins at the first camera."""
 
 
+SPANS_REACH = 6
+"""Keyframes before one, and after it, that tell how its surroundings are stretched."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
     """The map as it now stands: every keyframe's pose, and the sparse points (N, 3) in map units.
@@ -244,6 +248,44 @@ class MapUpdate:
         if pose is None:
             return None
         return Similarity(self.unit_of.get(keyframe_id, 1.0), pose.rotation, pose.translation)
+
+    def spans_of(self, keyframe_id: int) -> dict[int, float]:
+        """How far some keyframes of about then are from one, in the unit of its camera frame."""
+        place = self.place_of(keyframe_id)
+        if place is None:
+            return {}
+        around = range(keyframe_id - SPANS_REACH, keyframe_id + SPANS_REACH + 1)
+        others = [k for k in around if k != keyframe_id and self._with(place, k)]
+        return {k: self._span(place, k) for k in others}
+
+    def stretch_of(self, keyframe_id: int, spans: Mapping[int, float]) -> float:
+        """By what factor measures about a keyframe are longer now than when it had these spans.
+
+        The median of the spans, each with the weight of its length; 1 where none tells.
+        """
+        place = self.place_of(keyframe_id)
+        if place is None:
+            return 1.0
+        ratios = sorted(
+            (self._span(place, k) / span, span)
+            for k, span in spans.items()
+            if span > 0 and self._with(place, k)
+        )
+        half, passed = 0.5 * sum(span for _, span in ratios), 0.0
+        for ratio, span in ratios:
+            passed += span
+            if passed >= half:
+                return ratio
+        return 1.0
+
+    def _with(self, place: Similarity, other_id: int) -> bool:
+        """Whether a keyframe is there, and in the same unit."""
+        unit = self.unit_of.get(other_id, 1.0)
+        return other_id in self.map_from_camera and abs(unit / place.scale - 1.0) < 1e-9
+
+    def _span(self, place: Similarity, other_id: int) -> float:
+        away = self.map_from_camera[other_id].translation - place.translation
+        return float(np.linalg.norm(away)) / place.scale
 
 
 class PixelState(Enum):
@@ -283,7 +325,8 @@ class PointChunk:
     `points_camera` (N, 3) f32, `rgb` (N, 3) u8, `confidence` (N,) f32 in 0..1; `normals_camera`
     (N, 3) f32 unit vectors towards the camera, zero where not known; `sigma` (N,) f32 one standard
     deviation along the line of sight, map units. A moved keyframe moves its chunk: nothing here
-    changes.
+    changes. `spans` are `MapUpdate.spans_of` the keyframe when the points were made; a later map
+    tells by them how its scale has changed there.
     """
 
     keyframe_id: int
@@ -293,6 +336,7 @@ class PointChunk:
     confidence: Floats
     normals_camera: Floats
     sigma: Floats
+    spans: Mapping[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

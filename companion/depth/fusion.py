@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,8 @@ MAX_SIGMA = 0.01
 class _Held:
     map: DepthMap
     normals: Floats
+    spans: Mapping[int, float]
+    """of its keyframe when its depth was measured"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +55,9 @@ class Fusion:
     def add(self, depth_map: DepthMap, update: MapUpdate) -> list[PointChunk]:
         """Take a depth map; chunks of those that have waited long enough."""
         sure = measured_only(depth_map, MAX_SIGMA)
-        self._held[depth_map.keyframe_id] = _Held(sure, normals(sure.depth, sure.intrinsics))
+        self._held[depth_map.keyframe_id] = _Held(
+            sure, normals(sure.depth, sure.intrinsics), update.spans_of(depth_map.keyframe_id)
+        )
         self._open.append(depth_map.keyframe_id)
         out = []
         while len(self._open) > self._wait_for:
@@ -68,7 +73,8 @@ class Fusion:
         return [chunk for chunk in out if chunk is not None]
 
     def _fuse(self, keyframe_id: int, update: MapUpdate) -> PointChunk | None:
-        depth_map, facing = self._held[keyframe_id].map, self._held[keyframe_id].normals
+        held = self._held[keyframe_id]
+        depth_map, facing = held.map, held.normals
         place = update.place_of(keyframe_id)
         if place is None:
             return None
@@ -76,7 +82,9 @@ class Fusion:
         if len(rows) == 0:
             return None
         points = points_of(depth_map, rows, columns)
-        sigma = (depth_map.sigma[rows, columns] / points[:, 2]).astype(np.float64)
+        points *= update.stretch_of(keyframe_id, held.spans)
+        depth = depth_map.depth[rows, columns]
+        sigma = (depth_map.sigma[rows, columns] / depth).astype(np.float64)
         n_maps = np.ones(len(points), np.int64)
         further, scatter, variance = np.zeros(len(points)), np.zeros(len(points)), sigma**2
         normal: Array = facing[rows, columns].astype(np.float64)
@@ -84,7 +92,8 @@ class Fusion:
             other_place = update.place_of(other_id)
             if other_id == keyframe_id or other_place is None:
                 continue
-            witness = self._witness(points, other_place.inverse() @ place, other)
+            stretch = update.stretch_of(other_id, other.spans)
+            witness = self._witness(points, other_place.inverse() @ place, other, stretch)
             n_maps += witness.agrees
             further[witness.agrees] += witness.off
             scatter[witness.agrees] += witness.off**2
@@ -108,7 +117,7 @@ class Fusion:
             keyframe_id, depth_map.t_ns, points[kept].astype(np.float32),
             np.ascontiguousarray(depth_map.rgb[rows[kept], columns[kept]]),
             confidence[kept].astype(np.float32), _unit(normal[kept]).astype(np.float32),
-            fused[kept].astype(np.float32),
+            fused[kept].astype(np.float32), update.spans_of(keyframe_id),
         )  # fmt: skip
 
     def _voxel(self, points: Array, place: Similarity, update: MapUpdate) -> float:
@@ -117,8 +126,10 @@ class Fusion:
             return 0.01 * float(np.median(points[:, 2]))
         return self._config.voxel_m / (update.georeference.world_from_map.scale * place.scale)
 
-    def _witness(self, points: Array, other_from_here: Similarity, other: _Held) -> _Witness:
-        """What the other sees of points (N, 3)."""
+    def _witness(
+        self, points: Array, other_from_here: Similarity, other: _Held, stretch: float
+    ) -> _Witness:
+        """What the other, whose depths are to be stretched, sees of points (N, 3)."""
         p = other_from_here.apply(points)
         fx, fy, cx, cy = other.map.intrinsics
         height, width = other.map.depth.shape
@@ -129,7 +140,7 @@ class Fusion:
         inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
         row, column = (np.where(inside, x, 0).astype(np.int64) for x in (v, u))
         seen = np.where(inside, other.map.depth[row, column], 0.0)
-        off: Array = seen / z - 1.0
+        off: Array = stretch * seen / z - 1.0
         agrees: Mask = (seen > 0) & (np.abs(off) < self._config.agreement)
         row, column = row[agrees], column[agrees]
         return _Witness(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import tempfile
 from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -19,6 +21,15 @@ POINT = np.dtype(
 )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    t_ns: int
+    spans: Mapping[int, float]
+    begin: int
+    """in the file"""
+    n: int
+
+
 class ChunkStore:
     """One chunk for each keyframe; of their points no more than `memory_mb` in memory.
 
@@ -32,8 +43,7 @@ class ChunkStore:
         self._most = np.inf if folder is None else memory_mb * 1e6 / POINT.itemsize
         self._held: OrderedDict[int, PointChunk] = OrderedDict()
         self._n_held = 0
-        self._stored: dict[int, tuple[int, int, int]] = {}
-        """of each: time, where it begins in the file, points"""
+        self._stored: dict[int, _Stored] = {}
         self._file: IO[bytes] | None = None
         self._end = 0
         self.n_points = 0
@@ -47,7 +57,7 @@ class ChunkStore:
             self.n_points -= len(before.rgb)
         elif chunk.keyframe_id in self._stored:
             # its room in the file is lost: this is rare
-            self.n_points -= self._stored.pop(chunk.keyframe_id)[2]
+            self.n_points -= self._stored.pop(chunk.keyframe_id).n
         self._held[chunk.keyframe_id] = chunk
         self._n_held += len(chunk.rgb)
         self.n_points += len(chunk.rgb)
@@ -77,16 +87,17 @@ class ChunkStore:
         """The chunk of a keyframe; OSError where the file cannot be read."""
         if keyframe_id in self._held:
             return self._held[keyframe_id]
-        t_ns, begin, n = self._stored[keyframe_id]
+        stored = self._stored[keyframe_id]
         assert self._file is not None
-        self._file.seek(begin)
-        data = self._file.read(n * POINT.itemsize)
-        if len(data) != n * POINT.itemsize:
+        self._file.seek(stored.begin)
+        data = self._file.read(stored.n * POINT.itemsize)
+        if len(data) != stored.n * POINT.itemsize:
             raise OSError(f"points of keyframe {keyframe_id} cannot be read back")
         points = np.frombuffer(data, POINT)
         return PointChunk(
-            keyframe_id, t_ns, points["points_camera"].copy(), points["rgb"].copy(),
+            keyframe_id, stored.t_ns, points["points_camera"].copy(), points["rgb"].copy(),
             points["confidence"].copy(), points["normals_camera"].copy(), points["sigma"].copy(),
+            stored.spans,
         )  # fmt: skip
 
     def close(self) -> None:
@@ -98,7 +109,7 @@ class ChunkStore:
             self._file.close()
             self._file = None
 
-    def _append(self, chunk: PointChunk) -> tuple[int, int, int]:
+    def _append(self, chunk: PointChunk) -> _Stored:
         if self._file is None:
             assert self._folder is not None
             self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)
@@ -113,4 +124,4 @@ class ChunkStore:
         while data:
             data = data[self._file.write(data) :]
         self._end = begin + n * POINT.itemsize
-        return chunk.t_ns, begin, n
+        return _Stored(chunk.t_ns, chunk.spans, begin, n)

@@ -222,22 +222,25 @@ class FlightResult:
 
         Places are those of when it began; chunks that come meanwhile are left out.
         """
+        update, georeference = self.update, self.georeference
+        if update is None:
+            return no_cloud()
         places: dict[int, Similarity] = {}
         for keyframe_id in self._chunks.keyframe_ids:
-            place = self.update.place_of(keyframe_id) if self.update is not None else None
+            place = update.place_of(keyframe_id)
             if place is None or keyframe_id not in self._median_depths:
                 continue
-            if self.georeference is not None:
-                place = self.georeference.world_from_map @ place
-            places[keyframe_id] = place
+            places[keyframe_id] = georeference.world_from_map @ place if georeference else place
         if not places:
             return no_cloud()
-        metric = self.georeference is not None
+        metric = georeference is not None
         depths = [place.scale * self._median_depths[key] for key, place in places.items()]
         thinned = VoxelCloud(voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths)))
         for n, (keyframe_id, place) in enumerate(places.items()):
             if keyframe_id in self._chunks:  # else the disk was full meanwhile
-                thinned.add(placed(self._chunks.get(keyframe_id), place))
+                chunk = self._chunks.get(keyframe_id)
+                stretch = update.stretch_of(keyframe_id, chunk.spans)
+                thinned.add(placed(chunk, replace(place, scale=stretch * place.scale)))
             yield (n + 1) / len(places)
         return thinned.finish()
 

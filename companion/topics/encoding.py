@@ -142,6 +142,8 @@ def cloud_envelope(flight: str, chunk: PointChunk, update: MapUpdate | None) -> 
     }, {
         "points_camera": chunk.points_camera, "rgb": chunk.rgb, "confidence": chunk.confidence,
         "normals_camera": chunk.normals_camera, "sigma": chunk.sigma,
+        "span_ids": np.array([*chunk.spans], "<i8"),
+        "span_lengths": np.array([*chunk.spans.values()], "<f8"),
     })  # fmt: skip
 
 
@@ -151,10 +153,13 @@ def cloud_of_envelope(envelope: Envelope) -> PointChunk:
     n = len(points)
     if n > MOST_POINTS:
         raise StreamError(f"cloud: {n} points")
+    span_ids = envelope.array("span_ids", "<i8", -1)
+    span_lengths = envelope.array("span_lengths", "<f8", len(span_ids))
     return PointChunk(
         envelope.integer("keyframe_id", 0, MOST_ID), envelope.integer("t_ns"), points,
         envelope.array("rgb", "|u1", n, 3), envelope.array("confidence", "<f4", n),
         envelope.array("normals_camera", "<f4", n, 3), envelope.array("sigma", "<f4", n),
+        dict(zip(span_ids.tolist(), span_lengths.tolist(), strict=True)),
     )  # fmt: skip
 
 

@@ -62,8 +62,10 @@ def test_a_pose_is_as_it_was() -> None:
 
 def test_a_cloud_says_where_it_lies_in_the_world() -> None:
     chunk = flown.chunk(3, 50)
+    chunk = replace(chunk, spans={1: 0.75, 4: 2.5})
     envelope = unpack(cloud_envelope("f", chunk, flown.update()).pack())
     back = cloud_of_envelope(envelope)
+    assert back.spans == chunk.spans
     for name in ("points_camera", "rgb", "confidence", "normals_camera", "sigma"):
         assert np.array_equal(getattr(back, name), getattr(chunk, name))
     scale, *place = envelope.fields["world_from_camera"]
