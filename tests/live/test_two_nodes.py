@@ -85,6 +85,33 @@ def test_a_node_goes_on_with_its_map_after_a_restart(tmp_path: Path, closing: Ex
     assert kept.stat().st_size > n_kept
 
 
+def test_the_drone_begins_anew_and_so_does_its_map(tmp_path: Path, closing: ExitStack) -> None:
+    endpoint = free_endpoint()
+    messages = list(topic_flight.messages(130))
+    folders = [tmp_path / "ground" / f"drone-{name}" for name in ("a-flight", "b-flight")]
+
+    def kept_bytes(folder: Path) -> int:
+        return (folder / NAME).stat().st_size if (folder / NAME).exists() else 0
+
+    ground = Ground(ground_config(endpoint, tmp_path))
+    closing.callback(ground.stop)
+    with topics_of(endpoint, tmp_path) as topics:
+        for message in messages[:180]:
+            topics.step(message)
+        until(lambda: kept_bytes(folders[0]) > 2000, 60, "a cloud")
+    before = kept_bytes(folders[0])
+    with topics_of(endpoint, tmp_path) as topics:  # the same flight, another process
+        for message in messages[180:]:
+            topics.step(message)
+        until(lambda: kept_bytes(folders[0]) > before, 60, "more of this cloud")
+    with topics_of(endpoint, tmp_path, "b-flight") as topics:
+        for message in messages:
+            topics.step(message)
+        until(lambda: kept_bytes(folders[1]) > 2000, 60, "a cloud of the next flight")
+    ground.stop()
+    assert all(points_in(folder) > 50 for folder in folders)
+
+
 def slow_flight(folder: Path) -> Path:
     """The sample flight's pictures at longer intervals, without telemetry."""
     folder.mkdir()
