@@ -75,9 +75,9 @@ class Container:
 
     def install(self, package: Path) -> str:
         """Install a .deb before the first boot, as an image is made; what dpkg said."""
-        shutil.copy(package, self.root / "tmp")
+        shutil.copy(package, self.root / "srv")
         done = subprocess.run(
-            ["chroot", str(self.root), "dpkg", "-i", f"/tmp/{package.name}"],
+            ["chroot", str(self.root), "dpkg", "-i", f"/srv/{package.name}"],
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         return done.stdout

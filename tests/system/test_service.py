@@ -192,7 +192,7 @@ def test_it_and_its_recordings_survive_a_reboot(container: Container) -> None:
 
 def test_an_upgrade_keeps_the_configuration(container: Container) -> None:
     pid = shown(container, "MainPID")
-    container.run("dpkg", "-i", f"/tmp/{PACKAGES[-1].name}", timeout_s=900)
+    container.run("dpkg", "-i", f"/srv/{PACKAGES[-1].name}", timeout_s=900)
     until_flying(container)
     assert shown(container, "MainPID") != pid
     assert (container.root / "etc/companion/companion.toml").read_text() == CONFIG
