@@ -47,7 +47,8 @@ def carry_out(steps: Sequence[Step], told: Callable[[str], None], dry_run: bool)
             if not isinstance(error, (OSError, InstallError)):
                 raise
             after = f"; not undone: {', '.join(left)}" if left else "; nothing is left of it"
-            raise InstallError(f"{step.what}: {error}{after}") from None
+            why = error.strerror if isinstance(error, OSError) and error.strerror else error
+            raise InstallError(f"{step.what}: {why}{after}") from None
         told(f"done: {step.what}")
 
 
