@@ -48,6 +48,7 @@ GONE_S = 5.0
 LINGER_S = 10.0
 """After a flight so long for who still fetches it."""
 STEP_S = 0.1
+MALFORMED = "questions came over the network that cannot be read"
 TAKEN, NOT_TAKEN = "a node elsewhere makes the depth", "no node elsewhere makes depth any more"
 
 
@@ -65,6 +66,7 @@ class Topics(Work):
         self._backlog = Backlog(self._run, config.backlog_mb << 20, bytes_s)
         self._update: MapUpdate | None = None
         self._is_fetched = False
+        self._n_malformed, self._tell_malformed_at = 0, 1
         self.about = Envelope(
             "flight",
             {"flight": self._flight, "run": self._run, "camera": camera_fields(setup.camera)},
@@ -138,6 +140,7 @@ class Topics(Work):
             run, after = request.text("run"), request.integer("after", -1)
             whole = request.flag("whole")
         except StreamError:
+            self._n_malformed += 1
             return None
         return self._backlog.after(run, after, monotonic_s(), whole)
 
@@ -150,6 +153,9 @@ class Topics(Work):
             self._is_fetched = fetches
             self.device = "fetched" if fetches else "nobody fetches"
             yield Warned(t_ns, TAKEN if fetches else NOT_TAKEN, good=fetches)
+        if self._n_malformed >= self._tell_malformed_at:
+            self._tell_malformed_at = 2 * self._n_malformed
+            yield Warned(t_ns, MALFORMED, f"{self._n_malformed} so far")
 
 
 def work(setup: Setup) -> Work:

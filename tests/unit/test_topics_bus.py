@@ -15,7 +15,8 @@ from companion.config import Config, DistributedConfig
 from companion.errors import InputError
 from companion.geometry import Pose
 from companion.live.nodes import with_stages
-from companion.messages import MapUpdate, Odometry, TrackState
+from companion.messages import MapUpdate, Odometry, TrackState, Warned
+from companion.stages.topics_work import MALFORMED
 from companion.topics.bundle import bundle_of
 from companion.topics.envelope import Envelope, unpack
 from drivers.zenoh_bus import ZenohBus
@@ -67,6 +68,9 @@ def test_what_is_malformed_is_refused_by_both_sides(
         drone.step(message)
     for bad in (b"", b"\xff" * 40, wanted(run, 1)[:-2], Envelope("wanted", {"run": 3}, {}).pack()):
         assert bus.ask("depth_input", bad, 0.5) is None
+    given = drone.step(topic_flight.frame(21, topic_flight.wall()))
+    said = [(m.what, m.detail) for m in given if isinstance(m, Warned) and m.detail]
+    assert said == [(MALFORMED, "4 so far")]
     assert bundle_of(asked(bus, "depth_input", wanted(run, 0))).number == 1
 
     other = free_endpoint()
