@@ -287,6 +287,7 @@ class LocalisationStage:
         ):
             return []
         before = self._ned_from_camera(t_ns)
+        self._turn_downs(found.body_from_camera.T @ self._mount_rotation)
         self._mount_rotation = found.body_from_camera
         self._late_ns = int(found.offset_s * 1e9)
         after = self._ned_from_camera(t_ns)
@@ -304,6 +305,14 @@ class LocalisationStage:
             f"telemetry is {found.offset_s * 1e3:+.0f} ms late; put that into the calibration"
         )
         return [Warned(t_ns, "camera and autopilot were found to disagree, corrected", detail)]
+
+    def _turn_downs(self, turn: Array) -> None:
+        """What keyframes were told of the vertical was told by the mount as it was stated."""
+        with self._tracker.turn.tracking():
+            for segment in self._tracker.segments:
+                for keyframe in segment.keyframes.values():
+                    if keyframe.down_camera is not None:
+                        keyframe.down_camera = turn @ keyframe.down_camera
 
     def _map_update(self, final: bool) -> MapUpdate:
         """The map, all segments in the frame of the main one (the one with most keyframes)."""

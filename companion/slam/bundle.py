@@ -15,12 +15,15 @@ from scipy.sparse import bsr_matrix
 
 from companion.geometry import Array, Pose, rotation_from_vector
 from companion.slam.features import Bools, Ints
+from companion.slam.plumb import Plumb
 from companion.slam.pose_refinement import CHI2_2D, HUBER
 
 
 @dataclass(slots=True, eq=False)
 class Bundle:
     """Cameras (C), points (P, 3) and observations (O): which camera sees which point where.
+
+    `plumb` is what is told of the vertical, of all cameras.
 
     The first `n_variable` cameras move, the others hold the gauge. `normalised` (O, 2) and
     `whitening` (O, 2, 2) are as in Features. No camera sees a point twice.
@@ -33,6 +36,7 @@ class Bundle:
     point: Ints
     normalised: Array
     whitening: Array
+    plumb: Plumb | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +73,12 @@ def adjust(
     translation = np.stack([p.translation for p in b.poses])
     points = b.points.copy()
     p, residual = _project(rotation, translation, points, b)
-    cost = first_cost = _cost(residual, p[:, 2])
+    plumb, told = b.plumb, np.zeros(0, np.int64)
+    cost = _cost(residual, p[:, 2])
+    if plumb is not None:
+        told = plumb.told(n_var)
+        cost += plumb.cost(rotation, told)
+    first_cost = cost
     damping = 1e-4
     moving = np.flatnonzero(b.camera < n_var)
     # observations of moving cameras ordered by camera: the rows of the block-sparse matrix
@@ -94,6 +103,10 @@ def adjust(
             between()
             hcc = _sum_by(cam, np.matmul(jct, jc), n_var)
             gc = _sum_by(cam, np.matmul(jct, r[moving])[..., 0], n_var)
+            if plumb is not None:
+                information, gradient = plumb.normal_equations(rotation, told)
+                hcc[told, :3, :3] += information
+                gc[told, :3] += gradient
             hcp = np.matmul(jct, jp[moving])
             cross = bsr_matrix((hcp, pt, rows), shape=shape, blocksize=(6, 3))
         between()
@@ -127,6 +140,8 @@ def adjust(
         new_points = points + dp
         new_p, new_residual = _project(new_rotation, new_translation, new_points, b)
         new_cost = _cost(new_residual, new_p[:, 2])
+        if plumb is not None:
+            new_cost += plumb.cost(new_rotation, told)
         accepted = new_cost < cost
         if accepted:
             gain = (cost - new_cost) / max(cost, 1e-12)

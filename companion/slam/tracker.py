@@ -381,7 +381,7 @@ class Tracker:
             view.features.normalised.copy() if view.normalised is None else view.normalised,
             view.features.whitening.copy() if view.whitening is None else view.whitening,
             np.full(len(view.features), -1) if view.refined_for is None else view.refined_for,
-            view.grey,
+            view.grey, None if view.ned_from_camera is None else view.ned_from_camera[2],
         )  # fmt: skip
         self._next_keyframe_id += 1
         return keyframe

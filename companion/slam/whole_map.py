@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.geometry import Pose
+from companion.geometry import Array, Pose
 from companion.slam.bundle import Adjusted, Bundle
 from companion.slam.features import Bools, Ints
 from companion.slam.map import Keyframe, SlamMap
+from companion.slam.plumb import Plumb, plumb_of
 
 MOST_TOGETHER, MOST_HOLDING = 500, 80
 """Keyframes adjusted at once, for which memory grows with the square, and those that hold them."""
@@ -58,8 +59,21 @@ def take(
         cam, index,
         np.concatenate([k.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
         np.concatenate([k.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
+        _plumb(slam_map, cameras),
     )  # fmt: skip
     return Taken(bundle, cameras, feat, points, slam_map.born[points])
+
+
+def _plumb(slam_map: SlamMap, cameras: list[Keyframe]) -> Plumb | None:
+    everywhere = list(slam_map.keyframes.values())
+    rotation = np.stack([k.camera_from_map.rotation for k in everywhere])
+    found = plumb_of(rotation, _downs(everywhere))
+    return None if found is None else Plumb(_downs(cameras), *found)
+
+
+def _downs(keyframes: list[Keyframe]) -> Array:
+    untold = np.full(3, np.nan)
+    return np.stack([untold if k.down_camera is None else k.down_camera for k in keyframes])
 
 
 def put_back(slam_map: SlamMap, taken: Taken, result: Adjusted) -> None:
