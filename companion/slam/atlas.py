@@ -92,7 +92,11 @@ class Atlas:
             if segment is None:
                 continue
             level = level_from_camera if segment.level else None
-            found = self._relocalizer.locate(features, segment, segment.keyframes[key], level, seed)
+            expected = level_from_camera is None and key in latest
+            found = self._relocalizer.locate(
+                features, segment, segment.keyframes[key], level, seed,
+                EXPECTED_SHARE if expected else MIN_SEEN_SHARE,
+            )  # fmt: skip
             if found is not None:
                 return segment, found
         return None

@@ -35,11 +35,13 @@ class Start:
 class Bootstrap:
     """Tries each new frame against a reference frame until both start a map."""
 
-    def __init__(self, config: TrackingConfig, camera: Camera) -> None:
+    def __init__(
+        self, config: TrackingConfig, camera: Camera, reference: View | None = None
+    ) -> None:
         self._config = config
         self._camera = camera
         self.pending: deque[View] = deque(maxlen=MAX_PENDING)
-        self._reference: View | None = None
+        self._reference = reference
 
     def step(self, frame: Frame, features: Features, ned_from_camera: Array | None) -> Start | None:
         """Take a frame; a Start when a map can begin with it."""

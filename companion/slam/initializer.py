@@ -21,6 +21,10 @@ MAX_PRIOR_DISAGREEMENT_RAD = np.radians(8.0)
 MIN_POINTS = 60
 GAMMA = 5.991
 TURNED_PX = 2.0
+RIVAL_SHARE = 0.6
+"""Motions that fit fewer of the matches than this share of the best are no rivals to it."""
+MIN_WORSE = 1.15
+"""What another motion leaves unexplained must be so many times as much."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +67,7 @@ def initialise(
         direction = np.asarray(t, np.float64).ravel()
         rotations = (np.asarray(r1, np.float64), np.asarray(r2, np.float64))
         candidates += [(Pose(r, s * direction), False) for r in rotations for s in (1.0, -1.0)]
-    if homography is not None and (planar or essential is None):
+    if homography is not None and (planar or essential is None or rotation_prior is None):
         _, turns, shifts, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
         for r, t in zip(turns, shifts, strict=True):
             norm = float(np.linalg.norm(t))
@@ -183,15 +187,77 @@ def _best(
         return None
     scored.sort(key=lambda s: -s[0])
     top, pose = scored[0]
-    # two clearly different motions that explain as much: only the prior could tell
-    for other, rival in scored[1:]:
+    if top < MIN_POINTS // 2:
+        return None
+    if with_prior:
+        return pose
+    return _most_likely([p for n, p in scored if n > RIVAL_SHARE * top], a, b, index_a, index_b)
+
+
+def _most_likely(
+    poses: list[Pose], a: Features, b: Features, index_a: Ints, index_b: Ints
+) -> Pose | None:
+    """The pose that explains most, each at its best; None where another does nearly as well."""
+    best: list[tuple[float, Pose]] = []
+    for start in poses:
+        pose: Pose | None = start
+        for limit in (16.0, 9.0):
+            if pose is not None:
+                pose = _adjusted(pose, a, b, index_a, index_b, limit)
+        if pose is None:
+            continue
+        best.append((_unexplained(pose, a, b, index_a, index_b), pose))
+    if not best:
+        return None
+    best.sort(key=lambda c: c[0])
+    cost, pose = best[0]
+    for other, rival in best[1:]:
         different = (
-            angle_between(rival.rotation, pose.rotation) > np.radians(3)
-            or float(rival.translation @ pose.translation) < 0.9
+            angle_between(rival.rotation, pose.rotation) > np.radians(1.5)
+            or float(rival.translation @ pose.translation) < 0.95
         )
-        if different and other > 0.7 * top and not with_prior:
+        if different and other < MIN_WORSE * cost + 30.0:
             return None
-    return pose if top >= MIN_POINTS // 2 else None
+    return pose
+
+
+def _unexplained(pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints) -> float:
+    """Squared errors of all matches in both views, each no more than an outlier's."""
+    xa, xb = a.normalised[index_a], b.normalised[index_b]
+    points, _ = triangulate(xa, xb, pose)
+    in_b = pose.apply(points)
+    total = np.zeros(len(points))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for p, seen, white in (
+            (points, xa, a.whitening[index_a]), (in_b, xb, b.whitening[index_b])
+        ):  # fmt: skip
+            error = np.matmul(white, (p[:, :2] / p[:, 2:] - seen)[..., None])[..., 0]
+            total += (error * error).sum(1)
+        before = (points[:, 2] > 0) & (in_b[:, 2] > 0)
+    return float(np.where(before & (total < 2 * GAMMA), total, 2 * GAMMA).sum())
+
+
+def _adjusted(
+    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints, limit: float
+) -> Pose | None:
+    """A pose, its baseline of length one, adjusted to the matches that agree with it."""
+    points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
+    ok = consistent(
+        points, pose, a.normalised[index_a], b.normalised[index_b],
+        a.whitening[index_a], b.whitening[index_b], limit,
+    )  # fmt: skip
+    ia, ib, pts = index_a[ok], index_b[ok], points[ok]
+    n = len(ia)
+    if n < MIN_POINTS // 2:
+        return None
+    bundle = Bundle(
+        [pose, Pose.identity()], 1, pts,
+        np.repeat(np.array([0, 1]), n), np.tile(np.arange(n), 2),
+        np.r_[b.normalised[ib], a.normalised[ia]], np.r_[b.whitening[ib], a.whitening[ia]],
+    )  # fmt: skip
+    adjusted = adjust(bundle, 12)
+    scale = 1.0 / max(float(np.linalg.norm(adjusted.poses[0].translation)), 1e-12)
+    return Pose(adjusted.poses[0].rotation, adjusted.poses[0].translation * scale)
 
 
 def _refined(
@@ -199,23 +265,10 @@ def _refined(
     min_parallax_rad: float, planar: bool,
 ) -> TwoView | None:  # fmt: skip
     for limit in (16.0, 5.991):
-        points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
-        ok = consistent(
-            points, pose, a.normalised[index_a], b.normalised[index_b],
-            a.whitening[index_a], b.whitening[index_b], limit,
-        )  # fmt: skip
-        ia, ib, pts = index_a[ok], index_b[ok], points[ok]
-        n = len(ia)
-        if n < MIN_POINTS // 2:
+        adjusted = _adjusted(pose, a, b, index_a, index_b, limit)
+        if adjusted is None:
             return None
-        bundle = Bundle(
-            [pose, Pose.identity()], 1, pts,
-            np.repeat(np.array([0, 1]), n), np.tile(np.arange(n), 2),
-            np.r_[b.normalised[ib], a.normalised[ia]], np.r_[b.whitening[ib], a.whitening[ia]],
-        )  # fmt: skip
-        adjusted = adjust(bundle, 12)
-        scale = 1.0 / max(float(np.linalg.norm(adjusted.poses[0].translation)), 1e-12)
-        pose = Pose(adjusted.poses[0].rotation, adjusted.poses[0].translation * scale)
+        pose = adjusted
     points, cosine = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
     ok = consistent(
         points, pose, a.normalised[index_a], b.normalised[index_b],

@@ -17,7 +17,12 @@ from companion.geometry import Array, Pose
 from companion.slam.features import Features, Ints
 from companion.slam.local_map import Projector
 from companion.slam.map import Keyframe, SlamMap
-from companion.slam.matching import match_descriptors
+from companion.slam.matching import (
+    MAX_DISTANCE_STRICT,
+    hamming_matrix,
+    match_descriptors,
+    mutual_matches,
+)
 from companion.slam.pose_refinement import refine_pose
 from companion.slam.upright import upright_pose
 
@@ -27,6 +32,8 @@ TILT_ERROR_PX = 12.0
 """What an error of the vertical may move a point by."""
 MIN_SEEN, MIN_SEEN_SHARE = 30, 0.35
 """Map points that must be seen where a pose predicts them, and as a share of those predicted."""
+MANY_INLIERS, MANY_SEEN_SHARE = 25, 0.2
+"""Without the vertical: where so many matches agree, less of what the pose predicts is enough."""
 N_AROUND = 6
 
 
@@ -56,12 +63,7 @@ class Relocalizer:
         `level_from_camera` (3, 3), where the vertical is known, as in `upright_pose`; `share` as in
         `confirm`.
         """
-        seen, ids = slam_map.seen_by(keyframe)
-        ia, ib = match_descriptors(keyframe.features, features, ratio=0.8)
-        at = np.full(len(keyframe.features), -1)
-        at[seen] = ids
-        known = at[ia] >= 0
-        points, found = at[ia][known], ib[known]
+        points, found = _alike(features, slam_map, keyframe, level_from_camera is None)
         if len(points) < MIN_MATCHES:
             return None
         start = self._solve(slam_map.positions[points], features, found, level_from_camera, seed)
@@ -74,6 +76,8 @@ class Relocalizer:
         )  # fmt: skip
         if inlier.sum() < MIN_INLIERS:
             return None
+        if level_from_camera is None and inlier.sum() >= MANY_INLIERS:
+            share = min(share, MANY_SEEN_SHARE)
         return self.confirm(features, slam_map, keyframe, pose, share)
 
     def confirm(
@@ -128,6 +132,23 @@ class Relocalizer:
         rotation = np.asarray(cv2.Rodrigues(rotvec)[0], np.float64)
         agree = np.asarray(inliers, np.int64).ravel()
         return Pose(rotation, np.asarray(translation, np.float64).ravel()), agree
+
+
+def _alike(
+    features: Features, slam_map: SlamMap, keyframe: Keyframe, widely: bool
+) -> tuple[Ints, Ints]:
+    """Points and the features that look like them: of one keyframe, or of all around it."""
+    if widely:
+        ids = around(slam_map, keyframe)
+        distances = hamming_matrix(slam_map.descriptors[ids], features.descriptors)
+        nearest, found = mutual_matches(distances, MAX_DISTANCE_STRICT, 0.8)
+        return ids[nearest], found
+    seen, ids = slam_map.seen_by(keyframe)
+    ia, ib = match_descriptors(keyframe.features, features, ratio=0.8)
+    at = np.full(len(keyframe.features), -1)
+    at[seen] = ids
+    known = at[ia] >= 0
+    return at[ia][known], ib[known]
 
 
 def around(slam_map: SlamMap, keyframe: Keyframe, n: int = N_AROUND) -> Ints:

@@ -7,7 +7,7 @@ back. Knows no clock: times come with the frames, durations are measured by whoe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,8 @@ from companion.config import Config
 from companion.geometry import Array, Pose, angle_between
 from companion.messages import Frame, KeyframeAdded, Reunited, Track, TrackState
 from companion.slam.atlas import MAX_YOUNG_KEYFRAMES, Atlas
-from companion.slam.bootstrap import Bootstrap
+from companion.slam.bootstrap import Bootstrap, Start
+from companion.slam.bridge import Bridge, bridge
 from companion.slam.features import FeatureExtractor, Features, Ints
 from companion.slam.local_map import Projector, local_points
 from companion.slam.map import Keyframe, SlamMap
@@ -33,7 +34,7 @@ MOST_REFINED = 150
 MAX_TURN_UNSEEN_RAD = np.radians(15.0)
 MIN_FIRM, MIN_FIRM_SHARE = 25, 0.2
 """Without attitude a guess is believed when so many points of the last frame are found by it."""
-MIN_DUE_SHARE, ENOUGH = 0.12, 100
+MIN_DUE_SHARE, ENOUGH = 0.08, 30
 """Without attitude what is found is at least this share of what should be seen, or so many."""
 Told = Track | KeyframeAdded | Reunited
 
@@ -89,6 +90,8 @@ class Tracker:
     def _forget(self) -> None:
         """Another map is in use: what was known of the last frame is not of it."""
         self._last: View | None = None
+        self._ashore: View | None = None
+        """The last frame that was tracked before the camera was lost, where none tells its turns"""
         self._reference: Keyframe | None = None
         self._local: Ints = np.zeros(0, np.int64)
 
@@ -131,6 +134,11 @@ class Tracker:
     def _initialise(self, frame: Frame, features: Features, prior: Prior) -> list[Told]:
         with self._times("initialising"):
             start = self._bootstrap.step(frame, features, prior.ned_from_camera)
+        across = None
+        if start is not None and self._ashore is not None:
+            across = bridge(self.map, self._ashore, start)
+        if start is not None and across is not None:
+            return self._go_on(start, across)
         if start is None or not self._given_up(frame.t_ns):
             return [Track(frame.seq, frame.t_ns, self.state)]
         self.atlas.begin(level=start.first.ned_from_camera is not None)
@@ -162,6 +170,36 @@ class Tracker:
         out: list[Told] = [self._backfilled(v, first) for v in self._backfill(first, second)]
         out += [self._report(start.second), _added(self.map, first), _added(self.map, second)]
         return out
+
+    def _go_on(self, start: Start, across: Bridge) -> list[Told]:
+        """Take two views into the map that the first of them was the last to be tracked in."""
+        assert self._ashore is not None
+        slam_map, view = self.map, start.second
+        first = self._keyframe(self._ashore)
+        tracked = np.flatnonzero(self._ashore.point_ids >= 0)
+        tracked = tracked[slam_map.alive[self._ashore.point_ids[tracked]]]
+        slam_map.keyframes[first.keyframe_id] = first
+        slam_map.poses_changed()
+        slam_map.observe(first, tracked, self._ashore.point_ids[tracked])
+        ids = slam_map.add_points(
+            across.points_map, first, across.features_first, image_levels(self._ashore.grey)
+        )
+        slam_map.observe(first, across.features_first, ids)
+        slam_map.refresh(ids, [first])
+        self.atlas.remember(first)
+        self._reference, self._last, self._ashore = first, view, None
+        view.camera_from_map = across.second_from_map
+        view.point_ids = np.full(len(view.features), -1)
+        view.point_ids[start.features_second[across.known]] = across.known_points
+        view.point_ids[start.features_second[~across.known]] = ids
+        self._refresh_local(view)
+        self._insert(view)
+        assert self._reference is not None
+        between = self._backfill(first, self._reference)
+        self.state, self._lost_since_ns = TrackState.TRACKING, None
+        told: list[Told] = [_added(slam_map, first)]
+        told += [self._backfilled(v, first) for v in between]
+        return [*told, self._report(view)]
 
     def _backfill(self, first: Keyframe, second: Keyframe) -> list[View]:
         """Place the frames that came before the map: from the first keyframe outwards."""
@@ -329,7 +367,12 @@ class Tracker:
         """Note the loss, and see whether this frame could begin a new map."""
         if self.state is TrackState.TRACKING:
             self._lost_since_ns = frame.t_ns
-            self._bootstrap = Bootstrap(self._config, self._camera)
+            last = self._last
+            self._ashore = last if last is not None and last.ned_from_camera is None else None
+            start = self._ashore
+            if start is not None:
+                start = replace(start, point_ids=np.full(len(start.features), -1))
+            self._bootstrap = Bootstrap(self._config, self._camera, start)
         self.state = TrackState.LOST
         return self._initialise(frame, features, prior)
 

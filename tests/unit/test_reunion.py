@@ -167,8 +167,10 @@ def _bend(slam_map: SlamMap, per_keyframe: float) -> None:
     slam_map.positions[:n, 1] += per_keyframe * slam_map.first_seen[:n]
 
 
-def test_a_wall_that_repeats_itself_is_no_loop() -> None:
+@pytest.mark.parametrize("level", [True, False], ids=["level", "vision alone"])
+def test_a_wall_that_repeats_itself_is_no_loop(level: bool) -> None:
     ground = Ground(np.random.default_rng(7))
     ground.repeat(period=4.0)
     slam_map = mapped(ground, line((-24, 0), (24, 0), 30, 0.0), NOWHERE)
+    slam_map.level = level
     assert find(29, slam_map, [slam_map]) is None
