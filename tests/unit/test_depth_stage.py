@@ -79,6 +79,11 @@ def test_points_lie_on_the_surfaces(camera: Camera) -> None:
     for chunk in chunks:
         assert len(chunk.points_camera) == len(chunk.rgb) == len(chunk.confidence)
         assert ((chunk.confidence >= 0) & (chunk.confidence <= 1)).all()
+        assert (chunk.sigma > 0).all()
+        assert np.median(chunk.sigma) < 0.15  # a hundredth of 12 m
+        # ground and roofs are level; at their edges are a few points that are not
+        up = (chunk.normals_camera @ at(4 * chunk.keyframe_id).rotation.T)[:, 2]
+        assert np.median(up) < -0.98
 
 
 def test_keyframes_of_other_segments_do_not_meet() -> None:
