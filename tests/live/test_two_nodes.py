@@ -156,6 +156,11 @@ class Nodes:
             return next((int(s["n"]) for s in stages if s["name"] == "localisation"), 0)
         return 0
 
+    @property
+    def sent_bytes(self) -> int:
+        """What has gone over the air to the ground."""
+        return self._air.to_ground_bytes
+
     def kept_bytes(self) -> int:
         """Of the cloud on the ground."""
         return sum(p.stat().st_size for p in self.folder.glob(f"ground/*/{NAME}"))
@@ -207,6 +212,7 @@ def test_the_ground_is_killed_and_restarted_and_its_map_grows_on(nodes: Nodes) -
     (folder,) = nodes.folder.glob("ground/*")
     assert points_in(folder) * 20 < nodes.kept_bytes() < 2000 * points_in(folder)
     assert (folder / "report.json").exists() and (folder / "flight-2.rrd").exists()
+    assert nodes.sent_bytes > 300_000  # by no other way
     assert drone.poll() is None
     drone.send_signal(signal.SIGTERM)
     assert drone.wait(20) == 0
