@@ -71,7 +71,7 @@ class StatusFacts:
             "height_m": self.height_m,
             "speed_m_s": self.speed_m_s,
             "rate_hz": (len(self._tracked) - 1) * 1e9 / span_ns if span_ns else None,
-            "n_keyframes": len(self._update.map_from_camera) if self._update is not None else None,
+            "n_keyframes": self._update.n_keyframes if self._update is not None else None,
             "n_points": self._n_points_in_all or None,
             "warnings": recent[-MOST_WARNINGS:] or None,
         }
