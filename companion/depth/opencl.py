@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import warnings
 from collections import deque
 from importlib import resources
@@ -18,6 +19,7 @@ WANT = (
     "install PoCL (pip install 'companion[cpu]' on x86-64, apt install pocl-opencl-icd elsewhere),"
     " or set depth.enabled=false"
 )
+POCL, LINKERS = "Portable Computing Language", ("ld", "ld.lld")
 UPLOAD, READ_BACK, COPY = "upload", "read-back", "copy"
 MAX_COPIES = 4096
 
@@ -108,7 +110,7 @@ def open_device(config: OpenclConfig) -> ComputeDevice:
         raise DeviceError(f"no OpenCL device on this machine: {WANT}")
     if config.device == "auto":
         found.sort(key=lambda d: (not d[1].type & cl.device_type.GPU, d[0]))
-        return ComputeDevice(found[0][1])
+        return _usable(found[0][1])
     wanted = config.device.lower()
     for number, device in found:
         if (
@@ -116,6 +118,17 @@ def open_device(config: OpenclConfig) -> ComputeDevice:
             or wanted in device.name.lower()
             or wanted in device.platform.name.lower()
         ):
-            return ComputeDevice(device)
+            return _usable(device)
     names = "; ".join(f"{n} {d.name.strip()} ({d.platform.name.strip()})" for n, d in found)
     raise DeviceError(f"opencl.device = {config.device!r} is none of: {names}")
+
+
+def _usable(device: Any) -> ComputeDevice:
+    """PoCL ends the whole process where it finds no linker: better to say so before."""
+    on_processor = device.type & cl.device_type.CPU
+    if POCL in device.platform.name and on_processor and not any(map(shutil.which, LINKERS)):
+        raise DeviceError(
+            f"{device.name.strip()}: PoCL links kernels with `ld`, which is not installed: "
+            "apt install gcc libc6-dev"
+        )
+    return ComputeDevice(device)

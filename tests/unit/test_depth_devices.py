@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
@@ -11,7 +12,7 @@ import pytest
 from companion.clock import monotonic_s
 from companion.config import OpenclConfig
 from companion.depth.device_choice import choose_device
-from companion.depth.opencl import ComputeDevice, device_names, open_device
+from companion.depth.opencl import POCL, ComputeDevice, device_names, open_device
 from companion.depth.self_test import SIZE, check, reconstruct, scene
 from companion.devices import devices
 from companion.errors import DeviceError
@@ -45,6 +46,15 @@ def test_a_device_that_computes_wrongly_is_refused() -> None:
     good = open_device(OpenclConfig())
     with pytest.raises(DeviceError, match=r"self-test failed: only .* are right"):
         check(WrongDevice(good.device))
+
+
+def test_without_a_linker_pocl_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It would end the process."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for number, _, platform in device_names():
+        if platform == POCL:
+            with pytest.raises(DeviceError, match="apt install gcc libc6-dev"):
+                open_device(OpenclConfig(device=number))
 
 
 def test_the_choice_says_why() -> None:
