@@ -51,6 +51,7 @@ class StageProcess:
         self._deliver, self._ended = deliver, ended
         self.asked_to_end = False
         """Whether it was told to end, one way or the other."""
+        self._begun = False
         self._outbox: LatestWins[Any] = LatestWins(
             lambda message: not every_frame and isinstance(message, FrameInRing)
         )
@@ -84,12 +85,14 @@ class StageProcess:
         return self._outbox.n_dropped + self._outbox.n_overflown + inside
 
     def begin(self, setup: Setup) -> None:
-        """Say what to do; to be said first."""
+        """Say what to do; what is offered before is not for it."""
         self._outbox.put(setup)
+        self._begun = True
 
     def offer(self, message: Any) -> None:
         """Hand over a message or a FrameInRing; a frame that waits gives way to a newer one."""
-        self._outbox.put(message)
+        if self._begun:
+            self._outbox.put(message)
 
     def ask_to_finish(self, finish: Finish) -> None:
         """Have it give its last results and end."""

@@ -26,6 +26,7 @@ def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> Non
     told: queue.Queue[Any] = queue.Queue()
     ring = FrameRing(CAMERA.width, CAMERA.height)
     stage = StageProcess("recorder", 0, ring, told.put, lambda why: told.put(why))
+    stage.offer(TakeSnapshot(0))  # before it knows what to do: passed over
     stage.begin(Setup(Config(), CAMERA, tmp_path))
     try:
         poses = {n: Pose(np.eye(3), np.array([3.0 * n, 0, 0])) for n in range(N_CHUNKS)}
