@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from companion.cli.options import Command
 from companion.stopping import StopSignals
-
-Command = Callable[[argparse.Namespace, StopSignals], int]
 
 
 def _install(arguments: argparse.Namespace, signals: StopSignals) -> int:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from companion.cli.options import Command, configuration, json_option, seconds
 from companion.config_file import load_config
 from companion.errors import InputError
 from companion.progress import progress_on
 from companion.stopping import StopSignals
-
-Command = Callable[[argparse.Namespace, StopSignals], int]
 
 
 def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -92,11 +90,9 @@ def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
 COMMANDS: dict[str, Command] = {"flights": _flights, "compare": _compare, "batch": _batch}
 
 
-def add_parsers(
-    commands: Any, configuration: argparse.ArgumentParser, seconds: Callable[[str], float]
-) -> None:
-    """Describe these commands; `seconds` reads a time from the first frame on."""
-    _add_flights(commands, configuration, seconds)
+def add_parsers(commands: Any) -> None:
+    """Add them to the subparsers of the program."""
+    _add_flights(commands)
     compare = commands.add_parser(
         "compare", help="what differs between two runs of a flight",
         description="Compare the --out folders of two replays of one flight: poses, cloud, times. "
@@ -113,7 +109,7 @@ def add_parsers(
     )
 
     batch = commands.add_parser(
-        "batch", parents=[configuration], help="replay an archive of flights on many cores",
+        "batch", parents=[configuration()], help="replay an archive of flights on many cores",
         description="Replay each flight into a folder of DIR, and write DIR/index.html with a row "
         "for each. What is done already is not done again. Exit status 1 where a flight failed.",
     )  # fmt: skip
@@ -126,20 +122,16 @@ def add_parsers(
     )  # fmt: skip
 
 
-def _add_flights(
-    commands: Any, configuration: argparse.ArgumentParser, seconds: Callable[[str], float]
-) -> None:
-    place = argparse.ArgumentParser(add_help=False, parents=[configuration])
+def _add_flights(commands: Any) -> None:
+    place = argparse.ArgumentParser(add_help=False, parents=[configuration()])
     place.add_argument(
         "--flights", type=Path, metavar="DIR", help="folder of all flights (daemon.flights)"
     )
-    as_json = argparse.ArgumentParser(add_help=False)
-    as_json.add_argument("--json", action="store_true", help="as JSON, for programs")
     flights = commands.add_parser("flights", help="recordings of live flights")
     does = flights.add_subparsers(dest="what", required=True, metavar="WHAT")
 
-    does.add_parser("list", parents=[place, as_json], help="which there are")
-    show = does.add_parser("show", parents=[place, as_json], help="what is in one")
+    does.add_parser("list", parents=[place, json_option()], help="which there are")
+    show = does.add_parser("show", parents=[place, json_option()], help="what is in one")
     trim = does.add_parser("trim", parents=[place], help="a part of one, as a recording")
     trim.add_argument("--start", type=seconds, metavar="S", help="from this second on")
     trim.add_argument("--stop", type=seconds, metavar="S", help="up to this second")

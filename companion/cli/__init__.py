@@ -1,0 +1,49 @@
+"""The command line: what was asked, handed on; what came of it, as an exit status.
+
+0 done; 1 a fault; 2 bad input or usage; 130 and 143 stopped by Ctrl-C and SIGTERM. An error that
+the program raises on purpose is one line; anything else is a bug and shows its traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from companion import __version__
+from companion.cli import flying, hardware, measuring, recordings, replaying, service
+from companion.cli.options import Command
+from companion.errors import CompanionError, InputError
+from companion.stopping import StopSignals
+
+# In a command libraries are loaded late: they take a second, and --help needs none of them.
+FAMILIES = (flying, replaying, recordings, hardware, measuring, service)
+COMMANDS: dict[str, Command] = {
+    name: command for family in FAMILIES for name, command in family.COMMANDS.items()
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    arguments = _parser().parse_args(argv)
+    with StopSignals() as signals:
+        try:
+            return COMMANDS[arguments.command](arguments, signals)
+        except KeyboardInterrupt:
+            print("companion: stopped", file=sys.stderr)
+            return signals.exit_status
+        except CompanionError as error:
+            print(f"companion: error: {error}", file=sys.stderr)
+            return 2 if isinstance(error, InputError) else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="companion",
+        description="Visual SLAM and dense metric mapping for drones.",
+    )
+    parser.add_argument("--version", action="version", version=f"companion {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for family in FAMILIES:
+        family.add_parsers(commands)
+    return parser
