@@ -1,30 +1,19 @@
 """How a map lies in the world: scale, heading, tilt and origin from the autopilot's positions.
 
 A monocular map has neither unit nor north. Both come from comparing where the camera was in the map
-with where the autopilot says it was. Position errors of a GPS wander slowly: they are modelled as
-an Ornstein-Uhlenbeck process, so that a metre of drift over a minute does not pass for scale;
-velocity, whose errors do not add up, is used beside it. Attitude gives the tilt, and heading until
-the path does.
+with where the autopilot says it was (`companion.map_fit`). Attitude gives the tilt, and heading
+until the path does; without positions a rangefinder or the barometer gives the scale.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from companion.config import GeoreferenceConfig
-from companion.geometry import (
-    Array,
-    Pose,
-    Similarity,
-    rotation_from_vector,
-    skew,
-    vector_from_rotation,
-)
+from companion.geometry import Array, Pose, Similarity
+from companion.map_fit import SIGMA_YAW_RAD, Scale, agreed, fit_map
 from companion.messages import (
     Georeference,
     HeightSample,
@@ -33,25 +22,12 @@ from companion.messages import (
     RangeSample,
     Telemetry,
 )
+from companion.sample_series import SampleSeries
 
-Bools = NDArray[np.bool_]
-MAX_GAP_NS = 1_500_000_000
-SAME_TIME_NS = 1_000_000
-"""A sample of a frame's own time, as photographs have one, needs no other beside it."""
 MAX_HELD_NS = 400_000_000
 """A velocity may be as old as this."""
-MIN_SPACING_NS = 45_000_000
-DRIFT_TAU_S = 40.0
-SIGMA_DRIFT_M = 1.0
-SIGMA_WHITE_M = 0.15
-SIGMA_VELOCITY_M_S = 0.15
-VELOCITY_TAU_S = 1.0
-SIGMA_TILT_RAD = np.radians(0.5)
-SIGMA_YAW_RAD = np.radians(6.0)
 SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.01, 0.05
 """No rangefinder and no barometer tells the scale better than this."""
-DISAGREE = 3.0
-"""Standard deviations by which two scales differ that cannot both be right."""
 MAX_SIGMA_TURN_RAD = np.radians(8.0)
 MAX_PLACES = 400
 
@@ -70,57 +46,6 @@ class Place:
     ground_units: float | None = None
 
 
-class _Series:
-    """Samples over time, not closer together than needed."""
-
-    def __init__(self) -> None:
-        self._n = 0
-        self._times: NDArray[np.int64] = np.zeros(256, np.int64)
-        self._values: Array = np.zeros(0)
-
-    @property
-    def newest(self) -> tuple[int, Array] | None:
-        """Time and value of the last sample."""
-        last = self._n - 1
-        return (int(self._times[last]), self._values[last]) if self._n else None
-
-    def add(self, t_ns: int, value: Array, horizontal_only: bool = False) -> None:
-        known = value[..., :2] if horizontal_only else value
-        early = self._n > 0 and t_ns - self._times[self._n - 1] < MIN_SPACING_NS
-        if early or not np.isfinite(known).all():
-            return
-        if not self._n:
-            self._values = np.zeros((len(self._times), *value.shape))
-        elif self._n == len(self._times):
-            self._times = np.concatenate([self._times, np.zeros_like(self._times)])
-            self._values = np.concatenate([self._values, np.zeros_like(self._values)])
-        self._times[self._n], self._values[self._n] = t_ns, value
-        self._n += 1
-
-    def at(self, t_ns: Array) -> tuple[Array, Bools]:
-        """Interpolated values, and where samples on both sides are near enough."""
-        times, values = self._times[: self._n], self._values[: self._n]
-        i = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)
-        span = times[i] - times[i - 1]
-        f = ((t_ns - times[i - 1]) / np.maximum(span, 1)).reshape(-1, *([1] * (values.ndim - 1)))
-        nearest = np.minimum(np.abs(t_ns - times[i - 1]), np.abs(times[i] - t_ns))
-        told = (span < MAX_GAP_NS) | (nearest <= SAME_TIME_NS)
-        inside = (t_ns >= times[0]) & (t_ns <= times[-1]) & told
-        return values[i - 1] * (1 - f) + values[i] * f, inside
-
-    def __len__(self) -> int:
-        return self._n
-
-
-class _Scale(NamedTuple):
-    """Metres per map unit, its relative standard deviation, and what told it."""
-
-    scale: float
-    sigma: float
-    method: str
-    n: int
-
-
 class Georeferencer:
     """Collects what the autopilot says of its place; puts a map there when asked.
 
@@ -137,10 +62,10 @@ class Georeferencer:
         self._config = config
         self._sources = [PositionSource.GPS] if sensors_only else list(PositionSource)
         self._body_from_camera = body_from_camera
-        self._positions = {source: _Series() for source in PositionSource}
-        self._travel = {source: _Series() for source in PositionSource}
-        self._height = _Series()
-        self._range = _Series()
+        self._positions = {source: SampleSeries() for source in PositionSource}
+        self._travel = {source: SampleSeries() for source in PositionSource}
+        self._height = SampleSeries()
+        self._range = SampleSeries()
 
     def take(self, sample: Telemetry) -> None:
         """Take a sample; those that say nothing of the place are ignored."""
@@ -153,7 +78,7 @@ class Georeferencer:
         elif isinstance(sample, RangeSample):
             self._range.add(sample.t_ns, np.array([sample.distance_m]))
 
-    def _integrate(self, series: _Series, t_ns: int, velocity: Array) -> None:
+    def _integrate(self, series: SampleSeries, t_ns: int, velocity: Array) -> None:
         # rows: velocity, and the way travelled so far by it; a GPS may not tell the vertical part
         if series.newest is None:
             series.add(t_ns, np.stack([velocity, 0.0 * velocity]), horizontal_only=True)
@@ -207,7 +132,7 @@ class Georeferencer:
         by_range, by_height = self._range_scale(places), self._height_scale(places, level)
         if by_range is None or by_height is None:
             return self._from_scale(places, level, by_range or by_height)
-        return self._from_scale(places, level, _agreed(by_range, by_height))
+        return self._from_scale(places, level, agreed(by_range, by_height))
 
     def _from_positions(
         self, places: list[Place], level: Array | None, source: PositionSource
@@ -230,7 +155,7 @@ class Georeferencer:
         if level is not None:
             scales.append(self._height_scale(places, level))
         prior = min((s for s in scales if s is not None), key=lambda s: s.sigma, default=None)
-        solution = _fit(t_ns[ok] * 1e-9, mapped, target, way[ok], level, prior)
+        solution = fit_map(t_ns[ok] * 1e-9, mapped, target, way[ok], level, prior)
         if solution is None:
             return None
         similarity, covariance, residual = solution
@@ -256,7 +181,7 @@ class Georeferencer:
             for p in places
         ])  # fmt: skip
 
-    def _range_scale(self, places: list[Place]) -> _Scale | None:
+    def _range_scale(self, places: list[Place]) -> Scale | None:
         """Scale from the rangefinder against the map's ground."""
         if len(self._range) < 4:
             return None
@@ -271,9 +196,9 @@ class Georeferencer:
         scale = float(np.median(ratios))
         spread = 1.4826 * float(np.median(np.abs(ratios - scale))) / scale
         sigma = max(spread / np.sqrt(len(ratios)), SIGMA_RANGE_SCALE)
-        return _Scale(scale, sigma, "rangefinder", len(ratios))
+        return Scale(scale, sigma, "rangefinder", len(ratios))
 
-    def _height_scale(self, places: list[Place], level: Array) -> _Scale | None:
+    def _height_scale(self, places: list[Place], level: Array) -> Scale | None:
         """Scale from changes of barometric height."""
         if len(self._height) < 4:
             return None
@@ -290,10 +215,10 @@ class Georeferencer:
             return None
         size_m = float(np.sqrt(max(float((b * b).sum()), 1e-9)))
         sigma = max((0.5 + float(np.std(b - scale * a))) / size_m, SIGMA_HEIGHT_SCALE)
-        return _Scale(scale, sigma, "barometric height", int(ok.sum()))
+        return Scale(scale, sigma, "barometric height", int(ok.sum()))
 
     def _from_scale(
-        self, places: list[Place], level: Array, found: _Scale | None
+        self, places: list[Place], level: Array, found: Scale | None
     ) -> Georeference | None:
         """Scale alone: no positions, so no origin."""
         if found is None or found.sigma > self._config.max_sigma_scale:
@@ -312,15 +237,6 @@ class Georeferencer:
         )
 
 
-def _agreed(first: _Scale, second: _Scale) -> _Scale:
-    """The better of two, no surer than they agree: a rangefinder may see what the map does not."""
-    best = min(first, second, key=lambda scale: scale.sigma)
-    apart = abs(float(np.log(first.scale / second.scale)))
-    if apart < DISAGREE * float(np.hypot(first.sigma, second.sigma)):
-        return best
-    return best._replace(sigma=apart)
-
-
 def _mean_rotation(places: list[Place]) -> Array | None:
     """Rotation world_from_map by attitude alone: the chordal mean over keyframes; None without."""
     turns = [
@@ -333,113 +249,3 @@ def _mean_rotation(places: list[Place]) -> Array | None:
     u, _, vt = np.linalg.svd(np.sum(turns, axis=0))
     out: Array = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     return out
-
-
-def _start(mapped: Array, target: Array, level: Array | None) -> Similarity:
-    """Closed form (Umeyama 1991); about the vertical only where the level is known."""
-    ma, mb = mapped.mean(0), target.mean(0)
-    a, b = mapped - ma, target - mb
-    if level is None:
-        u, d, vt = np.linalg.svd(b.T @ a)
-        sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-        rotation = u @ sign @ vt
-        scale = float((d * np.diag(sign)).sum() / (a * a).sum())
-    else:
-        rotation = level
-        a = a @ level.T
-        scale = float(np.sqrt((b * b).sum() / max(float((a * a).sum()), 1e-18)))
-    return Similarity(scale, rotation, mb - scale * rotation @ ma)
-
-
-def _drift_root(t_s: Array) -> Array:
-    """Cholesky factor of the covariance of slowly wandering positions, for one axis."""
-    gap = np.abs(t_s[:, None] - t_s[None, :])
-    covariance = SIGMA_DRIFT_M**2 * np.exp(-gap / DRIFT_TAU_S) + SIGMA_WHITE_M**2 * np.eye(len(gap))
-    return np.asarray(np.linalg.cholesky(covariance), np.float64)
-
-
-def _fit(
-    t_s: Array,
-    mapped: Array,
-    target: Array,
-    way: Array,
-    level: Array | None,
-    scale: _Scale | None,
-) -> tuple[Similarity, Array, float] | None:
-    """Generalised least squares over (log scale, turn (3), origin (3)); covariance (7, 7).
-
-    `scale` is what others say of it.
-    """
-    guess = _start(mapped, target, level)
-    if not np.isfinite(guess.scale) or guess.scale <= 0:
-        return None
-    prior = (
-        np.array([1 / SIGMA_TILT_RAD, 1 / SIGMA_TILT_RAD, 1 / SIGMA_YAW_RAD])
-        if level is not None
-        else np.full(3, 1e-3)
-    )
-    keep = np.ones(len(t_s), bool)
-    steps = np.isfinite(way[1:, :2] - way[:-1, :2]).all(1)
-    dt = np.diff(t_s)
-    information, chi2, n_rows, root = np.eye(7), 0.0, 1, np.eye(len(t_s))
-    for iteration in range(12):
-        turned = guess.scale * mapped @ guess.rotation.T
-        residual = target - turned - guess.translation
-        if iteration == 6:  # positions that no drift explains
-            size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
-            keep = size < max(5.0 * float(np.median(size)), 3.0)
-        # derivative of the prediction: scale, turn, origin
-        jac = np.zeros((len(t_s), 3, 7))
-        jac[:, :, 0] = turned
-        jac[:, :, 1:4] = -skew(turned)
-        jac[:, :, 4:] = np.eye(3)
-        information = np.zeros((7, 7))
-        gradient = np.zeros(7)
-        chi2, n_rows = 0.0, 0
-        if iteration in (0, 6):
-            root = _drift_root(t_s[keep])
-        for axis in range(3):
-            j = solve_triangular(root, jac[keep, axis], lower=True)
-            r = solve_triangular(root, residual[keep, axis], lower=True)
-            information += j.T @ j
-            gradient += j.T @ r
-            chi2 += float(r @ r)
-            n_rows += len(r)
-        use = steps & (dt < 5.0) & keep[1:] & keep[:-1]
-        if use.any():
-            j = (jac[1:] - jac[:-1])[use]
-            r = ((way[1:] - way[:-1]) - (turned[1:] - turned[:-1]))[use]
-            told = np.isfinite(r)
-            j, r = j * told[..., None], np.where(told, r, 0.0)
-            sigma_m = SIGMA_VELOCITY_M_S * np.sqrt(dt[use] * np.maximum(dt[use], VELOCITY_TAU_S))
-            weight = 1.0 / sigma_m
-            length = np.linalg.norm(r, axis=1) * weight
-            weight = weight * np.sqrt(np.minimum(1.0, 3.0 / np.maximum(length, 1e-9)))
-            j, r = j * weight[:, None, None], r * weight[:, None]
-            information += np.einsum("nij,nik->jk", j, j)
-            gradient += np.einsum("nij,ni->j", j, r)
-            chi2 += float((r * r).sum())
-            n_rows += int(told.sum())
-        if scale is not None:
-            information[0, 0] += scale.sigma**-2
-            gradient[0] += np.log(scale.scale / guess.scale) / scale.sigma**2
-        if level is not None:
-            turn = vector_from_rotation(guess.rotation @ level.T)
-            information[1:4, 1:4] += np.diag(prior**2)
-            gradient[1:4] -= prior**2 * turn
-        else:
-            information[1:4, 1:4] += np.diag(prior**2)
-        try:
-            delta = np.asarray(np.linalg.solve(information, gradient), np.float64)
-        except np.linalg.LinAlgError:
-            return None
-        delta[:4] = np.clip(delta[:4], -0.5, 0.5)
-        guess = Similarity(
-            guess.scale * float(np.exp(delta[0])),
-            rotation_from_vector(delta[1:4]) @ guess.rotation,
-            guess.translation + delta[4:],
-        )
-    inflation = max(chi2 / max(n_rows - 7, 1), 1.0)
-    covariance = np.asarray(np.linalg.inv(information) * inflation, np.float64)
-    error = target - guess.apply(mapped)
-    return guess, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))
