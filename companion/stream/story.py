@@ -36,13 +36,13 @@ from companion.stream.items import (
     Item,
     LogItem,
     PathItem,
-    PlacesItem,
     PointsItem,
     PoseItem,
     Shown,
     SparseItem,
     StatusItem,
 )
+from companion.stream.placing import Placing
 from companion.stream.status_facts import StatusFacts
 
 Watched = Message | Health | GeoOrigin
@@ -55,13 +55,11 @@ PIECE_STEP = 5
 """A piece is told anew when it has grown by so many."""
 AUTOPILOT_STEP_NS = 200_000_000
 SPARSE_EVERY = 5
-MOVED_UNITS = 1e-4
 MOST_IMAGES_HELD = 4
 """Frames that wait for the points that will be found in them."""
 IN_WORDS = {
     TrackState.INITIALISING: Shown.INITIALISING,
     TrackState.TRACKING: Shown.TRACKING,
-    TrackState.COASTING: Shown.COASTING,
     TrackState.COASTING: Shown.COASTING,
     TrackState.LOST: Shown.LOST,
 }
@@ -87,8 +85,7 @@ class Story:
         self._facts = StatusFacts()
         self._status_ns = -(2**63)
         self._update: MapUpdate | None = None
-        self._places: dict[int, Similarity] = {}
-        self._world: Similarity | None = None
+        self._placing = Placing()
         self._path, self._autopilot_path = _Piece(), _Piece()
         self._path_ns, self._autopilot_ns = -(2**63), -(2**63)
         self._last_position_map: Array | None = None
@@ -124,6 +121,7 @@ class Story:
             out += self._map(message)
         elif isinstance(message, PointChunk):
             self._facts.points_came(message.keyframe_id, len(message.points_camera))
+            out += self._placing.measured(message)
             out.append(PointsItem(
                 message.t_ns, message.keyframe_id, WHOLE, message.points_camera, message.rgb,
                 message.confidence,
@@ -132,10 +130,7 @@ class Story:
             item = depth_picture(message)
             out += [item] if item is not None else []
         elif isinstance(message, KeyframeAdded):
-            place = Similarity(
-                1.0, message.map_from_camera.rotation, message.map_from_camera.translation
-            )
-            out += self._moved(message.t_ns, {message.keyframe_id: place})
+            out += self._placing.added(message)
         elif isinstance(message, PositionSample):
             out += self._autopilot(message)
         elif isinstance(message, Warned):
@@ -195,8 +190,9 @@ class Story:
 
     def _pose(self, track: Track, pose: Pose) -> PoseItem:
         height = None
-        if self._world is not None:
-            pose = self._world.apply_to_pose(pose)
+        world = self._placing.world
+        if world is not None:
+            pose = world.apply_to_pose(pose)
             height = float(-pose.translation[2])
             self._measure_speed(track.t_ns, pose.translation)
         self._facts.height_m, self._facts.speed_m_s = height, self._speed
@@ -282,17 +278,7 @@ class Story:
         self._update = update
         self._facts.mapped(update)
         out = self._origin_if_known()
-        places: dict[int, Similarity | None] = {}
-        for keyframe_id in update.map_from_camera:
-            place = update.place_of(keyframe_id)
-            if place is not None:
-                places[keyframe_id] = place
-        last = max(places, default=-1)
-        for keyframe_id in self._places:
-            if keyframe_id < last and keyframe_id not in places:
-                places[keyframe_id] = None
-        world = update.georeference.world_from_map if update.georeference is not None else None
-        out += self._moved(update.t_ns, places, world)
+        out += self._placing.mapped(update)
         if update.revision % SPARSE_EVERY == 1:
             out.append(SparseItem(update.t_ns, update.points_map.astype(np.float32)))
         return out
@@ -305,24 +291,6 @@ class Story:
         self.flight = replace(self.flight, origin=self._origin)
         return [self.flight]
 
-    def _moved(
-        self, t_ns: int, places: dict[int, Similarity] | dict[int, Similarity | None],
-        world: Similarity | None = None,
-    ) -> list[Item]:  # fmt: skip
-        """Tell where keyframes lie, but for those that have hardly moved."""
-        moved: dict[int, Similarity | None] = {}
-        for keyframe_id, place in places.items():
-            if place is None:
-                moved[keyframe_id] = None
-                del self._places[keyframe_id]
-            elif not _same(self._places.get(keyframe_id), place):
-                moved[keyframe_id] = self._places[keyframe_id] = place
-        if world is None or _same(self._world, world):
-            world = None
-        else:
-            self._world = world
-        return [PlacesItem(t_ns, moved, world)] if moved or world is not None else []
-
     # -- status ----------------------------------------------------------------------------------
 
     def _status(self, message: Watched) -> list[Item]:
@@ -334,11 +302,3 @@ class Story:
             return []
         self._status_ns = message.t_ns
         return [StatusItem(message.t_ns, self._facts.as_told(self._quality))]
-
-
-def _same(old: Similarity | None, new: Similarity) -> bool:
-    if old is None:
-        return False
-    moved = float(np.abs(old.translation - new.translation).max())
-    turned = float(np.abs(old.rotation - new.rotation).max())
-    return max(moved, turned) < MOVED_UNITS and old.scale == new.scale

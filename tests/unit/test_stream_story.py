@@ -6,8 +6,20 @@ import numpy as np
 import pytest
 
 from companion.camera import Camera
+from companion.geometry import Array, Pose, Similarity
 from companion.health import ComputerLoad, FeedbackHealth, Health, SourceHealth
-from companion.messages import GeoOrigin, Track, TrackState, Warned
+from companion.messages import (
+    Floats,
+    GeoOrigin,
+    MapUpdate,
+    Message,
+    PointChunk,
+    Track,
+    TrackState,
+    Warned,
+)
+from companion.output.flight_result import FlightResult
+from companion.stream.encoding import decode
 from companion.stream.items import (
     FlightItem,
     ImageItem,
@@ -15,10 +27,12 @@ from companion.stream.items import (
     LogItem,
     PathItem,
     PlacesItem,
+    PointsItem,
     PoseItem,
     Shown,
     StatusItem,
 )
+from companion.stream.parts import parts_of
 from companion.stream.story import Story, Watched
 from tests.support import flown
 
@@ -123,3 +137,84 @@ def test_status_says_what_is_known_and_nothing_else() -> None:
     assert facts["why_not"] == "no scale" and facts["scale"] == "GPS positions"
     assert facts["warnings"] == ["late telemetry"]
     assert facts["height_m"] == pytest.approx(-flown.place_m(130)[2], rel=1e-3)
+
+
+def stretched(by: float) -> MapUpdate:
+    """The map when its later half was found to be so much longer."""
+    update = flown.update()
+    poses = dict(update.map_from_camera)
+    half = len(poses) // 2
+    hinge = poses[half].translation
+    for keyframe_id in range(half + 1, len(poses)):
+        pose = poses[keyframe_id]
+        poses[keyframe_id] = Pose(pose.rotation, hinge + by * (pose.translation - hinge))
+    return replace(update, revision=2, map_from_camera=poses, t_ns=update.t_ns + 1)
+
+
+def spanned_chunk(keyframe_id: int) -> PointChunk:
+    """Points as the depth stage gives them, which knows how far keyframes about it are."""
+    spans = flown.update().spans_of(keyframe_id)
+    return replace(flown.chunk(keyframe_id, 60), spans=spans)
+
+
+def seen(items: list[Item]) -> Array:
+    """All points in the world, as a viewer has them: by what came over the wire."""
+    points: dict[int, list[Floats]] = {}
+    places: dict[int, Similarity | None] = {}
+    world: Similarity | None = None
+    for item in items:
+        for part in parts_of(item):
+            payload = part.payload
+            if isinstance(item, PlacesItem):  # a session puts several behind one time
+                payload = bytes(8) + payload
+            got = decode(part.kind, payload)
+            if isinstance(got, PlacesItem):
+                places.update(got.places)
+                world = got.world_from_map or world
+            elif isinstance(got, PointsItem):
+                points.setdefault(got.keyframe_id, []).append(got.points_camera)
+    assert world is not None
+    out: list[Array] = []
+    for keyframe_id, pieces in points.items():
+        place = places[keyframe_id]
+        assert place is not None
+        out.append((world @ place).apply(np.concatenate(pieces).astype(np.float64)))
+    return np.concatenate(out)
+
+
+def test_the_cloud_that_viewers_have_is_the_one_that_is_written() -> None:
+    ids = range(len(flown.update().map_from_camera))
+    chunks = [spanned_chunk(k) for k in ids]
+    messages: list[Message] = [flown.update(), *chunks, stretched(1.08)]
+    result = FlightResult()
+    for message in messages:
+        result.take(message)
+    written = result.cloud(1e-4).points
+    there = seen(told([flown.update(), *chunks, stretched(1.08)]))
+    assert len(there) == len(written)
+    off = np.linalg.norm(there[:, None] - written, axis=2).min(axis=1)
+    assert off.max() < 0.06  # what quantising takes
+    flat = [replace(chunk, spans={}) for chunk in chunks]
+    without = seen(told([flown.update(), *flat, stretched(1.08)]))
+    assert np.linalg.norm(without[:, None] - written, axis=2).min(axis=1).max() > 0.5
+
+
+def test_a_map_that_is_stretched_sends_transforms_only() -> None:
+    story = Story(FlightItem("a", "a", CAMERA))
+    ids = range(len(flown.update().map_from_camera))
+    told([flown.update(), *(spanned_chunk(k) for k in ids)], story)
+    (moved,) = told([stretched(1.08)], story)
+    assert isinstance(moved, PlacesItem)
+    place = moved.places[max(ids)]
+    assert place is not None and place.scale == pytest.approx(1.08)
+    assert told([stretched(1.08)], story) == []
+
+
+def test_points_that_come_after_the_map_was_stretched_are_stretched_at_once() -> None:
+    story = Story(FlightItem("a", "a", CAMERA))
+    last = max(flown.update().map_from_camera)
+    told([stretched(1.08)], story)
+    places, _ = told([spanned_chunk(last)], story)
+    assert isinstance(places, PlacesItem)
+    place = places.places[last]
+    assert place is not None and place.scale == pytest.approx(1.08)
