@@ -1,0 +1,140 @@
+"""The camera's attitude as the autopilot tells it, if that is the camera's at all.
+
+Mount and clock are corrected in flight; an attitude that is not the camera's (a gimbal) is dropped.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.geometry import Array, Pose, angle_between, rotation_from_vector
+from companion.messages import AttitudeSample, Warned
+from companion.motion import AttitudeHistory
+from companion.mount import RATE_STEP_NS, MountEstimate, MountEstimator
+
+MAX_DISAGREEMENT_RAD = np.radians(4.0)
+"""An attitude that misses this much of the camera's turning between frames is not the camera's."""
+MOUNT_EVERY_NS = 3_000_000_000
+MIN_MOUNT_RAD, MIN_LATE_S = np.radians(0.3), 0.006
+"""Corrections of mount and clock that are not worth making."""
+TOLD_DEG, TOLD_S = 1.5, 0.025
+"""Corrections that somebody should know of."""
+
+
+class Judged(NamedTuple):
+    """What came of a look at the attitude.
+
+    After a correction `now_from_before` (3, 3) turns what was told in the camera's axes by the
+    mount as it was, and `before_from_now_ned` (3, 3) is by what the frame's attitude was off.
+    """
+
+    warnings: list[Warned]
+    now_from_before: Array | None = None
+    before_from_now_ned: Array | None = None
+
+
+class CameraAttitude:
+    """Takes the autopilot's attitudes, and the camera's own turns to judge them by."""
+
+    def __init__(self, body_from_camera: Pose | None) -> None:
+        self.used = body_from_camera is not None
+        """Whether it tells anything of the camera."""
+        self._history = AttitudeHistory()
+        self._mount = body_from_camera.rotation if body_from_camera is not None else np.eye(3)
+        self._late_ns = 0
+        """What the autopilot's stamps were found to be late by."""
+        self._estimator = MountEstimator(self._mount)
+        self._told = False
+        self._due_ns = 0
+        self._kept: dict[int, tuple[Array, Array] | None] = {}
+        """`ned_from_body` and body rates of keyframes, kept when the history has moved on."""
+
+    def add(self, sample: AttitudeSample) -> None:
+        """Take what the autopilot says."""
+        self._history.add(sample)
+
+    def at(self, t_ns: int) -> Array | None:
+        """Rotation `ned_from_camera` (3, 3) of a frame; None where it is not known."""
+        if not self.used:
+            return None
+        attitude = self._history.at(t_ns + self._late_ns)
+        return None if attitude is None else attitude @ self._mount
+
+    def of_keyframe(self, keyframe_id: int, t_ns: int) -> Array | None:
+        """The same of a keyframe, interpolated once samples from after it have come."""
+        if not self.used:
+            return None
+        if keyframe_id not in self._kept:
+            if self._history.newest_t_ns < t_ns + RATE_STEP_NS:
+                return self.at(t_ns)
+            self._kept[keyframe_id] = self._history.with_rates_at(t_ns, RATE_STEP_NS)
+        kept = self._kept[keyframe_id]
+        if kept is None:
+            return None
+        attitude, rates = kept
+        return attitude @ rotation_from_vector(rates * (self._late_ns * 1e-9)) @ self._mount
+
+    def compare(self, t_ns: int, map_from_camera: Array) -> None:
+        """Take the rotation (3, 3) of a tracked frame."""
+        if self.used:
+            self._estimator.take(t_ns, map_from_camera, self._history)
+
+    def forget(self) -> None:
+        """Another map is in use: its turns are not comparable with those of the last."""
+        self._estimator.forget()
+
+    def judge(self, t_ns: int, disagreement_rad: float | None) -> Judged:
+        """See how far the attitude is the camera's: correct it, or stop using it.
+
+        `disagreement_rad` is what it misses of the camera's turning between frames.
+        """
+        if not self.used:
+            return Judged([])
+        if disagreement_rad is not None and disagreement_rad > MAX_DISAGREEMENT_RAD:
+            return self._drop(t_ns, disagreement_rad)
+        if t_ns < self._due_ns:
+            return Judged([])
+        self._due_ns = t_ns + MOUNT_EVERY_NS
+        found = self._estimator.estimate()
+        if found is None:
+            return Judged([])
+        if found.useless:
+            return self._drop(t_ns, found.residual_rad)
+        return self._correct(t_ns, found) if found.certain else Judged([])
+
+    def _drop(self, t_ns: int, off_rad: float) -> Judged:
+        self.used = False
+        detail = f"turns differ by {np.degrees(off_rad):.1f} degrees; is there a gimbal?"
+        return Judged(
+            [Warned(t_ns, "the autopilot's attitude is not the camera's and is not used", detail)]
+        )
+
+    def _correct(self, t_ns: int, found: MountEstimate) -> Judged:
+        """Use the mount and the clock as they were found to be; say so where they are far off."""
+        off_rad = angle_between(self._mount, found.body_from_camera)
+        off_s = abs(found.offset_s - self._late_ns * 1e-9)
+        sigma_rad = float(np.linalg.norm(found.sigma_turn_rad))
+        if off_rad < max(sigma_rad, MIN_MOUNT_RAD) and off_s < max(
+            2.0 * found.sigma_offset_s, MIN_LATE_S
+        ):
+            return Judged([])
+        now_from_before = found.body_from_camera.T @ self._mount
+        before = self.at(t_ns)
+        self._mount = found.body_from_camera
+        self._late_ns = int(found.offset_s * 1e9)
+        after = self.at(t_ns)
+        turned = None if before is None or after is None else before @ after.T
+        turn = np.degrees(found.turn_camera_rad)
+        slight = float(np.linalg.norm(turn)) < TOLD_DEG and abs(found.offset_s) < TOLD_S
+        if self._told or slight:
+            return Judged([], now_from_before, turned)
+        self._told = True
+        about = " ".join(f"{v:+.1f}" for v in turn)
+        detail = (
+            f"the camera is turned by {about} degrees about its right, down and forward axes, "
+            f"telemetry is {found.offset_s * 1e3:+.0f} ms late; put that into the calibration"
+        )
+        warned = Warned(t_ns, "camera and autopilot were found to disagree, corrected", detail)
+        return Judged([warned], now_from_before, turned)

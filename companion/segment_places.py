@@ -1,0 +1,128 @@
+"""Where the map's segments lie: each in the world, and all in the frame of the main one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from companion.camera_attitude import CameraAttitude
+from companion.geometry import Array, Pose, Similarity
+from companion.georeference import Georeferencer, Place
+from companion.messages import Georeference, MapUpdate
+from companion.slam.map import Keyframe, SlamMap
+from companion.slam.reunion import Reunion
+
+MAX_REUNION_OFF_M = 6.0
+"""What the autopilot's own positions may be wrong by between two times."""
+MIN_DOWN_COSINE = np.cos(np.radians(8.0))
+MOST_PLACES, MOST_PLACES_FINAL = 120, 400
+
+
+class SegmentPlaces:
+    """Georeferences of segments, told anew as they grow.
+
+    A segment is known by its first keyframe. `body_from_camera` is the mount, None where it is not
+    known.
+    """
+
+    def __init__(
+        self, georeferencer: Georeferencer, attitude: CameraAttitude, body_from_camera: Pose | None
+    ) -> None:
+        self.main_from_newest = Similarity.identity()
+        self._georeferencer = georeferencer
+        self._attitude = attitude
+        self._body_from_camera = body_from_camera
+        self._known: dict[int, Georeference] = {}
+        self._revision = 0
+
+    def of(self, segment: SlamMap) -> Georeference | None:
+        """How a segment lies in the world; None until that is known."""
+        return self._known.get(segment.first_keyframe_id)
+
+    def update(self, segments: Sequence[SlamMap], t_ns: int, final: bool) -> MapUpdate:
+        """The map, all segments in the frame of the main one (the one with most keyframes)."""
+        self._revision += 1
+        for segment in segments:
+            if final or (segment is segments[-1] and _due(segment)):
+                found = self._georeferencer.solve(
+                    [self._place(segment, keyframe) for keyframe in _spread(segment, final)]
+                )
+                if found is not None:
+                    self._known[segment.first_keyframe_id] = found
+        main = max(segments, key=lambda s: len(s.keyframes))
+        anchor = self.of(main)
+        poses: dict[int, Pose] = {}
+        scales: dict[int, float] = {}
+        points: list[Array] = []
+        n_retired = 0
+        for segment in segments:
+            own = self.of(segment)
+            if segment is main:
+                main_from_own = Similarity.identity()
+            elif anchor is not None and own is not None:
+                main_from_own = anchor.world_from_map.inverse() @ own.world_from_map
+            else:
+                continue  # nothing says how this segment lies to the main one
+            if segment is segments[-1]:
+                self.main_from_newest = main_from_own
+            n_retired += len(segment.retired)
+            for key, map_from_camera in segment.places():
+                poses[key] = main_from_own.apply_to_pose(map_from_camera)
+                unit = main_from_own.scale * segment.unit_of.get(key, 1.0)
+                if unit != 1.0:
+                    scales[key] = unit
+            points.append(main_from_own.apply(segment.living_positions()))
+        return MapUpdate(
+            self._revision, t_ns, poses, np.concatenate(points), anchor, scales, n_retired
+        )
+
+    def allowed(
+        self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: Reunion
+    ) -> bool:
+        """Whether the autopilot can have been where a reunion would have it been.
+
+        `keyframe` is of `segment`, where that is the map in use.
+        """
+        here = keyframe.keyframe_id in segment.keyframes
+        placed = self.of(segment) if here else None
+        if placed is None:
+            return True
+        way = found.here_from_there.apply(other.centre) - keyframe.centre
+        way_m = placed.world_from_map.scale * placed.world_from_map.rotation @ way
+        flown_m = self._georeferencer.way_between(keyframe.t_ns, other.t_ns)
+        if flown_m is None:
+            return True
+        off_m = float(np.linalg.norm(way_m - flown_m))
+        return off_m < MAX_REUNION_OFF_M + 3.0 * placed.sigma_scale * float(np.linalg.norm(way_m))
+
+    def _place(self, segment: SlamMap, keyframe: Keyframe) -> Place:
+        return Place(
+            keyframe.t_ns,
+            keyframe.camera_from_map.inverse(),
+            self._attitude.of_keyframe(keyframe.keyframe_id, keyframe.t_ns),
+            self._ground_below(segment, keyframe),
+        )
+
+    def _ground_below(self, segment: SlamMap, keyframe: Keyframe) -> float | None:
+        """Distance from the camera down the body's axis to the map, in map units."""
+        if self._body_from_camera is None:
+            return None
+        _, ids = segment.seen_by(keyframe)
+        in_camera = keyframe.camera_from_map.apply(segment.positions[ids])
+        p = in_camera @ self._body_from_camera.rotation.T
+        below = p[p[:, 2] > MIN_DOWN_COSINE * np.linalg.norm(p, axis=1)]
+        return float(np.median(below[:, 2])) if len(below) >= 5 else None
+
+
+def _due(segment: SlamMap) -> bool:
+    n = len(segment.keyframes)
+    return n < 40 or n % 5 == 0
+
+
+def _spread(segment: SlamMap, final: bool) -> list[Keyframe]:
+    keyframes = list(segment.keyframes.values())
+    most = MOST_PLACES_FINAL if final else MOST_PLACES
+    if len(keyframes) <= most:
+        return keyframes
+    return [keyframes[int(i)] for i in np.linspace(0, len(keyframes) - 1, most).astype(int)]
