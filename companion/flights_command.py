@@ -53,6 +53,7 @@ def list_flights(folder: Path, as_json: bool) -> str:
     """A line for each recording, the oldest first."""
     rows = [
         {
+            "path": os.fspath(path),
             "flight": flight.path.name + ("" if path.parent == flight.path else f"/{part}"),
             "start": _when(summary.start_ns) if summary.start_ns else None,
             "duration_s": round(summary.duration_s, 1),
@@ -73,7 +74,7 @@ def list_flights(folder: Path, as_json: bool) -> str:
             f"{row['mb']:>9}  {row['state']}"
         )
     free = free_bytes(folder) / MB
-    return "\n".join([*lines, f"{len(rows)} recordings, {free:.0f} MB free"])
+    return "\n".join([*lines, f"{len(rows)} recordings in {folder}, {free:.0f} MB free"])
 
 
 def show_flight(path: Path, as_json: bool) -> str:

@@ -17,10 +17,11 @@ from companion.stopping import StopSignals
 def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
     """List, show, trim, export, verify or prune."""
     from companion import flights_command as flights
+    from companion.service.flights_meant import flights_meant, installed_services
 
     folder = arguments.flights
     if folder is None:
-        folder = Path(load_config(arguments.config, arguments.set).daemon.flights)
+        folder = flights_meant(arguments.config, arguments.set, installed_services())
     what = arguments.what
     megabytes = signals.between_frames(progress_on(sys.stderr, "", "MB"))
     if what == "list":
@@ -125,8 +126,10 @@ def add_parsers(commands: Any) -> None:
 def _add_flights(commands: Any) -> None:
     place = argparse.ArgumentParser(add_help=False, parents=[configuration()])
     place.add_argument(
-        "--flights", type=Path, metavar="DIR", help="folder of all flights (daemon.flights)"
-    )
+        "--flights", type=Path, metavar="DIR",
+        help="folder of all flights (default: daemon.flights of the configuration given, else that "
+        "of the installed service, else ./flights)",
+    )  # fmt: skip
     flights = commands.add_parser("flights", help="recordings of live flights")
     does = flights.add_subparsers(dest="what", required=True, metavar="WHAT")
 

@@ -25,6 +25,8 @@ class Places:
     unit: Path
     config: Path
     rules: Path | None
+    working: Path
+    """Its working directory, where what it is told in relative paths lies."""
     kept: tuple[Path, ...]
     """What only --purge takes away: configuration, flights, caches, logs."""
     systemctl: tuple[str, ...]
@@ -36,6 +38,7 @@ SYSTEM = Places(
     unit=Path("/etc/systemd/system", UNIT),
     config=Path("/etc/companion/companion.toml"),
     rules=Path("/etc/udev/rules.d", RULES),
+    working=Path("/var/lib", ACCOUNT),
     kept=tuple(Path(name, ACCOUNT) for name in ("/etc", "/var/lib", "/var/cache", "/var/log")),
     systemctl=("systemctl",),
     manager=Path("/run/systemd/system"),
@@ -52,6 +55,7 @@ def user_places(environment: Mapping[str, str] = os.environ) -> Places:
         unit=config / "systemd/user" / UNIT,
         config=config / ACCOUNT / "companion.toml",
         rules=None,
+        working=state / ACCOUNT,
         kept=(config / ACCOUNT, state / ACCOUNT),
         systemctl=("systemctl", "--user"),
         manager=Path(environment.get("XDG_RUNTIME_DIR", "/nonexistent"), "systemd/private"),

@@ -33,6 +33,11 @@ def flights_in(folder: Path) -> list[FlightPlace]:
     """All flights, the oldest first; FlightError where the folder cannot be read."""
     try:
         names = sorted(each.name for each in os.scandir(folder) if each.is_dir())
+    except FileNotFoundError as error:
+        raise FlightError(f"{folder}: not there; --flights names a folder of flights") from error
+    except PermissionError as error:
+        hint = "join the group companion, or use sudo"
+        raise FlightError(f"{folder}: may not be read by this user; {hint}") from error
     except OSError as error:
         raise FlightError(f"{folder}: cannot be read: {error.strerror}") from error
     return [_place(folder / name) for name in names if STAMPED.fullmatch(name)]
