@@ -14,7 +14,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TextIO
 
-from companion.advice import FIRMWARES, Finding, advise, advise_on_line, names_to_read
+from companion.advice.line import advise_on_line, names_of_lines
+from companion.advice.pose import advise, names_to_read
+from companion.advice.wanted import FIRMWARES, Finding
 from companion.config import Config, LinkConfig
 from companion.errors import ConfigError, InputError, SourceError
 from drivers.asking_link import asking_link
@@ -119,7 +121,8 @@ async def _examine(
         parameters = Parameters(link)
 
         async def look() -> tuple[list[Finding], int]:
-            read = await parameters.read(names_to_read(firmware, line=baud > 0))
+            ports = names_of_lines(firmware) if baud > 0 else ()
+            read = await parameters.read([*names_to_read(firmware), *ports])
             values = {name: each.value for name, each in read.items()}
             findings = advise(firmware, values, feedback, mode, latency_ms)
             if baud:

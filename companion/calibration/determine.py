@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from companion.calibration.board_image import LensModel
 from companion.calibration.lens_fit import (
     LensFit,
-    LensModel,
     first_lens,
     fit_lens,
     residuals_of,

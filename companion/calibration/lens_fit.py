@@ -20,13 +20,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.calibration.board_image import (
+    N_BOW,
+    LensModel,
+    camera_of,
+    projected,
+    unexplained,
+)
+from companion.calibration.board_pose import board_pose
 from companion.calibration.views import View
 from companion.camera import Camera, Distortion
 from companion.geometry import Array
 
-N_BOW = 3
-"""Of the board's depth a x^2 + b x y + c y^2."""
-N_COEFFICIENTS = {Distortion.RADTAN: 5, Distortion.EQUIDISTANT: 4}
 FIRST_FOV_DEG = {
     Distortion.RADTAN: (35, 60, 85, 110),
     Distortion.EQUIDISTANT: (40, 75, 110, 145, 180),
@@ -37,29 +42,6 @@ FIRST_VIEWS = 12
 MAX_STEPS = 30
 CONVERGED = 1e-8
 """Relative fall of the cost under which a fit is at its end."""
-MIRRORED = 25.0
-"""The second of the two poses that a flat board allows is not tried when it is so much worse."""
-
-
-@dataclass(frozen=True, slots=True)
-class LensModel:
-    """A distortion model, of whose coefficients the last ones may be kept at zero."""
-
-    distortion: Distortion
-    n_free: int
-    bowed: bool = True
-    """Whether the board may be."""
-
-    @property
-    def n_lens(self) -> int:
-        """How many parameters fx fy cx cy k… there are; those of the board follow."""
-        return 4 + N_COEFFICIENTS[self.distortion]
-
-    @property
-    def free(self) -> NDArray[np.int64]:
-        """Which of the parameters are solved for."""
-        bow = self.n_lens + np.arange(N_BOW if self.bowed else 0)
-        return np.concatenate([np.arange(4 + self.n_free), bow])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +64,7 @@ class LensFit:
     @property
     def camera(self) -> Camera:
         """The lens as the rest of the program has it."""
-        return _camera(self.model, self.parameters, self.width, self.height)
+        return camera_of(self.model, self.parameters, self.width, self.height)
 
     def sag_m(self, board_m: Array) -> float:
         """How far the board's sides stand before or behind its middle, given its corners (N, 3)."""
@@ -122,7 +104,7 @@ def first_lens(views: Sequence[View], model: LensModel, huber_px: float) -> Lens
         focal = width / 2 / (math.tan(half) if model.distortion is Distortion.RADTAN else half)
         guess = np.zeros(model.n_lens + N_BOW)
         guess[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
-        some = [views[i] for i in at if _first_pose(views[i], rough, guess) is not None]
+        some = [views[i] for i in at if board_pose(views[i], rough, guess) is not None]
         if len(some) < max(3, len(at) // 2):
             continue
         tried = _solved(some, rough, guess, huber_px, 15)
@@ -150,10 +132,10 @@ def fit_lens(
 
 def residuals_of(lens: LensFit, view: View) -> Array:
     """What a view leaves unexplained when only the board's pose is fitted; (N, 2)."""
-    pose = _first_pose(view, lens.model, lens.parameters)
+    pose = board_pose(view, lens.model, lens.parameters)
     if pose is None:
         return np.full((view.n_corners, 2), np.nan)
-    return _residuals(view, lens.model, lens.parameters, pose)
+    return unexplained(view, lens.model, lens.parameters, pose)
 
 
 def standard_deviations(lens: LensFit, views: Sequence[View]) -> Array:
@@ -162,7 +144,7 @@ def standard_deviations(lens: LensFit, views: Sequence[View]) -> Array:
     n_free = len(free)
     schur = np.zeros((n_free, n_free))
     for view, pose in zip(views, lens.poses, strict=True):
-        _, by_lens, by_pose = _projected(view, lens.model, lens.parameters, pose)
+        _, by_lens, by_pose = projected(view, lens.model, lens.parameters, pose)
         a, b = by_lens[:, free], by_pose
         schur += a.T @ a - a.T @ b @ np.linalg.pinv(b.T @ b) @ b.T @ a
     n_measured = 2 * sum(view.n_corners for view in views)
@@ -183,7 +165,7 @@ def _solved(
     first = [
         known_poses[view.number]
         if view.number in known_poses
-        else _first_pose(view, model, parameters)
+        else board_pose(view, model, parameters)
         for view in views
     ]
     if sum(pose is not None for pose in first) < len(views):
@@ -237,7 +219,7 @@ def _block(
     huber_px: float,
 ) -> Block:  # fmt: skip
     """Normal equations of one view: lens, lens by pose, pose, and both right-hand sides."""
-    pixels, by_lens, by_pose = _projected(view, model, parameters, pose)
+    pixels, by_lens, by_pose = projected(view, model, parameters, pose)
     residual = view.sighting.image_px - pixels
     weight = np.repeat(np.sqrt(_weights(residual, huber_px)), 2)
     a, b = by_lens[:, free] * weight[:, None], by_pose * weight[:, None]
@@ -286,126 +268,5 @@ def _all_residuals(
     views: Sequence[View], model: LensModel, parameters: Array, poses: Sequence[Array]
 ) -> list[Array]:
     return [
-        _residuals(view, model, parameters, pose) for view, pose in zip(views, poses, strict=True)
+        unexplained(view, model, parameters, pose) for view, pose in zip(views, poses, strict=True)
     ]
-
-
-def _residuals(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
-    pixels, _, _ = _imaged(view, model, parameters, pose)
-    out: Array = view.sighting.image_px - pixels
-    return out
-
-
-def _imaged(
-    view: View, model: LensModel, parameters: Array, pose: Array
-) -> tuple[Array, Array, Array]:
-    """Corners (N, 2) of a view; derivatives (2 N, …) by the lens alone and by the pose."""
-    fx, fy, cx, cy = parameters[:4]
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    board_m = view.sighting.board_m.copy()
-    board_m[:, 2] = _bows(board_m) @ parameters[-N_BOW:]
-    lens = parameters[4 : model.n_lens]
-    if model.distortion is Distortion.RADTAN:
-        pixels, by = cv2.projectPoints(board_m, pose[:3], pose[3:], matrix, lens)
-        by_pose, by_lens = by[:, :6], by[:, 6:15]
-    else:
-        pixels, by = cv2.fisheye.projectPoints(
-            board_m[:, None], pose[:3], pose[3:], matrix, lens
-        )
-        by_lens, by_pose = by[:, :8], by[:, 8:14]
-    return (
-        np.asarray(pixels, np.float64).reshape(-1, 2),
-        np.asarray(by_lens, np.float64), np.asarray(by_pose, np.float64),
-    )  # fmt: skip
-
-
-def _projected(
-    view: View, model: LensModel, parameters: Array, pose: Array
-) -> tuple[Array, Array, Array]:
-    """Corners (N, 2) of a view; derivatives (2 N, …) by all parameters and by the pose."""
-    pixels, by_lens, by_pose = _imaged(view, model, parameters, pose)
-    # a corner that moves along the board's normal is one that the board's shift moves along it
-    by_depth = by_pose[:, 3:] @ cv2.Rodrigues(pose[:3])[0][:, 2]
-    by_bow = by_depth[:, None] * np.repeat(_bows(view.sighting.board_m), 2, axis=0)
-    return pixels, np.concatenate([by_lens, by_bow], 1), by_pose
-
-
-def _bows(board_m: Array) -> Array:
-    x, y = board_m[:, 0], board_m[:, 1]
-    out = np.empty((len(board_m), N_BOW))
-    out[:, 0], out[:, 1], out[:, 2] = x * x, x * y, y * y
-    return out
-
-
-def _camera(model: LensModel, parameters: Array, width: int, height: int) -> Camera:
-    fx, fy, cx, cy, *coefficients = (float(value) for value in parameters[: model.n_lens])
-    return Camera(width, height, fx, fy, cx, cy, model.distortion, tuple(coefficients))
-
-
-def _first_pose(view: View, model: LensModel, parameters: Array) -> Array | None:
-    """The board's pose under a known lens; of the two that a flat board allows, the better one."""
-    camera = _camera(model, parameters, view.width, view.height)
-    normalised = camera.normalise(view.sighting.image_px)
-    usable = np.isfinite(normalised).all(1)
-    if usable.sum() < 6:
-        return None
-    # far off the axis normalised coordinates stretch without end: look at the board instead
-    rays = np.concatenate([normalised[usable], np.ones((int(usable.sum()), 1))], 1)
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    facing = _facing(rays.mean(0))
-    faced = rays @ facing.T
-    try:
-        n, turns, shifts, _ = cv2.solvePnPGeneric(
-            view.sighting.board_m[usable], faced[:, :2] / faced[:, 2:], np.eye(3), None,
-            flags=cv2.SOLVEPNP_IPPE,
-        )  # fmt: skip
-    except cv2.error:  # corners in one line, or a lens guess that makes them so
-        return None
-    found = []
-    for turn, shift in list(zip(turns, shifts, strict=True))[:n]:
-        back = cv2.Rodrigues(facing.T @ cv2.Rodrigues(turn)[0])[0]
-        pose = np.concatenate([np.ravel(back), facing.T @ np.ravel(shift)])
-        if np.isfinite(pose).all() and pose[5] > 0:
-            found.append((_pose_cost(view, model, parameters, pose), pose))
-    found.sort(key=lambda one: one[0])
-    best: tuple[float, Array] | None = None
-    for before, pose in found:
-        if best is not None and before > MIRRORED * found[0][0]:
-            break
-        refined = _refined_pose(view, model, parameters, pose)
-        cost = _pose_cost(view, model, parameters, refined)
-        if math.isfinite(cost) and (best is None or cost < best[0]):
-            best = cost, refined
-    return None if best is None else best[1]
-
-
-def _facing(direction: Array) -> Array:
-    """The rotation that brings a direction to the front onto the axis."""
-    forward = direction / np.linalg.norm(direction)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    out: Array = np.stack([right, np.cross(forward, right), forward])
-    return out
-
-
-def _pose_cost(view: View, model: LensModel, parameters: Array, pose: Array) -> float:
-    return float((_residuals(view, model, parameters, pose) ** 2).sum())
-
-
-def _refined_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
-    damping = 1e-3
-    for _ in range(20):
-        pixels, _, by = _imaged(view, model, parameters, pose)
-        residual = (view.sighting.image_px - pixels).reshape(-1)
-        cost = float(residual @ residual)
-        normal = by.T @ by
-        damped = normal + damping * np.diag(np.diag(normal))
-        tried = pose + np.linalg.solve(damped, by.T @ residual)
-        tried_cost = _pose_cost(view, model, parameters, tried)
-        if tried_cost < cost:
-            pose, damping = tried, max(damping / 10, 1e-9)
-            if tried_cost > (1 - 1e-6) * cost:
-                break
-        else:
-            damping *= 10
-    return pose

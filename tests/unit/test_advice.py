@@ -4,14 +4,10 @@ import re
 
 import pytest
 
-from companion.advice import (
-    FIRMWARES,
-    RULES,
-    Finding,
-    advise,
-    advise_on_line,
-    names_to_read,
-)
+from companion.advice.line import advise_on_line, names_of_lines
+from companion.advice.pose import advise, names_to_read
+from companion.advice.rules import RULES
+from companion.advice.wanted import FIRMWARES, Finding
 from companion.config import FeedbackConfig, LinkConfig
 from tests.support import fake_parameters
 
@@ -156,7 +152,7 @@ def test_rate_that_px4_keeps_to() -> None:
 
 def test_names_fit_a_parameter() -> None:
     for firmware in FIRMWARES:
-        names = names_to_read(firmware, line=True)
+        names = [*names_to_read(firmware), *names_of_lines(firmware)]
         assert len(set(names)) == len(names)
         assert all(re.fullmatch(r"[A-Z][A-Z0-9_]{2,15}", name) for name in names)
         assert all(rule.why and rule.why[-1] not in ". " for rule in RULES[firmware])

@@ -1,0 +1,103 @@
+"""Whether the serial line to an autopilot carries what is asked of it."""
+
+from __future__ import annotations
+
+from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
+from companion.config import FeedbackConfig, LinkConfig
+
+BUSY = 0.6
+"""A line is not to be filled further than this, or stamps come late."""
+BITS_PER_BYTE = 10
+POSE_BYTES = {"odometry": 245, "vision_position": 129 + 69}
+OTHER_BYTES_PER_S = 700.0
+"""Heartbeat, time synchronisation and status of ours."""
+ATTITUDE_BYTES, IMU_BYTES, POSITION_BYTES, HEIGHT_BYTES = 44, 41, 40 + 40 + 64, 28 + 51
+USUAL_BAUDS = (115200, 230400, 460800, 921600, 1500000)
+OF_LINES = {
+    ARDUPILOT: tuple(f"SERIAL{n}_{what}" for n in range(1, 9) for what in ("BAUD", "PROTOCOL")),
+    PX4: (
+        *(f"MAV_{n}_{what}" for n in range(3) for what in ("CONFIG", "RATE")),
+        "SER_TEL1_BAUD", "SER_TEL2_BAUD", "SER_TEL3_BAUD", "SER_TEL4_BAUD",
+    ),
+}  # fmt: skip
+PX4_PORTS = {101: "TEL1", 102: "TEL2", 103: "TEL3", 104: "TEL4"}
+ARDUPILOT_MAVLINK = (1, 2)
+_BAUD_NAME = {ARDUPILOT: "SERIALn_BAUD", PX4: "SER_…_BAUD"}
+
+
+def names_of_lines(firmware: str) -> tuple[str, ...]:
+    """The parameters that this looks at."""
+    return OF_LINES[firmware]
+
+
+def advise_on_line(
+    firmware: str,
+    values: Values,
+    link: LinkConfig,
+    feedback: FeedbackConfig,
+    mode: str,
+    baud: int,
+) -> list[Finding]:
+    """Whether a serial line carries both ways what is asked of it; PX4's own limit as well."""
+    up = feedback.rate_hz * POSE_BYTES[mode] + OTHER_BYTES_PER_S
+    down = (
+        link.attitude_hz * ATTITUDE_BYTES
+        + link.imu_hz * IMU_BYTES
+        + link.position_hz * POSITION_BYTES
+        + link.height_hz * HEIGHT_BYTES
+        + OTHER_BYTES_PER_S
+    )
+    needed_baud = max(up, down) * BITS_PER_BYTE / BUSY
+    findings = []
+    ports = _ports_at(firmware, values, baud)
+    if baud < needed_baud:
+        enough = next((each for each in USUAL_BAUDS if each >= needed_baud), USUAL_BAUDS[-1])
+        findings.append(
+            Finding(
+                ports[0] if len(ports) == 1 else _BAUD_NAME[firmware], float(baud),
+                f"{enough} or more, and the same in link.url",
+                f"we send {up / 1000:.1f} kB/s and ask for {down / 1000:.1f} kB/s; this line "
+                f"carries {baud / BITS_PER_BYTE / 1000:.1f} kB/s each way",
+            )
+        )  # fmt: skip
+    if firmware == PX4:
+        findings += _px4_rate(values, baud, down)
+    return findings
+
+
+def _ports_at(firmware: str, values: Values, baud: int) -> list[str]:
+    """The parameters of the ports that speak MAVLink at a baud rate."""
+    if firmware == PX4:
+        return [
+            f"SER_{port}_BAUD"
+            for number, port in PX4_PORTS.items()
+            if values.get(f"SER_{port}_BAUD") == baud
+            and any(values.get(f"MAV_{n}_CONFIG") == number for n in range(3))
+        ]
+    return [
+        f"SERIAL{n}_BAUD"
+        for n in range(1, 9)
+        if values.get(f"SERIAL{n}_PROTOCOL") in ARDUPILOT_MAVLINK
+        and values.get(f"SERIAL{n}_BAUD") in (baud, baud // 1000)  # 57 stands for 57600
+    ]
+
+
+def _px4_rate(values: Values, baud: int, down: float) -> list[Finding]:
+    ports = _ports_at(PX4, values, baud)
+    if len(ports) != 1:
+        return []
+    number = next(n for n, port in PX4_PORTS.items() if f"SER_{port}_BAUD" == ports[0])
+    instance = next(n for n in range(3) if values.get(f"MAV_{n}_CONFIG") == number)
+    name = f"MAV_{instance}_RATE"
+    value = values.get(name)
+    half = baud / BITS_PER_BYTE / 2
+    if value is None or (value or half) >= down:
+        return []
+    return [
+        Finding(
+            name, value, f"{down:.0f} or more",
+            "bytes a second that PX4 sends here at most (0: half of the line); it slows all "
+            "streams down to keep to it",
+            float(round(BUSY * baud / BITS_PER_BYTE)), True,
+        )
+    ]  # fmt: skip

@@ -1,0 +1,84 @@
+"""The board's pose in one view under a known lens."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from companion.calibration.board_image import LensModel, camera_of, imaged, unexplained
+from companion.calibration.views import View
+from companion.geometry import Array
+
+MIRRORED = 25.0
+"""The second of the two poses that a flat board allows is not tried when it is so much worse."""
+
+
+def board_pose(view: View, model: LensModel, parameters: Array) -> Array | None:
+    """The board's pose under a known lens; of the two that a flat board allows, the better one."""
+    camera = camera_of(model, parameters, view.width, view.height)
+    normalised = camera.normalise(view.sighting.image_px)
+    usable = np.isfinite(normalised).all(1)
+    if usable.sum() < 6:
+        return None
+    # far off the axis normalised coordinates stretch without end: look at the board instead
+    rays = np.concatenate([normalised[usable], np.ones((int(usable.sum()), 1))], 1)
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    facing = _facing(rays.mean(0))
+    faced = rays @ facing.T
+    try:
+        n, turns, shifts, _ = cv2.solvePnPGeneric(
+            view.sighting.board_m[usable], faced[:, :2] / faced[:, 2:], np.eye(3), None,
+            flags=cv2.SOLVEPNP_IPPE,
+        )  # fmt: skip
+    except cv2.error:  # corners in one line, or a lens guess that makes them so
+        return None
+    found = []
+    for turn, shift in list(zip(turns, shifts, strict=True))[:n]:
+        back = cv2.Rodrigues(facing.T @ cv2.Rodrigues(turn)[0])[0]
+        pose = np.concatenate([np.ravel(back), facing.T @ np.ravel(shift)])
+        if np.isfinite(pose).all() and pose[5] > 0:
+            found.append((_pose_cost(view, model, parameters, pose), pose))
+    found.sort(key=lambda one: one[0])
+    best: tuple[float, Array] | None = None
+    for before, pose in found:
+        if best is not None and before > MIRRORED * found[0][0]:
+            break
+        refined = _refined_pose(view, model, parameters, pose)
+        cost = _pose_cost(view, model, parameters, refined)
+        if math.isfinite(cost) and (best is None or cost < best[0]):
+            best = cost, refined
+    return None if best is None else best[1]
+
+
+def _facing(direction: Array) -> Array:
+    """The rotation that brings a direction to the front onto the axis."""
+    forward = direction / np.linalg.norm(direction)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    out: Array = np.stack([right, np.cross(forward, right), forward])
+    return out
+
+
+def _pose_cost(view: View, model: LensModel, parameters: Array, pose: Array) -> float:
+    return float((unexplained(view, model, parameters, pose) ** 2).sum())
+
+
+def _refined_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
+    damping = 1e-3
+    for _ in range(20):
+        pixels, _, by = imaged(view, model, parameters, pose)
+        residual = (view.sighting.image_px - pixels).reshape(-1)
+        cost = float(residual @ residual)
+        normal = by.T @ by
+        damped = normal + damping * np.diag(np.diag(normal))
+        tried = pose + np.linalg.solve(damped, by.T @ residual)
+        tried_cost = _pose_cost(view, model, parameters, tried)
+        if tried_cost < cost:
+            pose, damping = tried, max(damping / 10, 1e-9)
+            if tried_cost > (1 - 1e-6) * cost:
+                break
+        else:
+            damping *= 10
+    return pose
