@@ -10,17 +10,22 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from companion.geometry import Array, Similarity, rotation_from_vector, skew, vector_from_rotation
 
+Bools = NDArray[np.bool_]
 DRIFT_TAU_S = 40.0
 SIGMA_DRIFT_M = 1.0
 SIGMA_WHITE_M = 0.15
 SIGMA_VELOCITY_M_S = 0.15
 VELOCITY_TAU_S = 1.0
+MAX_STEP_S = 5.0
+"""Between two places, for velocity to tell how far that is."""
 SIGMA_TILT_RAD = np.radians(0.5)
 SIGMA_YAW_RAD = np.radians(6.0)
+ITERATIONS, OUTLIERS_AT = 12, 6
 DISAGREE = 3.0
 """Standard deviations by which two scales differ that cannot both be right."""
 
@@ -43,79 +48,58 @@ def agreed(first: Scale, second: Scale) -> Scale:
     return best._replace(sigma=apart)
 
 
-def fit_map(
-    t_s: Array,
-    mapped: Array,
-    target: Array,
-    way: Array,
-    level: Array | None,
-    scale: Scale | None,
-) -> tuple[Similarity, Array, float] | None:
-    """Generalised least squares over (log scale, turn (3), origin (3)); covariance (7, 7).
+class _Equations:
+    """Normal equations of (log scale, turn (3), origin (3)), and what they leave unexplained."""
 
-    `scale` is what others say of it.
+    def __init__(self) -> None:
+        self.information = np.zeros((7, 7))
+        self.gradient = np.zeros(7)
+        self.chi2, self.n_rows = 0.0, 0
+
+    def add(self, jacobian: Array, residual: Array, n_told: int) -> None:
+        """Add rows (N, 7) and (N,), weighted already, `n_told` of which say anything."""
+        self.information += jacobian.T @ jacobian
+        self.gradient += jacobian.T @ residual
+        self.chi2 += float(residual @ residual)
+        self.n_rows += n_told
+
+
+def fit_map(
+    t_s: Array, mapped: Array, target: Array, way: Array, level: Array | None, scale: Scale | None
+) -> tuple[Similarity, Array, float] | None:
+    """Generalised least squares over (log scale, turn (3), origin (3)), N places of which.
+
+    `mapped` (N, 3) in map units are to lie on `target` (N, 3) in metres; `way` (N, 3) is what was
+    travelled so far, nan where it is not known; `level` the rotation world_from_map by attitude;
+    `scale` what others say of it. Gives the similarity, its covariance (7, 7) and the residual,
+    RMS in metres; None where nothing fits.
     """
     guess = _start(mapped, target, level)
     if not np.isfinite(guess.scale) or guess.scale <= 0:
         return None
-    prior = (
-        np.array([1 / SIGMA_TILT_RAD, 1 / SIGMA_TILT_RAD, 1 / SIGMA_YAW_RAD])
-        if level is not None
-        else np.full(3, 1e-3)
-    )
-    keep = np.ones(len(t_s), bool)
-    steps = np.isfinite(way[1:, :2] - way[:-1, :2]).all(1)
-    dt = np.diff(t_s)
-    information, chi2, n_rows, root = np.eye(7), 0.0, 1, np.eye(len(t_s))
-    for iteration in range(12):
+    keep, root, equations = np.ones(len(t_s), bool), np.eye(len(t_s)), _Equations()
+    for iteration in range(ITERATIONS):
         turned = guess.scale * mapped @ guess.rotation.T
         residual = target - turned - guess.translation
-        if iteration == 6:  # positions that no drift explains
+        if iteration == OUTLIERS_AT:  # positions that no drift explains
             size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
             keep = size < max(5.0 * float(np.median(size)), 3.0)
-        # derivative of the prediction: scale, turn, origin
-        jac = np.zeros((len(t_s), 3, 7))
-        jac[:, :, 0] = turned
-        jac[:, :, 1:4] = -skew(turned)
-        jac[:, :, 4:] = np.eye(3)
-        information = np.zeros((7, 7))
-        gradient = np.zeros(7)
-        chi2, n_rows = 0.0, 0
-        if iteration in (0, 6):
+        if iteration in (0, OUTLIERS_AT):
             root = _drift_root(t_s[keep])
+        # derivative of the prediction: scale, turn, origin
+        jacobian = np.zeros((len(t_s), 3, 7))
+        jacobian[:, :, 0] = turned
+        jacobian[:, :, 1:4] = -skew(turned)
+        jacobian[:, :, 4:] = np.eye(3)
+        equations = _Equations()
         for axis in range(3):
-            j = solve_triangular(root, jac[keep, axis], lower=True)
+            j = solve_triangular(root, jacobian[keep, axis], lower=True)
             r = solve_triangular(root, residual[keep, axis], lower=True)
-            information += j.T @ j
-            gradient += j.T @ r
-            chi2 += float(r @ r)
-            n_rows += len(r)
-        use = steps & (dt < 5.0) & keep[1:] & keep[:-1]
-        if use.any():
-            j = (jac[1:] - jac[:-1])[use]
-            r = ((way[1:] - way[:-1]) - (turned[1:] - turned[:-1]))[use]
-            told = np.isfinite(r)
-            j, r = j * told[..., None], np.where(told, r, 0.0)
-            sigma_m = SIGMA_VELOCITY_M_S * np.sqrt(dt[use] * np.maximum(dt[use], VELOCITY_TAU_S))
-            weight = 1.0 / sigma_m
-            length = np.linalg.norm(r, axis=1) * weight
-            weight = weight * np.sqrt(np.minimum(1.0, 3.0 / np.maximum(length, 1e-9)))
-            j, r = j * weight[:, None, None], r * weight[:, None]
-            information += np.einsum("nij,nik->jk", j, j)
-            gradient += np.einsum("nij,ni->j", j, r)
-            chi2 += float((r * r).sum())
-            n_rows += int(told.sum())
-        if scale is not None:
-            information[0, 0] += scale.sigma**-2
-            gradient[0] += np.log(scale.scale / guess.scale) / scale.sigma**2
-        if level is not None:
-            turn = vector_from_rotation(guess.rotation @ level.T)
-            information[1:4, 1:4] += np.diag(prior**2)
-            gradient[1:4] -= prior**2 * turn
-        else:
-            information[1:4, 1:4] += np.diag(prior**2)
+            equations.add(j, r, len(r))
+        _add_ways(equations, t_s, jacobian, turned, way, keep)
+        _add_priors(equations, guess, level, scale)
         try:
-            delta = np.asarray(np.linalg.solve(information, gradient), np.float64)
+            delta: Array = np.linalg.solve(equations.information, equations.gradient)
         except np.linalg.LinAlgError:
             return None
         delta[:4] = np.clip(delta[:4], -0.5, 0.5)
@@ -124,10 +108,47 @@ def fit_map(
             rotation_from_vector(delta[1:4]) @ guess.rotation,
             guess.translation + delta[4:],
         )
-    inflation = max(chi2 / max(n_rows - 7, 1), 1.0)
-    covariance = np.asarray(np.linalg.inv(information) * inflation, np.float64)
+    inflation = max(equations.chi2 / max(equations.n_rows - 7, 1), 1.0)
+    covariance = np.asarray(np.linalg.inv(equations.information) * inflation, np.float64)
     error = target - guess.apply(mapped)
     return guess, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))
+
+
+def _add_ways(
+    equations: _Equations, t_s: Array, jacobian: Array, turned: Array, way: Array, keep: Bools
+) -> None:
+    """From one place to the next, where velocity tells how far that was; robust (Huber)."""
+    dt = np.diff(t_s)
+    known = np.isfinite(way[1:, :2] - way[:-1, :2]).all(1)
+    use = known & (dt < MAX_STEP_S) & keep[1:] & keep[:-1]
+    if not use.any():
+        return
+    j = (jacobian[1:] - jacobian[:-1])[use]
+    r = ((way[1:] - way[:-1]) - (turned[1:] - turned[:-1]))[use]
+    told = np.isfinite(r)
+    j, r = j * told[..., None], np.where(told, r, 0.0)
+    sigma_m = SIGMA_VELOCITY_M_S * np.sqrt(dt[use] * np.maximum(dt[use], VELOCITY_TAU_S))
+    weight = 1.0 / sigma_m
+    length = np.linalg.norm(r, axis=1) * weight
+    weight = weight * np.sqrt(np.minimum(1.0, 3.0 / np.maximum(length, 1e-9)))
+    equations.add(
+        (j * weight[:, None, None]).reshape(-1, 7), (r * weight[:, None]).reshape(-1),
+        int(told.sum()),
+    )  # fmt: skip
+
+
+def _add_priors(
+    equations: _Equations, guess: Similarity, level: Array | None, scale: Scale | None
+) -> None:
+    if scale is not None:
+        equations.information[0, 0] += scale.sigma**-2
+        equations.gradient[0] += np.log(scale.scale / guess.scale) / scale.sigma**2
+    weight = np.full(3, 1e-6)
+    if level is not None:
+        weight = np.array([SIGMA_TILT_RAD, SIGMA_TILT_RAD, SIGMA_YAW_RAD]) ** -2
+        turn = vector_from_rotation(guess.rotation @ level.T)
+        equations.gradient[1:4] -= weight * turn
+    equations.information[1:4, 1:4] += np.diag(weight)
 
 
 def _start(mapped: Array, target: Array, level: Array | None) -> Similarity:
