@@ -99,9 +99,10 @@ def fit_map(
         _add_ways(equations, t_s, jacobian, turned, way, keep)
         _add_priors(equations, guess, level, scale)
         try:
-            delta: Array = np.linalg.solve(equations.information, equations.gradient)
+            solved = np.linalg.solve(equations.information, equations.gradient)
         except np.linalg.LinAlgError:
             return None
+        delta = np.asarray(solved, np.float64)
         delta[:4] = np.clip(delta[:4], -0.5, 0.5)
         guess = Similarity(
             guess.scale * float(np.exp(delta[0])),
