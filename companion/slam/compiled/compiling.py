@@ -1,0 +1,59 @@
+"""How the loops are compiled and kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numba import types
+
+from companion.geometry import Array
+
+Loop = TypeVar("Loop", bound=Callable[..., Any])
+
+number, integer, flag = types.float64, types.int64, types.boolean
+
+
+def given(element: Any, dimensions: int) -> Any:
+    """The type of an array in rows, which a loop only reads."""
+    return types.Array(element, dimensions, "C", readonly=True)
+
+
+def changed(element: Any, dimensions: int) -> Any:
+    """The type of an array in rows, into which a loop writes."""
+    return types.Array(element, dimensions, "C")
+
+
+numbers, pairs, matrices = given(number, 1), given(number, 2), given(number, 3)
+integers, bytes_, flags = given(integer, 1), given(types.uint8, 2), given(flag, 1)
+
+
+def in_rows(array: Array) -> Array:
+    """An array of numbers as loops want it: itself, where it lies in rows already."""
+    return np.ascontiguousarray(array, np.float64)
+
+
+not_kept: list[str] = []
+"""Why loops could not be kept on disk or taken from there, in words; each start compiles them."""
+
+
+def compiled(*arguments: Any) -> Callable[[Loop], Loop]:
+    """Compile a loop for these types of arguments, at once; a division by zero gives inf or nan."""
+
+    def compile_loop(loop: Loop) -> Loop:
+        try:
+            done: Any = numba.njit(arguments, nogil=True, cache=True, error_model="numpy")(loop)
+        except Exception as error:  # no room, or a damaged file; what else it is comes up again
+            not_kept.append(f"{loop.__name__}: {error}")
+            done = numba.njit(arguments, nogil=True, error_model="numpy")(loop)
+        return cast(Loop, done)
+
+    return compile_loop
+
+
+def part(loop: Loop) -> Loop:
+    """What only compiled loops of the same file call."""
+    done: Any = numba.njit(nogil=True, error_model="numpy")(loop)
+    return cast(Loop, done)

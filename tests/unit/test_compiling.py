@@ -1,0 +1,67 @@
+"""Loops are kept on disk, and still compiled where they cannot be."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.slam.compiled import compiling
+
+TEXT = """
+from companion.slam.compiled.compiling import compiled, number, numbers
+
+@compiled(numbers, number)
+def scaled(values, by):
+    return values * by / 0.0
+"""
+
+
+@pytest.fixture(autouse=True)
+def not_kept(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    found: list[str] = []
+    monkeypatch.setattr(compiling, "not_kept", found)
+    yield found
+
+
+def module_in(folder: Path) -> Any:
+    path = folder / "loops_of_a_test.py"
+    path.write_text(TEXT, "utf-8")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_loop_is_compiled_once(tmp_path: Path, not_kept: list[str]) -> None:
+    (loop,) = module_in(tmp_path).scaled.overloads  # there before it is called
+    assert len(loop) == 2
+    (kept,) = tmp_path.rglob("*.nbc")
+    stamp = kept.stat().st_mtime_ns
+    again = module_in(tmp_path).scaled
+    assert kept.stat().st_mtime_ns == stamp
+    assert sum(again.stats.cache_hits.values()) == 1
+    assert again(np.array([1.0, -2.0, 0.0]), 3.0)[:2].tolist() == [np.inf, -np.inf]
+    assert not_kept == []
+
+
+def test_a_kept_loop_that_is_damaged_is_compiled_anew(tmp_path: Path, not_kept: list[str]) -> None:
+    module_in(tmp_path)
+    (kept,) = tmp_path.rglob("*.nbc")
+    kept.write_bytes(kept.read_bytes()[:100])
+    assert np.isnan(module_in(tmp_path).scaled(np.zeros(3), 1.0)).all()
+    assert len(not_kept) == 1 and not_kept[0].startswith("scaled: ")
+
+
+def test_without_a_place_to_keep_it_a_loop_is_compiled_all_the_same(
+    tmp_path: Path, not_kept: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "__pycache__").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "__pycache__"))
+    assert np.isnan(module_in(tmp_path).scaled(np.zeros(2), 1.0)).all()
+    assert len(not_kept) == 1 and "cannot cache" in not_kept[0]
