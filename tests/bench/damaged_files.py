@@ -51,17 +51,18 @@ def try_source(source: Path, arguments: argparse.Namespace) -> int:
     """Read damaged copies of a source; return how many were worse than refused."""
     began = time.monotonic()
     outcomes: Counter[str] = Counter()
-    worst_s, bad = 0.0, 0
+    worst_s, worst_cpu_s, worst_mb, bad = 0.0, 0.0, 0.0, 0
     for seed in range(arguments.seeds):
         for kind in KINDS:
             with tempfile.TemporaryDirectory(dir=arguments.made) as place:
                 copy = damage_source(source, Path(place) / "copy", kind, seed)
                 one = time.monotonic()
-                said = in_limits(
+                said, cpu_s, peak_mb = in_limits(
                     lambda copy=copy: read_all(copy),  # type: ignore[misc]
                     arguments.limit_s, arguments.memory_mb,
                 )  # fmt: skip
                 worst_s = max(worst_s, time.monotonic() - one)
+                worst_cpu_s, worst_mb = max(worst_cpu_s, cpu_s), max(worst_mb, peak_mb)
             outcome = said.split(":")[0]
             outcomes[outcome] += 1
             if outcome not in ("read", "refused"):
@@ -69,7 +70,11 @@ def try_source(source: Path, arguments: argparse.Namespace) -> int:
                 print(f"  {source.name}, {kind} {seed}: {said[:1500]}", flush=True)
     counts = ", ".join(f"{outcome} {n}" for outcome, n in sorted(outcomes.items()))
     took_s = time.monotonic() - began
-    print(f"{source.name}: {counts}; slowest {worst_s:.1f} s, all {took_s:.0f} s", flush=True)
+    print(
+        f"{source.name}: {counts}; at most {worst_s:.1f} s, {worst_cpu_s:.1f} s of a processor and "
+        f"{worst_mb:.0f} MB for one; {took_s:.0f} s for all",
+        flush=True,
+    )
     return bad
 
 

@@ -9,6 +9,7 @@ import signal
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,15 @@ from companion.messages import Frame, Warned
 from drivers.open_flight import open_flight
 from drivers.telemetry_folder import READERS, aligned, read_log_file
 from drivers.telemetry_log import Pictures
+
+
+class Ended(NamedTuple):
+    """What became of some work, and what it took."""
+
+    said: str
+    cpu_s: float
+    peak_mb: float
+
 
 KINDS = ("cut", "flips", "zeros")
 MAX_FRAMES = 8
@@ -88,8 +98,8 @@ def read_all(path: Path) -> str:
     return f"read: {n} frames"
 
 
-def in_limits(work: Callable[[], str], limit_s: int, memory_mb: int) -> str:
-    """What work returns in a process of its own, or "crashed", "hung" or "memory" and why."""
+def in_limits(work: Callable[[], str], limit_s: int, memory_mb: int) -> Ended:
+    """What work says in a process of its own, or "crashed", "hung" or "memory" and why."""
     receive, send = os.pipe()
     child = os.fork()
     if child == 0:
@@ -109,8 +119,9 @@ def in_limits(work: Callable[[], str], limit_s: int, memory_mb: int) -> str:
     os.close(send)
     with os.fdopen(receive, "rb") as pipe:
         said_bytes = pipe.read()
-    _, status = os.waitpid(child, 0)
+    _, status, used = os.wait4(child, 0)
+    said = said_bytes.decode("utf-8", "replace") or "crashed: said nothing"
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
-        return "hung" if number == signal.SIGALRM else f"crashed: signal {number}"
-    return said_bytes.decode("utf-8", "replace") or "crashed: said nothing"
+        said = "hung" if number == signal.SIGALRM else f"crashed: signal {number}"
+    return Ended(said, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)

@@ -67,7 +67,7 @@ def test_processes_with_limits() -> None:
     def crash() -> str:
         raise KeyError("x")
 
-    assert in_limits(lambda: "read: 3", 20, 4000) == "read: 3"
-    assert in_limits(crash, 20, 4000).startswith("crashed: Traceback")
-    assert in_limits(hang, 1, 4000) == "hung"
-    assert in_limits(lambda: str(len(bytearray(8 << 30))), 20, 4000).startswith("memory")
+    assert in_limits(lambda: "read: 3", 20, 4000).said == "read: 3"
+    assert in_limits(crash, 20, 4000).said.startswith("crashed: Traceback")
+    assert in_limits(hang, 1, 4000).said == "hung"
+    assert in_limits(lambda: str(len(bytearray(8 << 30))), 20, 4000).said.startswith("memory")
