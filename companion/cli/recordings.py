@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from companion.cli.options import Command, configuration, json_option, seconds
 from companion.config_file import load_config
 from companion.errors import InputError
-from companion.progress import progress_on
+from companion.progress import Progress, progress_on
 from companion.stopping import StopSignals
 
 
 def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
-    """List, show, trim, export, verify or prune."""
+    """List, show, trim, export, verify, repair or prune."""
     from companion import flights_command as flights
     from companion.service.flights_meant import flights_meant, installed_services
 
@@ -44,6 +45,9 @@ def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
         )
         print(text)
         return 0 if well else 1
+    elif what == "repair":
+        paths = flights.recordings_meant(arguments.flights_named, folder)
+        return _repair(paths, arguments.gently, megabytes)
     else:
         print(
             flights.prune_flights(
@@ -53,6 +57,18 @@ def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
         )  # fmt: skip
     signals.take()
     return 0
+
+
+def _repair(paths: Sequence[Path], gently: bool, progress: Progress) -> int:
+    from companion.flights_repair import repair_flights
+
+    repaired = []
+    for line, well in repair_flights(paths, progress, gently):
+        print(line, flush=True)
+        repaired.append(well)
+    if not gently:
+        print(f"{sum(repaired)} of {len(paths)} recordings repaired")
+    return 0 if all(repaired) else 1
 
 
 def _compare(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -151,9 +167,18 @@ def _add_flights(commands: Any) -> None:
         "verify", parents=[place], help="check all checksums",
         description="Exit status 1 where a recording is damaged or cut short. Changes nothing.",
     )  # fmt: skip
-    verify.add_argument(
-        "flights_named", metavar="FLIGHT", nargs="*", help="name, folder or file (default: all)"
+    repair = does.add_parser(
+        "repair", parents=[place], help="end those that were cut short, where they lie",
+        description="What opens a recording does the same; the daemon does it after its start, for "
+        "all. Exit status 1 where one cannot be repaired.",
+    )  # fmt: skip
+    repair.add_argument(
+        "--gently", action="store_true", help="slowly, and without a last line; as the daemon does"
     )
+    for parser in (verify, repair):
+        parser.add_argument(
+            "flights_named", metavar="FLIGHT", nargs="*", help="name, folder or file (default: all)"
+        )
     prune = does.add_parser(
         "prune", parents=[place], help="delete the oldest",
         description="Delete finished flights with all their results, the oldest first. One with a "

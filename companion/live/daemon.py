@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import Callable, Coroutine
+from pathlib import Path
 from typing import Any
 
 from companion.camera import Camera
@@ -25,6 +26,7 @@ from companion.live.ground_control import GroundControl
 from companion.live.health_watch import HealthWatch
 from companion.live.journal import ERROR, INFO, WARNING, Journal
 from companion.live.kept_settings import kept_over
+from companion.live.left_overs import LeftOvers
 from companion.live.link_watch import LinkWatch
 from companion.live.loop_delay import measure_loop_delay
 from companion.live.missing import Missing
@@ -110,6 +112,9 @@ class Daemon:
             self._reports = VehicleReports(
                 self._link, clock, self._watch, config.feedback.obstacle_distance
             )
+        self._left_overs = LeftOvers(
+            Path(config.daemon.flights), clock, self._on_warned, lambda: self._armed
+        )
         self._missing = Missing(config.daemon.missing_device_s)
         self._spare_later: asyncio.TimerHandle | None = None
         self._watch.set_by_ground = kept
@@ -139,6 +144,7 @@ class Daemon:
             self._watch.govern(),
             measure_loop_delay(self._clock, self._loop_delay),
             self._notes.run(),
+            self._left_overs.run(),
         ]
         if self._link is not None:
             work.append(self._link.run())

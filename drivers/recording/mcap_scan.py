@@ -66,6 +66,8 @@ class Scan:
     """Those of them after the last whole record, where the file was cut."""
     good_end: int = 0
     """Where the data end that can be read."""
+    n_bytes: int = 0
+    """Of the file, as it was scanned."""
 
 
 def summary(file: McapFile) -> Scan | None:
@@ -91,7 +93,7 @@ def scan(file: McapFile, told: Callable[[int], None] | None = None) -> Scan:
 
     Chunks whose checksum is wrong are left out and counted.
     """
-    found = Scan(good_end=len(MAGIC))
+    found = Scan(good_end=len(MAGIC), n_bytes=file.size)
     at, in_data, lost = len(MAGIC), True, False
     while at < file.size and not found.whole:
         record = file.record_at(at)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from drivers.recording.growing_file import is_growing
@@ -17,15 +19,17 @@ NOTE = "repaired"
 def repair(path: Path, found: Scan) -> bool:
     """Cut a file where its data end, and write the index; whether that could be done.
 
-    Not where it is still being written, may not be written, or there is no room. `found` is what a
-    scan of it found. Whatever ends this half way leaves a file that can be repaired again.
+    Not where it is still being written, may not be written, there is no room, or another has
+    repaired it meanwhile. `found` is what a scan of it found. Whatever ends this half way leaves a
+    file that can be repaired again.
     """
     try:
         fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except OSError:
         return False
     try:
-        if is_growing(fd):
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(fd).st_size != found.n_bytes:
             return False
         note, index = note_record(NOTE, {"cut_bytes": str(n_cut_bytes(found))}, found.good_end)
         found.contents.metadata.append(index)
@@ -38,6 +42,25 @@ def repair(path: Path, found: Scan) -> bool:
     finally:
         os.close(fd)
     return True
+
+
+def unfinished(path: Path) -> bool:
+    """Whether its writer is gone and did not end it; looks at its end only.
+
+    FlightError where it is no MCAP file.
+    """
+    with McapFile(path) as file:
+        return file.end_of_data() is None and not is_growing(file.fd)
+
+
+def in_place(path: Path, told: Callable[[int], None] | None = None) -> int | None:
+    """Repair a file; how many bytes were cut off, None where that could not be done.
+
+    `told` hears of bytes read. FlightError where it is no MCAP file.
+    """
+    with McapFile(path) as file:
+        found = scan(file, told)
+    return found.n_cut_bytes if found.whole or repair(path, found) else None
 
 
 def n_cut_bytes(found: Scan) -> int:
