@@ -43,5 +43,3 @@ def show(link: GroundLink, screen: Screen, colours: Colours, stop: threading.Eve
             drawing.draw(item)
     if recording is not None:
         recording.flush(timeout_sec=FLUSH_S)
-
-

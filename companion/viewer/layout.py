@@ -10,10 +10,12 @@ PLOTS = {
     "Flying": ("height", "speed"), "Quality": ("quality", "cpu"), "Poses": ("rate", "latency"),
     "Link": ("link",),
 }  # fmt: skip
-SHARES = {"Quality": (0.0, 105.0)}
-"""Plots of a fixed range."""
 """What their numbers are is said by the names of the series; see companion.viewer.drawing."""
+LIVE_ONLY = ("Link",)
+RANGES = {"Quality": (0.0, 105.0), "Poses": (0.0, 120.0)}
+"""Plots of a fixed range: what hardly changes is to look so."""
 PLOTTED_S = 120.0
+BACKGROUND = [20, 22, 26]
 ZOOM = 17.0
 """About a metre for a point of the screen."""
 
@@ -23,14 +25,15 @@ def layout(*, live: bool) -> rrb.Blueprint:
 
     Plots are below, of the last while if live, and the log.
     """
+    plots = {title: names for title, names in PLOTS.items() if live or title not in LIVE_ONLY}
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
                 rrb.Spatial3DView(
                     origin="world",
-                    name="Map",
+                    name="Map (our path is orange, the autopilot's blue)",
                     contents=["+ $origin/**", "- /world/map/sparse"],
-                    background=[20, 22, 26],
+                    background=BACKGROUND,
                     line_grid=False,
                     eye_controls=rrb.EyeControls3D(eye_up=(0.0, 0.0, -1.0)),
                 ),
@@ -47,9 +50,9 @@ def layout(*, live: bool) -> rrb.Blueprint:
                 column_shares=[6, 3, 3],
             ),
             rrb.Horizontal(
-                *(_plot(title, names, live) for title, names in PLOTS.items()),
+                *(_plot(title, names, live) for title, names in plots.items()),
                 rrb.TextLogView(origin="log", name="Log", columns=_log_columns()),
-                column_shares=[4] * len(PLOTS) + [9],
+                column_shares=[4] * len(plots) + [10],
             ),
             row_shares=[7, 2],
         ),
@@ -70,7 +73,7 @@ def _plot(title: str, names: tuple[str, ...], live: bool) -> rrb.TimeSeriesView:
         origin="plots",
         contents=[f"+ $origin/{name}" for name in names],
         name=title,
-        axis_y=rrb.ScalarAxis(range=SHARES[title]) if title in SHARES else None,
+        axis_y=rrb.ScalarAxis(range=RANGES[title]) if title in RANGES else None,
         plot_legend=rrb.PlotLegend(corner="LeftTop"),
         time_ranges=last if live else None,
     )

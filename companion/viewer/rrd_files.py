@@ -12,7 +12,8 @@ import rerun as rr
 
 from companion.viewer.layout import layout
 
-APPLICATION = "companion"
+APPLICATION = "companion-2"
+"""Viewers remember by this name the layout that they were shown: a new layout has a new number."""
 N_FILES = 4
 """The files that there is room for; each is one such part of it."""
 LOOK_EVERY = 16

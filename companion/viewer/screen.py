@@ -91,7 +91,8 @@ class Screen:
 
 def page_of(host: str) -> str:
     """The address, for a browser, of a page that shows what is served there."""
-    return f"http://{host}:{WEB_PORT}/?url=rerun%2Bhttp://{host}:{GRPC_PORT}/proxy"
+    shown = f"rerun%2Bhttp://{host}:{GRPC_PORT}/proxy"
+    return f"http://{host}:{WEB_PORT}/?url={shown}&theme=dark"
 
 
 def listens(host: str, port: int) -> bool:

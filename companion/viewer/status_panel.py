@@ -16,16 +16,19 @@ HOT_C = 80.0
 
 
 def status_text(facts: Mapping[str, Any], flight: str) -> str:
-    """Markdown: the state as a headline, then what is worth knowing; unknown facts are left out."""
+    """Markdown: the state as a headline, what is wrong, what else is worth knowing.
+
+    Facts that are not known are left out.
+    """
     state = str(facts.get("state", "Waiting"))
     lines = [f"# {state}", MEANINGS.get(state, ""), ""]
+    problems = [*_problems(facts), *map(str, facts.get("warnings") or ())]
+    lines += [f"**⚠ {problem}**  " for problem in problems]
+    lines += [""] if problems else []
     for label, text in _rows(facts):
         lines.append(f"**{label}** {text}  ")
     if flight:
         lines.append(f"**Flight** {flight}  ")
-    problems = [*_problems(facts), *map(str, facts.get("warnings") or ())]
-    if problems:
-        lines += ["", *(f"**!** {problem}  " for problem in problems)]
     return "\n".join(lines)
 
 
@@ -47,6 +50,7 @@ def _rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
             _with(facts, "cpu_share", "processor {:.0f} %", 100),
             _with(facts, "temperature_c", "{:.0f} °C"),
             _with(facts, "memory_share", "memory {:.0f} %", 100),
+            _with(facts, "disk_free_gib", "{:.0f} GiB free on disk"),
         )),
         ("Link", _link(facts)),
     ]  # fmt: skip
@@ -57,7 +61,7 @@ def _scale(facts: Mapping[str, Any]) -> str:
     if "scale" not in facts:
         return "not known yet: lengths are not metres"
     sigma = _with(facts, "sigma_scale", "± {:.1f} %", 100)
-    return _joined(f"metres, by {facts['scale']}", sigma, sep=" ")
+    return f"{_joined('metres', sigma, sep=' ')}, by {facts['scale']}"
 
 
 def _autopilot(facts: Mapping[str, Any]) -> str:
@@ -78,7 +82,7 @@ def _link(facts: Mapping[str, Any]) -> str:
         _with(facts, "link_kbit_s", "{:.0f} kbit/s") + (f" of {budget:.0f}" if budget else ""),
         _with(facts, "round_trip_ms", "{:.0f} ms there and back"),
         f"{facts['waiting']} pieces of the map to come" if facts.get("waiting") else "",
-        f"{skipped} poses and pictures skipped" if skipped else "",
+        f"{skipped} older poses and pictures passed over" if skipped else "",
         f"{given_up} pieces given up" if given_up else "",
     )
 

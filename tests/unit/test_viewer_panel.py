@@ -20,22 +20,24 @@ def test_what_is_known_is_said_with_its_unit_and_the_rest_is_left_out() -> None:
             "state": "Tracking", "quality": 87, "rate_hz": 29.7, "latency_ms": 41.0,
             "height_m": 12.34, "speed_m_s": 3.21, "scale": "GPS", "sigma_scale": 0.012,
             "n_keyframes": 40, "n_points": 1_250_000, "feedback": "odometry", "sending": True,
-            "cpu_share": 0.62, "temperature_c": 84.0, "link_kbit_s": 480, "round_trip_ms": 310,
-            "budget_kbit_s": 500, "waiting": 12, "skipped": {"poses": 3, "pictures": 4},
+            "cpu_share": 0.62, "temperature_c": 84.0, "disk_free_gib": 7.2,
+            "link_kbit_s": 480, "round_trip_ms": 310, "budget_kbit_s": 500, "waiting": 12,
+            "skipped": {"poses": 3, "pictures": 4},
             "given_up": {}, "gone": ["camera silent"], "warnings": ["late telemetry"],
         },
         "2026-11-21T08-00-00Z",
     )  # fmt: skip
     for wanted in (
-        "quality 87 %, 30/s, 41 ms late", "12.3 m above home, 3.2 m/s", "metres, by GPS ± 1.2 %",
+        "quality 87 %, 30/s, 41 ms late", "12.3 m above home, 3.2 m/s", "metres ± 1.2 %, by GPS",
         "40 views, 1.2 million points", "gets our pose", "processor 62 %, 84 °C",
         "480 kbit/s of 500, 310 ms there and back, 12 pieces of the map to come",
-        "7 poses and pictures skipped", "**!** camera silent", "**!** the computer is hot",
-        "**!** late telemetry", "2026-11-21T08-00-00Z",
+        "7 older poses and pictures passed over", "**⚠ camera silent**",
+        "**⚠ the computer is hot**", "**⚠ late telemetry**", "7 GiB free on disk",
+        "2026-11-21T08-00-00Z",
     ):  # fmt: skip
         assert wanted in text, wanted
     bare = status_text({"state": "Waiting"}, "")
-    for absent in ("None", "Link", "Autopilot", "Computer", "!", "nan"):
+    for absent in ("None", "Link", "Autopilot", "Computer", "⚠", "nan"):
         assert absent not in bare
     assert "not metres" in bare
 
