@@ -28,7 +28,9 @@ PARAMETERS = (
     mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST, mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ,
     mavlink.MAVLINK_MSG_ID_PARAM_SET,
 )  # fmt: skip
-KINDS = frozenset({*COMMANDS, *PARAMETERS})
+PING: int = mavlink.MAVLINK_MSG_ID_PING
+KINDS = frozenset({*COMMANDS, *PARAMETERS, PING})
+EVERYBODY = (0, 0)
 
 
 class GroundRequests:
@@ -55,6 +57,8 @@ class GroundRequests:
         target, ours = (message.target_system, message.target_component), self._port.identity
         if target[0] not in (0, ours[0]) or target[1] not in (0, ours[1]):
             return
+        if kind == PING and target != EVERYBODY:
+            return  # an answer, and we have asked nothing
         asker = message.get_srcSystem(), message.get_srcComponent()
         if not self._limit.allows(asker, now_ns):
             if self._told_ns is None or now_ns - self._told_ns > TELL_NS:
@@ -63,6 +67,9 @@ class GroundRequests:
                 self._warn(Warned(now_ns, TOO_MANY, detail))
             return
         to_all = target != ours
+        if kind == PING:
+            self._port.send(mavlink.MAVLink_ping_message(message.time_usec, message.seq, *asker))
+            return
         if kind in PARAMETERS:
             self._parameters.take(message, to_all)
             return
