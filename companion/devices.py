@@ -7,15 +7,15 @@ import json
 from itertools import groupby
 from typing import Any
 
-from companion.clock import monotonic_s
-from companion.depth.device_choice import MeasuredDevice, measured_devices
+from companion.depth.device_choice import MeasuredDevice
+from companion.device_probe import probed_devices
 from drivers.camera_devices import CameraControl, CameraDevice, CameraFormat, cameras
 from drivers.serial_devices import SerialDevice, serial_devices
 
 
 def devices(as_json: bool) -> str:
     """Cameras, serial ports and OpenCL devices, as text for people or as JSON."""
-    found_cameras, found_ports, compute = cameras(), serial_devices(), measured_devices(monotonic_s)
+    found_cameras, found_ports, compute = cameras(), serial_devices(), probed_devices()
     if as_json:
         document = {
             "cameras": [_plain(each) for each in found_cameras],

@@ -26,15 +26,17 @@ class MeasuredDevice:
 
 def measured_devices(seconds: Clock) -> list[MeasuredDevice]:
     """All devices there are, each tested and measured for two seconds; `seconds` is a clock."""
-    out = []
-    for number, name, platform in device_names():
-        try:
-            device = open_device(OpenclConfig(device=number))
-            check(device)
-            out.append(MeasuredDevice(number, name, platform, frames_per_s(device, seconds)))
-        except DeviceError as error:
-            out.append(MeasuredDevice(number, name, platform, None, str(error)))
-    return out
+    return [measured_device(*each, seconds) for each in device_names()]
+
+
+def measured_device(number: str, name: str, platform: str, seconds: Clock) -> MeasuredDevice:
+    """One of them, by its number."""
+    try:
+        device = open_device(OpenclConfig(device=number))
+        check(device)
+        return MeasuredDevice(number, name, platform, frames_per_s(device, seconds))
+    except DeviceError as error:
+        return MeasuredDevice(number, name, platform, None, str(error))
 
 
 def choose_device(config: OpenclConfig, seconds: Clock) -> ComputeDevice:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from companion.config import OpenclConfig
 from companion.depth.device_choice import choose_device
 from companion.depth.opencl import POCL, ComputeDevice, device_names, open_device
 from companion.depth.self_test import SIZE, check, reconstruct, scene
+from companion.device_probe import probed
 from companion.devices import devices
 from companion.errors import DeviceError
 from companion.messages import PixelState
@@ -68,3 +70,18 @@ def test_devices_are_listed_with_their_speed() -> None:
     listed = json.loads(devices(as_json=True))["opencl_devices"]
     assert [device["number"] for device in listed] == EVERY
     assert all(device["frames_per_s"] > 0 and not device["problem"] for device in listed)
+
+
+@pytest.mark.parametrize(
+    ("program", "problem", "patience_s"),
+    [
+        ("import os; os.abort()", "its driver ends the program (SIGABRT)", 60.0),
+        ("import sys; sys.exit('why')", "its driver ends the program (status 1): why", 60.0),
+        ("import time; time.sleep(60)", "hangs for 1 s", 1.0),
+    ],
+)
+def test_a_driver_that_ends_its_process_is_named(
+    program: str, problem: str, patience_s: float
+) -> None:
+    found = probed("0:0", "a device", "a platform", (sys.executable, "-c", program), patience_s)
+    assert (found.name, found.frames_per_s, found.problem) == ("a device", None, problem)
