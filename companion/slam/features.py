@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from companion.camera import Camera
 from companion.config import FeaturesConfig
@@ -25,7 +24,7 @@ class Features:
     `pixels` (N, 2) distorted; `normalised` (N, 2) ideal coordinates x/z, y/z; `octaves` (N,)
     pyramid level; `angles_deg` (N,); `descriptors` (N, 32); `sigma_px` (N,) the expected error of a
     position; `whitening` (N, 2, 2) turns an error in normalised coordinates into one in units of
-    sigma; `tree` finds features near a pixel.
+    sigma.
     """
 
     pixels: Floats
@@ -35,7 +34,6 @@ class Features:
     descriptors: Bytes
     sigma_px: Array
     whitening: Array
-    tree: cKDTree
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -79,8 +77,7 @@ class FeatureExtractor:
         sigma = self._config.scale_factor ** octaves.astype(np.float64)
         whitening = self._camera.pixel_from_normalised_jacobian(normalised) / sigma[:, None, None]
         return Features(
-            pixels, normalised, octaves, angles, descriptors[seen], sigma, whitening,
-            cKDTree(pixels) if len(pixels) else cKDTree(np.zeros((0, 2))),
+            pixels, normalised, octaves, angles, descriptors[seen], sigma, whitening
         )  # fmt: skip
 
     @property

@@ -6,15 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.camera import Camera
+from companion.camera import Camera, Distortion
 from companion.geometry import Array, Pose
+from companion.slam.compiled.projecting import (
+    EQUIDISTANT,
+    N_COEFFICIENTS,
+    NO_LENS,
+    RADTAN,
+    visible,
+)
 from companion.slam.features import Bools, Features, Ints
 from companion.slam.map import SlamMap
 from companion.slam.matching import match_projected
 
 N_NEAREST = 8
-MIN_VIEW_COSINE = 0.5
-"""A point is looked for only within 60 degrees of where it was seen from before."""
+_MODELS = {
+    Distortion.NONE: NO_LENS, Distortion.RADTAN: RADTAN, Distortion.EQUIDISTANT: EQUIDISTANT
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +38,12 @@ class Projector:
     """Projects map points into one camera, with all the reasons not to see a point."""
 
     def __init__(self, camera: Camera) -> None:
-        self._camera = camera
+        self._model = _MODELS[camera.distortion]
+        self._coefficients = np.zeros(N_COEFFICIENTS)
+        self._coefficients[: len(camera.coefficients)] = camera.coefficients
+        self._intrinsics = np.array(
+            [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64
+        )
         w, h = camera.width - 1.0, camera.height - 1.0
         edge = np.array(
             [[0, 0], [w / 2, 0], [w, 0], [0, h / 2], [w, h / 2], [0, h], [w / 2, h], [w, h]]
@@ -41,29 +54,18 @@ class Projector:
 
     def visible(self, slam_map: SlamMap, camera_from_map: Pose, ids: Ints) -> Visible:
         """Which of the points `ids` a camera at this pose should see, and where."""
-        camera = self._camera
-        position = slam_map.positions[ids]
-        p = camera_from_map.apply(position)
-        towards = (-camera_from_map.rotation.T @ camera_from_map.translation) - position
-        distance = np.linalg.norm(towards, axis=1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            n = p[:, :2] / p[:, 2:]
-            ok = (p[:, 2] > 0) & ((n * n).sum(1) < self._max_radius**2)
-            ok &= (towards * slam_map.normals[ids]).sum(1) > MIN_VIEW_COSINE * distance
-            top = slam_map.base_distance[ids]
-            ok &= distance < top * 1.3
-            ok &= distance > top / slam_map.scale_factor ** (slam_map.n_levels - 1) * 0.7
-        ids, p, distance = ids[ok], p[ok], distance[ok]
-        px = camera.project(p)
-        inside = (px[:, 0] >= 0) & (px[:, 1] >= 0)
-        inside &= (px[:, 0] < camera.width) & (px[:, 1] < camera.height)
-        ids, px, distance = ids[inside], px[inside], distance[inside]
-        return Visible(ids, px, slam_map.expected_octaves(distance, ids))
+        found, px, octaves = visible(
+            slam_map.positions, slam_map.normals, slam_map.base_distance, ids,
+            camera_from_map.rotation, camera_from_map.translation, self._model,
+            self._coefficients, self._intrinsics, self._max_radius, slam_map.scale_factor,
+            slam_map.n_levels,
+        )  # fmt: skip
+        return Visible(found, px, octaves)
 
     def search(
         self,
         slam_map: SlamMap,
-        visible: Visible,
+        seen: Visible,
         features: Features,
         radius_px: float,
         usable: Bools | None = None,
@@ -74,12 +76,12 @@ class Projector:
 
         Returns point ids and features.
         """
-        radius = radius_px * slam_map.scale_factor ** visible.octaves.astype(np.float64)
+        radius = radius_px * slam_map.scale_factor ** seen.octaves.astype(np.float64)
         points, found = match_projected(
-            visible.pixels, slam_map.descriptors[visible.ids], visible.octaves, features, radius,
+            seen.pixels, seen.ids, slam_map.descriptors, seen.octaves, features, radius,
             usable, max_distance, max_octave_gap=max_octave_gap,
         )  # fmt: skip
-        return visible.ids[points], found
+        return seen.ids[points], found
 
 
 def local_points(slam_map: SlamMap, near_ids: Ints, centre: Array, n_keyframes: int = 20) -> Ints:

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from companion.geometry import Array, Pose, Similarity
-from companion.messages import Bytes, Floats
+from companion.messages import Bytes
+from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features import Bools, Features, Ints
-from companion.slam.patches import STORED, Patches, cut, level_of
+from companion.slam.patches import Patches, cut, level_of
 
 RING = 8
 REST_KEYFRAMES = 40
@@ -130,7 +131,7 @@ class SlamMap:
             setattr(self, name, grown)
 
     def add_points(
-        self, positions: Array, keyframe: Keyframe, features: Ints, levels: list[Floats]
+        self, positions: Array, keyframe: Keyframe, features: Ints, levels: list[Bytes]
     ) -> Ints:
         """Add points (M, 3), shown by `features` of a keyframe, whose image `levels` are.
 
@@ -319,12 +320,6 @@ class SlamMap:
         apart = np.linalg.norm(self._centres - centre, axis=1)
         order = np.argsort(apart, kind="stable")[: n + len(but)]
         return [k for k in self._ids[order].tolist() if k not in but][:n]
-
-    def expected_octaves(self, distance: Array, points: Ints) -> Ints:
-        """Pyramid level at which each of `points` is seen from `distance`."""
-        ratio = self.base_distance[points] / np.maximum(distance, 1e-9)
-        level = np.round(np.log(np.maximum(ratio, 1e-9)) / np.log(self.scale_factor))
-        return np.asarray(np.clip(level, 0, self.n_levels - 1), np.int64)
 
     def living_positions(self) -> Array:
         """Positions (M, 3) of all living points."""

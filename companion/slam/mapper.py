@@ -9,7 +9,7 @@ import numpy as np
 
 from companion.camera import Camera
 from companion.config import MappingConfig
-from companion.messages import Floats
+from companion.messages import Bytes
 from companion.slam.bundle import adjust
 from companion.slam.culling import cull_keyframes
 from companion.slam.features import Bools, Ints
@@ -82,7 +82,7 @@ class Mapper:
             k.refined_for[features] = points
 
     def _triangulate(
-        self, keyframe: Keyframe, neighbours: list[Keyframe], levels: list[Floats]
+        self, keyframe: Keyframe, neighbours: list[Keyframe], levels: list[Bytes]
     ) -> Ints:
         created = []
         slam_map = self._map

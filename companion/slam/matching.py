@@ -10,6 +10,7 @@ import numpy as np
 
 from companion.geometry import Array, Pose, skew
 from companion.messages import Bytes, Floats
+from companion.slam.compiled.searching import search
 from companion.slam.features import Bools, Features, Ints
 
 MAX_DISTANCE = 64
@@ -103,6 +104,7 @@ def _mutual_pairs(
 
 def match_projected(
     projected_px: Array,
+    ids: Ints,
     descriptors: Bytes,
     octaves: Ints,
     features: Features,
@@ -114,39 +116,18 @@ def match_projected(
 ) -> tuple[Ints, Ints]:
     """Match M points, seen to lie at `projected_px` (M, 2), with the features around there.
 
-    `octaves` (M,) is the pyramid level at which each is expected; `radius_px` (M,) how far to look;
-    `usable` (N,) features that may be taken. Returns indices into points and features, each at most
-    once.
+    Theirs are the rows `ids` (M,) of `descriptors` (P, 32); `octaves` (M,) is the pyramid level at
+    which each is expected; `radius_px` (M,) how far to look; `usable` (N,) features that may be
+    taken. Returns indices into ids and features, each at most once.
     """
     none = np.zeros(0, np.int64)
     if len(projected_px) == 0 or len(features) < 2:
         return none, none
-    k = min(12, len(features))
-    near_px, candidates = features.tree.query(
-        projected_px, k=k, distance_upper_bound=float(radius_px.max())
-    )
-    n = len(features)
-    valid = (candidates < n) & (near_px <= radius_px[:, None])
-    candidates = np.where(valid, candidates, 0)
-    valid &= np.abs(features.octaves[candidates] - octaves[:, None]) <= max_octave_gap
-    if usable is not None:
-        valid &= usable[candidates]
-    words = descriptors.view(np.uint64).reshape(-1, 1, 4)
-    others = features.descriptors.view(np.uint64).reshape(-1, 4)[candidates]
-    distance = np.bitwise_count(words ^ others).sum(-1).astype(np.float32)
-    distance[~valid] = FAR
-    rows = np.arange(len(projected_px))
-    best = distance.argmin(1)
-    value = distance[rows, best]
-    # a rival counts against a match only at the same level: the next level shows the same corner
-    rival = distance.copy()
-    rival[rows, best] = FAR
-    chosen_octave = features.octaves[candidates[rows, best]]
-    rival[features.octaves[candidates] != chosen_octave[:, None]] = FAR
-    good = (value <= max_distance) & (value < ratio * rival.min(1))
-    points = rows[good]
-    taken = candidates[points, best[good]]
-    order = np.lexsort((points, value[good]))
-    _, first = np.unique(taken[order], return_index=True)
-    keep = order[first]
-    return points[keep], taken[keep]
+    points, found = search(
+        projected_px, ids, descriptors.view(np.uint64),
+        octaves, radius_px,
+        features.pixels, features.descriptors.view(np.uint64), features.octaves,
+        np.ones(len(features), bool) if usable is None else usable, max_distance, ratio,
+        max_octave_gap,
+    )  # fmt: skip
+    return points, found

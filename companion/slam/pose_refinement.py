@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 
 from companion.geometry import Array, Pose, nearest_rotation
-from companion.slam.compiled.compiling import in_rows
 from companion.slam.compiled.pose import CHI2_2D, HUBER, cost, refine
 from companion.slam.features import Bools
 
@@ -17,8 +16,8 @@ def robust_cost(
     camera_from_map: Pose, points_map: Array, normalised: Array, whitening: Array
 ) -> float:
     """Huber's loss of all N points, those behind the camera at a high price."""
-    pose = in_rows(camera_from_map.rotation), in_rows(camera_from_map.translation)
-    return float(cost(*pose, in_rows(points_map), in_rows(normalised), in_rows(whitening)))
+    pose = camera_from_map.rotation, camera_from_map.translation
+    return float(cost(*pose, points_map, normalised, whitening))
 
 
 def other_pose(points_map: Array, normalised: Array) -> Pose | None:
@@ -52,8 +51,8 @@ def refine_pose(
     the (6, 6) information matrix (rotation, translation) in the camera frame.
     """
     rotation, translation, inlier, information = refine(
-        in_rows(camera_from_map.rotation), in_rows(camera_from_map.translation),
-        in_rows(points_map), in_rows(normalised), in_rows(whitening), rounds, iterations,
+        camera_from_map.rotation, camera_from_map.translation,
+        points_map, normalised, whitening, rounds, iterations,
     )  # fmt: skip
     # a pose is refined from one predicted from the last: what rounding adds would grow with each
     return Pose(nearest_rotation(rotation), translation), inlier, information

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from companion.geometry import Array, Pose
-from companion.messages import Floats
+from companion.messages import Bytes
+from companion.slam.compiled.projecting import warps
 from companion.slam.features import Bools, Features, Ints
 from companion.slam.map import SlamMap
 from companion.slam.patches import align
@@ -21,7 +22,7 @@ def refine_features(
     features: Features,
     index: Ints,
     points: Ints,
-    levels: list[Floats],
+    levels: list[Bytes],
 ) -> tuple[Array, Array, Bools]:
     """Finer positions of features `index` (M,), which show `points` (M,) of the map.
 
@@ -44,22 +45,14 @@ def refine_features(
 
 def _warps(slam_map: SlamMap, camera_from_map: Pose, points: Ints, jacobian: Array) -> Array:
     """How full-size pixels of each point's first view move in this one (M, 2, 2)."""
+    if len(points) == 0:
+        return np.zeros((0, 2, 2))
     first_ids, which = np.unique(slam_map.first_seen[points], return_inverse=True)
-    out = np.full((len(points), 2, 2), np.nan)
-    for k, first_id in enumerate(first_ids.tolist()):
-        first = slam_map.pose_of(first_id)
-        if first is None:
-            continue
-        here = np.flatnonzero(which == k)
-        ids = points[here]
-        depth = first.apply(slam_map.positions[ids])[:, 2]
-        turn = camera_from_map.rotation @ first.rotation.T
-        seen = camera_from_map.apply(slam_map.positions[ids])
-        z = np.where(np.abs(seen[:, 2]) < 1e-9, 1e-9, seen[:, 2])
-        # of a plane through the point, facing the first view
-        shift = slam_map.first_unproject[ids] * depth[:, None, None]
-        in_camera = np.matmul(turn[:, :2], shift)
-        n = seen[:, :2] / z[:, None]
-        projected = (in_camera[:, :2] - n[:, :, None] * in_camera[:, 2:]) / z[:, None, None]
-        out[here] = np.matmul(jacobian[here], projected)
-    return out
+    firsts = [slam_map.pose_of(first_id) for first_id in first_ids.tolist()]
+    poses = [Pose.identity() if first is None else first for first in firsts]
+    return warps(
+        slam_map.positions, slam_map.first_unproject, points,
+        camera_from_map.rotation, camera_from_map.translation,
+        np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses]),
+        np.array([p is not None for p in firsts]), which, jacobian,
+    )  # fmt: skip

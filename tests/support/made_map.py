@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from companion.camera import Camera
 from companion.geometry import Array, Pose, Similarity, yaw_rotation
@@ -53,7 +52,7 @@ class Ground:
         features = Features(
             seen, normalised, np.zeros(n, np.int64), np.zeros(n, np.float32),
             self.descriptors[index] ^ flips, np.ones(n),
-            CAMERA.pixel_from_normalised_jacobian(normalised) / 1.0, cKDTree(seen),
+            CAMERA.pixel_from_normalised_jacobian(normalised) / 1.0,
         )  # fmt: skip
         return features, index
 

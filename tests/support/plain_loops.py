@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from companion.camera import Camera
 from companion.geometry import Array, Pose, nearest_rotation, rotation_from_vector
+from companion.messages import Bytes
 from companion.slam.compiled.pose import CHI2_2D, HUBER
-from companion.slam.features import Bools
+from companion.slam.features import Bools, Features, Ints
+from companion.slam.map import SlamMap
 
 
 def _residuals(
@@ -84,3 +88,69 @@ def refine_pose(
         inlier = ((r * r).sum(1) < CHI2_2D) & (depth > 0)
     # a pose is refined from one predicted from the last: what rounding adds would grow with each
     return Pose(nearest_rotation(pose.rotation), pose.translation), inlier, information
+
+
+def visible(
+    camera: Camera, slam_map: SlamMap, camera_from_map: Pose, ids: Ints, max_radius: float
+) -> tuple[Ints, Array, Ints]:
+    """Ids, pixels and levels of the points that a camera should see."""
+    position = slam_map.positions[ids]
+    p = camera_from_map.apply(position)
+    towards = (-camera_from_map.rotation.T @ camera_from_map.translation) - position
+    distance = np.linalg.norm(towards, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        n = p[:, :2] / p[:, 2:]
+        ok = (p[:, 2] > 0) & ((n * n).sum(1) < max_radius**2)
+        ok &= (towards * slam_map.normals[ids]).sum(1) > 0.5 * distance
+        top = slam_map.base_distance[ids]
+        ok &= distance < top * 1.3
+        ok &= distance > top / slam_map.scale_factor ** (slam_map.n_levels - 1) * 0.7
+    ids, p, distance = ids[ok], p[ok], distance[ok]
+    px = camera.project(p)
+    inside = ((px >= 0) & (px < [camera.width, camera.height])).all(1)
+    ids, px, distance = ids[inside], px[inside], distance[inside]
+    level = np.round(np.log(slam_map.base_distance[ids] / distance) / np.log(slam_map.scale_factor))
+    return ids, px, np.clip(level, 0, slam_map.n_levels - 1).astype(np.int64)
+
+
+def match_projected(
+    projected_px: Array, descriptors: Bytes, octaves: Ints, features: Features, radius_px: Array,
+    usable: Bools, max_distance: float = 64, ratio: float = 0.85, max_octave_gap: int = 2,
+) -> tuple[Ints, Ints]:  # fmt: skip
+    """Indices of points and features that are each other's."""
+    n, far = len(features), np.float32(1000.0)
+    near_px, candidates = cKDTree(features.pixels).query(projected_px, k=min(12, n))
+    candidates = candidates.astype(np.int64)
+    valid = near_px <= radius_px[:, None]
+    valid &= np.abs(features.octaves[candidates] - octaves[:, None]) <= max_octave_gap
+    valid &= usable[candidates]
+    bits = np.unpackbits(descriptors[:, None] ^ features.descriptors[candidates], axis=2)
+    distance = bits.sum(2).astype(np.float32)
+    distance[~valid] = far
+    rows = np.arange(len(projected_px))
+    best = distance.argmin(1)
+    value = distance[rows, best]
+    rival = distance.copy()
+    rival[rows, best] = far
+    chosen_octave = features.octaves[candidates[rows, best]]
+    rival[features.octaves[candidates] != chosen_octave[:, None]] = far
+    good = (value <= max_distance) & (value < ratio * rival.min(1))
+    points = rows[good]
+    taken = candidates[points, best[good]]
+    order = np.lexsort((points, value[good]))
+    _, first = np.unique(taken[order], return_index=True)
+    return points[order[first]], taken[order[first]]
+
+
+def warps(
+    slam_map: SlamMap, camera_from_map: Pose, points: Ints, jacobian: Array, first: Pose
+) -> Array:
+    """How pixels of the first view of each point move in this one."""
+    depth = first.apply(slam_map.positions[points])[:, 2]
+    turn = camera_from_map.rotation @ first.rotation.T
+    seen = camera_from_map.apply(slam_map.positions[points])
+    shift = slam_map.first_unproject[points] * depth[:, None, None]
+    in_camera = np.matmul(turn[:, :2], shift)
+    n = seen[:, :2] / seen[:, 2:]
+    projected = (in_camera[:, :2] - n[:, :, None] * in_camera[:, 2:]) / seen[:, 2:, None]
+    return np.asarray(np.matmul(jacobian, projected), np.float64)

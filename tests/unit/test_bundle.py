@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from companion.geometry import Array, Pose, angle_between, rotation_from_vector
 from companion.slam.bundle import Bundle, adjust
@@ -116,7 +115,7 @@ def features(normalised: Array) -> Features:
     pixels = (normalised * FOCAL + 300).astype(np.float32)
     return Features(
         pixels, normalised, np.zeros(n, np.int64), np.zeros(n, np.float32),
-        np.zeros((n, 32), np.uint8), np.ones(n), whitening(n), cKDTree(pixels),
+        np.zeros((n, 32), np.uint8), np.ones(n), whitening(n),
     )  # fmt: skip
 
 

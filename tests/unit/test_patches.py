@@ -10,6 +10,7 @@ from companion.geometry import Array
 from companion.messages import Bytes
 from companion.slam.features import Bools
 from companion.slam.patches import align, cut, image_levels
+from tests.support import plain_patches
 
 CENTRE = np.array([160.0, 120.0])
 N = 120
@@ -78,3 +79,39 @@ def test_patches_of_nothing_and_at_the_edge_are_left_alone() -> None:
     found, sure = align(patches, warps, image_levels(blank), pixels, np.full(2, 6.0))
     assert not sure.any()
     assert np.array_equal(found, pixels)
+
+
+def test_patches_are_found_where_plain_numpy_finds_them() -> None:
+    rng = np.random.default_rng(8)
+    first = picture(rng)
+    turned = cv2.warpAffine(first, np.array([[1.05, 0.1, -20.0], [-0.05, 0.9, 15.0]]), (320, 240))
+    moved = np.asarray(turned, np.uint8)
+    pixels = rng.uniform([20, 20], [300, 220], (300, 2))
+    patches = cut(image_levels(first), pixels, rng.integers(0, 3, 300))
+    warps = np.array([[1.05, 0.1], [-0.05, 0.9]]) * rng.choice([0.4, 1.0, 1.0, 2.0], (300, 1, 1))
+    warps[:5] = (
+        [[0.0, 0.0], [0.0, 0.0]],
+        [[np.nan, 0.0], [0.0, 1.0]],
+        [[1, 1], [1, 1]],
+        [[9, 0], [0, 9]],
+        [[-1, 0], [0, 1]],
+    )
+    start = pixels @ np.array([[1.05, 0.1], [-0.05, 0.9]]).T + [-20.0, 15.0]
+    start += rng.normal(scale=0.7, size=start.shape)
+    found, sure = align(patches, warps, image_levels(moved), start, np.full(300, 2.0))
+    there, certain = plain_patches.align(
+        patches, warps, image_levels(moved), start, np.full(300, 2.0)
+    )
+    assert not sure[:4].any()
+    assert np.mean(sure == certain) > 0.98
+    both = sure & certain
+    assert both.sum() > 100
+    assert np.abs(found - there)[both].max() < 0.05
+    assert np.array_equal(found[~sure], start[~sure])
+
+
+def test_no_patches_are_found_nowhere() -> None:
+    levels = image_levels(np.zeros((48, 64), np.uint8))
+    patches = cut(levels, np.zeros((0, 2)), np.zeros(0, np.int64))
+    found, sure = align(patches, np.zeros((0, 2, 2)), levels, np.zeros((0, 2)), np.zeros(0))
+    assert found.shape == (0, 2) and sure.shape == (0,)

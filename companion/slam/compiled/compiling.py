@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
 from numba import types
-
-from companion.geometry import Array
+from numba.np.numpy_support import as_dtype
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
@@ -21,18 +21,10 @@ def given(element: Any, dimensions: int) -> Any:
     return types.Array(element, dimensions, "C", readonly=True)
 
 
-def changed(element: Any, dimensions: int) -> Any:
-    """The type of an array in rows, into which a loop writes."""
-    return types.Array(element, dimensions, "C")
-
-
 numbers, pairs, matrices = given(number, 1), given(number, 2), given(number, 3)
-integers, bytes_, flags = given(integer, 1), given(types.uint8, 2), given(flag, 1)
-
-
-def in_rows(array: Array) -> Array:
-    """An array of numbers as loops want it: itself, where it lies in rows already."""
-    return np.ascontiguousarray(array, np.float64)
+integers, flags = given(integer, 1), given(flag, 1)
+places, words = given(types.float32, 2), given(types.uint64, 2)
+images, patches = given(types.uint8, 2), given(types.uint8, 3)
 
 
 not_kept: list[str] = []
@@ -40,7 +32,11 @@ not_kept: list[str] = []
 
 
 def compiled(*arguments: Any) -> Callable[[Loop], Loop]:
-    """Compile a loop for these types of arguments, at once; a division by zero gives inf or nan."""
+    """Compile a loop for these types of arguments, at once; a division by zero gives inf or nan.
+
+    Arrays that it is given may lie otherwise in memory, which costs a copy.
+    """
+    kinds = [as_dtype(a.dtype) if isinstance(a, types.Array) else None for a in arguments]
 
     def compile_loop(loop: Loop) -> Loop:
         try:
@@ -48,7 +44,17 @@ def compiled(*arguments: Any) -> Callable[[Loop], Loop]:
         except Exception as error:  # no room, or a damaged file; what else it is comes up again
             not_kept.append(f"{loop.__name__}: {error}")
             done = numba.njit(arguments, nogil=True, error_model="numpy")(loop)
-        return cast(Loop, done)
+
+        @wraps(loop)
+        def call(*values: Any) -> Any:
+            return done(
+                *[
+                    value if kind is None else np.ascontiguousarray(value, kind)
+                    for value, kind in zip(values, kinds, strict=True)
+                ]
+            )
+
+        return cast(Loop, call)
 
     return compile_loop
 

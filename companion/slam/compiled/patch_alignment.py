@@ -1,0 +1,175 @@
+"""Stored patches of points laid over an image: how they are warped, and where they fit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.geometry import Array
+from companion.messages import Bytes
+from companion.slam.compiled.compiling import (
+    compiled,
+    images,
+    integers,
+    matrices,
+    numbers,
+    pairs,
+    part,
+    patches,
+)
+from companion.slam.features import Bools, Ints
+
+N_LEVELS = 3
+STORED = 24
+"""Side of a stored patch: room for the compared part to be turned and scaled."""
+HALF = 4
+ITERATIONS = 8
+CONVERGED_PX = 0.02
+MIN_ZNCC = 0.85
+MIN_TEXTURE = 25.0
+"""Least eigenvalue of the mean outer product of gradients, (grey levels per pixel) squared."""
+MIN_SPREAD = 2.0
+"""Least standard deviation of a patch, grey levels."""
+MIN_SCALE, MAX_SCALE = 0.6, 1.6
+_SIDE = 2 * HALF + 1
+_AREA = float(_SIDE * _SIDE)
+
+
+@part
+def _template(stored: Bytes, centre: Array, patch_from_image: Array, out: Array) -> bool:
+    """A patch as the image should show it, a pixel wider than is compared; False if too small."""
+    for i in range(_SIDE + 2):
+        for j in range(_SIDE + 2):
+            dx, dy = float(j - HALF - 1), float(i - HALF - 1)
+            x = patch_from_image[0, 0] * dx + patch_from_image[0, 1] * dy + centre[0]
+            y = patch_from_image[1, 0] * dx + patch_from_image[1, 1] * dy + centre[1]
+            if not (0.0 <= x <= STORED - 1.0 and 0.0 <= y <= STORED - 1.0):
+                return False
+            column, row = min(int(x), STORED - 2), min(int(y), STORED - 2)
+            x, y = x - column, y - row
+            above = (1.0 - x) * stored[row, column] + x * stored[row, column + 1]
+            below = (1.0 - x) * stored[row + 1, column] + x * stored[row + 1, column + 1]
+            out[i, j] = (1.0 - y) * above + y * below
+    return True
+
+
+@part
+def _without_mean(values: Array) -> None:
+    total = 0.0
+    for i in range(_SIDE):
+        for j in range(_SIDE):
+            total += values[i, j]
+    values -= total / _AREA
+
+
+@part
+def _sample(image: Bytes, x: float, y: float, out: Array) -> bool:
+    """What an image shows around a pixel; False where that is not all inside."""
+    h, w = image.shape
+    if not (HALF <= x < w - HALF - 1 and HALF <= y < h - HALF - 1):
+        return False
+    column, row = int(x), int(y)
+    x, y = x - column, y - row
+    a, b, c, d = (1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y
+    for i in range(_SIDE):
+        top, left = row + i - HALF, column - HALF
+        for j in range(_SIDE):
+            out[i, j] = (
+                a * image[top, left + j]
+                + b * image[top, left + j + 1]
+                + c * image[top + 1, left + j]
+                + d * image[top + 1, left + j + 1]
+            )
+    return True
+
+
+@part
+def _fit(
+    stored: Bytes, centre: Array, patch_from_image: Array, image: Bytes, place: Array, work: Array
+) -> bool:
+    """Move a place (2,) to where a patch fits an image; False where that is not sure."""
+    wide = np.empty((_SIDE + 2, _SIDE + 2))
+    if not _template(stored, centre, patch_from_image, wide):
+        return False
+    inner, gx, gy, seen = work[0], work[1], work[2], work[3]
+    for i in range(_SIDE):
+        for j in range(_SIDE):
+            inner[i, j] = wide[i + 1, j + 1]
+            gx[i, j] = 0.5 * (wide[i + 1, j + 2] - wide[i + 1, j])
+            gy[i, j] = 0.5 * (wide[i + 2, j + 1] - wide[i, j + 1])
+    _without_mean(inner)
+    _without_mean(gx)
+    _without_mean(gy)
+    variance, a, b, c = 0.0, 0.0, 0.0, 0.0
+    for i in range(_SIDE):
+        for j in range(_SIDE):
+            variance += inner[i, j] * inner[i, j]
+            a += gx[i, j] * gx[i, j]
+            b += gx[i, j] * gy[i, j]
+            c += gy[i, j] * gy[i, j]
+    spread, a, b, c = np.sqrt(variance / _AREA), a / _AREA, b / _AREA, c / _AREA
+    least = 0.5 * (a + c) - np.sqrt(0.25 * (a - c) * (a - c) + b * b)
+    if not (least > MIN_TEXTURE and spread > MIN_SPREAD):
+        return False
+    det = a * c - b * b
+    zncc, last = 0.0, np.inf
+    for _ in range(ITERATIONS):
+        if not _sample(image, place[0], place[1], seen):
+            return False
+        _without_mean(seen)
+        square = 0.0
+        for i in range(_SIDE):
+            for j in range(_SIDE):
+                square += seen[i, j] * seen[i, j]
+        contrast = max(np.sqrt(square / _AREA), 1e-3)
+        gain = spread / contrast
+        ex, ey, alike = 0.0, 0.0, 0.0
+        for i in range(_SIDE):
+            for j in range(_SIDE):
+                error = seen[i, j] * gain - inner[i, j]
+                ex += gx[i, j] * error
+                ey += gy[i, j] * error
+                alike += seen[i, j] * inner[i, j]
+        ex, ey = ex / _AREA, ey / _AREA
+        zncc = alike / _AREA / (contrast * spread)
+        step_x = min(max((c * ex - b * ey) / det, -1.0), 1.0)
+        step_y = min(max((a * ey - b * ex) / det, -1.0), 1.0)
+        place[0] -= step_x
+        place[1] -= step_y
+        last = max(abs(step_x), abs(step_y))
+        if last <= CONVERGED_PX:
+            break
+    h, w = image.shape
+    inside = HALF <= place[0] < w - HALF - 1 and HALF <= place[1] < h - HALF - 1
+    return inside and zncc > MIN_ZNCC and last < 0.1
+
+
+@compiled(patches, pairs, integers, matrices, images, images, images, pairs, numbers)
+def align(
+    grey: Bytes, centre: Array, stored_level: Ints, image_from_patch: Array, image: Bytes,
+    half_image: Bytes, quarter_image: Bytes, pixels: Array, max_move_px: Array,
+) -> tuple[Array, Bools]:  # fmt: skip
+    """As `companion.slam.patches.align`."""
+    found, sure = pixels.copy(), np.zeros(len(pixels), np.bool_)
+    back, place, work = np.empty((2, 2)), np.empty(2), np.empty((4, _SIDE, _SIDE))
+    for i in range(len(pixels)):
+        warp = image_from_patch[i]
+        det = warp[0, 0] * warp[1, 1] - warp[0, 1] * warp[1, 0]
+        scale = np.sqrt(abs(det))
+        if stored_level[i] < 0 or not 0.0 < scale < np.inf:
+            continue
+        level = stored_level[i] + int(np.rint(np.log2(scale)))
+        level = min(max(level, 0), N_LEVELS - 1)
+        shrunk = 2.0 ** (stored_level[i] - level)
+        if not MIN_SCALE < scale * shrunk < MAX_SCALE:
+            continue
+        back[0, 0], back[0, 1] = warp[1, 1] / det / shrunk, -warp[0, 1] / det / shrunk
+        back[1, 0], back[1, 1] = -warp[1, 0] / det / shrunk, warp[0, 0] / det / shrunk
+        size = 2.0**level
+        place[0], place[1] = pixels[i, 0] / size, pixels[i, 1] / size
+        here = image if level == 0 else half_image if level == 1 else quarter_image
+        if not _fit(grey[i], centre[i], back, here, place, work):
+            continue
+        x, y = place[0] * size, place[1] * size
+        if np.hypot(x - pixels[i, 0], y - pixels[i, 1]) < max_move_px[i]:
+            found[i, 0], found[i, 1], sure[i] = x, y, True
+    return found, sure

@@ -1,0 +1,127 @@
+"""Which feature shows a point that should lie near a pixel, by position, level and descriptor."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry import Array
+from companion.messages import Floats
+from companion.slam.compiled.compiling import (
+    compiled,
+    flags,
+    integer,
+    integers,
+    number,
+    numbers,
+    pairs,
+    part,
+    places,
+    words,
+)
+from companion.slam.features import Bools, Ints
+
+Words = NDArray[np.uint64]
+
+CELL_PX = 32.0
+N_NEAREST = 12
+"""So many features around a pixel are looked at."""
+_FAR = np.float32(1000.0)
+_PAIRS, _FOURS = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
+_EIGHTS, _SUM = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
+_1, _2, _4, _56 = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
+
+
+@part
+def _differing_bits(a: Words, b: Words) -> int:
+    total = 0
+    for k in range(4):
+        x = a[k] ^ b[k]
+        x = x - ((x >> _1) & _PAIRS)
+        x = (x & _FOURS) + ((x >> _2) & _FOURS)
+        x = (x + (x >> _4)) & _EIGHTS
+        total += int((x * _SUM) >> _56)
+    return total
+
+
+@part
+def _cell(position: float, n_cells: int) -> int:
+    return int(min(max(position / CELL_PX, 0.0), n_cells - 1.0))
+
+
+@part
+def _in_cells(pixels: Floats, n_columns: int, n_rows: int) -> tuple[Ints, Ints]:
+    """Features ordered by the cell they are in, and where each cell begins, and the end."""
+    starts = np.zeros(n_columns * n_rows + 1, np.int64)
+    cells = np.empty(len(pixels), np.int64)
+    for i in range(len(pixels)):
+        cells[i] = _cell(pixels[i, 1], n_rows) * n_columns + _cell(pixels[i, 0], n_columns)
+        starts[cells[i] + 1] += 1
+    starts = np.cumsum(starts)
+    place, order = starts[:-1].copy(), np.empty(len(pixels), np.int64)
+    for i in range(len(pixels)):
+        order[place[cells[i]]] = i
+        place[cells[i]] += 1
+    return order, starts
+
+
+@compiled(
+    pairs, integers, words, integers, numbers, places, words, integers, flags,
+    number, number, integer,
+)  # fmt: skip
+def search(
+    projected: Array, ids: Ints, point_words: Words, levels: Ints, radius: Array,
+    pixels: Floats, feature_words: Words, octaves: Ints, usable: Bools,
+    max_distance: float, ratio: float, max_octave_gap: int,
+) -> tuple[Ints, Ints]:  # fmt: skip
+    """Places in `ids` (M,) and features, each at most once, by feature.
+
+    `projected` (M, 2), `levels` (M,) and `radius` (M,) are of the points `ids`, `point_words`
+    (P, 4) of all points; the others of the features (N,).
+    """
+    n = len(pixels)
+    right, bottom = 0.0, 0.0
+    for i in range(n):
+        right, bottom = max(right, pixels[i, 0]), max(bottom, pixels[i, 1])
+    n_columns, n_rows = int(right / CELL_PX) + 1, int(bottom / CELL_PX) + 1
+    order, starts = _in_cells(pixels, n_columns, n_rows)
+    near, apart = np.empty(N_NEAREST, np.int64), np.empty(N_NEAREST)
+    bits = np.empty(N_NEAREST, np.float32)
+    taken_by, taken_for = np.full(n, -1, np.int64), np.full(n, _FAR)
+    for m in range(len(ids)):
+        x, y, r = projected[m, 0], projected[m, 1], radius[m]
+        n_near = 0
+        for row in range(_cell(y - r, n_rows), _cell(y + r, n_rows) + 1):
+            first = row * n_columns + _cell(x - r, n_columns)
+            last = row * n_columns + _cell(x + r, n_columns)
+            for at in range(starts[first], starts[last + 1]):
+                i = order[at]
+                dx, dy = pixels[i, 0] - x, pixels[i, 1] - y
+                d2 = dx * dx + dy * dy
+                if d2 > r * r or (n_near == N_NEAREST and d2 >= apart[N_NEAREST - 1]):
+                    continue
+                k = min(n_near, N_NEAREST - 1)
+                while k > 0 and apart[k - 1] > d2:
+                    near[k], apart[k] = near[k - 1], apart[k - 1]
+                    k -= 1
+                near[k], apart[k] = i, d2
+                n_near = min(n_near + 1, N_NEAREST)
+        best = -1
+        for k in range(n_near):
+            i = near[k]
+            bits[k] = _FAR
+            if usable[i] and abs(octaves[i] - levels[m]) <= max_octave_gap:
+                bits[k] = _differing_bits(point_words[ids[m]], feature_words[i])
+            if bits[k] <= max_distance and (best < 0 or bits[k] < bits[best]):
+                best = k
+        if best < 0:
+            continue
+        # a rival counts against a match only at the same level: the next shows the same corner
+        feature, rival = near[best], _FAR
+        for k in range(n_near):
+            if k != best and octaves[near[k]] == octaves[feature]:
+                rival = min(rival, bits[k])
+        if bits[best] < np.float32(ratio) * rival and bits[best] < taken_for[feature]:
+            taken_by[feature], taken_for[feature] = m, bits[best]
+    found = np.flatnonzero(taken_by >= 0)
+    return taken_by[found], found
