@@ -1,0 +1,87 @@
+"""How a map begins with two views, or goes on with them, and what came before them is placed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from companion.geometry import Pose
+from companion.slam.atlas import Atlas
+from companion.slam.bootstrap import Start
+from companion.slam.bridge import Bridge
+from companion.slam.map import Keyframe
+from companion.slam.patches import image_levels
+from companion.slam.placing import Placer
+from companion.slam.view import View
+
+
+def begin_map(atlas: Atlas, start: Start, first: Keyframe, second: Keyframe) -> None:
+    """Fill the map in use, which is empty, with the points of a Start and its two keyframes."""
+    slam_map = atlas.map
+    assert second.grey is not None
+    ids = slam_map.add_points(
+        start.points_map, second, start.features_second, image_levels(second.grey)
+    )
+    slam_map.first_keyframe_id = first.keyframe_id
+    slam_map.keyframes[first.keyframe_id] = first
+    slam_map.poses_changed()
+    slam_map.observe(first, start.features_first, ids)
+    slam_map.observe(second, start.features_second, ids)
+    slam_map.refresh(ids, [first, second])
+    mapper = atlas.mapper
+    mapper.add(second)
+    mapper.adjust_all(10)
+    atlas.remember(first)
+    atlas.remember(second)
+    start.second.camera_from_map = second.camera_from_map
+    start.second.point_ids = second.point_ids.copy()
+
+
+def carry_on(atlas: Atlas, ashore: View, first: Keyframe, start: Start, across: Bridge) -> None:
+    """Take two views into the map that the first of them, `ashore`, was the last to be tracked in.
+
+    Its keyframe `first` is in the map then, the second view has a pose and points in it.
+    """
+    slam_map, view = atlas.map, start.second
+    tracked = np.flatnonzero(ashore.point_ids >= 0)
+    tracked = tracked[slam_map.alive[ashore.point_ids[tracked]]]
+    slam_map.keyframes[first.keyframe_id] = first
+    slam_map.poses_changed()
+    slam_map.observe(first, tracked, ashore.point_ids[tracked])
+    ids = slam_map.add_points(
+        across.points_map, first, across.features_first, image_levels(ashore.grey)
+    )
+    slam_map.observe(first, across.features_first, ids)
+    slam_map.refresh(ids, [first])
+    atlas.remember(first)
+    view.camera_from_map = across.second_from_map
+    view.point_ids = np.full(len(view.features), -1)
+    view.point_ids[start.features_second[across.known]] = across.known_points
+    view.point_ids[start.features_second[~across.known]] = ids
+
+
+def place_earlier(
+    placer: Placer, views: Iterable[View], first: Keyframe, second: Keyframe
+) -> list[View]:
+    """Place the frames that came before the map: from the first keyframe outwards."""
+    views = [v for v in views if v.seq != second.seq]
+    placed: list[View] = []
+    before = [v for v in views if v.seq <= first.seq][::-1]
+    after = [v for v in views if v.seq > first.seq]
+    for run, start, end in ((before, first, None), (after, first, second)):
+        pose, misses, last = start.camera_from_map, 0, start.t_ns
+        for v in run:
+            guess = pose
+            if end is not None:
+                share = (v.t_ns - start.t_ns) / max(end.t_ns - start.t_ns, 1)
+                centre = (1 - share) * start.centre + share * end.centre
+                guess = Pose(pose.rotation, -pose.rotation @ centre)
+            if placer.place_near(v, guess) or placer.locate_by(v, start):
+                pose, misses, last = v.camera_from_map, 0, v.t_ns
+                placed.append(v)
+            else:
+                misses += 1
+                if misses > 5 or abs(v.t_ns - last) > 1e9:
+                    break
+    return sorted(placed, key=lambda v: v.seq)
