@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 
 from companion.config import DepthConfig
-from companion.depth.opencl import COPY, READ_BACK, UPLOAD, ComputeDevice, event_ms
+from companion.depth.opencl import READ_BACK, UPLOAD, ComputeDevice, event_ms
 from companion.depth.regularisation import Regularisation, edges
 from companion.depth.sweep import PLANES, PlaneSweep
 from companion.depth.verification import Verification
@@ -180,7 +180,7 @@ class DepthEngine:
         return len(self._events)
 
     def device_ms(self, first: int = 0, beyond: int | None = None) -> dict[str, float]:
-        """What commands took on the device, by the kernel's name, or `UPLOAD`, `READ_BACK`, `COPY`.
+        """What commands took on the device, by the kernel's name, or `UPLOAD` or `READ_BACK`.
 
         `first` and `beyond` are what `n_commands` was; waits until all is done.
         """
@@ -192,4 +192,4 @@ class DepthEngine:
 
     def _kernel_ms(self) -> dict[str, float]:
         every = self.device_ms()
-        return {name: ms for name, ms in every.items() if name not in (UPLOAD, READ_BACK, COPY)}
+        return {name: ms for name, ms in every.items() if name not in (UPLOAD, READ_BACK)}

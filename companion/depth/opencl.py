@@ -20,7 +20,7 @@ WANT = (
     " or set depth.enabled=false"
 )
 POCL, LINKERS = "Portable Computing Language", ("ld", "ld.lld")
-UPLOAD, READ_BACK, COPY = "upload", "read-back", "copy"
+UPLOAD, READ_BACK = "upload", "read-back"
 MAX_COPIES = 4096
 
 
@@ -37,7 +37,7 @@ class ComputeDevice:
             self.context, properties=cl.command_queue_properties.PROFILING_ENABLE
         )
         self.copies: deque[tuple[str, cl.Event]] = deque(maxlen=MAX_COPIES)
-        """The last ones, as `UPLOAD`, `READ_BACK` or `COPY`, for who wants to know their times."""
+        """The last ones, as `UPLOAD` or `READ_BACK`, for who wants to know their times."""
 
     @property
     def described(self) -> str:
@@ -65,11 +65,6 @@ class ComputeDevice:
         event = cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
         self.copies.append((UPLOAD, event))
         return event
-
-    def copy(self, to: cl.Buffer, source: cl.Buffer, offset: int, n_bytes: int) -> None:
-        """Copy the first bytes of a buffer into another, from an offset on."""
-        event = cl.enqueue_copy(self.queue, to, source, dst_offset=offset, byte_count=n_bytes)
-        self.copies.append((COPY, event))
 
     def read(self, array: NDArray[Any], buffer: cl.Buffer) -> None:
         """Copy a buffer to a contiguous array and wait."""

@@ -55,7 +55,6 @@ class PlaneSweep:
         self.images = [device.buffer(self._n_pixels) for _ in range(MAX_VIEWS)]
         self._words = device.buffer(4 * self._n_pixels * MAX_VIEWS)
         self._stale: set[int] = set()
-        self._word = device.buffer(4 * self._n_pixels)
         self._views = device.buffer(4 * 12 * MAX_VIEWS)
         self._blocks = device.buffer(4 * n)
         self._cost, self._sum = device.buffer(PLANES[-1] * n), device.buffer(2 * PLANES[-1] * n)
@@ -65,7 +64,7 @@ class PlaneSweep:
     def set_reference(self, grey: Bytes, run: Run) -> None:
         """Take the reference image (H, W)."""
         self._device.write(self.reference, np.ascontiguousarray(grey))
-        self._census(self.reference, self._words_r, run)
+        self._census(self.reference, self._words_r, 0, run)
 
     def set_image(self, slot: int, grey: Bytes) -> None:
         """Take an image (H, W) into a slot; it is looked at when next a sweep runs."""
@@ -80,10 +79,8 @@ class PlaneSweep:
         planes = next(n for n in PLANES if n >= n_planes)
         looked_at = (1 << -(-n_planes // BLOCK)) - 1
         n = len(projections)
-        n_bytes = 4 * self._n_pixels
         for slot in sorted(self._stale):
-            self._census(self.images[slot], self._word, run)
-            self._device.copy(self._words, self._word, slot * n_bytes, n_bytes)
+            self._census(self.images[slot], self._words, slot * self._n_pixels, run)
         self._stale.clear()
         dropped = 2 if n >= 5 else 1 if n >= 3 else 0
         self._device.write(self._views, np.ascontiguousarray(projections, np.float32))
@@ -137,11 +134,11 @@ class PlaneSweep:
             self.noise,
         )
 
-    def _census(self, image: cl.Buffer, words: cl.Buffer, run: Run) -> None:
+    def _census(self, image: cl.Buffer, words: cl.Buffer, first: int, run: Run) -> None:
         width, height = self.size
         run(
             "census", self._kernels[PLANES[0]]["census"], (-(-width // 8), height), (16, 1), image,
-            np.int32(width), np.int32(height), words,
+            np.int32(width), np.int32(height), words, np.int32(first),
         )  # fmt: skip
 
 

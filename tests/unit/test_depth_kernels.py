@@ -76,12 +76,13 @@ def some_projections(width: int, height: int, n: int) -> NDArray[np.float32]:
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (65, 49), (97, 33), (13, 9), (5, 4)])
 def test_census(device: ComputeDevice, sweep: cl.Program, width: int, height: int) -> None:
     (image,) = pictures(width, height, 1)
-    out = np.zeros((height, width), np.uint32)
+    out = np.full((2, height, width), 7, np.uint32)
     buffer = put(device, out)
-    size = (-(-width // 8), height)
-    run(device, sweep, "census", size, put(device, image), *i32(width, height), buffer)
+    size, first = (-(-width // 8), height), width * height
+    run(device, sweep, "census", size, put(device, image), *i32(width, height), buffer, *i32(first))
     device.read(out, buffer)
-    np.testing.assert_array_equal(out, reference.census(image))
+    np.testing.assert_array_equal(out[1], reference.census(image))
+    assert (out[0] == 7).all()
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])

@@ -124,8 +124,22 @@ __kernel void verify(__global const float *reference, __global const float *valu
     const int8 fits = seen & (explained > limits.x * limits.x * tt) & (gain > 0.25f) & (gain < 4.0f)
                       & (way < limits.z) & (way > -limits.z);
     const float8 zero = 0.0f, one = 1.0f;
-    *(__global float8_anywhere *)(good + cell) += fits ? one : zero;
-    *(__global float8_anywhere *)(bad + cell) += seen & ~fits ? one : zero;
+    const float8 more_good = fits ? one : zero, more_bad = seen & ~fits ? one : zero;
+    if (x == 8 * (int)get_global_id(0)) {
+        *(__global float8_anywhere *)(good + cell) += more_good;
+        *(__global float8_anywhere *)(bad + cell) += more_bad;
+        return;
+    }
+    /* at the ends of a row another work-item writes some of these eight */
+    const float more[16] = {more_good.s0, more_good.s1, more_good.s2, more_good.s3,
+                            more_good.s4, more_good.s5, more_good.s6, more_good.s7,
+                            more_bad.s0, more_bad.s1, more_bad.s2, more_bad.s3,
+                            more_bad.s4, more_bad.s5, more_bad.s6, more_bad.s7};
+    for (int k = 0; k < 8; ++k)
+        if (x + k >= first && x + k < 8 * (int)get_global_id(0) + 8) {
+            good[cell + k] += more[k];
+            bad[cell + k] += more[8 + k];
+        }
 }
 
 /* Standard deviation, inlier ratio, label and the regulariser's weight of each grid pixel. Labels: 0

@@ -28,13 +28,15 @@ static int inside(int value, int high)
     return value < 0 ? 0 : value > high ? high : value;
 }
 
-/* Grid: (width + 7) / 8 x height; a work-item does 8 pixels. Beyond the border the image repeats. */
+/* Words of an image, from out[first] on. Grid: (width + 7) / 8 x height; a work-item does 8 pixels.
+ * Beyond the border the image repeats. */
 __kernel void census(__global const uchar *image, const int width, const int height,
-                     __global uint *out)
+                     __global uint *words, const int first)
 {
     const int x0 = 8 * get_global_id(0), y = get_global_id(1);
     if (x0 >= width || y >= height)
         return;
+    __global uint *out = words + first;
     if (x0 >= 2 && x0 + 10 <= width && y >= 2 && y + 2 < height) {
         __global const uchar *at = image + y * width + x0;
         const uchar8 centre = *(__global const uchar8_anywhere *)at;
@@ -53,11 +55,13 @@ __kernel void census(__global const uchar *image, const int width, const int hei
     for (int x = x0; x < x0 + 8 && x < width; ++x) {
         const uchar centre = image[y * width + x];
         uint word = 0;
-        for (int n = 0; n < 24; ++n) {
-            const int m = n < 12 ? n : n + 1;
-            const int v = inside(y + m / 5 - 2, height - 1), u = inside(x + m % 5 - 2, width - 1);
-            word |= (uint)(image[v * width + u] > centre) << n;
-        }
+        int n = 0;
+        for (int j = -2; j <= 2; ++j)
+            for (int i = -2; i <= 2; ++i) {
+                const int v = inside(y + j, height - 1), u = inside(x + i, width - 1);
+                if (i != 0 || j != 0)
+                    word |= (uint)(image[v * width + u] > centre) << n++;
+            }
         out[y * width + x] = word;
     }
 }
