@@ -13,6 +13,7 @@ from companion.config import CloudConfig
 from companion.depth.normals import MAX_STEP, normals
 from companion.geometry import Array, Similarity
 from companion.messages import DepthMap, Floats, MapUpdate, PixelState, PointChunk
+from companion.stretch import typical_ratio
 from companion.voxel import thin_by_voxel
 
 Mask = NDArray[np.bool_]
@@ -82,7 +83,7 @@ class Fusion:
         if len(rows) == 0:
             return None
         points = points_of(depth_map, rows, columns)
-        points *= update.stretch_of(keyframe_id, held.spans)
+        points *= _stretch(held, place, update)
         depth = depth_map.depth[rows, columns]
         sigma = (depth_map.sigma[rows, columns] / depth).astype(np.float64)
         n_maps = np.ones(len(points), np.int64)
@@ -92,7 +93,7 @@ class Fusion:
             other_place = update.place_of(other_id)
             if other_id == keyframe_id or other_place is None:
                 continue
-            stretch = update.stretch_of(other_id, other.spans)
+            stretch = _stretch(other, other_place, update)
             witness = self._witness(points, other_place.inverse() @ place, other, stretch)
             n_maps += witness.agrees
             further[witness.agrees] += witness.off
@@ -178,6 +179,22 @@ def measured_only(depth_map: DepthMap, max_sigma: float = np.inf) -> DepthMap:
         depth_map, depth=np.where(known, depth_map.depth, nothing),
         sigma=np.where(known, depth_map.sigma, nothing),
     )  # fmt: skip
+
+
+def _stretch(held: _Held, place: Similarity, update: MapUpdate) -> float:
+    """By what factor the map's points are further away now than the depths; by spans if too few."""
+    depth_map = held.map
+    points = place.inverse().apply(update.points_map)
+    points = points[points[:, 2] > 1e-6]
+    fx, fy, cx, cy = depth_map.intrinsics
+    height, width = depth_map.depth.shape
+    u = np.rint(fx * points[:, 0] / points[:, 2] + cx)
+    v = np.rint(fy * points[:, 1] / points[:, 2] + cy)
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    depth = depth_map.depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+    known = depth > 0
+    ratio = typical_ratio(points[inside][known, 2] / depth[known])
+    return update.stretch_of(depth_map.keyframe_id, held.spans) if ratio is None else ratio
 
 
 def _unit(vectors: Array) -> Array:

@@ -33,6 +33,7 @@ from companion.output.chunk_store import ChunkStore
 from companion.output.cloud import Cloud, no_cloud, placed
 from companion.output.depth_pictures import DepthPicture, DepthPictures
 from companion.output.voxel_cloud import VoxelCloud
+from companion.stretch import stretch_of_points
 
 POSITION_STEP_NS = 100_000_000
 VOXEL_PER_DEPTH = 0.01
@@ -239,7 +240,7 @@ class FlightResult:
         for n, (keyframe_id, place) in enumerate(places.items()):
             if keyframe_id in self._chunks:  # else the disk was full meanwhile
                 chunk = self._chunks.get(keyframe_id)
-                stretch = update.stretch_of(keyframe_id, chunk.spans)
+                stretch = _stretch(chunk, update)
                 thinned.add(placed(chunk, replace(place, scale=stretch * place.scale)))
             yield (n + 1) / len(places)
         return thinned.finish()
@@ -255,6 +256,16 @@ class FlightResult:
     def depth_pictures(self, n: int) -> list[DepthPicture]:
         """At most `n` pictures of depth maps, spread over the flight."""
         return self._pictures.spread(n)
+
+
+def _stretch(chunk: PointChunk, update: MapUpdate) -> float:
+    """By what factor points are further away in the map as it is now; by spans if it has few."""
+    place = update.place_of(chunk.keyframe_id)
+    if place is None:
+        return 1.0
+    in_camera = place.inverse().apply(update.points_map)
+    ratio = stretch_of_points(chunk.points_camera.astype(np.float64), in_camera)
+    return update.stretch_of(chunk.keyframe_id, chunk.spans) if ratio is None else ratio
 
 
 def _tracking(track: Track) -> bool:

@@ -10,6 +10,7 @@ import pytest
 from companion.geometry import Pose
 from companion.messages import MapUpdate, PointChunk
 from companion.output.flight_result import FlightResult
+from companion.stretch import stretch_of_points
 
 N = 20
 
@@ -62,3 +63,50 @@ def test_points_of_the_cloud_are_stretched_with_the_map() -> None:
         clouds.append(result.cloud(0.1))
     np.testing.assert_allclose(clouds[1].points, 1.05 * clouds[0].points, rtol=1e-5)
     np.testing.assert_allclose(clouds[1].sigma, 1.05 * clouds[0].sigma, rtol=1e-5)
+
+
+def wall(n: int, seed: int, z: float = 8.0) -> np.ndarray:
+    """Points of a slanted wall as a camera sees them."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(-0.5, 0.5, (2, n))
+    depth = z / (1.0 + 0.4 * u)
+    return np.stack([u * depth, v * depth, depth], 1)
+
+
+def test_points_of_the_map_tell_the_stretch() -> None:
+    dense, sparse = wall(40_000, 1), 1.03 * wall(600, 2)
+    noise = np.random.default_rng(3).normal(0, 0.01, 600)
+    assert stretch_of_points(dense, sparse * (1 + noise)[:, None]) == pytest.approx(1.03, abs=2e-3)
+
+
+def test_what_lies_before_and_behind_does_not_count() -> None:
+    hidden, before = wall(400, 4, 9.0), wall(200, 5, 5.0)
+    behind_us = -wall(300, 6)
+    sparse = np.concatenate([0.98 * wall(500, 2), hidden, before, behind_us])
+    assert stretch_of_points(wall(40_000, 1), sparse) == pytest.approx(0.98, abs=3e-3)
+
+
+def test_too_few_points_tell_nothing() -> None:
+    assert stretch_of_points(wall(1000, 1), wall(20, 2)) is None
+    assert stretch_of_points(wall(1000, 1), np.zeros((0, 3))) is None
+    assert stretch_of_points(np.zeros((0, 3)), wall(100, 2)) is None
+    aside = wall(500, 2) + [50.0, 0.0, 0.0]
+    assert stretch_of_points(wall(1000, 1), aside) is None
+
+
+def test_the_cloud_goes_by_the_points_of_the_map_before_it_goes_by_keyframes() -> None:
+    dense = wall(20_000, 1).astype(np.float32)
+    ones = np.ones(len(dense), np.float32)
+    chunk = PointChunk(
+        8, 0, dense, np.zeros((len(dense), 3), np.uint8), ones, np.zeros_like(dense), ones,
+        update().spans_of(8),
+    )  # fmt: skip
+    result = FlightResult()
+    result.take(chunk)
+    now = update(1.05)
+    place = now.map_from_camera[8]
+    result.take(replace(now, points_map=place.apply(0.97 * wall(500, 2))))
+    cloud = result.cloud(0.1).points - place.translation
+    assert np.median(cloud[:, 2] * (1 + 0.4 * cloud[:, 0] / cloud[:, 2])) == pytest.approx(
+        0.97 * 8.0, rel=2e-3
+    )
