@@ -3,7 +3,7 @@
 The format is public (github.com/gopro/gpmf-parser, docs): a key of four letters, a letter for the
 type, a byte for the size of one element and two for their count, then the elements, padded to four
 bytes. Type 0 holds further keys. In a stream (STRM) SCAL divides what follows it, TYPE gives the
-letters of elements made of several types ("?").
+letters of elements made of several types ("?"), STNM its name, ORIN the axes of its fields.
 """
 
 from __future__ import annotations
@@ -30,6 +30,10 @@ class GpmfStream:
 
     key: str
     rows: Array
+    name: str = ""
+    """What the stream calls itself."""
+    orientation: str = ""
+    """A letter for the axis of each field, small where it points the other way; "" if not told."""
 
 
 class GpmfError(ValueError):
@@ -46,11 +50,16 @@ def read_streams(payload: bytes) -> list[GpmfStream]:
 def _walk(data: bytes, found: list[GpmfStream]) -> None:
     scale: Array | None = None
     letters: str | None = None
+    name = orientation = ""
     for key, kind, size, body in _entries(data):
         if kind == "\0":
             _walk(body, found)
         elif key == "TYPE":
-            letters = body.decode("latin-1").rstrip("\0")
+            letters = _text(body)
+        elif key == "STNM":
+            name = _text(body)
+        elif key == "ORIN":
+            orientation = _text(body)
         elif key == "SCAL":
             scale = _numbers(body, kind, size, None)[:, 0]
             if not scale.all():
@@ -58,9 +67,13 @@ def _walk(data: bytes, found: list[GpmfStream]) -> None:
         elif kind not in TEXT and key.isalnum() and len(body):
             rows = _numbers(body, kind, size, letters)
             if scale is not None and scale.size in (1, rows.shape[1]):
-                found.append(GpmfStream(key, rows / scale))
+                found.append(GpmfStream(key, rows / scale, name, orientation))
             elif scale is None:
-                found.append(GpmfStream(key, rows))
+                found.append(GpmfStream(key, rows, name, orientation))
+
+
+def _text(body: bytes) -> str:
+    return body.decode("latin-1").rstrip("\0")
 
 
 def _entries(data: bytes) -> Iterator[tuple[str, str, int, bytes]]:

@@ -1,7 +1,7 @@
 """Telemetry inside a GoPro video (GPMF): what a Karma drone's autopilot told its camera.
 
-Where there was none, the places of the camera's own receiver. Its gyro and accelerometer (ACCL,
-GYRO) are not read: their axes differ from model to model.
+Where there was none, the places of the camera's own receiver. Its gyro tells elsewhere when a log
+was made (`gpmf_gyro`); its accelerometer is not read.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 
-import av
-import av.error
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,11 +28,11 @@ from companion.messages import (
 )
 from drivers.gpmf_camera import HEIGHTS, camera_fixes
 from drivers.gpmf_records import GpmfError, read_streams
+from drivers.gpmf_track import blocks_of
 from drivers.mavlink_samples import FIX_3D, STANDARD_GRAVITY, height_from_pressure
 from drivers.stamp_filter import MAX_BOOT_NS, believable
 from drivers.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
 
-HANDLER = "GoPro MET"
 Times = NDArray[np.int64]
 
 
@@ -45,7 +43,7 @@ def read_gpmf(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogCo
     of the video, then on the flight's clock by `host_from_file_ns`, given times after the first
     frame's.
     """
-    payloads = _payloads(video) if video.is_file() else []
+    payloads = blocks_of(video) if video.is_file() else []
     if not payloads:
         return None
     collected = TelemetryCollector(video.name)
@@ -116,32 +114,6 @@ def _offset(spans: list[tuple[int, int, int, int]]) -> tuple[int, float]:
     # bounds that contradict one another: some blocks are late
     middle = np.array([(begin - first + end - last) / 2 for begin, end, first, last in spans])
     return round(float(np.median(middle))), float(max(middle.std(), (least - most) / 2))
-
-
-def _payloads(video: Path) -> list[tuple[int, int, bytes]]:
-    """Begin and end in ns of the video's own time, and content of each block."""
-    out = []
-    try:
-        with av.open(str(video)) as container:
-            stream = next(
-                (
-                    s
-                    for s in container.streams
-                    if s.type == "data" and HANDLER in s.metadata.get("handler_name", "")
-                ),
-                None,
-            )
-            if stream is None or stream.time_base is None:
-                return []
-            unit_ns = stream.time_base * 1_000_000_000
-            for packet in container.demux(stream):
-                if packet.pts is not None and packet.size:
-                    begin_ns = round(packet.pts * unit_ns)
-                    end_ns = begin_ns + round((packet.duration or 0) * unit_ns)
-                    out.append((begin_ns, end_ns, bytes(packet)))
-    except av.error.FFmpegError:
-        pass  # the video is cut short: what came so far is what there is
-    return out
 
 
 def _attitude(row: Array) -> Telemetry:

@@ -1,9 +1,13 @@
-"""A log put on the time of a video by the turns that both saw, where no clock does it."""
+"""A log put on the time of a video by the turns that both saw, where no clock does it.
+
+What the camera saw is told by its own gyro, where the video has that, else by the pictures.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,6 +20,8 @@ from companion.errors import FlightError
 from companion.geometry import Array, rotation_from_quaternion, vector_from_rotation
 from companion.image_rotation import RotationMeter
 from companion.messages import AttitudeSample, ClockReport, Frame, ImuSample, Telemetry, Warned
+from drivers.gpmf_gyro import gyro_turns
+from drivers.gpmf_track import blocks_of
 from drivers.telemetry_folder import aligned, read_log_file, read_telemetry
 from drivers.telemetry_log import Pictures, TelemetryLog
 
@@ -34,66 +40,101 @@ def read_unaligned(
     """
     if not paths or config.align == "never" or config.offset_s:
         return read_telemetry(paths, pictures, config)
-    seen = _seen(camera, frames(), pictures.start_ns)
     free = dataclasses.replace(config, starts_with_video=True)
-    mounted = camera.body_from_camera.rotation if camera.body_from_camera is not None else None
-    found: list[tuple[TimeAlignment, Path, TelemetryLog]] = []
-    reasons = []
-    for path in paths:
-        log = aligned(read_log_file(path), pictures, free)
-        logged = _logged(log.samples, pictures.start_ns)
+    logs = [(path, aligned(read_log_file(path), pictures, free)) for path in paths]
+    reasons: list[str] = []
+    for see in (_felt, _seen):
+        seen = see(camera, frames, pictures)
+        found = None if seen is None else _best(seen, logs, pictures.start_ns, reasons)
+        if seen is not None and found is not None:
+            return _moved(*found, seen.by_what, pictures)
+    raise FlightError(
+        f"{pictures.path}: no log can be put on its time by rotation ({'; '.join(reasons)}); "
+        "say the shift by --offset S, seconds added to the log's times, or give frames.csv, or "
+        "--set telemetry.align=never to trust the clocks"
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turns:
+    by_what: str
+    record: TurnRecord
+    body_from_camera: Array | None
+    """Rotation (3, 3), where it is known and so are the axes."""
+
+
+def _best(
+    seen: _Turns, logs: Sequence[tuple[Path, TelemetryLog]], start_ns: int, reasons: list[str]
+) -> tuple[TelemetryLog, TimeAlignment, Path] | None:
+    found = []
+    for path, log in logs:
+        logged = _logged(log.samples, start_ns)
         if logged is None:
             reasons.append(f"{path.name} has neither rates nor attitude")
             continue
-        step_s = float(np.median(np.diff(seen.t_s))) if len(seen.t_s) > 1 else 0.0
-        by_turns = align_turns(seen, logged, step_s, mounted) if step_s > 0 else None
+        t_s = seen.record.t_s
+        step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+        by_turns = None
+        if step_s > 0:
+            by_turns = align_turns(seen.record, logged, step_s, seen.body_from_camera)
         if by_turns is None:
             reasons.append(f"{path.name}: too little is in both")
         elif by_turns.why_not is not None:
             reasons.append(f"{path.name}: {by_turns.why_not}")
         else:
-            found.append((by_turns, path, log))
-    if not found:
-        raise FlightError(
-            f"{pictures.path}: no log can be put on its time by rotation ({'; '.join(reasons)}); "
-            "say the shift by --offset S, seconds added to the log's times, or give frames.csv, or "
-            "--set telemetry.align=never to trust the clocks"
-        )
-    best, path, log = max(found, key=lambda each: each[0].score)
-    return _moved(log, best, path, pictures)
+            found.append((log, by_turns, path))
+    return max(found, key=lambda each: each[1].score, default=None)
 
 
 def _moved(
-    log: TelemetryLog, by_turns: TimeAlignment, path: Path, pictures: Pictures
+    log: TelemetryLog, by_turns: TimeAlignment, path: Path, by_what: str, pictures: Pictures
 ) -> TelemetryLog:
     shift_ns = round(by_turns.offset_s * 1e9)
     samples = [dataclasses.replace(sample, t_ns=sample.t_ns + shift_ns) for sample in log.samples]
     clock = ClockReport(
-        "rotation of the pictures", by_turns.offset_s, 0.0, by_turns.sigma_s * 1e3,
+        f"rotation of {by_what}", by_turns.offset_s, 0.0, by_turns.sigma_s * 1e3,
         log.clock.n_reboots if log.clock is not None else 0,
     )  # fmt: skip
-    remark = f"{path.name} put on the time of {pictures.path.name} by rotation: {by_turns}"
+    how = f"put on the time of {pictures.path.name} by rotation of {by_what}"
+    remark = f"{path.name} {how}: {by_turns}"
     warnings = tuple(w for w in log.warnings if "begin with the video" not in w.what)
     return dataclasses.replace(
         log, samples=samples, clock=clock, warnings=warnings, remarks=(remark,)
     )
 
 
-def _seen(camera: Camera, frames: Iterator[Frame | Warned], start_ns: int) -> TurnRecord:
+def _mount(camera: Camera) -> Array | None:
+    return None if camera.body_from_camera is None else camera.body_from_camera.rotation
+
+
+def _felt(camera: Camera, frames: Frames, pictures: Pictures) -> _Turns | None:
+    """By the camera's gyro; None where the video has nothing of it."""
+    turns = gyro_turns(blocks_of(pictures.path)) if pictures.path.is_file() else None
+    if turns is None:
+        return None
+    host_ns = pictures.host_from_file_ns(np.rint(turns.t_ns).astype(np.int64))
+    t_s = (host_ns - pictures.start_ns) * 1e-9
+    mount = _mount(camera) if turns.axes_known else None
+    return _Turns("the camera's gyro", TurnRecord(t_s, turns.angle_rad), mount)
+
+
+def _seen(camera: Camera, frames: Frames, pictures: Pictures) -> _Turns:
+    """By the pictures."""
     meter = RotationMeter(camera)
     times_s: list[float] = []
     angles: list[Array] = []
     angle = np.zeros(3)
-    for frame in frames:
+    for frame in frames():
         if not isinstance(frame, Frame):
             continue
         turn = meter.turn(frame)
         angle = angle if turn is None else angle + turn
-        times_s.append((frame.t_ns - start_ns) * 1e-9)
+        times_s.append((frame.t_ns - pictures.start_ns) * 1e-9)
         angles.append(angle)
         if len(times_s) == MAX_FRAMES:
             break
-    return TurnRecord(np.array(times_s), np.array(angles).reshape(-1, 3))
+    record = TurnRecord(np.array(times_s), np.array(angles).reshape(-1, 3))
+    return _Turns("the pictures", record, _mount(camera))
 
 
 def _logged(samples: Sequence[Telemetry], start_ns: int) -> TurnRecord | None:

@@ -30,7 +30,7 @@ def true_offset_s() -> float:
 def test_aligned_by_rotation_and_said(folder: Path) -> None:
     run = replay(folder, folder / "out", *FAST)
     assert run.status == 0, run.stderr
-    said = re.search(r"by rotation: ([-+][\d.]+) s, within (\d+) ms", run.stdout)
+    said = re.search(r"by rotation of the pictures: ([-+][\d.]+) s, within (\d+) ms", run.stdout)
     assert said is not None
     assert float(said[1]) == pytest.approx(true_offset_s(), abs=0.05)
     assert run.report["unit"] == "m"
