@@ -113,7 +113,7 @@ def _felt(camera: Camera, frames: Frames, pictures: Pictures) -> _Turns | None:
     if turns is None:
         return None
     host_ns = pictures.host_from_file_ns(np.rint(turns.t_ns).astype(np.int64))
-    t_s = (host_ns - pictures.start_ns) * 1e-9
+    t_s = np.asarray((host_ns - pictures.start_ns) * 1e-9, np.float64)
     mount = _mount(camera) if turns.axes_known else None
     return _Turns("the camera's gyro", TurnRecord(t_s, turns.angle_rad), mount)
 

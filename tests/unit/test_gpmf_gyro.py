@@ -63,8 +63,8 @@ def test_a_video_without_is_known_as_such() -> None:
     assert gyro_turns([(0, SECOND, gyro_block(np.zeros((3, 3)), HERO5))]) is None
 
 
-def felt(first_ns: int) -> list[bytes]:
-    """What a gyro would have felt in the sample's flight, by its true poses."""
+def felt(first_ns: int) -> list[Array]:
+    """Rates of each second that a gyro would have felt in the sample's flight, by its true poses."""
     rows = np.loadtxt(SAMPLE / "truth" / "world_from_camera.tum")
     turned = [rotation_from_quaternion(q) for q in rows[:, [7, 4, 5, 6]]]
     rates = np.array([
