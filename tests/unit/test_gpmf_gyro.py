@@ -64,7 +64,7 @@ def test_a_video_without_is_known_as_such() -> None:
 
 
 def felt(first_ns: int) -> list[Array]:
-    """Rates of each second that a gyro would have felt in the sample's flight, by its true poses."""
+    """Rates of each second, as a gyro would have felt them in the sample, by its true poses."""
     rows = np.loadtxt(SAMPLE / "truth" / "world_from_camera.tum")
     turned = [rotation_from_quaternion(q) for q in rows[:, [7, 4, 5, 6]]]
     rates = np.array([
