@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.camera import Camera
 from companion.config import FeaturesConfig
 from companion.geometry import Array
 from companion.messages import Bytes, Floats
+from companion.slam.compiled.compiling import Bools, Ints
+from companion.slam.compiled.spreading import spread
 
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+__all__ = ["Bools", "FeatureExtractor", "Features", "Ints"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +64,7 @@ class FeatureExtractor:
             described, words = self._orb.compute(grey, chosen)
             keypoints = list(described)
         descriptors = np.zeros((0, 32), np.uint8) if words is None else np.asarray(words, np.uint8)
-        pixels = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
+        pixels = _pixels(keypoints)
         octaves = np.array([k.octave for k in keypoints], np.int64)
         angles = np.array([k.angle for k in keypoints], np.float32)
         # levels are shrunk about the image's corner, not about the centre of its first pixel
@@ -101,19 +101,11 @@ class FeatureExtractor:
         return keypoints
 
     def _spread(self, keypoints: list[cv2.KeyPoint]) -> list[int]:
-        """Take the strongest of every cell in turn, until there are enough."""
-        n = self._n_wanted
-        if len(keypoints) <= n:
-            return list(range(len(keypoints)))
+        response = np.array([k.response for k in keypoints], np.float32)
         cell_px = self._config.cell_px
-        points = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
-        response = np.array([k.response for k in keypoints])
-        cells = (points // cell_px).astype(np.int64)
-        cell = cells[:, 1] * 100_000 + cells[:, 0]
-        order = np.lexsort((np.arange(len(cell)), -response, cell))
-        starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0])
-        sizes = np.diff(np.r_[starts, len(order)])
-        rank = np.empty(len(order), np.int64)
-        rank[order] = np.arange(len(order)) - np.repeat(starts, sizes)
-        chosen = np.lexsort((np.arange(len(cell)), -response, rank))[:n]
-        return [int(i) for i in np.sort(chosen)]
+        chosen: list[int] = spread(_pixels(keypoints), response, cell_px, self._n_wanted).tolist()
+        return chosen
+
+
+def _pixels(keypoints: list[cv2.KeyPoint]) -> Floats:
+    return np.array(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2)

@@ -10,12 +10,13 @@ import numpy as np
 
 from companion.geometry import Array, Pose, skew
 from companion.messages import Bytes, Floats
-from companion.slam.compiled.searching import search
+from companion.slam.compiled.searching import search, search_along
 from companion.slam.features import Bools, Features, Ints
 
 MAX_DISTANCE = 64
 """Bits that the same corner may differ by between views."""
 MAX_DISTANCE_STRICT = 50
+MAX_OCTAVE_GAP = 4
 FAR = np.float32(1000.0)
 
 
@@ -63,43 +64,15 @@ def match_epipolar(
     essential = skew(b_from_a.translation) @ b_from_a.rotation
     rays_a = np.c_[a.normalised[index_a], np.ones(len(index_a))]
     rays_b = np.c_[b.normalised[index_b], np.ones(len(index_b))]
-    lines = (rays_a @ essential.T).astype(np.float32)
-    norm = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-    lines /= np.maximum(norm, 1e-12)
-    error = np.abs(lines @ rays_b.T.astype(np.float32))
+    lines = rays_a @ essential.T
+    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
     sigma = 1.0 / np.sqrt(np.abs(np.linalg.det(b.whitening[index_b])))
-    # few pairs lie along the lines: only their descriptors are compared
-    near_a, near_b = np.nonzero(error < (max_error * sigma)[None, :].astype(np.float32))
-    octaves_a, octaves_b = a.octaves[index_a], b.octaves[index_b]
-    alike = np.abs(octaves_a[near_a] - octaves_b[near_b]) <= 4
-    near_a, near_b = near_a[alike], near_b[alike]
-    words_a = a.descriptors[index_a].view(np.uint64)
-    words_b = b.descriptors[index_b].view(np.uint64)
-    distance = np.bitwise_count(words_a[near_a] ^ words_b[near_b]).sum(1, dtype=np.int64)
-    ia, ib = _mutual_pairs(near_a, near_b, distance, MAX_DISTANCE_STRICT, 0.9)
+    ia, ib = search_along(
+        lines, rays_b, max_error * sigma, a.descriptors[index_a].view(np.uint64),
+        b.descriptors[index_b].view(np.uint64), a.octaves[index_a], b.octaves[index_b],
+        MAX_OCTAVE_GAP, MAX_DISTANCE_STRICT, 0.9,
+    )  # fmt: skip
     return index_a[ia], index_b[ib]
-
-
-def _mutual_pairs(
-    ia: Ints, ib: Ints, distance: Ints, max_distance: float, ratio: float
-) -> tuple[Ints, Ints]:
-    """As `mutual_matches`, over listed pairs."""
-    none = np.zeros(0, np.int64)
-    if len(ia) == 0:
-        return none, none
-    by_a = np.lexsort((ib, distance, ia))
-    first = np.flatnonzero(np.r_[True, np.diff(ia[by_a]) != 0])
-    best = by_a[first]
-    following = np.minimum(first + 1, len(by_a) - 1)
-    has_rival = (following > first) & (ia[by_a[following]] == ia[best])
-    rival = np.where(has_rival, distance[by_a[following]], FAR)
-    by_b = np.lexsort((ia, distance, ib))
-    best_of_b = np.full(int(ib.max()) + 1, -1)
-    starts = np.flatnonzero(np.r_[True, np.diff(ib[by_b]) != 0])
-    best_of_b[ib[by_b[starts]]] = by_b[starts]
-    good = (distance[best] <= max_distance) & (distance[best] < ratio * rival)
-    good &= best_of_b[ib[best]] == best
-    return ia[best[good]], ib[best[good]]
 
 
 def match_projected(

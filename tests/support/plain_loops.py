@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from companion.camera import Camera
-from companion.geometry import Array, Pose, nearest_rotation, rotation_from_vector
-from companion.messages import Bytes
+from companion.geometry import Array, Pose, nearest_rotation, rotation_from_vector, skew
+from companion.messages import Bytes, Floats
 from companion.slam.compiled.pose import CHI2_2D, HUBER
 from companion.slam.features import Bools, Features, Ints
 from companion.slam.map import SlamMap
@@ -154,3 +154,67 @@ def warps(
     n = seen[:, :2] / seen[:, 2:]
     projected = (in_camera[:, :2] - n[:, :, None] * in_camera[:, 2:]) / seen[:, 2:, None]
     return np.asarray(np.matmul(jacobian, projected), np.float64)
+
+
+def match_epipolar(
+    a: Features, b: Features, index_a: Ints, index_b: Ints, b_from_a: Pose, max_error: float = 2.0
+) -> tuple[Ints, Ints]:
+    """Match features `index_a` of a with `index_b` of b near their epipolar lines.
+
+    `max_error` is in units of a feature's sigma. Returns indices into a and b.
+    """
+    none = np.zeros(0, np.int64)
+    if len(index_a) < 2 or len(index_b) < 2:
+        return none, none
+    essential = skew(b_from_a.translation) @ b_from_a.rotation
+    rays_a = np.c_[a.normalised[index_a], np.ones(len(index_a))]
+    rays_b = np.c_[b.normalised[index_b], np.ones(len(index_b))]
+    lines = (rays_a @ essential.T).astype(np.float32)
+    norm = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    lines /= np.maximum(norm, 1e-12)
+    error = np.abs(lines @ rays_b.T.astype(np.float32))
+    sigma = 1.0 / np.sqrt(np.abs(np.linalg.det(b.whitening[index_b])))
+    # few pairs lie along the lines: only their descriptors are compared
+    near_a, near_b = np.nonzero(error < (max_error * sigma)[None, :].astype(np.float32))
+    octaves_a, octaves_b = a.octaves[index_a], b.octaves[index_b]
+    alike = np.abs(octaves_a[near_a] - octaves_b[near_b]) <= 4
+    near_a, near_b = near_a[alike], near_b[alike]
+    words_a = a.descriptors[index_a].view(np.uint64)
+    words_b = b.descriptors[index_b].view(np.uint64)
+    distance = np.bitwise_count(words_a[near_a] ^ words_b[near_b]).sum(1, dtype=np.int64)
+    ia, ib = _mutual_pairs(near_a, near_b, distance, 50, 0.9)
+    return index_a[ia], index_b[ib]
+
+
+def _mutual_pairs(
+    ia: Ints, ib: Ints, distance: Ints, max_distance: float, ratio: float
+) -> tuple[Ints, Ints]:
+    """As `mutual_matches`, over listed pairs."""
+    none = np.zeros(0, np.int64)
+    if len(ia) == 0:
+        return none, none
+    by_a = np.lexsort((ib, distance, ia))
+    first = np.flatnonzero(np.r_[True, np.diff(ia[by_a]) != 0])
+    best = by_a[first]
+    following = np.minimum(first + 1, len(by_a) - 1)
+    has_rival = (following > first) & (ia[by_a[following]] == ia[best])
+    rival = np.where(has_rival, distance[by_a[following]], np.float32(1000.0))
+    by_b = np.lexsort((ia, distance, ib))
+    best_of_b = np.full(int(ib.max()) + 1, -1)
+    starts = np.flatnonzero(np.r_[True, np.diff(ib[by_b]) != 0])
+    best_of_b[ib[by_b[starts]]] = by_b[starts]
+    good = (distance[best] <= max_distance) & (distance[best] < ratio * rival)
+    good &= best_of_b[ib[best]] == best
+    return ia[best[good]], ib[best[good]]
+
+
+def spread(pixels: Floats, response: Floats, cell_px: float, n: int) -> Ints:
+    """The strongest of every cell in turn, until there are enough."""
+    cells = (pixels.astype(np.float64) // cell_px).astype(np.int64)
+    cell = cells[:, 1] * 100_000 + cells[:, 0]
+    order = np.lexsort((np.arange(len(cell)), -response, cell))
+    starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0])
+    sizes = np.diff(np.r_[starts, len(order)])
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - np.repeat(starts, sizes)
+    return np.sort(np.lexsort((np.arange(len(cell)), -response, rank))[:n])

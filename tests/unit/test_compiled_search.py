@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from companion.camera import Camera, Distortion
-from companion.geometry import Array, Pose, Similarity, yaw_rotation
+from companion.geometry import Array, Pose, Similarity, rotation_from_vector, yaw_rotation
 from companion.slam.features import Features
 from companion.slam.local_map import Projector, Visible
 from companion.slam.map import SlamMap
+from companion.slam.matching import match_epipolar
 from companion.slam.refinement import _warps
 from tests.support import plain_loops
 from tests.support.made_map import Ground, flown, mapped
@@ -128,3 +129,33 @@ def test_patches_are_warped_as_in_plain_numpy(slam_map: SlamMap) -> None:
     slam_map.first_seen[ids[:2]] = 12345  # a keyframe that nobody knows
     assert np.isnan(_warps(slam_map, pose, ids, jacobian)[:2]).all()
     assert _warps(slam_map, pose, ids[:0], jacobian[:0]).shape == (0, 2, 2)
+
+
+@pytest.mark.parametrize("n", [2, 40, 600])
+def test_what_is_found_along_lines_is_as_in_plain_numpy(n: int) -> None:
+    rng = np.random.default_rng(n)
+    camera = LENSES[0]
+    points = rng.uniform([-3, -2, 3], [3, 2, 9], (n, 3))
+    b_from_a = Pose(rotation_from_vector(np.array([0.02, -0.1, 0.05])), np.array([0.4, 0.1, -0.2]))
+    pixels = [camera.project(p) + rng.normal(size=(n, 2)) for p in (points, b_from_a.apply(points))]
+    words = np.packbits(rng.random((n, 256)) < 0.15, axis=1)
+    levels = rng.integers(0, 8, n)
+    seen = []
+    for places in pixels:
+        flips = np.packbits(rng.random((n, 256)) < 0.03, axis=1)
+        octaves = np.clip(levels + rng.integers(-3, 4, n), 0, 7)
+        normalised = camera.normalise(places)
+        whitening = camera.pixel_from_normalised_jacobian(normalised)
+        one = Features(
+            places.astype(np.float32), normalised, octaves, np.zeros(n, np.float32), words ^ flips,
+            np.ones(n), whitening / 1.2 ** octaves[:, None, None],
+        )  # fmt: skip
+        seen.append(one)
+    a, b = seen
+    index_a, index_b = rng.permutation(n)[: n - n // 9], rng.permutation(n)[: n - n // 7]
+    found = match_epipolar(a, b, index_a, index_b, b_from_a)
+    wanted = plain_loops.match_epipolar(a, b, index_a, index_b, b_from_a)
+    np.testing.assert_array_equal(found[0], wanted[0])
+    np.testing.assert_array_equal(found[1], wanted[1])
+    assert n < 600 or len(found[0]) > 100
+    assert len(match_epipolar(a, b, index_a[:1], index_b, b_from_a)[0]) == 0

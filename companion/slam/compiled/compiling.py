@@ -10,10 +10,13 @@ import numba
 import numpy as np
 from numba import types
 from numba.np.numpy_support import as_dtype
+from numpy.typing import NDArray
 
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
-number, integer, flag = types.float64, types.int64, types.boolean
+number, single, integer, flag = types.float64, types.float32, types.int64, types.boolean
 
 
 def given(element: Any, dimensions: int) -> Any:

@@ -7,6 +7,8 @@ import numpy as np
 from companion.geometry import Array
 from companion.messages import Bytes
 from companion.slam.compiled.compiling import (
+    Bools,
+    Ints,
     compiled,
     images,
     integers,
@@ -16,7 +18,6 @@ from companion.slam.compiled.compiling import (
     part,
     patches,
 )
-from companion.slam.features import Bools, Ints
 
 N_LEVELS = 3
 STORED = 24

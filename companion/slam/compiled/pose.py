@@ -6,6 +6,7 @@ import numpy as np
 
 from companion.geometry import Array
 from companion.slam.compiled.compiling import (
+    Bools,
     compiled,
     integer,
     matrices,
@@ -13,7 +14,6 @@ from companion.slam.compiled.compiling import (
     pairs,
     part,
 )
-from companion.slam.features import Bools
 
 CHI2_2D = 5.991
 """95 % of squared errors of a pixel position, in units of its sigma, lie below this."""

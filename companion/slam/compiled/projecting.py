@@ -6,6 +6,8 @@ import numpy as np
 
 from companion.geometry import Array
 from companion.slam.compiled.compiling import (
+    Bools,
+    Ints,
     compiled,
     flags,
     integer,
@@ -16,7 +18,6 @@ from companion.slam.compiled.compiling import (
     pairs,
     part,
 )
-from companion.slam.features import Bools, Ints
 
 NO_LENS, RADTAN, EQUIDISTANT = 0, 1, 2
 """The distortion models of companion.camera."""

@@ -1,4 +1,4 @@
-"""Which feature shows a point that should lie near a pixel, by position, level and descriptor."""
+"""Which feature shows what another shows, or a point: by where it lies, level and descriptor."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from companion.geometry import Array
 from companion.messages import Floats
 from companion.slam.compiled.compiling import (
+    Bools,
+    Ints,
     compiled,
     flags,
     integer,
@@ -19,7 +21,6 @@ from companion.slam.compiled.compiling import (
     places,
     words,
 )
-from companion.slam.features import Bools, Ints
 
 Words = NDArray[np.uint64]
 
@@ -125,3 +126,44 @@ def search(
             taken_by[feature], taken_for[feature] = m, bits[best]
     found = np.flatnonzero(taken_by >= 0)
     return taken_by[found], found
+
+
+@compiled(
+    places, places, numbers, words, words, integers, integers, integer, integer, number
+)  # fmt: skip
+def search_along(
+    lines: Floats, rays: Floats, reach: Array, words_a: Words, words_b: Words, octaves_a: Ints,
+    octaves_b: Ints, max_octave_gap: int, max_distance: int, ratio: float,
+) -> tuple[Ints, Ints]:  # fmt: skip
+    """Features of two images that are each other's best near epipolar lines, by the first.
+
+    Those of the second, by their `rays` (Nb, 3), may lie within `reach` (Nb,) of the `lines`
+    (Na, 3) of the first's.
+    """
+    n, far = len(rays), 1000
+    off = np.empty(n, np.float32)
+    best_of_a, bits_of_a = np.full(len(lines), -1, np.int64), np.full(len(lines), far, np.int64)
+    rival_of_a = np.full(len(lines), far, np.int64)
+    best_of_b, bits_of_b = np.full(n, -1, np.int64), np.full(n, far, np.int64)
+    for a in range(len(lines)):
+        x, y, z = lines[a, 0], lines[a, 1], lines[a, 2]
+        for b in range(n):
+            off[b] = abs(x * rays[b, 0] + y * rays[b, 1] + z * rays[b, 2])
+        for b in range(n):
+            if not off[b] < reach[b] or abs(octaves_a[a] - octaves_b[b]) > max_octave_gap:
+                continue
+            bits = _differing_bits(words_a[a], words_b[b])
+            if bits < bits_of_a[a]:
+                rival_of_a[a] = bits_of_a[a]
+                best_of_a[a], bits_of_a[a] = b, bits
+            elif bits < rival_of_a[a]:
+                rival_of_a[a] = bits
+            if bits < bits_of_b[b]:
+                best_of_b[b], bits_of_b[b] = a, bits
+    good = np.zeros(len(lines), np.bool_)
+    for a in range(len(lines)):
+        b = best_of_a[a]
+        if b >= 0 and best_of_b[b] == a and bits_of_a[a] <= max_distance:
+            good[a] = bits_of_a[a] < ratio * rival_of_a[a]
+    found = np.flatnonzero(good)
+    return found, best_of_a[found]
