@@ -54,6 +54,7 @@ class StageHealth:
     n_dropped: int = 0
     n_restarted: int = 0
     detail: str = ""
+    latency_p99_ms: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,6 +315,7 @@ class StageMeter:
             n_dropped=self.n_dropped,
             n_restarted=self.n_restarted,
             detail=self.detail,
+            latency_p99_ms=self._latency.percentile_ms(99, now_ns),
         )
 
 

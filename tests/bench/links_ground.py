@@ -34,9 +34,11 @@ def main() -> None:
     pictures: list[tuple[float, float, int]] = []
     facts: dict[str, object] = {}
     memory: list[tuple[float, float]] = []
+    first_s: float | None = None
     for item in link.items(stop):
         drawing.draw(item)
         now_s = time.time()
+        first_s = first_s or now_s
         if isinstance(item, PoseItem):
             poses.append((now_s, item.t_ns * 1e-9))
         elif isinstance(item, PointsItem):
@@ -49,6 +51,7 @@ def main() -> None:
     document = {
         "poses": poses, "points": points, "pictures": pictures, "facts": facts,
         "memory_mib": memory, "connections": link.n_connections, "bytes": link.n_bytes,
+        "first_s": first_s,
     }  # fmt: skip
     Path(out).write_text(json.dumps(document))
 

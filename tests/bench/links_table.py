@@ -2,6 +2,9 @@
 
     python -m tests.bench.links_table --flight FOLDER [--tape FILE] [--only NAME] [--json FILE]
 
+It takes twelve minutes, and two more where there is no tape yet, on a machine that does nothing
+else; the short form, of half a minute, is tests/live/test_thin_link.py.
+
 A flight is replayed once and kept as a tape; then it is told to the exporter at its own pace, in a
 network namespace, and watched from another over a thin link: rate by `tc tbf`, loss by nftables,
 delay by a relay between two TUN devices. Delay and loss are those of either direction. Ages count
@@ -23,12 +26,15 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import Config
+from tests.bench import viewers_and_pose
 from tests.support.flight_tape import make_tape
 from tests.support.link_trial import Trial, fly
 from tests.support.two_namespaces import TwoNamespaces, why_not
 
 SETTLE_S = 5.0
 MARGIN_S = 1.0
+HEAD = "| link | what | measured | asked | holds |\n|---|---|---|---|---|"
+VIEWERS, SAMPLE = "pose beside viewers", Path("sample/survey")
 Row = tuple[str, str, str, bool]
 """What, measured, asked, and whether that holds."""
 
@@ -48,6 +54,8 @@ class Link:
     until_s: float = 0.0
     """Between these the link is cut, or the viewer stopped."""
     stops_viewer: bool = False
+    joins_s: float = 0.0
+    """The viewer comes so late."""
 
 
 def good(trial: Trial) -> list[Row]:
@@ -105,6 +113,28 @@ def stopped(trial: Trial) -> list[Row]:
     ]
 
 
+def late(trial: Trial) -> list[Row]:
+    before = [k for k, t in trial.told.items() if t < trial.joined_s]
+    took_s = max((trial.coarse.get(k, np.inf) for k in before), default=np.inf) - trial.joined_s
+    asked_s = 5.0
+    return [(f"coarse map of {len(before)} views there", f"{took_s:.1f} s", f"{asked_s:g} s",
+             took_s <= asked_s)]  # fmt: skip
+
+
+def late_and_thin(trial: Trial) -> list[Row]:
+    """Newest first: what is made meanwhile does not wait for all that was before."""
+    asked_s = 5.0
+    fresh = [trial.coarse.get(k, np.inf) - t for k, t in trial.told.items()
+             if trial.joined_s + 1.0 < t < trial.ended_s - asked_s]  # fmt: skip
+    worst = max(fresh, default=np.inf)
+    before = [k for k, t in trial.told.items() if t < trial.joined_s]
+    there = [k for k in before if k in trial.coarse]
+    return [
+        ("new views there", f"{worst:.1f} s", f"{asked_s:g} s", worst <= asked_s),
+        ("views from before, there at the end", f"{len(there)} of {len(before)}", "-", True),
+    ]  # fmt: skip
+
+
 CUT, STOP = (60.0, 90.0), (20.0, 80.0)
 LINKS = (
     Link("20 Mbit/s, 10 ms", 20_000, 10, 0.0, 60, good),
@@ -113,6 +143,9 @@ LINKS = (
     Link("30 s outage at minute 1", 2_000, 60, 0.0, 112, outage, from_s=CUT[0], until_s=CUT[1]),
     Link("viewer stopped for 60 s", 20_000, 10, 0.0, 100, stopped, from_s=STOP[0],
          until_s=STOP[1], stops_viewer=True),
+    Link("joins after a minute, 20 Mbit/s", 20_000, 10, 0.0, 80, late, joins_s=60.0),
+    Link("joins after a minute, 500 kbit/s, 5 % loss", 500, 150, 0.05, 90, late_and_thin,
+         budget_kbit_s=400, joins_s=60.0),
 )  # fmt: skip
 
 
@@ -152,7 +185,9 @@ def measured(link: Link, tape: Path) -> list[Row]:
         TwoNamespaces(link.kbit_s, link.delay_ms, link.loss) as air,
         tempfile.TemporaryDirectory() as folder,
     ):
-        trial = fly(air, tape, Path(folder), link.seconds, link.budget_kbit_s, meanwhile)
+        trial = fly(
+            air, tape, Path(folder), link.seconds, link.budget_kbit_s, meanwhile, link.joins_s
+        )
     rate = sum(n for _, n in trial.bytes_per_s) / len(trial.bytes_per_s) / 125
     return [*link.rows(trial), ("on the air, mean", f"{rate:.0f} kbit/s", "-", True)]
 
@@ -163,6 +198,7 @@ def main() -> int:
     parser.add_argument("--tape", type=Path, help="where it is, or is to be, kept")
     parser.add_argument("--only", help="links whose name has this in it")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--rounds", type=int, default=3, help="of the pose beside viewers")
     arguments = parser.parse_args()
     reason = why_not()
     if reason:
@@ -174,17 +210,30 @@ def main() -> int:
             parser.error("--flight is missing: there is no tape yet")
         make_tape(arguments.flight, tape, Config())
     table: dict[str, list[Row]] = {}
-    print("| link | what | measured | asked | |\n|---|---|---|---|---|")
+    print(HEAD)
     for link in LINKS:
-        if arguments.only and arguments.only not in link.name:
-            continue
-        table[link.name] = measured(link, tape)
-        for what, value, asked, holds in table[link.name]:
-            print(f"| {link.name} | {what} | {value} | {asked} | {'' if holds else 'FAILS'} |")
-        sys.stdout.flush()
+        if not arguments.only or arguments.only in link.name:
+            table[link.name] = measured(link, tape)
+            print(as_text(link.name, table[link.name]), flush=True)
+    if not arguments.only or arguments.only in VIEWERS:
+        found = viewers_and_pose.measured(SAMPLE, arguments.rounds)
+        table[VIEWERS] = viewers_and_pose.rows_of(found)
+        print(as_text(VIEWERS, table[VIEWERS]), flush=True)
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(table, indent=1))
-    return 0 if all(row[3] for rows in table.values() for row in rows) else 1
+    asked = [row for rows in table.values() for row in rows if row[2] != "-"]
+    n_held = sum(row[3] for row in asked)
+    print(f"\n{n_held} of {len(asked)} rows hold that are asked for")
+    return 0 if n_held == len(asked) else 1
+
+
+def as_text(name: str, rows: list[Row]) -> str:
+    """Rows of the table in Markdown."""
+    verdicts = [("-" if asked == "-" else "yes" if holds else "NO") for _, _, asked, holds in rows]
+    return "\n".join(
+        f"| {name} | {what} | {value} | {asked} | {verdict} |"
+        for (what, value, asked, _), verdict in zip(rows, verdicts, strict=True)
+    )
 
 
 if __name__ == "__main__":

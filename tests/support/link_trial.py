@@ -40,6 +40,8 @@ class Trial:
     n_connections: int
     dropped: int
     slowest_take_ms: float
+    joined_s: float
+    """When the viewer was given the first thing."""
     facts: dict[str, object] = field(default_factory=dict)
 
     def pose_age_s(self, since_s: float, until_s: float) -> np.ndarray:
@@ -65,8 +67,12 @@ class Trial:
 def fly(
     link: TwoNamespaces, tape: Path, folder: Path, seconds: float, budget_kbit_s: float = 0.0,
     meanwhile: Callable[[float, subprocess.Popen[bytes]], None] = lambda now_s, ground: None,
+    joins_s: float = 0.0,
 ) -> Trial:  # fmt: skip
-    """Tell a tape over a link; `meanwhile` is called often, with seconds since the start."""
+    """Tell a tape over a link; `meanwhile` is called often, with seconds since the start.
+
+    The viewer is started `joins_s` after that.
+    """
     listen = f"{link.DRONE}:{PORT}"
     python = [sys.executable, "-m"]
     out = {side: folder / f"{side}.json" for side in ("drone", "ground")}
@@ -74,8 +80,9 @@ def fly(
         [*link.in_drone, *python, "tests.bench.links_feeder", str(tape), listen,
          str(budget_kbit_s), str(seconds), str(out["drone"])],
     )  # fmt: skip
+    wait = ["sh", "-c", 'sleep "$0"; exec "$@"', str(joins_s)] if joins_s else []
     ground = subprocess.Popen(
-        [*link.in_ground, *python, "tests.bench.links_ground", listen, str(out["ground"]),
+        [*wait, *link.in_ground, *python, "tests.bench.links_ground", listen, str(out["ground"]),
          str(folder / "ground.rrd")], stderr=subprocess.DEVNULL,
     )  # fmt: skip
     time.sleep(START_S)
@@ -109,5 +116,6 @@ def fly(
         began_s, ended_s, sent["told"], [tuple(p) for p in got["poses"]], first["coarse"],
         first["fine"], [tuple(p) for p in got["pictures"]],
         [tuple(p) for p in sent["memory_mib"]], [tuple(p) for p in got["memory_mib"]], rates,
-        got["connections"], sent["dropped"], sent["slowest_take_ms"], got["facts"],
+        got["connections"], sent["dropped"], sent["slowest_take_ms"],
+        got["first_s"] or np.inf, got["facts"],
     )  # fmt: skip
