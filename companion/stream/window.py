@@ -22,6 +22,9 @@ STANDING_S = 0.1
 delays all that follows it by one."""
 FORGET_S = 20.0
 """The least round trip is that of the last so long, or twice so long."""
+CREEP_S = 0.005
+"""By so much more than before it the least may have our own queue in it, on a link that is always
+full. Then no more than LEAST_BYTES is on its way for a round trip, which measures it anew."""
 SHRINK = 0.8
 RATE_OVER_S = 1.0
 
@@ -43,6 +46,8 @@ class Window:
         """What was sent up to here left no room; so acknowledged, it says that more would do."""
         self._shrunk_s = -1e9
         self._has_seen_queue = False
+        self._drains_from: int | None = None
+        """While the least is measured anew: what was sent before that."""
 
     @property
     def on_way_bytes(self) -> int:
@@ -51,8 +56,9 @@ class Window:
 
     def room_bytes(self) -> int:
         """So much more may be sent now."""
-        room = int(self.size_bytes) - self.on_way_bytes
-        if room < LEAST_USED:
+        drains = self._drains_from is not None
+        room = (LEAST_BYTES if drains else int(self.size_bytes)) - self.on_way_bytes
+        if room < LEAST_USED and not drains:
             self._limited_at = self.sent_bytes
         return max(0, room)
 
@@ -74,6 +80,8 @@ class Window:
             self._delivered.popleft()
         if went_s is None:
             return
+        if self._drains_from is not None and total_bytes > self._drains_from:
+            self._drains_from = None
         self.round_trip_s = now_s - went_s
         self._adjust(now_s, self.round_trip_s, n_new)
 
@@ -114,6 +122,8 @@ class Window:
     def _least_s(self, now_s: float, round_trip_s: float) -> float:
         """The least round trip, in two halves of which the older is forgotten."""
         if not self._least or now_s - self._least[-1][0] > FORGET_S:
+            if self._least and self._least[-1][1] > self._least[0][1] + CREEP_S:
+                self._drains_from = self.sent_bytes
             self._least = [*self._least[-1:], (now_s, round_trip_s)]
         elif round_trip_s < self._least[-1][1]:
             self._least[-1] = (self._least[-1][0], round_trip_s)

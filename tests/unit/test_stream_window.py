@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections import deque
+
 import pytest
 
 from companion.stream.window import LEAST_BYTES, MOST_BYTES, Budget, Window
@@ -35,6 +37,26 @@ def test_it_closes_when_all_is_delayed_but_not_when_some_is() -> None:
     assert queued.run([0.35] * 600) < 0.5 * open_bytes
     repaired.run([0.05] * 25)
     assert repaired.run([0.05, 0.15, 0.05, 0.05] * 10) >= open_bytes
+
+
+def test_a_link_that_is_always_full_has_no_queue_that_grows() -> None:
+    window, now_s, free_s = Window(), 0.0, 0.0
+    bytes_s, round_trip_s = 2.5e6, 0.02
+    on_way: deque[tuple[float, int]] = deque()
+    queued_s = []
+    while now_s < 120.0:
+        now_s += 0.002
+        while (room := window.room_bytes()) >= 1000:
+            piece = min(room, 5000)
+            window.sent(now_s, piece)
+            free_s = max(free_s, now_s) + piece / bytes_s
+            on_way.append((free_s + round_trip_s, window.sent_bytes))
+        while on_way and on_way[0][0] <= now_s:
+            window.acknowledged(now_s, on_way.popleft()[1])
+        queued_s.append(max(0.0, free_s - now_s))
+    late = queued_s[len(queued_s) // 2 :]
+    assert max(late) < 0.2
+    assert window.sent_bytes > 0.93 * 120.0 * bytes_s  # and it is full all the same
 
 
 def test_what_was_never_sent_or_is_old_is_no_acknowledgement() -> None:
