@@ -1,0 +1,162 @@
+"""Sums over the observations of a bundle: errors, normal equations, and cameras without points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.geometry import Array
+from companion.slam.compiled.compiling import Ints, compiled, integer, integers, matrices, pairs
+from companion.slam.compiled.pose import HUBER
+
+_BEHIND_COST = HUBER * 100.0
+
+
+@compiled(matrices, pairs, pairs, integers, integers, pairs, matrices)
+def errors(
+    rotation: Array, translation: Array, points: Array, camera: Ints, point: Ints, seen: Array,
+    whitening: Array,
+) -> tuple[Array, Array, float]:  # fmt: skip
+    """Observed points in their cameras (O, 3), whitened errors (O, 2), and Huber's loss of all.
+
+    Of C cameras, P points and O observations, those behind a camera at a high price.
+    """
+    n = len(camera)
+    inside, residual, cost = np.empty((n, 3)), np.empty((n, 2)), 0.0
+    for o in range(n):
+        turn, p = rotation[camera[o]], points[point[o]]
+        for i in range(3):
+            along = turn[i, 0] * p[0] + turn[i, 1] * p[1] + turn[i, 2] * p[2]
+            inside[o, i] = along + translation[camera[o], i]
+        z = inside[o, 2]
+        divisor = 1e-9 if abs(z) < 1e-9 else z
+        off_x, off_y = inside[o, 0] / divisor - seen[o, 0], inside[o, 1] / divisor - seen[o, 1]
+        residual[o, 0] = whitening[o, 0, 0] * off_x + whitening[o, 0, 1] * off_y
+        residual[o, 1] = whitening[o, 1, 0] * off_x + whitening[o, 1, 1] * off_y
+        size = np.sqrt(residual[o, 0] * residual[o, 0] + residual[o, 1] * residual[o, 1])
+        if not z > 0.0:
+            cost += _BEHIND_COST
+        elif size < HUBER:
+            cost += 0.5 * size * size
+        else:
+            cost += HUBER * (size - 0.5 * HUBER)
+    return inside, residual, cost
+
+
+@compiled(matrices, pairs, pairs, integers, integers, matrices, integer, integer)
+def normal_equations(
+    rotation: Array, inside: Array, residual: Array, camera: Ints, point: Ints, whitening: Array,
+    n_variable: int, n_points: int,
+) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
+    """Information and gradient of cameras (V, 6, 6), (V, 6) and points (P, 3, 3), (P, 3).
+
+    The last is what ties the camera of each observation to its point (O, 6, 3). The first
+    `n_variable` cameras move; Huber's weights.
+    """
+    hcc, gc = np.zeros((n_variable, 6, 6)), np.zeros((n_variable, 6))
+    hpp, gp = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
+    hcp = np.zeros((len(camera), 6, 3))
+    jc, jp, plain = np.empty((2, 6)), np.empty((2, 3)), np.zeros((2, 6))
+    for o in range(len(camera)):
+        c, p, z = camera[o], point[o], inside[o, 2]
+        if not z > 0.0:
+            continue
+        u, v = residual[o, 0], residual[o, 1]
+        weight = min(1.0, HUBER / max(np.sqrt(u * u + v * v), 1e-9))
+        inverse = 1.0 / max(z, 1e-9)
+        x, y = inside[o, 0] * inverse, inside[o, 1] * inverse
+        # derivative of (x/z, y/z) for a left perturbation (rotation, translation)
+        plain[0, 0], plain[0, 1], plain[0, 2] = -x * y, 1 + x * x, -y
+        plain[1, 0], plain[1, 1], plain[1, 2] = -1 - y * y, x * y, x
+        plain[0, 3], plain[0, 5] = inverse, -x * inverse
+        plain[1, 4], plain[1, 5] = inverse, -y * inverse
+        white, turn = whitening[o], rotation[c]
+        for i in range(2):
+            for k in range(6):
+                jc[i, k] = white[i, 0] * plain[0, k] + white[i, 1] * plain[1, k]
+            for k in range(3):
+                jp[i, k] = 0.0
+                for m in range(3):
+                    jp[i, k] += jc[i, 3 + m] * turn[m, k]
+        for k in range(3):
+            a, b = weight * jp[0, k], weight * jp[1, k]
+            gp[p, k] += a * u + b * v
+            for m in range(3):
+                hpp[p, k, m] += a * jp[0, m] + b * jp[1, m]
+        if c >= n_variable:
+            continue
+        for k in range(6):
+            a, b = weight * jc[0, k], weight * jc[1, k]
+            gc[c, k] += a * u + b * v
+            for m in range(6):
+                hcc[c, k, m] += a * jc[0, m] + b * jc[1, m]
+            for m in range(3):
+                hcp[o, k, m] = a * jp[0, m] + b * jp[1, m]
+    return hcc, gc, hpp, gp, hcp
+
+
+@compiled(matrices, pairs, matrices, integers, integers, integers, integer)
+def without_points(
+    inverse: Array, gradient: Array, hcp: Array, camera: Ints, point: Ints, by_point: Ints,
+    n_variable: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """What points take from the cameras' information (6 V, 6 V) and add to their right side (6 V).
+
+    `inverse` (P, 3, 3) of the points' information, their `gradient` (P, 3); `by_point` lists the
+    observations of cameras that move, ordered by point.
+    """
+    taken, added = np.zeros((6 * n_variable, 6 * n_variable)), np.zeros(6 * n_variable)
+    through = np.empty((6, 3))
+    start = 0
+    for end in range(1, len(by_point) + 1):
+        p = point[by_point[start]]
+        if end < len(by_point) and point[by_point[end]] == p:
+            continue
+        for one in by_point[start:end]:
+            row = 6 * camera[one]
+            for k in range(6):
+                for m in range(3):
+                    through[k, m] = (
+                        hcp[one, k, 0] * inverse[p, 0, m]
+                        + hcp[one, k, 1] * inverse[p, 1, m]
+                        + hcp[one, k, 2] * inverse[p, 2, m]
+                    )
+                added[row + k] += (
+                    through[k, 0] * gradient[p, 0]
+                    + through[k, 1] * gradient[p, 1]
+                    + through[k, 2] * gradient[p, 2]
+                )
+            for other in by_point[start:end]:
+                column = 6 * camera[other]
+                if column < row:
+                    continue
+                for k in range(6):
+                    for m in range(6):
+                        taken[row + k, column + m] += (
+                            through[k, 0] * hcp[other, m, 0]
+                            + through[k, 1] * hcp[other, m, 1]
+                            + through[k, 2] * hcp[other, m, 2]
+                        )
+        start = end
+    for i in range(6 * n_variable):
+        for k in range(i):
+            taken[i, k] = taken[k, i]
+    return taken, added
+
+
+@compiled(matrices, pairs, matrices, integers, integers, integers, pairs)
+def moves_of_points(
+    inverse: Array, gradient: Array, hcp: Array, camera: Ints, point: Ints, by_point: Ints,
+    moves: Array,
+) -> Array:  # fmt: skip
+    """How points move (P, 3) where cameras move by `moves` (V, 6)."""
+    right = -gradient
+    for o in by_point:
+        for m in range(3):
+            for k in range(6):
+                right[point[o], m] -= hcp[o, k, m] * moves[camera[o], k]
+    out = np.zeros(right.shape)
+    for p in range(len(out)):
+        for i in range(3):
+            for k in range(3):
+                out[p, i] += inverse[p, i, k] * right[p, k]
+    return out
