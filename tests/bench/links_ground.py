@@ -35,10 +35,12 @@ def main() -> None:
     facts: dict[str, object] = {}
     memory: list[tuple[float, float]] = []
     first_s: float | None = None
+    came: list[tuple[float, int]] = []
     for item in link.items(stop):
         drawing.draw(item)
         now_s = time.time()
         first_s = first_s or now_s
+        came.append((now_s, link.n_bytes))
         if isinstance(item, PoseItem):
             poses.append((now_s, item.t_ns * 1e-9))
         elif isinstance(item, PointsItem):
@@ -51,7 +53,7 @@ def main() -> None:
     document = {
         "poses": poses, "points": points, "pictures": pictures, "facts": facts,
         "memory_mib": memory, "connections": link.n_connections, "bytes": link.n_bytes,
-        "first_s": first_s,
+        "first_s": first_s, "came": came,
     }  # fmt: skip
     Path(out).write_text(json.dumps(document))
 

@@ -2,7 +2,8 @@
 
     python -m tests.bench.long_map [--keyframes N]
 
-Prints the memory of the exporter and of the viewers along the way, and how long the late one takes.
+Prints the memory of the exporter and of the viewers along the way, how long the late one takes, and
+what goes out when all of the map is found to be two percent longer, as a loop that closes has it.
 """
 
 from __future__ import annotations
@@ -22,13 +23,18 @@ import psutil
 
 from companion.camera import Camera
 from companion.config import StreamConfig, ViewerConfig
-from companion.messages import KeyframeAdded, Track, TrackState
+from companion.geometry import Pose
+from companion.messages import SPANS_REACH, KeyframeAdded, MapUpdate, Track, TrackState
 from companion.viewer import LiveViewer
 from companion.viewer.web_gate import free_ports
 from tests.support import flown
 
 POINTS = 2800
 EACH_S = 0.012
+MAP_EVERY = 30
+"""Keyframes from one map to the next: live there is one for each."""
+LONGER = 1.02
+ADJUSTED_S = 5.0
 
 
 def main() -> None:
@@ -50,11 +56,13 @@ def main() -> None:
         return float(process.memory_info().rss / 2**20)
 
     stream = StreamConfig(listen=f"127.0.0.1:{port}")
-    with tempfile.TemporaryDirectory() as name, LiveViewer(
-        ViewerConfig(), camera, name="hour", stream=stream
-    ) as live:
+    with (
+        tempfile.TemporaryDirectory() as name,
+        LiveViewer(ViewerConfig(), camera, name="hour", stream=stream) as live,
+    ):
         exporter, folder = psutil.Process(live.pid), Path(name)
         first = viewer_in(folder, "first")
+        places: dict[int, Pose] = {}
         print("| keyframes | points | exporter | viewer |\n|---|---|---|---|")
         for k in range(n_keyframes):
             t_ns = flown.START_NS + k * 1_000_000_000
@@ -62,9 +70,16 @@ def main() -> None:
             shift = place.translation + np.array([0.01 * k, 0, 0])
             place = replace(place, translation=shift)
             live.take(KeyframeAdded(k, k, t_ns, place, np.zeros((0, 3))))
-            live.take(replace(chunks[k % 12], keyframe_id=k, t_ns=t_ns))
+            places[k] = place
+            spans = {
+                other: float(np.linalg.norm(places[other].translation - place.translation))
+                for other in range(max(0, k - SPANS_REACH), k)
+            }
+            live.take(replace(chunks[k % 12], keyframe_id=k, t_ns=t_ns, spans=spans))
             relative = flown.track(20).map_from_camera
             live.take(Track(k, t_ns, TrackState.TRACKING, place, k, relative))
+            if (k + 1) % MAP_EVERY == 0:
+                live.take(MapUpdate(k, t_ns, dict(places), np.zeros((0, 3)), None))
             time.sleep(EACH_S)
             if (k + 1) % (n_keyframes // 6) == 0:
                 row = (k + 1, (k + 1) * POINTS, mib(exporter), mib(first))
@@ -72,6 +87,10 @@ def main() -> None:
         late = viewer_in(folder, "late")
         began_s = time.time()
         time.sleep(25)
+        longer = {k: Pose(p.rotation, LONGER * p.translation) for k, p in places.items()}
+        adjusted_s = time.time()
+        live.take(MapUpdate(n_keyframes, t_ns + 1, longer, np.zeros((0, 3)), None))
+        time.sleep(ADJUSTED_S)
         print(f"at the end: exporter {mib(exporter):.0f} MiB, {live.report}, dropped "
               f"{live.n_dropped}")  # fmt: skip
         for process in (first, late):
@@ -82,6 +101,8 @@ def main() -> None:
             levels = {level: len({k for k, _ in at}) for level, at in got["points"].items()}
             line = f"{each}: {levels}, {got['bytes'] / 1e6:.1f} MB"
             if each == "late":
+                before = max(n for at, n in got["came"] if at < adjusted_s)
+                line += f", {(got['bytes'] - before) / 1e3:.0f} kB of them for a longer map"
                 for level, at in got["points"].items():
                     line += f", {level} complete after {max(t for _, t in at) - began_s:.1f} s"
             print(line)
