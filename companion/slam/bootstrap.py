@@ -17,6 +17,8 @@ from companion.slam.matching import match_descriptors
 from companion.slam.view import View
 
 MAX_PENDING = 150
+MIN_PARALLAX_PX = 8.0
+"""Of a coarse picture the same angle is fewer pixels, of which each is as uncertain."""
 FORWARD_IS_NORTH = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Attitude of a camera that is taken as level and looking north, where nobody tells."""
 
@@ -72,9 +74,10 @@ class Bootstrap:
         rotation_prior = None
         if ned_from_camera is not None and reference.ned_from_camera is not None:
             rotation_prior = ned_from_camera.T @ reference.ned_from_camera
+        focal_px = self._camera.focal_px
         result = initialise(
-            reference.features, features, ia, ib, self._camera.focal_px, seq + 1, rotation_prior,
-            float(np.radians(self._config.min_init_parallax_deg)),
+            reference.features, features, ia, ib, focal_px, seq + 1, rotation_prior,
+            max(np.radians(self._config.min_init_parallax_deg), MIN_PARALLAX_PX / focal_px),
         )  # fmt: skip
         if result is None:
             return None

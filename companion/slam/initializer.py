@@ -21,6 +21,8 @@ MAX_PRIOR_DISAGREEMENT_RAD = np.radians(8.0)
 MIN_POINTS = 60
 GAMMA = 5.991
 TURNED_PX = 2.0
+TOLD_TURN_RAD, TOLD_TURN_SHARE = np.radians(0.5), 0.1
+"""What the autopilot's turn between two views may be off by, at least and as a share of it."""
 RIVAL_SHARE = 0.6
 """Motions that fit fewer of the matches than this share of the best are no rivals to it."""
 MIN_WORSE = 1.15
@@ -53,7 +55,7 @@ def initialise(
     if len(index_a) < MIN_POINTS:
         return None
     xa, xb = a.normalised[index_a], b.normalised[index_b]
-    if rotation_prior is None and _turned_only(xa, xb, focal_px):
+    if _turned_only(xa, xb, focal_px, rotation_prior):
         return None
     candidates: list[tuple[Pose, bool]] = []
     essential, homography = _models(xa * focal_px, xb * focal_px, focal_px, seed)
@@ -86,17 +88,26 @@ def initialise(
     return _refined(best, a, b, index_a, index_b, min_parallax_rad, planar)
 
 
-def _turned_only(xa: Array, xb: Array, focal_px: float) -> bool:
-    """Whether a rotation alone explains most of what moved: then any baseline would be made up."""
+def _turned_only(xa: Array, xb: Array, focal_px: float, told: Array | None) -> bool:
+    """Whether a rotation alone explains most of what moved: then any baseline would be made up.
+
+    A short way over a plane looks like a turn, but not like the one that was `told`.
+    """
     rays_a, rays_b = _unit_rays(xa), _unit_rays(xb)
     weight = np.ones(len(rays_a))
     error_px = np.zeros(len(rays_a))
+    rotation = np.eye(3)
     for _ in range(15):  # robust Kabsch
         u, _, vt = np.linalg.svd((rays_b * weight[:, None]).T @ rays_a)
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         error_px = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1) * focal_px
         weight = 1.0 / (1.0 + (error_px / TURNED_PX) ** 2) ** 2
-    return float(np.mean(error_px < TURNED_PX)) > 0.5
+    if float(np.mean(error_px < TURNED_PX)) <= 0.5:
+        return False
+    if told is None:
+        return True
+    off_rad = float(TOLD_TURN_RAD) + TOLD_TURN_SHARE * angle_between(told, np.eye(3))
+    return angle_between(rotation, told) < off_rad
 
 
 def _unit_rays(normalised: Array) -> Array:

@@ -44,11 +44,11 @@ class Projector:
         self._intrinsics = np.array(
             [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64
         )
-        w, h = camera.width - 1.0, camera.height - 1.0
-        edge = np.array(
-            [[0, 0], [w / 2, 0], [w, 0], [0, h / 2], [w, h / 2], [0, h], [w / 2, h], [w, h]]
+        u, v = np.meshgrid(
+            np.linspace(0, camera.width - 1.0, 33), np.linspace(0, camera.height - 1.0, 25)
         )
-        rim = camera.normalise(edge)
+        # all over: at the rim of a fisheye's image there may be no rays
+        rim = camera.normalise(np.stack([u.ravel(), v.ravel()], 1))
         # a distortion model folds back far outside the image: points there must not come in again
         self._max_radius = float(np.nanmax(np.linalg.norm(rim, axis=1), initial=0.5)) * 1.05
 

@@ -1,0 +1,72 @@
+"""Ways to fly that give a single camera little to go by."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.camera import Camera
+from companion.geometry import Pose, rotation_from_vector, yaw_rotation
+from tests.support.rendered_flight import CAMERA_DOWN, Terrain, fly
+
+CAMERA = Camera(320, 240, 260.0, 258.0, 161.0, 118.0, body_from_camera=CAMERA_DOWN)
+BOTH = pytest.mark.parametrize("plane", [False, True], ids=["over roofs", "over flat ground"])
+
+
+def eased(after_s: float, start_s: float, stop_s: float) -> float:
+    """From 0 to 1, without a jolt."""
+    share = float(np.clip((after_s - start_s) / (stop_s - start_s), 0.0, 1.0))
+    return share * share * (3.0 - 2.0 * share)
+
+
+def turning_at_take_off(after_s: float) -> Pose:
+    """On the spot by 137 degrees in 4 s, then away."""
+    gone = eased(after_s, 4.0, 8.0)
+    turned = yaw_rotation(2.4 * eased(after_s, 0.0, 4.0))
+    return Pose(turned, np.array([12.0 * gone, 0.0, -8.0 - 4.0 * gone]))
+
+
+@BOTH
+def test_a_turn_on_the_spot_begins_no_map_and_is_filled_in_later(plane: bool) -> None:
+    flown = fly(CAMERA, turning_at_take_off, Terrain(3, plane), 8.0, 8.0)
+    assert flown.keyframes_s[1] > 4.0
+    assert flown.placed_share > 0.95
+    errors = flown.errors()
+    assert errors.ate_sim3_m < 0.35
+    assert errors.scale_error < 0.04
+
+
+def hovering(after_s: float) -> Pose:
+    """Within decimetres of one place for 12 s, then 8 m to the north."""
+    sway = np.array([0.1 * np.sin(0.7 * after_s), 0.1 * np.sin(0.9 * after_s), -12.0])
+    turn = 0.01 * np.sin(np.array([1.1, 1.4, 0.6]) * after_s)
+    return Pose(
+        rotation_from_vector(turn), sway + np.array([8.0 * eased(after_s, 12.0, 15.0), 0, 0])
+    )
+
+
+def test_hovering_adds_nothing_and_loses_nothing() -> None:
+    flown = fly(CAMERA, hovering, Terrain(3), 15.0, 4.0)
+    while_there = [s for s in flown.keyframes_s if 4.0 < s < 12.0]
+    assert len(while_there) <= 2
+    assert flown.placed_share > 0.9
+    assert flown.errors().ate_sim3_m < 0.2
+
+
+def lawn_mower(after_s: float, speed_m_s: float = 4.0) -> Pose:
+    """Three lines of 20 m, 5 m apart, always 15 m high, the nose to the north all the time."""
+    corners = np.array([[-10, -5], [10, -5], [10, 0], [-10, 0], [-10, 5], [10, 5.0]])
+    way = np.r_[0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))]
+    flat = [np.interp(speed_m_s * after_s, way, corners[:, axis]) for axis in (0, 1)]
+    turn = np.array([0.03 * np.sin(1.1 * after_s), 0.03 * np.sin(0.9 * after_s), 0.0])
+    return Pose(rotation_from_vector(turn), np.array([*flat, -15.0]))
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["with telemetry", "vision alone"])
+def test_a_survey_of_flat_ground_from_straight_above(told: bool) -> None:
+    flown = fly(CAMERA, lawn_mower, Terrain(3, plane=True), 17.0, 5.0, told=told)
+    assert flown.placed_share == 1.0 if told else flown.placed_share > 0.8
+    assert flown.stage.n_segments == 1
+    assert flown.errors().ate_sim3_m < (0.15 if told else 0.4)
+    if told:
+        assert flown.errors().scale_error < 0.01
