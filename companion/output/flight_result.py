@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +33,7 @@ from companion.messages import (
 from companion.output.chunk_store import ChunkStore
 from companion.output.cloud import Cloud, no_cloud, placed
 from companion.output.depth_pictures import DepthPicture, DepthPictures
-from companion.output.voxel_cloud import VoxelCloud
+from companion.output.gathered_cloud import gathered
 from companion.stretch import stretch_of_points
 
 POSITION_STEP_NS = 100_000_000
@@ -236,14 +237,21 @@ class FlightResult:
             return no_cloud()
         metric = georeference is not None
         depths = [place.scale * self._median_depths[key] for key, place in places.items()]
-        thinned = VoxelCloud(voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths)))
-        for n, (keyframe_id, place) in enumerate(places.items()):
-            if keyframe_id in self._chunks:  # else the disk was full meanwhile
-                chunk = self._chunks.get(keyframe_id)
-                stretch = _stretch(chunk, update)
-                thinned.add(placed(chunk, replace(place, scale=stretch * place.scale)))
-            yield (n + 1) / len(places)
-        return thinned.finish()
+        voxel = voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths))
+        stretches: dict[int, float] = {}
+        parts = [partial(self._placed, k, p, update, stretches) for k, p in places.items()]
+        return (yield from gathered(parts, self.n_points, voxel))
+
+    def _placed(
+        self, keyframe_id: int, place: Similarity, update: MapUpdate, stretches: dict[int, float]
+    ) -> Cloud:
+        """A chunk in the world; none where the disk was full meanwhile."""
+        if keyframe_id not in self._chunks:
+            return no_cloud()
+        chunk = self._chunks.get(keyframe_id)
+        if keyframe_id not in stretches:
+            stretches[keyframe_id] = _stretch(chunk, update)
+        return placed(chunk, replace(place, scale=stretches[keyframe_id] * place.scale))
 
     def autopilot_path(self) -> tuple[PositionSource, Array, Array] | None:
         """The autopilot's own path from its best source: t_ns (N,), NED metres (N, 3)."""

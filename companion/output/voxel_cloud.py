@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry import Array
+from companion.messages import Floats
 from companion.output.cloud import Cloud, joined, no_cloud
 from companion.voxel import thin_by_voxel
 
@@ -18,46 +18,53 @@ LEAST_WAITING = 20_000
 """Points that wait in a tile before it is thinned, or half as many as it has."""
 
 
+Tile = tuple[int, int]
+
+
+def tiles_of(points: Floats, low: Array, voxel: float) -> tuple[list[Tile], NDArray[np.int64]]:
+    """The tiles that points (N, 3) lie in, in their order, and which of them each lies in (N,)."""
+    side = voxel * TILE_VOXELS
+    tiles = np.floor((points[:, :2].astype(np.float64) - low[:2]) / side).astype(np.int64)
+    found, which = np.unique(tiles, axis=0, return_inverse=True)
+    return [(int(i), int(j)) for i, j in found], which.ravel()
+
+
 class VoxelCloud:
     """One point for each cube of side `voxel`, the most confident, else the earliest.
 
-    The cubes begin at the lowest corner of what is added first.
+    The cubes begin at `low` (3,), by default the lowest corner of what is added first. Where
+    `only` some tiles are wanted, points of others are left out.
     """
 
-    def __init__(self, voxel: float) -> None:
+    def __init__(
+        self, voxel: float, low: Array | None = None, only: set[Tile] | None = None
+    ) -> None:
         self._voxel = voxel
-        self._low: Array | None = None
-        self._tiles: dict[tuple[int, int], list[Cloud]] = {}
+        self._low = low
+        self._only = only
+        self._tiles: dict[Tile, list[Cloud]] = {}
 
     def add(self, cloud: Cloud) -> None:
         """Take more points."""
         if len(cloud) == 0:
             return
-        points = cloud.points.astype(np.float64)
         if self._low is None:
-            self._low = points.min(0)
-        side = self._voxel * TILE_VOXELS
-        tiles = np.floor((points[:, :2] - self._low[:2]) / side).astype(np.int64)
-        found, which = np.unique(tiles, axis=0, return_inverse=True)
+            self._low = cloud.points.astype(np.float64).min(0)
+        found, which = tiles_of(cloud.points, self._low, self._voxel)
         order = np.argsort(which, kind="stable")
-        ends = np.cumsum(np.bincount(which.ravel(), minlength=len(found)))
-        for (i, j), part in zip(found, np.split(order.ravel(), ends[:-1]), strict=True):
-            waiting = self._tiles.setdefault((int(i), int(j)), [no_cloud()])
+        ends = np.cumsum(np.bincount(which, minlength=len(found)))
+        for tile, part in zip(found, np.split(order, ends[:-1]), strict=True):
+            if self._only is not None and tile not in self._only:
+                continue
+            waiting = self._tiles.setdefault(tile, [no_cloud()])
             waiting.append(cloud.part(part))
             if sum(map(len, waiting[1:])) > max(LEAST_WAITING, len(waiting[0]) // 2):
                 waiting[:] = [self._thinned(waiting)]
 
-    def finish(self) -> Cloud:
-        """All of it, tile by tile; nothing is left here."""
-        arrays: dict[str, list[NDArray[Any]]] = {f.name: [] for f in fields(Cloud)}
+    def finished(self) -> Iterator[Cloud]:
+        """All of it, tile by tile in their order; nothing is left here."""
         for tile in sorted(self._tiles):
-            thinned = self._thinned(self._tiles.pop(tile))
-            for name, parts in arrays.items():
-                parts.append(getattr(thinned, name))
-        if not arrays["points"]:
-            return no_cloud()
-        # each kind by itself, so that not all of it is there twice
-        return Cloud(**{name: np.concatenate(arrays.pop(name)) for name in list(arrays)})
+            yield self._thinned(self._tiles.pop(tile))
 
     def _thinned(self, parts: list[Cloud]) -> Cloud:
         together = joined(parts)
