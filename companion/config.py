@@ -270,7 +270,10 @@ class TrackingConfig:
     """A new keyframe comes when the view of the points has turned by this much."""
     keyframe_max_s: Annotated[float, Range(0.05, 3600)] = 3.0
     restart_after_s: Annotated[float, Range(0, 3600)] = 1.0
-    """A camera that has been lost for so long may begin a new segment of the map."""
+    """A camera that has been lost for so long may begin a new segment of the map.
+
+    With the autopilot's attitude after 0.4 of it.
+    """
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,14 @@ import numpy as np
 
 from companion.config import GeoreferenceConfig
 from companion.geometry import Array, Pose, Similarity
-from companion.map_fit import SIGMA_YAW_RAD, Scale, agreed, fit_map
+from companion.map_fit import (
+    SIGMA_VELOCITY_M_S,
+    SIGMA_YAW_RAD,
+    VELOCITY_TAU_S,
+    Scale,
+    agreed,
+    fit_map,
+)
 from companion.messages import (
     Georeference,
     HeightSample,
@@ -30,6 +37,8 @@ SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.01, 0.05
 """No rangefinder and no barometer tells the scale better than this."""
 MAX_SIGMA_TURN_RAD = np.radians(8.0)
 MAX_PLACES = 400
+MAX_SIGMA_BEGUN = 0.5
+"""A map that has just begun is placed by a scale no worse than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,6 +142,28 @@ class Georeferencer:
         if by_range is None or by_height is None:
             return self._from_scale(places, level, by_range or by_height)
         return self._from_scale(places, level, agreed(by_range, by_height))
+
+    def begin(self, places: list[Place], start_ned_m: Array) -> Georeference | None:
+        """How a map lies that has just begun, its first keyframe at a known place (3,).
+
+        Its scale is by the autopilot's velocity since, roughly; None where that does not tell.
+        """
+        first, last = places[0], places[-1]
+        level, moved_m = _mean_rotation(places), self.moved(first.t_ns, last.t_ns)
+        if level is None or moved_m is None:
+            return None
+        mapped = level @ (last.map_from_camera.translation - first.map_from_camera.translation)
+        scale = float(mapped @ moved_m) / max(float(mapped @ mapped), 1e-12)
+        way_s = (last.t_ns - first.t_ns) * 1e-9
+        sigma_m = SIGMA_VELOCITY_M_S * float(np.sqrt(way_s * max(way_s, VELOCITY_TAU_S)))
+        sigma = sigma_m / max(float(np.linalg.norm(moved_m)), 1e-9)
+        if scale <= 0 or sigma > MAX_SIGMA_BEGUN:
+            return None
+        origin = start_ned_m - scale * level @ first.map_from_camera.translation
+        return Georeference(
+            Similarity(scale, level, origin), sigma, float(SIGMA_YAW_RAD), "velocity",
+            len(places), 0.0,
+        )  # fmt: skip
 
     def _from_positions(
         self, places: list[Place], level: Array | None, source: PositionSource

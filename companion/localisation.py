@@ -22,6 +22,7 @@ from companion.messages import (
     Frame,
     HeightSample,
     KeyframeAdded,
+    MapUpdate,
     Message,
     Odometry,
     PositionSample,
@@ -132,10 +133,13 @@ class LocalisationStage:
             tied = predicted is not None and attitude is not None and self._motion.tied
             in_map = predicted.rotation if predicted is not None and tied else None
             tracked = self._tracker.step(frame, Prior(predicted, attitude, in_map))
-        if self._tracker.map is not before or self.state is TrackState.INITIALISING:
+        other_map = self._tracker.map is not before
+        if other_map or self.state is TrackState.INITIALISING:
             self._motion.reset()
             self._attitude.forget()
             self._last = None
+        # where another map lies must be known before the first pose in it is told
+        update = self._map_update() if other_map and self._segments() else None
         for message in tracked:
             if isinstance(message, Track) and message.map_from_camera is not None:
                 if message.seq == frame.seq:
@@ -151,11 +155,15 @@ class LocalisationStage:
                 yield message if coasting is None else replace(coasting, map_from_camera=None)
             else:
                 yield message
-        if any(isinstance(m, KeyframeAdded) for m in tracked):
-            with self._times("georeference"), self._tracker.turn.tracking():
-                update = self._places.update(self._segments(), self._t_ns, final=False)
+        if update is None and any(isinstance(m, KeyframeAdded) for m in tracked):
+            update = self._map_update()
+        if update is not None:
             yield update
         yield from self._judge_attitude(frame.t_ns)
+
+    def _map_update(self) -> MapUpdate:
+        with self._times("georeference"), self._tracker.turn.tracking():
+            return self._places.update(self._segments(), self._t_ns, final=False)
 
     def _follow_map(self) -> None:
         """Go on from where the last frame is in the map as it now is."""

@@ -34,6 +34,7 @@ class SegmentPlaces:
         self._attitude = attitude
         self._body_from_camera = body_from_camera
         self._known: dict[int, Georeference] = {}
+        self._main: int | None = None
         self._revision = 0
 
     def of(self, segment: SlamMap) -> Georeference | None:
@@ -41,7 +42,7 @@ class SegmentPlaces:
         return self._known.get(segment.first_keyframe_id)
 
     def update(self, segments: Sequence[SlamMap], t_ns: int, final: bool) -> MapUpdate:
-        """The map, all segments in the frame of the main one (the one with most keyframes)."""
+        """The map, all segments in the frame of the main one."""
         self._revision += 1
         for segment in segments:
             if final or (segment is segments[-1] and _due(segment)):
@@ -50,7 +51,7 @@ class SegmentPlaces:
                 )
                 if found is not None:
                     self._known[segment.first_keyframe_id] = found
-        main = max(segments, key=lambda s: len(s.keyframes))
+        main = self._main_of(segments, final)
         anchor = self.of(main)
         poses: dict[int, Pose] = {}
         scales: dict[int, float] = {}
@@ -58,6 +59,8 @@ class SegmentPlaces:
         n_retired = 0
         for segment in segments:
             own = self.of(segment)
+            if own is None and segment is segments[-1]:
+                own = self._begun(segment, segments[:-1])
             if segment is main:
                 main_from_own = Similarity.identity()
             elif anchor is not None and own is not None:
@@ -76,6 +79,34 @@ class SegmentPlaces:
         return MapUpdate(
             self._revision, t_ns, poses, np.concatenate(points), anchor, scales, n_retired
         )
+
+    def _main_of(self, segments: Sequence[SlamMap], final: bool) -> SlamMap:
+        """The segment with most keyframes; in flight the one before, while its place is known."""
+        main = max(segments, key=lambda s: len(s.keyframes))
+        kept = next((s for s in segments if s.first_keyframe_id == self._main), None)
+        if not final and kept is not None and self.of(kept) is not None:
+            main = kept  # what is told in its frame does not jump
+        self._main = main.first_keyframe_id
+        return main
+
+    def _begun(self, segment: SlamMap, left: Sequence[SlamMap]) -> Georeference | None:
+        """How a segment lies that is too young to tell: by the way since the last keyframe left."""
+        places = [self._place(segment, k) for k in segment.keyframes.values()]
+        start_ns = places[0].t_ns
+        before = [
+            (k.t_ns, placed.world_from_map.apply(k.centre))
+            for s in left
+            if (placed := self.of(s)) is not None
+            for k in s.keyframes.values()
+            if k.t_ns < start_ns
+        ]
+        if not before:
+            return None
+        since_ns, from_ned_m = max(before, key=lambda place: place[0])
+        moved_m = self._georeferencer.moved(since_ns, start_ns)
+        if moved_m is None:
+            return None
+        return self._georeferencer.begin(places, from_ned_m + moved_m)
 
     def allowed(
         self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: Reunion

@@ -29,6 +29,8 @@ from companion.slam.view import View
 from companion.slam.worker import AtOnce, Beside, Done, MappingWorker, MapTurn
 
 MAX_TURN_UNSEEN_RAD = np.radians(15.0)
+TOLD_RESTART_SHARE = 0.4
+"""With attitude two views are surer to fit together, and another map may begin so much sooner."""
 MIN_FIRM, MIN_FIRM_SHARE = 25, 0.2
 """Without attitude a guess is believed when so many points of the last frame are found by it."""
 Told = Track | KeyframeAdded | Reunited
@@ -133,7 +135,8 @@ class Tracker:
             across = bridge(self.map, self._ashore, start)
         if start is not None and across is not None:
             return self._go_on(start, across)
-        if start is None or not self._given_up(frame.t_ns):
+        told = prior.ned_from_camera is not None
+        if start is None or not self._given_up(frame.t_ns, told):
             return [Track(frame.seq, frame.t_ns, self.state)]
         self.atlas.begin(level=start.first.ned_from_camera is not None)
         self._forget()
@@ -211,12 +214,13 @@ class Tracker:
             self._reference = located.keyframe
         return self._placer.accept(view, located)
 
-    def _given_up(self, t_ns: int) -> bool:
+    def _given_up(self, t_ns: int, told: bool) -> bool:
         """Whether the map in use has been out of sight for so long that another may begin."""
         since = self._lost_since_ns
         if since is None or len(self.map.keyframes) <= MAX_YOUNG_KEYFRAMES:
             return True
-        return t_ns - since > self._config.restart_after_s * 1e9
+        wait_s = self._config.restart_after_s * (TOLD_RESTART_SHARE if told else 1.0)
+        return t_ns - since > wait_s * 1e9
 
     def _lost(self, frame: Frame, features: Features, prior: Prior) -> list[Told]:
         """Note the loss, and see whether this frame could begin a new map."""

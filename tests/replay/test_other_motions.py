@@ -70,3 +70,19 @@ def test_a_survey_of_flat_ground_from_straight_above(told: bool) -> None:
     assert flown.errors().ate_sim3_m < (0.15 if told else 0.4)
     if told:
         assert flown.errors().scale_error < 0.01
+
+
+def going_north(after_s: float) -> Pose:
+    """At 5 m/s, 12 m high, rolling and pitching a little."""
+    turn = 0.05 * np.sin(np.array([1.3, 1.7, 0.4]) * after_s)
+    return Pose(rotation_from_vector(turn), np.array([5.0 * after_s - 20.0, 0.0, -12.0]))
+
+
+def test_where_sight_returns_over_a_place_never_seen_the_map_goes_on_in_the_same_frame() -> None:
+    flown = fly(CAMERA, going_north, Terrain(3), 8.5, 8.0, blind_s=(3.5, 6.5))
+    assert flown.stage.n_segments == 2
+    due = [t_ns for t_ns in flown.frames_ns if not 3.5 <= (t_ns - flown.frames_ns[0]) * 1e-9 < 6.5]
+    placed = {pose.t_ns for pose in flown.result.poses()}
+    assert len(placed & set(due)) >= 0.95 * len(due)
+    assert flown.live_errors().ate_sim3_m < 0.4, "42 m are flown, 15 of them blind"
+    assert flown.errors().ate_sim3_m < 0.3

@@ -117,10 +117,20 @@ class Flown:
 
     def errors(self) -> PathErrors:
         """Of the path as it is known in the end."""
-        poses = [p.world_from_camera for p in self.result.poses()]
+        return self._errors_of([(p.t_ns, p.world_from_camera) for p in self.result.poses()])
+
+    def live_errors(self) -> PathErrors:
+        """Of the poses as they were first given, in the map's frame."""
+        return self._errors_of([
+            (t.t_ns, t.map_from_camera)
+            for t in self.tracks
+            if t.map_from_camera is not None and not t.backfilled
+        ])  # fmt: skip
+
+    def _errors_of(self, poses: list[tuple[int, Pose]]) -> PathErrors:
         path = Path(
-            np.array([p.t_ns for p in self.result.poses()], np.float64),
-            np.stack([p.translation for p in poses]), np.stack([p.rotation for p in poses]),
+            np.array([t_ns for t_ns, _ in poses], np.float64),
+            np.stack([p.translation for _, p in poses]), np.stack([p.rotation for _, p in poses]),
         )  # fmt: skip
         assert self.truth is not None
         found = path_errors(path, self.truth)
@@ -130,9 +140,12 @@ class Flown:
 
 def fly(
     camera: Camera, ned_from_body: PathOf, terrain: Terrain, seconds: float, rate_hz: float,
-    *, told: bool = True,
+    *, told: bool = True, blind_s: tuple[float, float] = (0.0, 0.0),
 ) -> Flown:  # fmt: skip
-    """Fly, in lockstep; without `told` there is no telemetry, and the mount is not known."""
+    """Fly, in lockstep; without `told` there is no telemetry, and the mount is not known.
+
+    From the first to the second time of `blind_s` the picture is white.
+    """
     if not told:
         camera = replace(camera, body_from_camera=None)
     flown = Flown(LocalisationStage(Config(), camera, lambda _: nullcontext()))
@@ -145,7 +158,9 @@ def fly(
 
     def pictures() -> Iterator[Frame]:
         for seq, (t_ns, pose) in enumerate(poses):
+            blind = _ns(blind_s[0]) <= t_ns < _ns(blind_s[1])
             grey = terrain.picture(camera, pose)
+            grey = np.full_like(grey, 252) if blind else grey
             yield Frame(seq, t_ns, grey, np.repeat(grey[..., None], 3, 2))
 
     samples = list(_telemetry(ned_from_body, seconds)) if told else []

@@ -136,3 +136,23 @@ def test_a_rangefinder_that_the_barometer_contradicts_is_not_believed(
 def test_nothing_known_gives_nothing() -> None:
     kept, _ = places()
     assert Georeferencer(GeoreferenceConfig(), None).solve(kept) is None
+
+
+def test_a_map_that_has_just_begun_lies_roughly_by_the_velocity_since() -> None:
+    kept, ned = places(4)
+    velocity_noise = np.array([[0.1, -0.1, 0.05], [-0.1, 0.1, -0.05]])
+    georeferencer = reference(ned, np.zeros_like(ned), velocity_noise)
+    found = georeferencer.begin(kept[:3], ned[0])
+    assert found is not None
+    np.testing.assert_allclose(found.world_from_map.scale, TRUTH.scale, rtol=0.15)
+    np.testing.assert_allclose(
+        found.world_from_map.apply(kept[0].map_from_camera.translation), ned[0], atol=1e-6
+    )
+    off_m = found.world_from_map.apply(kept[2].map_from_camera.translation) - ned[2]
+    assert np.linalg.norm(off_m) < 0.15 * np.linalg.norm(ned[2] - ned[0])
+    assert found.sigma_scale > 0.02, "two keyframes are no measure"
+
+
+def test_without_velocity_a_map_that_has_just_begun_has_no_place() -> None:
+    kept, ned = places(4)
+    assert reference(ned, np.zeros_like(ned), None).begin(kept[:3], ned[0]) is None
