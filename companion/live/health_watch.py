@@ -37,8 +37,8 @@ STUCK_NS = 3_000_000_000
 """Frames come but no track does: the pose loop hangs,"""
 BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
 """unless it works: then the computer has too much else to do, and it is given longer."""
-START_S = 30.0
-"""A localisation that is not ready by then never will be."""
+START_S = 120.0
+"""A localisation that is not ready by then never will be; the first of all compiles its loops."""
 PATIENCE_NS = 20_000_000_000
 """Frames come, localisation was started again, and still no track: nothing here will help."""
 NO_SIGN_S = 10.0

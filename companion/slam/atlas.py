@@ -121,6 +121,7 @@ class Atlas:
         mapper = self.mapper_of(segment)
         for gone in mapper.add(keyframe):
             self._places.remove(gone)
+        self._turn.give_way()
         self._resting -= 1
         found = None
         if self._resting <= 0 and len(segment.keyframes) > MAX_YOUNG_KEYFRAMES:

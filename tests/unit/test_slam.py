@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -154,3 +155,31 @@ def test_a_pose_that_the_attitude_rules_out_is_not_taken(images: list[np.ndarray
     (track,) = tracker.step(frame, Prior(turned, path(20).rotation))
     assert isinstance(track, Track)
     assert track.state is TrackState.LOST
+
+
+def test_a_map_that_was_outrun_is_carried_on_by_two_views(images: list[np.ndarray]) -> None:
+    """Without attitude, and with too few points left to be tracked by, but enough for the scale."""
+    config = Config()
+    few = replace(config, tracking=replace(config.tracking, min_inliers=100))
+    tracker = Tracker(few, CAMERA, nothing)
+    tracks: dict[int, Track] = {}
+    states, keyframes_after = [], set()
+    for k, image in enumerate(images):
+        if k == 20:
+            slam_map = tracker.map
+            known = np.flatnonzero(slam_map.alive)
+            slam_map.alive[np.delete(known, np.s_[:: len(known) // 100])] = False
+        frame = Frame(k, k * 100_000_000, image, np.repeat(image[..., None], 3, 2))
+        for message in tracker.step(frame, Prior(None, None)):
+            if isinstance(message, KeyframeAdded) and k >= 20:
+                keyframes_after.add(message.seq)
+            elif isinstance(message, Track):
+                states.append((message.seq, message.state))
+                if message.map_from_camera is not None:
+                    tracks[message.seq] = message
+    assert (20, TrackState.LOST) in states
+    assert tracker.map is slam_map, "no map was begun anew"
+    assert 19 in keyframes_after, "the last view before became a keyframe"
+    assert set(range(20, 40)) <= set(tracks)
+    error, _ = aligned_error(*positions(tracker, tracks))
+    assert error < 0.2
