@@ -14,6 +14,7 @@ from companion.messages import Frame
 from companion.slam.features import Features, Ints
 from companion.slam.initializer import MIN_POINTS, initialise
 from companion.slam.matching import match_descriptors
+from companion.slam.third_view import contradicts, half_way
 from companion.slam.view import View
 
 MAX_PENDING = 150
@@ -90,4 +91,7 @@ class Bootstrap:
         b_from_a = Pose(result.b_from_a.rotation, result.b_from_a.translation * unit)
         view.camera_from_map = b_from_a @ reference.camera_from_map
         points_map = result.points_a * unit @ map_rotation.T
+        third = half_way(self.pending, reference, view)
+        if third is not None and contradicts(third, reference, view, points_map, result.features_a):
+            return None
         return Start(reference, view, points_map, result.features_a, result.features_b)
