@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -59,8 +60,10 @@ class SegmentPlaces:
         n_retired = 0
         for segment in segments:
             own = self.of(segment)
-            if own is None and segment is segments[-1]:
-                own = self._begun(segment, segments[:-1])
+            if own is not None and not own.has_origin:
+                own = self._begun(segment, segments, own)
+            elif own is None and segment is segments[-1] and not final:
+                own = self._begun(segment, segments, None)
             if segment is main:
                 main_from_own = Similarity.identity()
             elif anchor is not None and own is not None:
@@ -84,29 +87,44 @@ class SegmentPlaces:
         """The segment with most keyframes; in flight the one before, while its place is known."""
         main = max(segments, key=lambda s: len(s.keyframes))
         kept = next((s for s in segments if s.first_keyframe_id == self._main), None)
-        if not final and kept is not None and self.of(kept) is not None:
+        if not final and kept is not None and self._anchors(kept) >= self._anchors(main):
             main = kept  # what is told in its frame does not jump
         self._main = main.first_keyframe_id
         return main
 
-    def _begun(self, segment: SlamMap, left: Sequence[SlamMap]) -> Georeference | None:
-        """How a segment lies that is too young to tell: by the way since the last keyframe left."""
-        places = [self._place(segment, k) for k in segment.keyframes.values()]
-        start_ns = places[0].t_ns
+    def _anchors(self, segment: SlamMap) -> int:
+        """Whether others can be placed by a segment: 0 not at all, 1 by the way, 2 in the world."""
+        placed = self.of(segment)
+        return 0 if placed is None else 1 + placed.has_origin
+
+    def _begun(
+        self, segment: SlamMap, segments: Sequence[SlamMap], own: Georeference | None
+    ) -> Georeference | None:
+        """How a segment lies that is too young to tell: by the way since the last keyframe left.
+
+        `own` is what tells its scale, without an origin, or None.
+        """
+        first = next(iter(segment.keyframes.values()))
         before = [
             (k.t_ns, placed.world_from_map.apply(k.centre))
-            for s in left
-            if (placed := self.of(s)) is not None
+            for s in segments
+            if s is not segment and (placed := self.of(s)) is not None
             for k in s.keyframes.values()
-            if k.t_ns < start_ns
+            if k.t_ns < first.t_ns
         ]
         if not before:
             return None
         since_ns, from_ned_m = max(before, key=lambda place: place[0])
-        moved_m = self._georeferencer.moved(since_ns, start_ns)
+        moved_m = self._georeferencer.moved(since_ns, first.t_ns)
         if moved_m is None:
             return None
-        return self._georeferencer.begin(places, from_ned_m + moved_m)
+        start_ned_m = from_ned_m + moved_m
+        if own is None:
+            places = [self._place(segment, k) for k in segment.keyframes.values()]
+            return self._georeferencer.begin(places, start_ned_m)
+        to_world = own.world_from_map
+        origin = start_ned_m - to_world.scale * to_world.rotation @ first.centre
+        return replace(own, world_from_map=replace(to_world, translation=origin))
 
     def allowed(
         self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: Reunion

@@ -86,3 +86,28 @@ def test_where_sight_returns_over_a_place_never_seen_the_map_goes_on_in_the_same
     assert len(placed & set(due)) >= 0.95 * len(due)
     assert flown.live_errors().ate_sim3_m < 0.4, "42 m are flown, 15 of them blind"
     assert flown.errors().ate_sim3_m < 0.3
+
+
+def agile(after_s: float) -> Pose:
+    """Turning by up to 80 degrees a second, tilting by 20, all over a place of 20 m."""
+    turn = np.array([0.28 * np.sin(1.6 * after_s), 0.25 * np.sin(1.3 * after_s + 0.7), 0.0])
+    place = [9.0 * np.sin(0.55 * after_s), 8.0 * np.sin(0.4 * after_s + 0.3)]
+    return Pose(
+        yaw_rotation(1.6 * np.sin(0.9 * after_s)) @ rotation_from_vector(turn),
+        np.array([*place, -12.0 - 2.0 * np.sin(0.7 * after_s)]),
+    )
+
+
+def test_an_agile_flight_blind_for_two_seconds_is_tracked_again_within_one() -> None:
+    flown = fly(CAMERA, agile, Terrain(3), 10.0, 15.0, blind_s=(5.0, 7.0))
+    after_s = [(t_ns - flown.frames_ns[0]) * 1e-9 for t_ns in flown.frames_ns]
+    known_s = {
+        round((t.t_ns - flown.frames_ns[0]) * 1e-9, 6)
+        for t in flown.tracks
+        if t.map_from_camera is not None and not t.backfilled
+    }
+    due = [s for s in after_s if not 5.0 <= s < 7.0]
+    assert sum(round(s, 6) in known_s for s in due) >= 0.95 * len(due)
+    assert min(s for s in known_s if s >= 7.0) < 7.5
+    assert flown.live_errors().ate_sim3_m < 0.5, "the map goes on where it was"
+    assert flown.errors().ate_sim3_m < 0.3
