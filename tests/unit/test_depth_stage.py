@@ -76,6 +76,9 @@ def test_points_lie_on_the_surfaces(camera: Camera) -> None:
     off = np.abs(heights[:, None] - surfaces).min(1)
     assert np.median(off) < 0.06  # metres, from 12 m above
     assert (off < 0.24).mean() > 0.95
+    normalised = off / np.concatenate([c.sigma for c in chunks])
+    assert 0.4 < np.quantile(normalised, 0.68) < 1.2, "sigma is what it says"
+    assert np.quantile(normalised, 0.95) < 2.5
     for chunk in chunks:
         assert len(chunk.points_camera) == len(chunk.rgb) == len(chunk.confidence)
         assert ((chunk.confidence >= 0) & (chunk.confidence <= 1)).all()
