@@ -30,7 +30,8 @@ from companion.viewer.web_gate import free_ports
 from tests.support import flown
 
 POINTS = 2800
-EACH_S = 0.012
+EACH_S, MOST_WAITING = 0.012, 40
+"""An hour in a minute, or slower where the exporter cannot: this is about memory, not speed."""
 MAP_EVERY = 30
 """Keyframes from one map to the next: live there is one for each."""
 LONGER = 1.02
@@ -81,6 +82,8 @@ def main() -> None:
             if (k + 1) % MAP_EVERY == 0:
                 live.take(MapUpdate(k, t_ns, dict(places), np.zeros((0, 3)), None))
             time.sleep(EACH_S)
+            while len(live._inbox) > MOST_WAITING:
+                time.sleep(EACH_S)
             if (k + 1) % (n_keyframes // 6) == 0:
                 row = (k + 1, (k + 1) * POINTS, mib(exporter), mib(first))
                 print("| {} | {} | {:.0f} MiB | {:.0f} MiB |".format(*row), flush=True)

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.live.flight_parameters import PARAMETERS
 from companion.live.ground_control import BUDGET, MAPPING, NEW_MAP, SNAPSHOT
+from tests.support.daemon import UNGOVERNED
 from tests.support.fake_wire import free_port
 from tests.support.flying import Flying
 from tests.support.ground import OURS, GroundStation
@@ -28,14 +29,6 @@ REQUEST_MESSAGE, SET_INTERVAL = (
     mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
 )  # fmt: skip
 PORT, VIEWERS = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM)
-UNGOVERNED = """
-import sys
-from companion.governor import Governor
-Governor.step = lambda self, t_ns, pressure: False
-from companion.__main__ import main
-sys.exit(main())
-"""
-"""The daemon on a machine that never seems too busy for a dense map."""
 MAP_S = 120.0
 """A first piece of the dense map on a processor that others use too."""
 
@@ -52,7 +45,7 @@ def flying(folder: Path) -> Iterator[Flying]:
         f"control.keep={folder}/kept.toml", "depth.enabled=true", "depth.stride=8",
         "feedback.min_quality=15", "features.n_features=500",
     )  # fmt: skip
-    with Flying(folder, *settings, program=("-c", UNGOVERNED)) as begun:
+    with Flying(folder, *settings, program=UNGOVERNED) as begun:
         begun.until_source("camera", "running")
         begun.until_source("autopilot", "running")
         yield begun

@@ -30,6 +30,15 @@ from tests.support.command import Run
 
 ASK_EVERY_S = 0.05
 PROGRAM = ("-m", "companion")
+NO_GOVERNOR = """
+import sys
+from companion.governor import Governor
+Governor.step = lambda self, t_ns, pressure: False
+from companion.__main__ import main
+sys.exit(main())
+"""
+UNGOVERNED = ("-c", NO_GOVERNOR)
+"""The daemon on a machine that never seems too busy for viewers and a dense map."""
 
 
 @dataclass(frozen=True, slots=True)
