@@ -12,8 +12,10 @@ OUT ?= out/demo
 demo: $(VENV)/.installed
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
 
+# First what only computes, on all cores; then, with nothing beside them, tests that measure times.
 test: lint
-	$(BIN)/pytest
+	$(BIN)/pytest -m "not alone" -n logical --maxprocesses 4 --dist loadfile
+	$(BIN)/pytest -m alone
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check

@@ -6,10 +6,19 @@ import ipaddress
 import os
 import random
 import socket
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+
+ALONE = [Path(__file__).with_name(name) for name in ("live", "system")]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if any(folder in item.path.parents for folder in ALONE):
+            item.add_marker("alone")
 
 
 @pytest.fixture

@@ -43,6 +43,7 @@ from tests.support.memory_port import MemoryPort
 
 SURVEY = Path(__file__).parents[2] / "sample" / "survey"
 SECOND = 1_000_000_000
+pytestmark = pytest.mark.alone
 SET_INTERVAL = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
 
 
