@@ -100,8 +100,14 @@ def test_clients_that_never_read_or_never_leave_do_no_harm(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """More than the kernel buffers, so that a client which does not read holds its place."""
-    monkeypatch.setattr(short_answers, "TIMEOUT_S", 0.3)
+    monkeypatch.setattr(short_answers, "TIMEOUT_S", 1.0)
     big = {"text": "x" * (1 << 21)}
+
+    async def is_answered() -> bool:
+        try:
+            return bool(await ask(path) == big)
+        except SourceError:
+            return False
 
     async def test() -> None:
         async with served(path, lambda: big):
@@ -110,11 +116,10 @@ def test_clients_that_never_read_or_never_leave_do_no_harm(
                 client = socket.socket(socket.AF_UNIX)
                 client.connect(str(path))
                 stuck.append(client)
-            await asyncio.sleep(0.1)
-            with pytest.raises(SourceError):
-                await ask(path)  # no place is free
-            await asyncio.sleep(0.4)
-            assert await ask(path) == big
+            while await is_answered():  # until no place is free
+                await asyncio.sleep(0.01)
+            while not await is_answered():
+                await asyncio.sleep(0.1)
             for client in stuck:
                 client.close()
 
