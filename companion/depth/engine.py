@@ -12,7 +12,7 @@ from companion.config import DepthConfig
 from companion.depth.opencl import READ_BACK, UPLOAD, ComputeDevice, event_ms
 from companion.depth.regularisation import Regularisation, edges
 from companion.depth.sweep import PLANES, PlaneSweep
-from companion.depth.verification import Verification
+from companion.depth.verification import Verification, image_noise
 from companion.depth.views import Intrinsics, View, Views
 from companion.geometry import Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
@@ -57,7 +57,7 @@ class DepthEngine:
         self._verification = Verification(device, self._sweep, config)
         self._regularisation = Regularisation(device, self._sweep.grid)
         self._shape = self._sweep.grid[::-1]
-        self._grey = np.zeros((height, width), np.uint8)
+        self._grey, self._noise_grey = np.zeros((height, width), np.uint8), 0.0
         self._labels = np.zeros(self._shape, np.uint8)
         self._rho = (0.0, 0.0)
         self._events: list[tuple[str, cl.Event]] = []
@@ -82,7 +82,7 @@ class DepthEngine:
         """Start on an image (H, W) whose depths lie between `near` and `far` (map units)."""
         self._events = []
         self._device.copies.clear()
-        self._grey = grey
+        self._grey, self._noise_grey = grey, image_noise(grey)
         self._rho = (1.0 / far, 1.0 / near)
         self._views.begin(*self._rho)
         self._searched = set()
@@ -113,7 +113,7 @@ class DepthEngine:
         n_planes = min(max(wanted, LEAST_PLANES), PLANES[-1])
         step = (self._rho[1] - self._rho[0]) / (n_planes - 1)
         self._sweep.run(projections, self._rho[0], step, n_planes, self._run)
-        self._verification.run(projections, step, self._run)
+        self._verification.run(projections, step, self._noise_grey, self._run)
         self._device.read(self._labels, self._verification.label)
         self._n_swept = self._views.n_kept
 

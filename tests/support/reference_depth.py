@@ -127,10 +127,14 @@ def follow(image: Array, projection: Real, rho: Real, stride: int) -> tuple[Arra
 
 
 def verify(
-    reference: Array, value: Array, change: Array, least: float, noise: float, furthest_px: float
-) -> tuple[Array, Array]:
-    """Whether one image fits (H, W), and whether it does not, by least squares over 5 x 5."""
-    good, bad = np.zeros(reference.shape), np.zeros(reference.shape)
+    reference: Array, value: Array, change: Array, least: float, noise: float, furthest_px: float,
+    most_apart: float,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Whether one image fits (H, W), and whether it does not, by least squares over 5 x 5.
+
+    And whether one that does not is alike: squared differences that sum to less than `most_apart`.
+    """
+    good, bad, alike = (np.zeros(reference.shape) for _ in range(3))
     for y in range(2, reference.shape[0] - 2):
         for x in range(2, reference.shape[1] - 2):
             window = slice(y - 2, y + 3), slice(x - 2, x + 3)
@@ -146,7 +150,9 @@ def verify(
             fits = explained > least**2 * energy and 0.25 < gain < 4.0
             fits = fits and abs(slope / gain) < furthest_px
             good[y, x], bad[y, x] = fits, not fits
-    return good, bad
+            apart = float(((t - (w - w.mean())) ** 2).sum())
+            alike[y, x] = not fits and apart < most_apart
+    return good, bad, alike
 
 
 def regularise(

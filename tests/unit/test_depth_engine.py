@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 
 from companion.camera import Camera
 from companion.config import DepthConfig, OpenclConfig
+from companion.depth import verification
 from companion.depth.engine import DepthEngine
 from companion.depth.opencl import ComputeDevice, open_device
+from companion.depth.verification import MOST_NOISE_GREY, image_noise
 from companion.depth.views import Intrinsics
 from companion.errors import DeviceError
 from companion.geometry import Pose, rotation_from_vector
@@ -31,9 +34,15 @@ def engine(device: ComputeDevice, width: int, height: int, **keys: float) -> Dep
 
 
 def fly(
-    device: ComputeDevice, stride: int = 2, on_update: Callable[[int], object] = int
+    device: ComputeDevice,
+    stride: int = 2,
+    on_update: Callable[[int], object] = int,
+    taken: Callable[[Bytes], Bytes] = lambda image: image,
 ) -> tuple[DepthMap, np.ndarray]:
-    """Depth of a rendered scene from eight other views, and its true depth on the grid."""
+    """Depth of a rendered scene from eight other views, and its true depth on the grid.
+
+    `taken` is what a camera makes of each image.
+    """
     camera = Camera(322, 241, 260.0, 258.0, 161.0, 118.0)
     world = PlaneWorld(np.random.default_rng(11))
     tilt = rotation_from_vector(np.array([0.2, 0.1, 0.0])) @ DOWN_LOOKING
@@ -45,9 +54,9 @@ def fly(
     first, truth = world.render(camera, at(0))
     intrinsics = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy)
     it = DepthEngine(device, camera.width, camera.height, intrinsics, DepthConfig(stride=stride))
-    it.begin(first, 6.0, 25.0)
+    it.begin(taken(first), 6.0, 25.0)
     for k in (1, -1, 2, -2, 4, -4, 6, 9):
-        on_update(it.update(world.render(camera, at(k))[0], at(k).inverse() @ at(0)))
+        on_update(it.update(taken(world.render(camera, at(k))[0]), at(k).inverse() @ at(0)))
     rgb = np.repeat(first[..., None], 3, 2)
     return it.finish(7, 99, rgb), truth[::stride, ::stride]
 
@@ -67,6 +76,40 @@ def test_a_rendered_scene_is_measured(device: ComputeDevice, stride: int) -> Non
     assert (depth_map.sigma[known] > 0).all()
     off = error[known] * depth_map.depth[known] / depth_map.sigma[known]
     assert 0.4 < np.quantile(off, 0.68) < 1.6, "sigma is what it says"
+
+
+def test_what_noise_hides_says_nothing_against_a_depth(
+    device: ComputeDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def weak() -> tuple[DepthMap, np.ndarray]:
+        rng = np.random.default_rng(4)
+
+        def taken(image: Bytes) -> Bytes:
+            noisy = 100.0 + 0.1 * (image - 128.0) + rng.normal(0.0, 1.5, image.shape)
+            return noisy.astype(np.uint8)
+
+        return fly(device, 1, taken=taken)
+
+    depth_map, truth = weak()
+    monkeypatch.setattr(verification, "NOISE_BOUND", 0.0)
+    strict, _ = weak()
+    known, before = (m.state == PixelState.CONVERGED.value for m in (depth_map, strict))
+    error = np.abs(depth_map.depth - truth) / truth
+    assert known.mean() > 2 * before.mean() > 0.1 and known[before].all()
+    assert (error[known] < 0.05).mean() > 0.95
+    np.testing.assert_array_equal(depth_map.depth, strict.depth, "it weighs no more for that")
+
+
+def test_noise_is_measured_where_an_image_is_smoothest() -> None:
+    rng = np.random.default_rng(5)
+    picture = cv2.resize(texture(rng, 128), (320, 240), interpolation=cv2.INTER_CUBIC)
+    for noise in (0.7, 1.5, 4.0):
+        noisy = 60.0 + 0.3 * picture + rng.normal(0.0, noise, picture.shape)
+        assert image_noise(noisy.astype(np.uint8)) == pytest.approx(noise, rel=0.25)
+    assert image_noise(np.full((65, 97), 9, np.uint8)) == 0.0
+    assert image_noise(np.full((7, 9), 9, np.uint8)) == 0.0
+    anything = rng.integers(0, 256, (240, 320), np.uint8)
+    assert image_noise(anything) == MOST_NOISE_GREY
 
 
 def test_an_estimate_is_there_before_the_end_and_gets_better(device: ComputeDevice) -> None:

@@ -19,6 +19,8 @@ from tests.support.scene import texture
 
 PLANES = 32
 SMALL, LARGE, SOFT = 7, 54, 16
+MOST_APART = 9000.0
+"""What the sum of squared differences of a window may be where it is alike."""
 
 
 @pytest.fixture(scope="module", params=[number for number, _, _ in device_names()])
@@ -217,21 +219,24 @@ def test_follow_and_verify(
     np.testing.assert_allclose(got[1][seen], want[1][seen], atol=0.02)
 
     grey = np.ascontiguousarray(first[::stride, ::stride]).astype(np.float32)
-    counts = np.full((2, grid[1], grid[0]), 3, np.float32)
-    good, bad = (put(device, array) for array in counts)
-    limits = np.array([0.3, 1.5, 1.5, 0], np.float32)
+    counts = np.full((3, grid[1], grid[0]), 3, np.float32)
+    good, bad, alike = (put(device, array) for array in counts)
+    limits = np.array([0.3, 1.5, 1.5, MOST_APART], np.float32)
     size = (-(-grid[0] // 8), grid[1])
     run(
-        device, measure, "verify", size, put(device, grey), value, change, good, bad, limits,
-        *i32(*grid),
+        device, measure, "verify", size, put(device, grey), value, change, good, bad, alike,
+        limits, *i32(*grid),
     )  # fmt: skip
-    for array, buffer in zip(counts, (good, bad), strict=True):
+    for array, buffer in zip(counts, (good, bad, alike), strict=True):
         device.read(array, buffer)
     unseen_as_nan = np.where(seen, got[0].astype(float), np.nan)
-    fits, fails = reference.verify(grey.astype(float), unseen_as_nan, got[1], 0.3, 1.5, 1.5)
-    assert fits.sum() > 5 and fails.sum() > 5
-    np.testing.assert_array_equal(counts.sum(0) - 6, fits + fails)
+    fits, fails, like = reference.verify(
+        grey.astype(float), unseen_as_nan, got[1], 0.3, 1.5, 1.5, MOST_APART
+    )
+    assert fits.sum() > 5 and fails.sum() > 5 and 5 < like.sum() < fails.sum() - 5
+    np.testing.assert_array_equal(counts[:2].sum(0) - 6, fits + fails)
     assert (counts[0] - 3 == fits).mean() > 0.995  # thresholds fall the other way in float32
+    assert (counts[2] - 3 == like).mean() > 0.995
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (33, 127), (48, 64)])

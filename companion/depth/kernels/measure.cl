@@ -64,10 +64,12 @@ __kernel void to_grid(__global const uchar *image, const int width, __global flo
 /* Counts for each grid pixel whether one more image fits. Grid: (grid_width + 7) / 8 x grid_height, 8
  * pixels each; the outermost two pixels get nothing, and grids narrower than 12 pixels neither.
  *   good, bad  how many images fit, and how many do not; blank windows count as neither
- *   limits     least correlation; grey levels of noise; furthest way in pixels */
+ *   alike      how many of those that do not differ by no more than noise does
+ *   limits     least correlation; grey levels below which a window is blank; furthest way in pixels; sum
+ *              of squared differences up to which images are alike */
 __kernel void verify(__global const float *reference, __global const float *value,
                      __global const float *change, __global float *good, __global float *bad,
-                     const float4 limits, const int grid_width, const int grid_height)
+                     __global float *alike, const float4 limits, const int grid_width, const int grid_height)
 {
     int x = 8 * get_global_id(0);
     const int y = get_global_id(1);
@@ -125,20 +127,26 @@ __kernel void verify(__global const float *reference, __global const float *valu
                       & (way < limits.z) & (way > -limits.z);
     const float8 zero = 0.0f, one = 1.0f;
     const float8 more_good = fits ? one : zero, more_bad = seen & ~fits ? one : zero;
+    /* 0 counts none: less than nothing is rounding */
+    const float8 more_alike = seen & ~fits & (tt + ww - 2.0f * tw < limits.w) ? one : zero;
     if (x == 8 * (int)get_global_id(0)) {
         *(__global float8_anywhere *)(good + cell) += more_good;
         *(__global float8_anywhere *)(bad + cell) += more_bad;
+        *(__global float8_anywhere *)(alike + cell) += more_alike;
         return;
     }
     /* at the ends of a row another work-item writes some of these eight */
-    const float more[16] = {more_good.s0, more_good.s1, more_good.s2, more_good.s3,
+    const float more[24] = {more_good.s0, more_good.s1, more_good.s2, more_good.s3,
                             more_good.s4, more_good.s5, more_good.s6, more_good.s7,
                             more_bad.s0, more_bad.s1, more_bad.s2, more_bad.s3,
-                            more_bad.s4, more_bad.s5, more_bad.s6, more_bad.s7};
+                            more_bad.s4, more_bad.s5, more_bad.s6, more_bad.s7,
+                            more_alike.s0, more_alike.s1, more_alike.s2, more_alike.s3,
+                            more_alike.s4, more_alike.s5, more_alike.s6, more_alike.s7};
     for (int k = 0; k < 8; ++k)
         if (x + k >= first && x + k < 8 * (int)get_global_id(0) + 8) {
             good[cell + k] += more[k];
             bad[cell + k] += more[8 + k];
+            alike[cell + k] += more[16 + k];
         }
 }
 
@@ -150,7 +158,8 @@ __kernel void verify(__global const float *reference, __global const float *valu
  * The error of a winner was found to be 0.15 planes where it stands out, and 0.2 planes / margin where
  * it does not, whatever the scene (companion/depth/README.md). */
 __kernel void judge(__global const float *rho, __global const float *margin, __global const float *good,
-                    __global const float *bad, __global const float *noise, const float step, const float4 accept, const int border,
+                    __global const float *bad, __global const float *alike, __global const float *noise,
+                    const float step, const float4 accept, const int border,
                     __global float *sigma, __global float *ratio, __global uchar *label,
                     __global float *weight, const int grid_width, const int grid_height)
 {
@@ -158,17 +167,18 @@ __kernel void judge(__global const float *rho, __global const float *margin, __g
     if (x >= grid_width || y >= grid_height)
         return;
     const int cell = y * grid_width + x;
-    const float r = rho[cell], g = good[cell], b = bad[cell];
+    const float r = rho[cell], g = good[cell], b = bad[cell], a = alike[cell];
     const float unsure = 0.2f / (margin[cell] > 0.01f ? margin[cell] : 0.01f);
     const float rough = ROUGH * noise[cell] / step;
     const float s = step * sqrt(0.0225f + unsure * unsure + rough * rough);
-    const float share = (g + 1.0f) / (g + b + 2.0f);
+    /* what noise hides says nothing against a pixel, and holds it no better against its neighbours */
+    const float share = (g + a + 1.0f) / (g + b + 2.0f), correlated = (g + 1.0f) / (g + b + 2.0f);
     const bool outer = x < border || y < border || x >= grid_width - border || y >= grid_height - border;
-    const bool done = g >= accept.w && share >= accept.y && s < accept.x * r;
+    const bool done = g + a >= accept.w && share >= accept.y && s < accept.x * r;
     sigma[cell] = s;
     ratio[cell] = share;
     label[cell] = outer ? 3 : done ? 1 : share < accept.z ? 2 : 0;
     const float precision = 0.01f * r / s;
     const float w = precision * precision;
-    weight[cell] = (w < 4.0f ? w : 4.0f) * share;
+    weight[cell] = (w < 4.0f ? w : 4.0f) * correlated;
 }
