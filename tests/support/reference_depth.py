@@ -45,6 +45,7 @@ def costs(
     for gy, gx in np.ndindex(out.shape[:2]):
         word = words_r[gy * stride, gx * stride]
         bits = np.full((len(words), len(rhos)), UNRELATED)
+        told = np.zeros(bits.shape, bool)
         for k, projection in enumerate(projections):
             u, v, z = project(projection, gx * stride, gy * stride, rhos)
             with np.errstate(invalid="ignore"):
@@ -53,7 +54,12 @@ def costs(
             for p in np.flatnonzero(seen):
                 other = int(words[k][int(iv[p]), int(iu[p])])
                 bits[k, p] = bin(other ^ int(word)).count("1")
-        out[gy, gx] = np.sort(bits, axis=0)[: len(words) - n_dropped].sum(0)
+            told[k] = seen
+        counted = len(words) - n_dropped
+        out[gy, gx] = np.sort(bits, axis=0)[:counted].sum(0)
+        few = (told.sum(0) > 0) & (told.sum(0) < counted)
+        mean = np.mean(bits[:, few], axis=0, where=told[:, few])
+        out[gy, gx, few] = np.floor(counted * mean + 0.5)
     return out
 
 

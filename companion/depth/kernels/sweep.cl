@@ -66,9 +66,10 @@ __kernel void census(__global const uchar *image, const int width, const int hei
     }
 }
 
-/* Differing bits between a word and the words at the projections of 8 planes; outside: UNRELATED. */
+/* Differing bits between a word and the words at the projections of 8 planes; outside UNRELATED, and
+ * one more in `unseen`. */
 static uchar8 differing(__global const uint *words, uint word, float8 rho, float3 base, float3 shift,
-                        int width, int height)
+                        int width, int height, uchar8 *unseen)
 {
     const float8 z = base.z + rho * shift.z;
     const float8 scale = 1.0f / z;
@@ -83,6 +84,7 @@ static uchar8 differing(__global const uint *words, uint word, float8 rho, float
     bits = (bits & 0x33333333u) + ((bits >> 2) & 0x33333333u);
     bits = (bits + (bits >> 4)) & 0x0f0f0f0fu;
     bits = (bits + (bits >> 8) + (bits >> 16)) & 0x1fu;
+    *unseen += convert_uchar8(seen ? (uint8)0 : (uint8)1);
     return convert_uchar8(seen ? bits : (uint8)UNRELATED);
 }
 
@@ -91,7 +93,9 @@ static uchar8 differing(__global const uint *words, uint word, float8 rho, float
  *   views           per image 12 numbers: rows of (3 x 3 | 3), pixel (x, y) at inverse depth rho is
  *                   seen at (M (x, y, 1) + rho m), to be divided by its third component
  *   blocks          per grid pixel a bit for each block of 8 planes
- *   n_dropped       views left out at each plane, those that fit worst: 0, 1 or 2 */
+ *   n_dropped       views left out at each plane, those that fit worst: 0, 1 or 2
+ * Where fewer views see a plane than should count, their mean stands for the others: else planes would
+ * win for being seen by more. */
 __kernel void costs(__global const uint *words_r, __global const uint *words, const int width,
                     const int height, __global const float *views, const int n_views,
                     const int n_dropped, const float rho0, const float step,
@@ -113,19 +117,27 @@ __kernel void costs(__global const uint *words_r, __global const uint *words, co
             continue;
         }
         const float8 rho = rho0 + step * (lane + (float)(BLOCK * b));
-        uchar8 sum = 0, worst = 0, second = 0;
+        uchar8 sum = 0, worst = 0, second = 0, unseen = 0;
         for (int k = 0; k < n_views; ++k) {
             __global const float *m = views + 12 * k;
             const float3 base = (float3)(m[0] * x + m[1] * y + m[2], m[4] * x + m[5] * y + m[6],
                                          m[8] * x + m[9] * y + m[10]);
             const uchar8 bits = differing(words + (size_t)k * width * height, word, rho, base,
-                                          (float3)(m[3], m[7], m[11]), width, height);
+                                          (float3)(m[3], m[7], m[11]), width, height, &unseen);
             sum += bits;
             const uchar8 lesser = worst < bits ? worst : bits;
             worst = worst > bits ? worst : bits;
             second = second > lesser ? second : lesser;
         }
-        out[b] = n_dropped == 0 ? sum : n_dropped == 1 ? sum - worst : sum - worst - second;
+        uchar8 least = n_dropped == 0 ? sum : n_dropped == 1 ? sum - worst : sum - worst - second;
+        const char8 few = (unseen > (uchar8)n_dropped) & (unseen < (uchar8)n_views);
+        if (any(few)) {
+            const float8 out_of_sight = convert_float8(unseen), seen = (float)n_views - out_of_sight;
+            const float8 mean = (convert_float8(sum) - UNRELATED * out_of_sight) / (seen > 1.0f ? seen : 1.0f);
+            const uchar8 all = convert_uchar8(mean * (float)(n_views - n_dropped) + 0.5f);
+            least = few ? all : least;
+        }
+        out[b] = least;
     }
 }
 
