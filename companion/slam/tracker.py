@@ -21,7 +21,7 @@ from companion.slam.beginning import begin_map, carry_on, place_earlier
 from companion.slam.bootstrap import Bootstrap, Start
 from companion.slam.bridge import Bridge, bridge
 from companion.slam.features import FeatureExtractor, Features
-from companion.slam.keyframe_choice import keyframe_of, wants_keyframe
+from companion.slam.keyframe_choice import covering, keyframe_of, wants_keyframe
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.placing import Placer
 from companion.slam.reports import keyframe_added, track_of
@@ -88,6 +88,8 @@ class Tracker:
         self._ashore: View | None = None
         """The last frame that was tracked before the camera was lost, where none tells its turns"""
         self._reference: Keyframe | None = None
+        self._covered_ns: int | None = None
+        """Since when the reference, an older keyframe, has been showing what frames do"""
         self._placer.forget()
 
     def step(self, frame: Frame, prior: Prior) -> list[Told]:
@@ -120,7 +122,7 @@ class Tracker:
         self.state = TrackState.TRACKING
         self._lost_since_ns = None
         self._last = view
-        if not self._worker.busy and wants_keyframe(self._config, self.map, self._reference, view):
+        if not self._worker.busy and self._wants_keyframe(view):
             self._insert(view)
         assert self._reference is not None
         return [track_of(self.map, view, self._reference)]
@@ -237,11 +239,24 @@ class Tracker:
 
     # -- keyframes ------------------------------------------------------------------------------
 
+    def _wants_keyframe(self, view: View) -> bool:
+        """Whether no keyframe shows what a view does; one that does is referred to from now on."""
+        reference = self._reference
+        if reference is not None and reference.keyframe_id not in self.map.retired:
+            since_ns = reference.t_ns if self._covered_ns is None else self._covered_ns
+            if not wants_keyframe(self._config, self.map, reference, view, since_ns):
+                return False
+        cover = covering(self._config, self.map, view)
+        if cover is None:
+            return True
+        self._reference, self._covered_ns = cover, view.t_ns
+        return False
+
     def _insert(self, view: View) -> Keyframe:
         keyframe = self._keyframe(view)
         features = np.flatnonzero(view.point_ids >= 0)
         self.map.observe(keyframe, features, view.point_ids[features])
-        self._reference = keyframe
+        self._reference, self._covered_ns = keyframe, None
         slam_map = self.map
 
         def extend() -> Done:
