@@ -20,7 +20,9 @@ from types import TracebackType
 
 import psutil
 
-ALWAYS = ("systemd", "systemd-sysv", "dbus", "udev", "procps", "init-system-helpers")
+ALWAYS = (
+    "systemd", "systemd-sysv", "dbus", "libpam-systemd", "udev", "procps", "init-system-helpers",
+)  # fmt: skip
 TOOLS = {"debootstrap": "debootstrap", "systemd-nspawn": "systemd-container"}
 
 

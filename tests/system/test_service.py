@@ -8,17 +8,16 @@ policy, where root may not raise its own limits.
 
 from __future__ import annotations
 
-import json
 import platform
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from tests.support.booted_service import BootedService, told, until
 from tests.support.container import Container, lacking
 
 REPOSITORY = Path(__file__).parents[2]
@@ -75,45 +74,9 @@ def container(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
         yield made
 
 
-def told(*words: object) -> None:
-    print(time.strftime("%H:%M:%S"), *words, flush=True)
-
-
-def status(container: Container) -> dict[str, Any]:
-    said = container.run("companion", "status", "--json", check=False)
-    document: dict[str, Any] = json.loads(said) if said.startswith("{") else {}
-    return document
-
-
-def shown(container: Container, name: str) -> str:
-    said = container.run("systemctl", "show", "companion", "--property", name, "--value")
-    return said.strip()
-
-
-def until(such: Callable[[], Any], timeout_s: float, what: str) -> None:
-    until_s = time.monotonic() + timeout_s
-    while not such():
-        assert time.monotonic() < until_s, f"not within {timeout_s:g} s: {what}"
-        time.sleep(0.5)
-
-
-def until_flying(container: Container, timeout_s: float = 240) -> dict[str, Any]:
-    """Its status once it is active, tracks, and has camera and autopilot."""
-    found: dict[str, Any] = {}
-
-    def flies() -> bool:
-        found.update(status(container))
-        sources = [source["state"] == "running" for source in found.get("sources", ())]
-        active = shown(container, "ActiveState") == "active"
-        return active and all(sources) and found.get("tracker") in ("tracking", "coasting")
-
-    try:
-        until(flies, timeout_s, "a running service that tracks")
-    except AssertionError:
-        told(container.run("journalctl", "--unit=companion", "--no-pager", "--lines=40"))
-        raise
-    told("flies:", found["flight"], found["line"] if "line" in found else "")
-    return found
+@pytest.fixture
+def service(container: Container) -> BootedService:
+    return BootedService(container)
 
 
 def recordings(container: Container) -> list[str]:
@@ -127,11 +90,15 @@ def assert_readable(container: Container, names: list[str]) -> None:
     Of a killed daemon's the end is missing, since systemd kills the rest of the service at once.
     """
     for name in names:
-        folder = f"/var/lib/companion/flights/{name}"
-        said = container.run("companion", "flights", "verify", folder, check=False).strip()
+        said = verified(container, name)
         told(said.partition("flights/")[2])
         cut = "cut short" in said and ", 0 bytes cannot be read" in said
-        assert " whole " in said or cut, said
+        assert " whole " in said or " repaired " in said or cut, said
+
+
+def verified(container: Container, name: str) -> str:
+    """What verify says of a recording, by its name in the folder that it finds by itself."""
+    return container.run("companion", "flights", "verify", name, check=False).strip()
 
 
 def test_unit_and_rules_are_well_formed(container: Container) -> None:
@@ -145,10 +112,10 @@ def test_unit_and_rules_are_well_formed(container: Container) -> None:
     assert "99-companion.rules:" not in said  # which is how it begins to tell of an error
 
 
-def test_it_boots_into_the_running_service(container: Container) -> None:
-    until_flying(container)
-    assert shown(container, "User") == "companion"
-    pid = shown(container, "MainPID")
+def test_it_boots_into_the_running_service(container: Container, service: BootedService) -> None:
+    service.until_flying()
+    assert service.shown("User") == "companion"
+    pid = service.shown("MainPID")
     assert container.run("ps", "-o", "user=,ni=", "-p", pid).split() == ["compani+", "-10"]
     died = container.run(
         "journalctl", "--unit=companion", "--no-pager", "--grep=has died|linker", check=False
@@ -156,53 +123,83 @@ def test_it_boots_into_the_running_service(container: Container) -> None:
     assert "died" not in died, died
 
 
-def test_killed_it_comes_back(container: Container) -> None:
+def test_killed_it_comes_back(container: Container, service: BootedService) -> None:
     before = recordings(container)
     time.sleep(5)  # something to lose
-    container.run("kill", "-KILL", shown(container, "MainPID"))
-    until(lambda: shown(container, "NRestarts") == "1", 30, "another start")
-    until_flying(container)
+    container.run("kill", "-KILL", service.shown("MainPID"))
+    until(lambda: service.shown("NRestarts") == "1", 30, "another start")
+    service.until_flying()
     assert set(recordings(container)) > set(before)
     assert_readable(container, before)
 
 
-def test_a_wedged_pose_loop_is_ended_by_the_watchdog(container: Container) -> None:
-    before, n_before = recordings(container), int(shown(container, "NRestarts"))
+def test_what_was_cut_short_is_repaired_unless_armed(
+    container: Container, service: BootedService
+) -> None:
+    n_before = int(service.shown("NRestarts"))
+    # all its processes, as a power cut; systemd may complain of one that was quicker
+    service.systemctl("kill", "--signal=KILL", "companion", check=False)
+    until(lambda: int(service.shown("NRestarts")) > n_before, 60, "another start")
+    service.until_flying()
+    names = recordings(container)[:-1]
+    assert "cut short" in verified(container, names[-1])
+    container.run("systemctl", "stop", "autopilot")
+    service.systemctl("restart", "companion")
+
+    def all_well() -> bool:
+        return not any("cut short" in verified(container, name) for name in names)
+
+    until(all_well, 60, "no recording that is cut short")
+    assert_readable(container, names)
+    said = service.run("journalctl", "--unit=companion", "--no-pager", "--lines=200")
+    assert "an earlier recording was cut short: " in said and ": repaired, " in said
+    container.run("systemctl", "start", "autopilot")
+    service.until_flying()
+
+
+def test_a_wedged_pose_loop_is_ended_by_the_watchdog(
+    container: Container, service: BootedService
+) -> None:
+    before, n_before = recordings(container), int(service.shown("NRestarts"))
     began_s = time.monotonic()
     while "Watchdog timeout" not in container.run("journalctl", "--unit=companion", "--no-pager"):
         assert time.monotonic() < began_s + 120
         container.run("pkill", "-STOP", "-f", "companion.stages.child localisation", check=False)
         time.sleep(0.2)
     told(f"watchdog after {time.monotonic() - began_s:.0f} s")
-    until(lambda: int(shown(container, "NRestarts")) > n_before, 60, "another start")
-    until_flying(container)
+    until(lambda: int(service.shown("NRestarts")) > n_before, 60, "another start")
+    service.until_flying()
     assert_readable(container, before)
 
 
-def test_it_and_its_recordings_survive_a_reboot(container: Container) -> None:
+def test_it_and_its_recordings_survive_a_reboot(
+    container: Container, service: BootedService
+) -> None:
     before = recordings(container)
     container.reboot()
-    until_flying(container)
-    assert shown(container, "NRestarts") == "0"
-    last = f"/var/lib/companion/flights/{before[-1]}"
-    assert " whole " in container.run("companion", "flights", "verify", last)
+    service.until_flying()
+    assert service.shown("NRestarts") == "0"
+    assert " whole " in verified(container, before[-1])
+    assert "in /var/lib/companion/flights," in container.run("companion", "flights", "list")
     assert set(recordings(container)) > set(before)
     assert_readable(container, before)
 
 
-def test_an_upgrade_keeps_the_configuration(container: Container) -> None:
-    pid = shown(container, "MainPID")
+def test_an_upgrade_keeps_the_configuration(container: Container, service: BootedService) -> None:
+    pid = service.shown("MainPID")
     container.run("dpkg", "-i", f"/srv/{PACKAGES[-1].name}", timeout_s=900)
-    until_flying(container)
-    assert shown(container, "MainPID") != pid
+    service.until_flying()
+    assert service.shown("MainPID") != pid
     assert (container.root / "etc/companion/companion.toml").read_text() == CONFIG
 
 
-def test_removed_it_leaves_what_is_the_owners_purged_nothing(container: Container) -> None:
+def test_removed_it_leaves_what_is_the_owners_purged_nothing(
+    container: Container, service: BootedService
+) -> None:
     shutil.copytree(container.root / "opt/companion", container.root / "opt/own", symlinks=True)
     before = recordings(container)
     container.run("dpkg", "--remove", "companion")
-    assert shown(container, "ActiveState") == "inactive"
+    assert service.shown("ActiveState") == "inactive"
     assert not (container.root / "opt/companion").exists()
     assert (container.root / "etc/companion/companion.toml").read_text() == CONFIG
     assert recordings(container) == before
@@ -212,7 +209,7 @@ def test_removed_it_leaves_what_is_the_owners_purged_nothing(container: Containe
     assert "companion:" not in (container.root / "etc/passwd").read_text()
 
 
-def test_install_does_without_the_package(container: Container) -> None:
+def test_install_does_without_the_package(container: Container, service: BootedService) -> None:
     """From an environment of its own, copied from the package's; a failure leaves nothing."""
     own, root = "/opt/own/bin/companion", container.root
     bin_folder = root / "opt/own/bin"
@@ -236,15 +233,45 @@ def test_install_does_without_the_package(container: Container) -> None:
     assert "would do: user companion" in said and not unit.exists()
     container.run(own, "install", "--config", "/srv/own.toml", "--now")
     assert f"ExecStart={own} run" in unit.read_text()
-    until_flying(container)
+    service.until_flying()
     said = container.run(own, "install")
     assert {line for line in said.splitlines() if line.startswith("done:")} <= {
         "done: units read", "done: rules for devices read",
     }, said  # fmt: skip
     container.run(own, "uninstall")
-    assert shown(container, "ActiveState") == "inactive" and not unit.exists()
+    assert service.shown("ActiveState") == "inactive" and not unit.exists()
     assert (root / "etc/companion/companion.toml").read_text() == CONFIG
     assert recordings(container)
     container.run(own, "uninstall", "--purge")
     assert not (root / "var/lib/companion").exists()
     assert "companion:" not in (root / "etc/passwd").read_text()
+
+
+def test_a_user_installs_one_of_his_own(container: Container) -> None:
+    """Without root, but for what keeps his services running while he is not logged in."""
+    root, home = container.root, container.root / "home/pilot"
+    container.run("useradd", "--create-home", "pilot")
+    container.run("loginctl", "enable-linger", "pilot")
+    own, service = "/opt/own/bin/companion", BootedService(container, "pilot")
+    until(lambda: service.systemctl("is-system-running", check=False).strip() in ("running",
+          "degraded"), 60, "the user's service manager")  # fmt: skip
+    said = service.run(own, "install", "--user", "--config", "/srv/own.toml", "--now")
+    told(said.splitlines()[-1])
+    unit = home / ".config/systemd/user/companion.service"
+    assert service.run("systemd-analyze", "--user", "verify", f"/{unit.relative_to(root)}") == ""
+    assert f"ExecStart={own} run" in unit.read_text()
+    service.until_flying()
+    time.sleep(5)
+    service.run("kill", "-KILL", service.shown("MainPID"))
+    until(lambda: service.shown("NRestarts") == "1", 30, "another start")
+    service.until_flying()
+    said = service.run("companion", "flights", "list")
+    told(said)
+    assert "2 recordings in /home/pilot/.local/state/companion/flights," in said
+    said = service.run(own, "install", "--user")
+    assert {line for line in said.splitlines() if line.startswith("done:")} <= {"done: units read"}
+    service.run(own, "uninstall", "--user")
+    assert service.shown("ActiveState") == "inactive" and not unit.exists()
+    assert (home / ".config/companion/companion.toml").read_text() == CONFIG
+    service.run(own, "uninstall", "--user", "--purge")
+    assert not (home / ".local/state/companion").exists()
