@@ -63,7 +63,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
     folder, out = tmp_path_factory.mktemp("flight"), Flown()
     first_ns = open_flight(SAMPLE, CameraConfig()).start_ns
     udp_port, metrics_port = free_port(), free_port()
-    out.begins_unix_s = time.time() + 6.0
+    out.begins_unix_s = time.time() + 10.0
     begins_ns = time.monotonic_ns() + round((out.begins_unix_s - time.time()) * 1e9)
 
     def wait_until(flight_s: float) -> None:
@@ -77,7 +77,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
     with Daemon(folder, *settings) as daemon:
         daemon.until(lambda health: True, 20, "it answers")
         with Daemon(folder, *settings) as second:  # with the socket of the first
-            out.second = second.ended(20)
+            out.second = second.ended(60)
         autopilot = FakeAutopilot(
             "ardupilot", f"udpout:127.0.0.1:{udp_port}", RecordedFlight(SAMPLE)
         )
