@@ -11,6 +11,7 @@ import difflib
 import json
 import math
 import re
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -91,6 +92,11 @@ def shown(config: Config) -> dict[str, dict[str, Any]]:
 def without_passwords(text: str) -> str:
     """A text, with the passwords of URLs in it made unreadable."""
     return _PASSWORD.sub(r"\1:***@", text)
+
+
+def command_shown(argv: Sequence[str]) -> str:
+    """A command line as a report has it: without passwords, and without where the program lies."""
+    return without_passwords(shlex.join([Path(argv[0]).name, *argv[1:]]))
 
 
 def to_toml(config: Config) -> str:

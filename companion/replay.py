@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
@@ -10,7 +9,7 @@ from pathlib import Path
 
 from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
-from companion.config_file import shown, without_passwords
+from companion.config_file import command_shown, shown
 from companion.depth.device_choice import choose_device
 from companion.depth.opencl import ComputeDevice
 from companion.depth.stage import DepthStage
@@ -96,7 +95,7 @@ def replay(
                 origin=log.origin if _has_origin(result) else None,
                 device=device.described if device else "none (depth.enabled = false)",
                 config=shown(config), versions=versions(),
-                command=without_passwords(shlex.join(sys.argv)),
+                command=command_shown(sys.argv),
                 peak_memory_mb=peak_memory_mb(), camera=flight.camera,
                 n_frames_total=flight.n_frames_between(start_ns, stop_ns),
                 completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Mapping
 
 from companion.config import Config
-from companion.config_file import shown, without_passwords
+from companion.config_file import command_shown, shown
 from companion.live.flight import LiveFlight
 from companion.output.flight_result import RunFacts
 from companion.output.surroundings import peak_memory_mb, versions
@@ -31,7 +30,7 @@ def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> 
         device=device,
         config=shown(config),
         versions=versions(),
-        command=without_passwords(shlex.join(sys.argv)),
+        command=command_shown(sys.argv),
         peak_memory_mb=peak_memory_mb(),
         camera=flight.camera,
         n_frames_total=flight.n_frames,

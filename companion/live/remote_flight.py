@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections import OrderedDict
 from collections.abc import Callable
@@ -11,7 +10,7 @@ from pathlib import Path
 from companion.camera import Camera
 from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
-from companion.config_file import shown, without_passwords
+from companion.config_file import command_shown, shown
 from companion.depth.opencl import ComputeDevice
 from companion.depth.stage import DepthStage
 from companion.live.journal import WARNING, Journal
@@ -113,7 +112,7 @@ class RemoteFlight:
         facts = RunFacts(
             stage_times=self._times.summary(), wall_s=monotonic_s() - self._began_s, clock=None,
             origin=None, device=self._device.described, config=shown(self._config),
-            versions=versions(), command=without_passwords(shlex.join(sys.argv)),
+            versions=versions(), command=command_shown(sys.argv),
             peak_memory_mb=peak_memory_mb(), camera=self.camera,
             n_frames_total=self._result.n_frames, completed=True,
             dropped={"bundles": self.n_missed},

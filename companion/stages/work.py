@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any, Protocol
 
@@ -14,7 +15,7 @@ from companion.stages.protocol import Finish, Setup, Snapshot
 MOST_HELD = 32
 
 
-class Work:
+class Work(ABC):
     """What all stages have; `step` and `finish` are theirs."""
 
     latest_only = False
@@ -42,13 +43,13 @@ class Work:
         """Whether a message gives way to a newer one of its kind."""
         return self.latest_only and isinstance(message, FrameInRing)
 
+    @abstractmethod
     def step(self, message: Any) -> Iterable[Message | Snapshot]:
         """Take one message."""
-        raise NotImplementedError
 
+    @abstractmethod
     def finish(self, finish: Finish) -> Iterable[Message | Snapshot]:
         """Give what is left."""
-        raise NotImplementedError
 
 
 class WorkModule(Protocol):

@@ -41,11 +41,7 @@ def refine_pose(
     rounds: int = 4,
     iterations: int = 4,
 ) -> tuple[Pose, Bools, Array]:
-    """Refine a pose on N points; after each round points with too large an error are set aside.
-
-    Huber's loss in all rounds but the last. Returns the pose, which points agree with it (N,), and
-    the (6, 6) information matrix (rotation, translation) in the camera frame.
-    """
+    """As `companion.slam.pose_refinement.refine_pose`."""
     pose = camera_from_map
     inlier = np.ones(len(points_map), bool)
     information = np.zeros((6, 6))
@@ -159,10 +155,7 @@ def warps(
 def match_epipolar(
     a: Features, b: Features, index_a: Ints, index_b: Ints, b_from_a: Pose, max_error: float = 2.0
 ) -> tuple[Ints, Ints]:
-    """Match features `index_a` of a with `index_b` of b near their epipolar lines.
-
-    `max_error` is in units of a feature's sigma. Returns indices into a and b.
-    """
+    """As `companion.slam.matching.match_epipolar`."""
     none = np.zeros(0, np.int64)
     if len(index_a) < 2 or len(index_b) < 2:
         return none, none

@@ -35,11 +35,7 @@ def align(
     pixels: Array,
     max_move_px: Array,
 ) -> tuple[Array, Bools]:
-    """Where patches lie near full-size `pixels` (N, 2) of an image, and which were found for sure.
-
-    `image_from_patch` (N, 2, 2) is the warp between full-size pixels; a patch may move by
-    `max_move_px` (N,) at most.
-    """
+    """As `companion.slam.patches.align`."""
     found = pixels.astype(np.float64)
     sure = np.zeros(len(pixels), bool)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -7,7 +7,14 @@ from pathlib import Path
 import pytest
 
 from companion.config import Config
-from companion.config_file import dump, load_config, shown, to_toml, without_passwords
+from companion.config_file import (
+    command_shown,
+    dump,
+    load_config,
+    shown,
+    to_toml,
+    without_passwords,
+)
 from companion.errors import ConfigError
 
 DESCRIBED = Path(__file__).parents[2] / "config" / "companion.toml"
@@ -161,3 +168,8 @@ def test_passwords_are_not_shown() -> None:
     assert without_passwords("run --set camera.url=rtsp://a:b@c/") == (
         "run --set camera.url=rtsp://a:***@c/"
     )
+
+
+def test_a_command_is_shown_without_where_the_program_lies() -> None:
+    argv = ["/home/pilot/.venv/bin/companion", "replay", "a flight", "--set", "x=rtsp://a:b@c/"]
+    assert command_shown(argv) == "companion replay 'a flight' --set x=rtsp://a:***@c/"
