@@ -54,6 +54,25 @@ def seconds(text: str) -> float:
     return value
 
 
+def number(text: str) -> int:
+    """How many, from none on."""
+    value = int(text) if text.isascii() and text.isdigit() else -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"wanted a number from 0 on, given is {text}")
+    return value
+
+
+def amount(text: str) -> float:
+    """How much, from nothing on."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"wanted a number from 0 on, given is {text}")
+    return value
+
+
 def frames(text: str) -> tuple[int | None, int | None]:
     """From the first up to, not including, the second; None where it is open."""
     first, colon, beyond = text.partition(":")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.cli.options import Command, configuration, json_option, seconds
+from companion.cli.options import Command, amount, configuration, json_option, number, seconds
 from companion.config_file import load_config
 from companion.errors import InputError
 from companion.progress import Progress, progress_on
@@ -67,7 +67,8 @@ def _repair(paths: Sequence[Path], gently: bool, progress: Progress) -> int:
         print(line, flush=True)
         repaired.append(well)
     if not gently:
-        print(f"{sum(repaired)} of {len(paths)} recordings repaired")
+        n = f"{len(repaired)} of {len(paths)}"
+        print(f"{n} recordings cut short, {sum(repaired)} repaired")
     return 0 if all(repaired) else 1
 
 
@@ -158,7 +159,7 @@ def _add_flights(commands: Any) -> None:
     export = does.add_parser(
         "export", parents=[place], help="one as a flight folder, for other programs",
         description="Write pictures as they were recorded, frames.csv, camera.json, config.toml "
-        "and flight.tlog.",
+        "and flight.tlog, or telemetry.csv where no bytes of a link were recorded.",
     )  # fmt: skip
     export.add_argument("--out", type=Path, required=True, metavar="DIR")
     for parser in (show, trim, export):
@@ -184,7 +185,7 @@ def _add_flights(commands: Any) -> None:
         description="Delete finished flights with all their results, the oldest first. One with a "
         'file named "keep" in its folder stays. Of several conditions all must hold.',
     )  # fmt: skip
-    prune.add_argument("--keep-newest", type=int, metavar="N", help="all but the newest N")
-    prune.add_argument("--older-than", type=float, metavar="DAYS")
-    prune.add_argument("--free", type=float, metavar="MB", help="until so much room is free")
+    prune.add_argument("--keep-newest", type=number, metavar="N", help="all but the newest N")
+    prune.add_argument("--older-than", type=amount, metavar="DAYS")
+    prune.add_argument("--free", type=amount, metavar="MB", help="until so much room is free")
     prune.add_argument("--dry-run", action="store_true", help="only say which")

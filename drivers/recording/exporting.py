@@ -1,7 +1,8 @@
 """A recording as a flight folder: pictures, their times, camera and telemetry, for other programs.
 
 Pictures are not encoded again: JPEG and PNG become files as they are, a video a video. What was
-recorded raw becomes PNG.
+recorded raw becomes PNG. Telemetry is what came over the link; where none of that was recorded, as
+of an import, it is the samples.
 """
 
 from __future__ import annotations
@@ -19,21 +20,24 @@ import cv2
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 
+from companion.config import TelemetryConfig
 from companion.errors import FlightError
 from drivers.mavlink_stream import MavlinkStream
 from drivers.recording.flights_folder import TLOG
 from drivers.recording.pictures import still
+from drivers.recording.recorded_flight import telemetry_of
 from drivers.recording.recording import PicturePlace, Recording
 from drivers.recording.topics import IMAGE, RECEIVED, SENT, VIDEO, MavlinkBytes
+from drivers.telemetry_csv import NAME, telemetry_csv
 
 MICROSECONDS = Fraction(1, 1_000_000)
 NAMES = {"jpeg": "jpg", "png": "png"}
 
 
 def export(recording: Recording, out: Path, told: Callable[[int], None]) -> None:
-    """Write the folder `out`, which must not hold anything; `told` hears of pictures done.
+    """Write one that has pictures as the folder `out`; `told` hears of pictures done.
 
-    FlightError where it cannot be written.
+    FlightError where it cannot be written, or holds anything already.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FlightError(f"{out}: is there already; give a folder that is not, or empty")
@@ -41,10 +45,13 @@ def export(recording: Recording, out: Path, told: Callable[[int], None]) -> None
         out.mkdir(parents=True, exist_ok=True)
         for name, data in recording.found.attachments.items():
             (out / Path(name).name).write_bytes(data)
-        (out / TLOG).write_bytes(tlog(recording))
         places = recording.pictures
-        if not places:
-            return
+        packets = tlog(recording)
+        if packets:
+            (out / TLOG).write_bytes(packets)
+        elif recording.samples:
+            table = "".join(telemetry_csv(telemetry_of(recording, TelemetryConfig())))
+            (out / NAME).write_text(table, encoding="utf-8")
         if recording.picture_data(places[0])[0] == VIDEO:
             places = _video(recording, out / "camera.mp4", told)
         else:

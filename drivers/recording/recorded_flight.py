@@ -122,7 +122,7 @@ def open_recording(path: Path, config: CameraConfig, telemetry: TelemetryConfig)
         raise FlightError(f"{path}: there are no pictures in it")
     start_ns = recording.pictures[0].t_ns
     camera, missing = _camera(recording, config, start_ns)
-    return RecordedFlight(recording, camera, _log(recording, telemetry, missing))
+    return RecordedFlight(recording, camera, telemetry_of(recording, telemetry, missing))
 
 
 def is_recorded_folder(path: Path) -> bool:
@@ -183,9 +183,10 @@ def _camera(
     return assumed_camera(width, height, config.assumed_hfov_deg), (warned,)
 
 
-def _log(
-    recording: Recording, config: TelemetryConfig, warnings: tuple[Warned, ...]
+def telemetry_of(
+    recording: Recording, config: TelemetryConfig, warnings: tuple[Warned, ...] = ()
 ) -> TelemetryLog:
+    """The samples of a recording, with these warnings; it must have pictures."""
     shift_ns = round(config.offset_s * 1e9)
     samples = recording.samples
     if shift_ns:

@@ -33,6 +33,9 @@ POSE, ODOMETRY, CLOUD = "/pose", "/odometry", "/cloud"
 EVENTS, HEALTH = "/events", "/health"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
 """One of them has the pictures of a flight."""
+ARMED = "/telemetry/armed"
+LASTING = frozenset({CALIBRATION, HEALTH, ARMED})
+"""What is said there holds until it is said otherwise, which may be never."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 
@@ -116,7 +119,7 @@ TOPICS: dict[str, Any] = {
         "companion.HeightSample", "Barometric height above an arbitrary level, up positive",
         {"height_m": NUMBER},
     ),
-    "/telemetry/armed": _Json(
+    ARMED: _Json(
         "companion.ArmedSample", "Whether the motors are armed", {"armed": FLAG}
     ),
     POSE: PoseInFrame,

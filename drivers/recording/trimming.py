@@ -7,9 +7,10 @@ from pathlib import Path
 
 from companion.errors import FlightError
 from drivers.recording.growing_file import GrowingFile
+from drivers.recording.mcap_file import McapMessage
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.recording import Recording
-from drivers.recording.topics import GREY, PICTURES, PROFILE, open_channels
+from drivers.recording.topics import GREY, LASTING, PICTURES, PROFILE, open_channels
 
 LEAD_NS = 10_000_000_000
 """Of what is no picture so much from before the first is kept, as a replay uses it."""
@@ -21,8 +22,9 @@ def trim(
 ) -> int:
     """Write start_ns <= time < stop_ns to a new file; how many pictures that are.
 
-    A video begins with the last picture before that needs no other. FlightError where nothing is
-    left, or the file cannot be written or is there already. `told` hears of bytes read.
+    A video begins with the last picture before that needs no other. What held when the part began
+    (LASTING) is said at its begin. FlightError where nothing is left, or the file cannot be written
+    or is there already. `told` hears of bytes read.
     """
     first_ns = max(
         (p.t_ns for p in recording.pictures if p.alone and p.t_ns <= start_ns), default=start_ns
@@ -59,19 +61,27 @@ def _copy(
         writer.note(name, words)
     writer.note("trimmed", {"from": recording.path.name})
     first_ns, stop_ns = span_ns
+    lead_ns = first_ns - LEAD_NS
+    held: dict[str, McapMessage] = {}
+
+    def put(message: McapMessage, t_ns: int, publish_ns: int) -> None:
+        channel, data = channels[message.channel.topic], bytes(message.data)
+        writer.add(channel, t_ns, data, publish_ns, message.sequence)
+
     for number, chunk in enumerate(found.chunks):
         for at, message in enumerate(recording.messages(number)):
             topic = message.channel.topic
             if topic in PICTURES:
                 keep = (number, at) in pictures
             else:
-                lead_ns = 0 if topic == GREY else LEAD_NS
-                keep = first_ns - lead_ns <= message.t_ns < stop_ns
-            if keep and topic in channels:
-                data = bytes(message.data)
-                writer.add(
-                    channels[topic], message.t_ns, data, message.publish_ns, message.sequence
-                )
+                keep = (first_ns if topic == GREY else lead_ns) <= message.t_ns < stop_ns
+            if topic in LASTING and message.t_ns < lead_ns:
+                held[topic] = message
+            elif keep and topic in channels:
+                for before in held.values():
+                    put(before, lead_ns, lead_ns)
+                held.clear()
+                put(message, message.t_ns, message.publish_ns)
         if writer.n_waiting_bytes > CHUNK_BYTES:
             writer.flush()
         told(chunk.end)

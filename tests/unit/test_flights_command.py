@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -7,8 +8,10 @@ import pytest
 
 from companion.cli import main
 from companion.config import CameraConfig
-from companion.messages import Frame
+from companion.messages import ArmedSample, Frame
 from drivers.open_flight import open_flight
+from drivers.recording import trimming
+from drivers.recording.importing import write_recording
 from drivers.recording.recorded_flight import RecordedFlight
 from tests.support.recorded import STEP_NS, record
 
@@ -99,6 +102,60 @@ def test_an_exported_flight_is_the_same_flight(
     for a, b in zip(frames_of(tmp_path / "f"), frames_of(tmp_path / "out"), strict=True):
         assert np.array_equal(a.rgb, b.rgb)
     assert run(capsys, "export", tmp_path / "f", "--out", tmp_path / "out")[0] == 2
+
+
+@pytest.fixture
+def imported(tmp_path: Path) -> Path:
+    """A recording that was imported: no bytes of a link, one health document, one armed sample."""
+    record(tmp_path / "flown", 40)
+    source = open_flight(tmp_path / "flown", CameraConfig())
+    log = source.telemetry()
+    armed = [sample for sample in log.samples if isinstance(sample, ArmedSample)]
+    samples = [s for s in log.samples if not isinstance(s, ArmedSample) or s is armed[0]]
+    source._telemetry = dataclasses.replace(log, samples=samples)
+    write_recording(source, tmp_path / "a.mcap", lambda n: None)
+    return tmp_path / "a.mcap"
+
+
+def test_an_exported_import_has_its_telemetry(
+    imported: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = imported.parent / "out"
+    assert run(capsys, "export", imported, "--out", out)[0] == 0
+    assert not (out / "flight.tlog").exists()
+    ours, theirs = (open_flight(path, CameraConfig()).telemetry() for path in (imported, out))
+    assert len(theirs.samples) == len(ours.samples) > 100
+    assert theirs.origin == ours.origin is not None
+    assert repr(theirs.clock) == repr(ours.clock) != "None"
+
+
+def test_a_part_far_from_the_begin_has_what_was_said_at_the_begin_only(
+    imported: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Place on Earth, clock, and that the motors are armed."""
+    monkeypatch.setattr(trimming, "LEAD_NS", 3 * STEP_NS)
+    out = imported.parent / "part.mcap"
+    assert run(capsys, "trim", imported, "--start", 1, "--out", out)[0] == 0
+    whole, part = (open_flight(path, CameraConfig()) for path in (imported, out))
+    assert part.telemetry().origin == whole.telemetry().origin is not None
+    assert repr(part.telemetry().clock) == repr(whole.telemetry().clock) != "None"
+    samples = part.telemetry().samples
+    assert [s.armed for s in samples if isinstance(s, ArmedSample)] == [True]
+    assert isinstance(samples[0], ArmedSample)
+    assert samples[0].t_ns == part.start_ns - 3 * STEP_NS
+    assert len(samples) < len(whole.telemetry().samples) / 2
+
+
+@pytest.mark.parametrize(
+    "words", [["--keep-newest", -1], ["--older-than", -3], ["--older-than", "nan"], ["--free", -1]]
+)
+def test_prune_takes_no_number_below_zero(
+    flights: Path, capsys: pytest.CaptureFixture[str], words: list[object]
+) -> None:
+    with pytest.raises(SystemExit):
+        run(capsys, "prune", "--flights", flights, *words)
+    assert "wanted a number from 0 on" in capsys.readouterr().err
+    assert (flights / FIRST).exists() and (flights / SECOND).exists()
 
 
 def test_prune_deletes_the_oldest_only(flights: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,11 +40,12 @@ def test_by_command_once(cut: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["flights", "repair", "--flights", str(folder)]
     assert main(words) == 0
     out = capsys.readouterr().out.splitlines()
-    assert out[0].startswith(f"{cut}: repaired, ") and out[1] == "1 of 3 recordings repaired"
+    assert out[0].startswith(f"{cut}: repaired, ")
+    assert out[1] == "1 of 3 recordings cut short, 1 repaired"
     assert summarise(cut).state == "repaired" and summarise(cut, lambda n: None).n_lost_bytes == 0
     content = cut.read_bytes()
     assert main(words) == 0
-    assert capsys.readouterr().out == "0 of 3 recordings repaired\n"
+    assert capsys.readouterr().out == "0 of 3 recordings cut short, 0 repaired\n"
     assert cut.read_bytes() == content
 
 
@@ -57,7 +58,7 @@ def test_what_another_writes_to_is_left_alone(
         assert not unfinished(cut)
         assert in_place(cut) is None
         assert main(["flights", "repair", "--flights", str(cut.parents[1])]) == 0
-    assert capsys.readouterr().out == "0 of 2 recordings repaired\n"
+    assert capsys.readouterr().out == "0 of 2 recordings cut short, 0 repaired\n"
     assert cut.read_bytes() == content
 
 
