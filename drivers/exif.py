@@ -80,10 +80,15 @@ def _photo(path: Path, image: Image.Image) -> Photo:
         longitude_deg=_degrees(of_place, gps.GPSLongitude, gps.GPSLongitudeRef, "W", 180.0),
         altitude_m=None if height_m is None else -height_m if below else height_m,
         focal_px=_focal_px(of_shot, *image.size),
-        camera=" ".join(str(exif.get(tag, "")).strip("\0 ") for tag in (base.Make, base.Model)),
+        camera=_camera(*(str(exif.get(tag, "")).strip("\0 ") for tag in (base.Make, base.Model))),
         relative_altitude_m=xmp.get("RelativeAltitude"),
         gimbal_deg=None if roll is None or pitch is None or yaw is None else (roll, pitch, yaw),
     )  # fmt: skip
+
+
+def _camera(make: str, model: str) -> str:
+    """Both, unless the model says who made it."""
+    return model if model.startswith(make) else f"{make} {model}".strip()
 
 
 def _xmp(image: Image.Image) -> dict[str, float]:

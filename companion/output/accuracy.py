@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,20 @@ ABSOLUTE = (
 )
 
 
-def accuracy_statement(run: FinishedRun, file: str, frame: MapFrame | None) -> bytes:
-    """A page of text beside an export; `frame` is None for formats with axes of their own."""
+class Axes(Enum):
+    """What the coordinates of an export are."""
+
+    LOCAL = "local north, east, down in metres"
+    FIRST_CAMERA = "right, down, forward of the first camera that was placed, in metres from it"
+    EARTH = "latitude and longitude in degrees, WGS84"
+    MAP = "those of a map's frame"
+
+
+def accuracy_statement(run: FinishedRun, file: str, axes: Axes | MapFrame) -> bytes:
+    """A page of text beside an export; for those in map coordinates `axes` is the map's frame."""
     report = run.report
     lines = [f"{file}: how it was placed, and how far that can be trusted", ""]
-    lines += _placed(run, frame)
+    lines += _placed(run, axes)
     lines += ["", *_scale(run, report.get("scale"))]
     camera = report.get("camera") or {}
     if camera.get("assumed"):
@@ -54,7 +64,8 @@ def remarks_on_heights(run: FinishedRun) -> list[str]:
     ]
 
 
-def _placed(run: FinishedRun, frame: MapFrame | None) -> list[str]:
+def _placed(run: FinishedRun, axes: Axes | MapFrame) -> list[str]:
+    coordinates = axes.name if isinstance(axes, MapFrame) else axes.value
     if not run.metric:
         return [
             "Unit: map units. No metric scale was found, so lengths are only in proportion, and "
@@ -62,31 +73,34 @@ def _placed(run: FinishedRun, frame: MapFrame | None) -> list[str]:
         ]
     if run.origin is None:
         return [
+            f"Coordinates: {coordinates}.",
             "Frame: local, metres; zero at the first camera. No position was known, so neither "
-            "place nor, but for the compass, heading are."
+            "place nor, but for the compass, heading are.",
         ]
     o = run.origin
+    against = remarks_on_heights(run)
+    level = "in heights that are not those above the sea" if against else "above mean sea level"
     zero = (
         f"Zero of the local frame: latitude {o.latitude_deg:.8f}, longitude "
-        f"{o.longitude_deg:.8f} (WGS84), {o.altitude_m:.3f} m above mean sea level."
+        f"{o.longitude_deg:.8f} (WGS84), {o.altitude_m:.3f} m {level}."
     )
-    if frame is None:
-        return [zero, ABSOLUTE]
-    shift = "UTM by Krueger's series, error below a micrometre"
-    how = shift if frame.name.startswith("WGS 84 / UTM") else "projected by PROJ from WGS84"
-    against = remarks_on_heights(run)
-    heights = (
-        "Heights: NOT above mean sea level. " + "; ".join(against) + "."
-        if against
-        else "Heights: above mean sea level as the autopilot gives them, written as EGM96; no "
-        "geoid model was applied."
-    )
-    return [
-        f"Coordinates: {frame.name} (EPSG:{frame.epsg}); {how}.",
-        heights,
-        zero,
-        ABSOLUTE,
-    ]
+    if isinstance(axes, MapFrame):
+        shift = "UTM by Krueger's series, error below a micrometre"
+        how = shift if axes.name.startswith("WGS 84 / UTM") else "projected by PROJ from WGS84"
+        coordinates += f" (EPSG:{axes.epsg}); {how}"
+    lines = [f"Coordinates: {coordinates}."]
+    if against:
+        lines.append("Heights: NOT above mean sea level. " + "; ".join(against) + ".")
+    elif axes is Axes.EARTH:
+        lines.append(
+            "Heights: above mean sea level as the autopilot gives them, not above the ellipsoid."
+        )
+    elif isinstance(axes, MapFrame):
+        lines.append(
+            "Heights: above mean sea level as the autopilot gives them, written as EGM96; no geoid "
+            "model was applied."
+        )
+    return [*lines, zero, ABSOLUTE]
 
 
 def _scale(run: FinishedRun, scale: Mapping[str, Any] | None) -> list[str]:

@@ -12,7 +12,7 @@ from companion import __version__
 from companion.config import ExportConfig
 from companion.errors import InputError
 from companion.messages import GeoOrigin
-from companion.output.accuracy import accuracy_statement, remarks_on_heights
+from companion.output.accuracy import Axes, accuracy_statement, remarks_on_heights
 from companion.output.atomic_file import write_atomically
 from companion.output.cloud_las import cloud_las
 from companion.output.cloud_pcd import cloud_pcd
@@ -59,29 +59,29 @@ class Export:
 
 
 class Product(NamedTuple):
-    """The files of a format, each with what makes it; `own_axes` where the frame is not theirs."""
+    """The files of a format, each with what makes it, and what their coordinates are."""
 
     what: str
     files: Mapping[str, Callable[[Export], bytes]]
-    own_axes: bool = True
+    axes: Axes = Axes.LOCAL
 
 
 PRODUCTS: Mapping[str, Product] = {
     "ply": Product(
         "cloud, local NED", {"cloud.ply": lambda e: (e.run.path / "cloud.ply").read_bytes()}
     ),
-    "pcd": Product("cloud", {"cloud.pcd": lambda e: cloud_pcd(e.run.cloud, e.frame)}, False),
-    "las": Product("cloud", {"cloud.las": lambda e: _las(e, packed=False)}, False),
-    "laz": Product("cloud, packed", {"cloud.laz": lambda e: _las(e, packed=True)}, False),
+    "pcd": Product("cloud", {"cloud.pcd": lambda e: cloud_pcd(e.run.cloud, e.frame)}, Axes.MAP),
+    "las": Product("cloud", {"cloud.las": lambda e: _las(e, packed=False)}, Axes.MAP),
+    "laz": Product("cloud, packed", {"cloud.laz": lambda e: _las(e, packed=True)}, Axes.MAP),
     "dsm": Product(
         "surface model, GeoTIFF",
         {"surface.tif": lambda e: surface_tiff(e.surface, e.frame)},
-        False,
+        Axes.MAP,
     ),
     "ortho": Product(
         "orthomosaic of the cloud, GeoTIFF",
         {"orthomosaic.tif": lambda e: orthomosaic_tiff(e.surface, e.frame)},
-        False,
+        Axes.MAP,
     ),
     "tum": Product(
         "path", {"trajectory.tum": lambda e: (e.run.path / "trajectory.tum").read_bytes()}
@@ -92,12 +92,23 @@ PRODUCTS: Mapping[str, Product] = {
             "trajectory.kitti.txt": lambda e: path_kitti(e.run.poses),
             "trajectory.kitti.times.txt": lambda e: times_kitti(e.run.poses),
         },
+        Axes.FIRST_CAMERA,
     ),
     "euroc": Product("path", {"trajectory.euroc.csv": lambda e: path_euroc(e.run.poses)}),
-    "gpx": Product("path", {"trajectory.gpx": lambda e: path_gpx(e.run.poses, e.origin, e.name)}),
-    "kml": Product("path", {"trajectory.kml": lambda e: path_kml(e.run.poses, e.origin, e.name)}),
+    "gpx": Product(
+        "path",
+        {"trajectory.gpx": lambda e: path_gpx(e.run.poses, e.origin, e.name)},
+        Axes.EARTH,
+    ),
+    "kml": Product(
+        "path",
+        {"trajectory.kml": lambda e: path_kml(e.run.poses, e.origin, e.name)},
+        Axes.EARTH,
+    ),
     "geojson": Product(
-        "path", {"trajectory.geojson": lambda e: path_geojson(e.run.poses, e.origin, e.name)}
+        "path",
+        {"trajectory.geojson": lambda e: path_geojson(e.run.poses, e.origin, e.name)},
+        Axes.EARTH,
     ),
 }
 
@@ -113,11 +124,11 @@ def export_run(run: FinishedRun, out: Path, config: ExportConfig) -> list[Path]:
     made: list[tuple[Path, bytes]] = []
     for name in dict.fromkeys(config.formats):
         product = PRODUCTS[name]
-        frame = None if product.own_axes else export.frame
+        axes = export.frame if product.axes is Axes.MAP else product.axes
         for file, make in product.files.items():
             path = out / file
             made.append((path, make(export)))
-            statement = accuracy_statement(run, file, frame)
+            statement = accuracy_statement(run, file, axes)
             made.append((path.with_name(f"{file}.accuracy.txt"), statement))
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -22,11 +22,11 @@ def write_photo(
     path: Path, number: int, *, local: str | None = None, subsecond: str | None = None,
     utc: tuple[str, tuple[float, float, float]] | None = None,
     place: tuple[float, float, float | None] | None = None,
-    shot: dict[int, Any] | None = None, xmp: str | None = None,
+    shot: dict[int, Any] | None = None, xmp: str | None = None, model: str = "Model",
 ) -> None:  # fmt: skip
     """A picture whose brightness tells its number; `place` is latitude, longitude, height."""
     exif = Image.Exif()
-    exif[Base.Make], exif[Base.Model] = "Maker", "Model"
+    exif[Base.Make], exif[Base.Model] = "Maker", model
     inside = exif.get_ifd(ExifTags.IFD.Exif)
     inside.update(shot or {})
     if local is not None:

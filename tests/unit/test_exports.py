@@ -238,7 +238,7 @@ def test_surface_model(run: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_cells_are_not_too_many(run: FinishedRun, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--cell"):
+    with pytest.raises(InputError, match=r"set export\.cell_m"):
         exported(run, tmp_path, "dsm", cell_m=1e-4)
 
 
@@ -289,7 +289,12 @@ def test_accuracy_beside_each_file(run: FinishedRun, tmp_path: Path) -> None:
         assert "1.00 %" in text
         assert "47.39770000" in text
         assert "no better than the autopilot's own" in text
-    assert "EPSG:32632" in (tmp_path / "surface.tif.accuracy.txt").read_text()
+    for name, axes in {
+        "surface.tif": "(EPSG:32632)", "cloud.ply": "local north, east, down",
+        "trajectory.kitti.txt": "of the first camera", "trajectory.gpx": "latitude and longitude",
+        "trajectory.geojson": "not above the ellipsoid",
+    }.items():  # fmt: skip
+        assert axes in (tmp_path / f"{name}.accuracy.txt").read_text()
 
 
 def test_heights_that_are_not_above_the_sea(tmp_path: Path) -> None:
@@ -297,12 +302,14 @@ def test_heights_that_are_not_above_the_sea(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     what = "heights of NavSatFix are above the ellipsoid"
     told = {**run.report, "warnings": [{"what": what, "count": 1, "first_detail": "so"}]}
-    (path,) = exported(replace(run, report=told), tmp_path, "las")
+    path, _, _ = exported(replace(run, report=told), tmp_path, "las", "gpx", "ply")
     crs = laspy.read(path).header.parse_crs()
     assert crs is not None
     assert crs.to_epsg() == 32632
-    text = (tmp_path / "cloud.las.accuracy.txt").read_text()
-    assert "NOT above mean sea level. heights of NavSatFix" in text
+    for name in ("cloud.las", "trajectory.gpx", "cloud.ply"):
+        text = (tmp_path / f"{name}.accuracy.txt").read_text()
+        assert "NOT above mean sea level. heights of NavSatFix" in text
+        assert "m above mean sea level" not in text
 
 
 @pytest.mark.parametrize("formats", [("gpx",), ("las", "kml"), ("geojson",)])
@@ -320,6 +327,8 @@ def test_local_coordinates(tmp_path: Path) -> None:
     las = laspy.read(path)
     assert [las.x[-1], las.y[-1], las.z[-1]] == [-30.0, 70.0, 12.5]
     assert las.header.parse_crs() is None
+    text = (tmp_path / "cloud.laz.accuracy.txt").read_text()
+    assert "Coordinates: local east, north, up in metres." in text
     with pytest.raises(InputError, match="EPSG:32632 cannot be had"):
         exported(run, tmp_path, "laz", epsg=32632)
 

@@ -80,7 +80,14 @@ def test_focal_length_of_a_smaller_copy(tmp_path: Path) -> None:
     flight = opened(tmp_path)
     assert flight.camera.fx == pytest.approx(4.5 / (4000 / 16393.44 * 25.4) * 64, rel=1e-4)
     assert flight.camera.assumed
-    assert "no camera.json: the focal length is that of EXIF" in whats(flight.warnings)
+    told = {warned.what: warned.detail for warned in flight.warnings}
+    assert "by Maker Model," in told["no camera.json: the focal length is that of EXIF"]
+
+
+def test_maker_is_said_once(tmp_path: Path) -> None:
+    write_photo(tmp_path / "a.jpg", 0, model="Maker A1")
+    photo = read_photo(tmp_path / "a.jpg")
+    assert photo is not None and photo.camera == "Maker A1"
 
 
 def test_focal_length_for_film(tmp_path: Path) -> None:
