@@ -57,7 +57,7 @@ def _write(flight: Flight, folder: Path, told: Callable[[int], None]) -> int:
     (folder / "camera.json").write_text(json.dumps(camera_json(flight.camera), indent=1) + "\n")
     if log.samples:
         with (folder / NAME).open("w", encoding="utf-8") as file:
-            file.writelines(telemetry_csv(log))
+            file.writelines(telemetry_csv(log, flight.warnings))
     truth = flight.truth()
     if truth:
         (folder / "truth").mkdir()

@@ -1,7 +1,7 @@
 """Telemetry as a table, `telemetry.csv`: on the flight's clock, about one origin, nothing rounded.
 
 A line is `unix_ns,kind,values`; what a sample does not have is empty. Comments before hold the
-origin and how the clocks were put together.
+origin, how the clocks were put together, and what was amiss where the samples come from.
 
 | kind | values |
 |---|---|
@@ -15,7 +15,8 @@ origin and how the clocks were put together.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,24 +33,28 @@ from companion.messages import (
     PositionSource,
     RangeSample,
     Telemetry,
+    Warned,
 )
 from drivers.telemetry_log import LogContent, TelemetryCollector, TelemetryLog, kind_of
 
 NAME = "telemetry.csv"
 HEADER = "unix_ns,kind,values"
+WARNING = "# warning"
 SOURCES = {source.value: source for source in PositionSource}
 WIDTHS = {"attitude": 7, "imu": 6, "range": 1, "height": 1, "armed": 1, **dict.fromkeys(SOURCES, 8)}
 MAX_BYTES = 4_000_000_000
 
 
-def telemetry_csv(log: TelemetryLog) -> Iterator[str]:
-    """The lines of the table."""
+def telemetry_csv(log: TelemetryLog, amiss: Sequence[Warned] = ()) -> Iterator[str]:
+    """The lines of the table; `amiss` is said in it beside the log's own warnings."""
     if log.origin is not None:
         yield "# origin," + ",".join(map(repr, dataclasses.astuple(log.origin))) + "\n"
     if log.clock is not None:
         c = log.clock
         numbers = f"{c.offset_s!r},{c.drift_ppm!r},{c.sigma_ms!r},{c.n_reboots}"
         yield f"# clock,{c.method.replace(',', ' ')},{numbers}\n"
+    for warned in (*amiss, *log.warnings):
+        yield f"{WARNING},{warned.t_ns},{json.dumps([warned.what, warned.detail])}\n"
     yield HEADER + "\n"
     for sample in log.samples:
         values = ",".join("" if v is None else repr(float(v)) for v in _values(sample))
@@ -60,6 +65,7 @@ def read_telemetry_csv(path: Path) -> LogContent:
     """Read such a table; FlightError where it is none. Lines that are damaged are counted."""
     collected = TelemetryCollector(path.name)
     clock: ClockReport | None = None
+    amiss: list[Warned] = []
     with path.open(encoding="utf-8", errors="replace") as lines:
         begun = False
         for line in lines:
@@ -70,6 +76,7 @@ def read_telemetry_csv(path: Path) -> LogContent:
                 if origin is not None:
                     collected.origin[0] = origin
                 clock = _clock(words) or clock
+                amiss += _warning(line)
                 if not begun and not line.startswith("#"):
                     break
                 continue
@@ -80,7 +87,7 @@ def read_telemetry_csv(path: Path) -> LogContent:
                 collected.add(read.t_ns, 0, read)
     if not begun:
         raise FlightError(f'{path}: wanted a line "{HEADER}" after the comments')
-    return LogContent(collected, lambda remote_ns, segment: remote_ns, clock)
+    return LogContent(collected, lambda remote_ns, segment: remote_ns, clock, tuple(amiss))
 
 
 def _values(sample: Telemetry) -> list[float | None]:
@@ -138,6 +145,19 @@ def _origin(words: list[str]) -> GeoOrigin | None:
         return None
     believable = abs(origin.latitude_deg) <= 90 and abs(origin.longitude_deg) <= 180
     return origin if believable and abs(origin.altitude_m) < 1e5 else None
+
+
+def _warning(line: str) -> list[Warned]:
+    """The warning of such a line; none of another."""
+    name, _, rest = line.partition(",")
+    t_ns, _, said = rest.partition(",")
+    if name != WARNING or not (t_ns.isascii() and t_ns.isdigit() and len(t_ns) < 20):
+        return []
+    try:
+        what, detail = json.loads(said)
+    except (ValueError, TypeError, RecursionError):
+        return []
+    return [Warned(int(t_ns), str(what), str(detail))]
 
 
 def _clock(words: list[str]) -> ClockReport | None:

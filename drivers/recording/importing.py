@@ -66,6 +66,10 @@ def _write(flight: Flight, file: GrowingFile, told: Callable[[int], None]) -> in
     known = {
         "clock": None if log.clock is None else dataclasses.asdict(log.clock),
         "origin": None if log.origin is None else dataclasses.asdict(log.origin),
+        "warnings": [
+            {"t_ns": warned.t_ns, "what": warned.what, "detail": warned.detail}
+            for warned in (*flight.warnings, *log.warnings)
+        ],
     }
     put(HEALTH, start_ns, json_bytes(known))
     put(CALIBRATION, start_ns, calibration_bytes(camera, start_ns))

@@ -23,6 +23,7 @@ from drivers.recording.recording import PicturePlace, Recording
 from drivers.recording.topics import PROFILE, VIDEO
 from drivers.telemetry_log import TelemetryLog, rates_hz
 
+NO_TELEMETRY = "no telemetry"
 LOST = "a picture could not be decoded"
 
 
@@ -163,6 +164,18 @@ def origin_of(health: dict[str, Any]) -> GeoOrigin | None:
     return GeoOrigin(*values) if all(map(math.isfinite, values)) else None
 
 
+def warnings_of(health: dict[str, Any]) -> tuple[Warned, ...]:
+    """What was amiss with what a recording was imported from, in a health document."""
+    given = health.get("warnings")
+    out = []
+    for each in given if isinstance(given, list) else ():
+        try:
+            out.append(Warned(int(each["t_ns"]), str(each["what"]), str(each["detail"])))
+        except (KeyError, TypeError, ValueError, OverflowError):
+            continue
+    return tuple(out)
+
+
 def _camera(
     recording: Recording, config: CameraConfig, start_ns: int
 ) -> tuple[Camera, tuple[Warned, ...]]:
@@ -186,16 +199,17 @@ def _camera(
 def telemetry_of(
     recording: Recording, config: TelemetryConfig, warnings: tuple[Warned, ...] = ()
 ) -> TelemetryLog:
-    """The samples of a recording, with these warnings; it must have pictures."""
+    """The samples of a recording, with these warnings and its own; it must have pictures."""
     shift_ns = round(config.offset_s * 1e9)
     samples = recording.samples
     if shift_ns:
         samples = [dataclasses.replace(each, t_ns=each.t_ns + shift_ns) for each in samples]
-    if not samples:
-        start_ns = recording.pictures[0].t_ns
-        missing = Warned(start_ns, "no telemetry", "neither scale nor level will be known")
-        warnings = (*warnings, missing)
     health = recording.health
+    warnings = (*warnings, *warnings_of(health))
+    if not samples and all(warned.what != NO_TELEMETRY for warned in warnings):
+        start_ns = recording.pictures[0].t_ns
+        missing = Warned(start_ns, NO_TELEMETRY, "neither scale nor level will be known")
+        warnings = (*warnings, missing)
     return TelemetryLog(
         recording.path.name, samples, clock_of(health), origin_of(health), warnings,
         rates_hz(samples),

@@ -78,6 +78,7 @@ NUMBER, TEXT, FLAG, OBJECT = {"type": "number"}, {"type": "string"}, {"type": "b
     "type": "object"
 }  # fmt: skip
 NUMBERS = {"type": "array", "items": {"type": ["number", "null"]}}
+OBJECTS = {"type": "array", "items": OBJECT}
 INTEGER = {"type": "integer"}
 
 TOPICS: dict[str, Any] = {
@@ -136,8 +137,9 @@ TOPICS: dict[str, Any] = {
     EVENTS: Log,
     HEALTH: _Json(
         "companion.Health",
-        "How the daemon was: its status document, the autopilot's clock, the origin of local NED",
-        {"health": OBJECT, "clock": OBJECT, "origin": OBJECT},
+        "How the daemon was: its status document, the autopilot's clock, the origin of local NED; "
+        "of an import, what was amiss with its source",
+        {"health": OBJECT, "clock": OBJECT, "origin": OBJECT, "warnings": OBJECTS},
     ),
 }  # fmt: skip
 """In the order of their channels."""

@@ -81,6 +81,9 @@ def assert_same(one: Flight, other: Flight) -> None:
     assert same_pictures(one, other)
     assert same_samples(one.telemetry(), other.telemetry())
     assert one.telemetry().origin == other.telemetry().origin
+    ours = [(w.t_ns, w.what, w.detail) for w in one.telemetry().warnings]
+    for warned in (*other.warnings, *other.telemetry().warnings):
+        assert (warned.t_ns, warned.what, warned.detail) in ours
 
 
 @pytest.mark.parametrize("origin", [None, GeoOrigin(-35.36, 149.17, 584.0)])
@@ -109,9 +112,19 @@ def test_as_a_recording(tmp_path: Path, flown: Piece, origin: GeoOrigin | None) 
     flight = open_flight(tmp_path / "a.mcap", CameraConfig())
     assert format_of(tmp_path / "a.mcap").name == "recording"
     assert flight.n_frames == n
+    heights = [w for w in flight.telemetry().warnings if w.what.startswith("heights of NavSatFix")]
+    assert len(heights) == (origin is not None)
     assert_same(flight, open_flight(tmp_path / "bag", CameraConfig()))
     with pytest.raises(FlightError, match="is there already"):
         import_flight(tmp_path / "bag", tmp_path / "a.mcap", Config(), NoProgress(), print)
+
+
+def test_lines_about_what_was_amiss_may_be_damaged(tmp_path: Path) -> None:
+    said = ['1,["a, b", "c"]', '1,["a"]', "1,[", '-1,["a", "b"]', "1,7", "", f'{9**30},["a", "b"]']
+    lines = [*(f"# warning,{each}" for each in said), "unix_ns,kind,values", "5,height,1.0", ""]
+    (tmp_path / "telemetry.csv").write_text("\n".join(lines))
+    amiss = read_telemetry_csv(tmp_path / "telemetry.csv").warnings
+    assert [(w.t_ns, w.what, w.detail) for w in amiss] == [(1, "a, b", "c")]
 
 
 def test_recording_that_cannot_be_written(tmp_path: Path, flown: Piece) -> None:
