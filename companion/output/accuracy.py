@@ -48,7 +48,7 @@ def accuracy_statement(run: FinishedRun, file: str, axes: Axes | MapFrame) -> by
         )
     lines.append(
         f"Path: {report.get('tracked', 0)} of {report.get('frames', 0)} frames placed. "
-        "Times are of the middle of the exposure, on the recording computer's clock."
+        + _times(run, clock)
     )
     lines.append("No ground control was used; nothing here was checked against surveyed points.")
     return ("\n".join(lines) + "\n").encode()
@@ -56,12 +56,26 @@ def accuracy_statement(run: FinishedRun, file: str, axes: Axes | MapFrame) -> by
 
 def remarks_on_heights(run: FinishedRun) -> list[str]:
     """What the run's warnings say against its heights: they are then not those above the sea."""
-    warnings = run.report.get("warnings") or []
+    return [f"{what}: {detail}" for what, detail in _warnings(run) if what.startswith("heights")]
+
+
+def _warnings(run: FinishedRun) -> list[tuple[str, str]]:
+    """What, and its first detail."""
     return [
-        f"{warning['what']}: {warning.get('first_detail', '')}"
-        for warning in warnings
-        if isinstance(warning, dict) and str(warning.get("what")).startswith("heights")
+        (str(warning.get("what")), str(warning.get("first_detail", "")))
+        for warning in run.report.get("warnings") or []
+        if isinstance(warning, dict)
     ]
+
+
+def _times(run: FinishedRun, clock: Mapping[str, Any] | None) -> str:
+    own = [detail for what, detail in _warnings(run) if what.startswith("no frames.csv")]
+    if not own:
+        return "Times are of the middle of the exposure, on the recording computer's clock."
+    text = f"Times are the video's own, {own[0]}."
+    if clock and str(clock.get("method")).startswith("rotation") and "offset_s" in clock:
+        text += f" The log's are these less {clock['offset_s']:.3f} s."
+    return text
 
 
 def _placed(run: FinishedRun, axes: Axes | MapFrame) -> list[str]:

@@ -179,9 +179,7 @@ def test_cloud_in_a_given_projection(run: FinishedRun, tmp_path: Path) -> None:
     ("epsg", "why"), [(4326, "no flat projection"), (999_998, "no such"), (4978, "no flat"),
                       (2263, "no flat projection in metres")],
 )  # fmt: skip
-def test_projection_that_will_not_do(
-    run: FinishedRun, tmp_path: Path, epsg: int, why: str
-) -> None:
+def test_projection_that_will_not_do(run: FinishedRun, tmp_path: Path, epsg: int, why: str) -> None:
     with pytest.raises(InputError, match=why):
         exported(run, tmp_path / "out", "las", epsg=epsg)
     assert not (tmp_path / "out").exists()
@@ -310,6 +308,20 @@ def test_heights_that_are_not_above_the_sea(tmp_path: Path) -> None:
         text = (tmp_path / f"{name}.accuracy.txt").read_text()
         assert "NOT above mean sea level. heights of NavSatFix" in text
         assert "m above mean sea level" not in text
+
+
+def test_times_that_are_of_no_day(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    what = "no frames.csv: times are the file's own"
+    told = {
+        **run.report, "warnings": [{"what": what, "count": 1, "first_detail": "counted from zero"}],
+        "clock": {"method": "rotation of the pictures", "offset_s": -1762e6, "sigma_ms": 1.0},
+    }  # fmt: skip
+    exported(replace(run, report=told), tmp_path, "gpx")
+    text = (tmp_path / "trajectory.gpx.accuracy.txt").read_text()
+    assert "Times are the video's own, counted from zero" in text
+    assert "The log's are these less -1762000000.000 s." in text
+    assert "recording computer" not in text
 
 
 @pytest.mark.parametrize("formats", [("gpx",), ("las", "kml"), ("geojson",)])
