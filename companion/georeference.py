@@ -106,6 +106,26 @@ class Georeferencer:
                     return np.asarray(where[1] - where[0], np.float64)
         return None
 
+    def travelled(self, t_ns: Array) -> Array | None:
+        """The way (N, 3) of the body so far by the autopilot's velocity at times (N,), NED metres.
+
+        By one source; nan where it does not tell. None where none does.
+        """
+        for source in self._sources:
+            series = self._travel[source]
+            if len(series) >= 4:
+                value, ok = series.at(t_ns)
+                if np.count_nonzero(ok) > 1:
+                    return np.where(ok[:, None], value[:, 1], np.nan)
+        return None
+
+    def lever_ned(self, ned_from_camera: Array) -> Array:
+        """From body to camera (N, 3), NED metres, for rotations (N, 3, 3)."""
+        if self._body_from_camera is None:
+            return np.zeros((len(ned_from_camera), 3))
+        mount = self._body_from_camera
+        return np.asarray(ned_from_camera @ (mount.rotation.T @ mount.translation))
+
     def moved(self, from_ns: int, to_ns: int) -> Array | None:
         """The way (3,) by the autopilot's velocity, NED metres; None where it is not known.
 
@@ -203,14 +223,10 @@ class Georeferencer:
         return Georeference(similarity, sigma_scale, sigma_yaw, method, int(ok.sum()), residual)
 
     def _lever_ned(self, places: list[Place]) -> Array:
-        """From body to camera, in NED."""
-        if self._body_from_camera is None:
-            return np.zeros((len(places), 3))
-        lever_camera = self._body_from_camera.rotation.T @ self._body_from_camera.translation
-        return np.stack([
-            p.ned_from_camera @ lever_camera if p.ned_from_camera is not None else np.zeros(3)
-            for p in places
-        ])  # fmt: skip
+        """The same of places; nothing where their attitude is not known."""
+        untold = np.zeros((3, 3))
+        turns = [untold if p.ned_from_camera is None else p.ned_from_camera for p in places]
+        return self.lever_ned(np.stack(turns))
 
     def _range_scale(self, places: list[Place]) -> Scale | None:
         """Scale from the rangefinder against the map's ground."""

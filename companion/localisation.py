@@ -69,6 +69,7 @@ class LocalisationStage:
         """The last frame with a pose, in the newest segment's own frame."""
         self._t_ns = 0
         self._tracker.atlas.allowed = self._allowed
+        self._tracker.atlas.ways_of = self._places.ways_of
 
     @property
     def state(self) -> TrackState:

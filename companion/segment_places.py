@@ -10,13 +10,17 @@ import numpy as np
 from companion.camera_attitude import CameraAttitude
 from companion.geometry import Array, Pose, Similarity
 from companion.georeference import Georeferencer, Place
+from companion.map_fit import MAX_STEP_S, SIGMA_VELOCITY_M_S, VELOCITY_TAU_S
 from companion.messages import Georeference, MapUpdate
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.reunion import Reunion
+from companion.slam.ways import Ways, usual_error
 
 MAX_REUNION_OFF_M = 6.0
 """What the autopilot's own positions may be wrong by between two times."""
 MIN_DOWN_COSINE = np.cos(np.radians(8.0))
+MAX_SIGMA_SCALE_TOLD = 0.05
+"""A map whose scale is known no better is not told how far its cameras are apart."""
 MOST_PLACES, MOST_PLACES_FINAL = 120, 400
 
 
@@ -81,6 +85,47 @@ class SegmentPlaces:
             points.append(main_from_own.apply(segment.living_positions()))
         return MapUpdate(
             self._revision, t_ns, poses, np.concatenate(points), anchor, scales, n_retired
+        )
+
+    def ways_of(self, segment: SlamMap, keyframes: list[Keyframe]) -> Ways | None:
+        """Ways between keyframes of a segment that follow each other, by the autopilot's velocity.
+
+        As wrong as they are found to be all over the segment; None where they do not fit it.
+        """
+        placed = self.of(segment)
+        if placed is None or placed.sigma_scale > MAX_SIGMA_SCALE_TOLD:
+            return None
+        everywhere = list(segment.keyframes.values())
+        whole = self._ways(placed, everywhere)
+        if whole is None:
+            return None
+        error = usual_error(whole, *_poses(everywhere))
+        ways = None if error is None else self._ways(placed, keyframes)
+        if ways is None or error is None:
+            return None
+        return replace(ways, sigma_m=ways.sigma_m * max(error, 1.0))
+
+    def _ways(self, placed: Georeference, keyframes: list[Keyframe]) -> Ways | None:
+        t_ns = np.array([k.t_ns for k in keyframes])
+        travelled_m = self._georeferencer.travelled(t_ns)
+        if travelled_m is None:
+            return None
+        to_world, (rotation, _) = placed.world_from_map, _poses(keyframes)
+        ned_from_camera = to_world.rotation @ rotation.transpose(0, 2, 1)
+        where_m = travelled_m + self._georeferencer.lever_ned(ned_from_camera)
+        order = np.argsort(t_ns, kind="stable")
+        first, second = order[:-1], order[1:]
+        way_m, dt_s = where_m[second] - where_m[first], (t_ns[second] - t_ns[first]) * 1e-9
+        use = np.isfinite(way_m[:, :2]).all(1) & (dt_s < MAX_STEP_S)
+        if not use.any():
+            return None
+        placing = np.hypot(placed.sigma_scale, placed.sigma_yaw_rad)
+        sigma_m = np.hypot(
+            SIGMA_VELOCITY_M_S * np.sqrt(dt_s * np.maximum(dt_s, VELOCITY_TAU_S)),
+            placing * np.linalg.norm(np.nan_to_num(way_m), axis=1),
+        )
+        return Ways(
+            first[use], second[use], way_m[use], sigma_m[use], to_world.scale * to_world.rotation
         )
 
     def _main_of(self, segments: Sequence[SlamMap], final: bool) -> SlamMap:
@@ -162,6 +207,12 @@ class SegmentPlaces:
         p = in_camera @ self._body_from_camera.rotation.T
         below = p[p[:, 2] > MIN_DOWN_COSINE * np.linalg.norm(p, axis=1)]
         return float(np.median(below[:, 2])) if len(below) >= 5 else None
+
+
+def _poses(keyframes: list[Keyframe]) -> tuple[Array, Array]:
+    """Rotations (K, 3, 3) and translations (K, 3), `camera_from_map`."""
+    poses = [k.camera_from_map for k in keyframes]
+    return np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])
 
 
 def _due(segment: SlamMap) -> bool:

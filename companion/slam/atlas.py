@@ -17,6 +17,7 @@ from companion.slam.mapper import Mapper
 from companion.slam.places import PlaceIndex
 from companion.slam.relocalizer import MIN_SEEN_SHARE, Located, Relocalizer, around
 from companion.slam.reunion import Reunion, ReunionFinder
+from companion.slam.whole_map import WaysOf, no_ways
 from companion.slam.worker import MapTurn
 
 MAX_YOUNG_KEYFRAMES = 5
@@ -57,6 +58,8 @@ class Atlas:
         self.segments: list[SlamMap] = []
         self.allowed: Allowed = lambda keyframe, other, reunion: True
         """What is known beside the images has a say in whether a reunion is believed."""
+        self.ways_of: WaysOf = no_ways
+        """How far cameras are apart by what is known beside the images."""
         self.n_loops = 0
         self.begin(level=False)
 
@@ -72,7 +75,7 @@ class Atlas:
 
     def mapper_of(self, segment: SlamMap) -> Mapper:
         """Who extends and adjusts a map."""
-        return Mapper(self._mapping, self._camera, segment, self._turn)
+        return Mapper(self._mapping, self._camera, segment, self._turn, self.ways_of)
 
     def begin(self, level: bool) -> None:
         """Use a fresh map; one that was hardly begun is given up for it."""

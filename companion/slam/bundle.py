@@ -22,13 +22,14 @@ from companion.slam.compiled.bundle_sums import (
 from companion.slam.compiled.pose import CHI2_2D
 from companion.slam.features import Bools, Ints
 from companion.slam.plumb import Plumb
+from companion.slam.ways import Ways
 
 
 @dataclass(slots=True, eq=False)
 class Bundle:
     """Cameras (C), points (P, 3) and observations (O): which camera sees which point where.
 
-    `plumb` is what is told of the vertical, of all cameras.
+    `plumb` is what is told of the vertical, of all cameras, and `ways` of how far they are apart.
 
     The first `n_variable` cameras move, the others hold the gauge. `normalised` (O, 2) and
     `whitening` (O, 2, 2) are as in Features. No camera sees a point twice.
@@ -42,6 +43,7 @@ class Bundle:
     normalised: Array
     whitening: Array
     plumb: Plumb | None = None
+    ways: Ways | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +73,9 @@ def adjust(
     if plumb is not None:
         told = plumb.told(n_var)
         cost += plumb.cost(rotation, told)
+    ways = b.ways
+    if ways is not None:
+        cost += ways.cost(rotation, translation)
     first_cost = cost
     damping = 1e-4
     moving = np.flatnonzero(b.camera < n_var)
@@ -97,6 +102,10 @@ def adjust(
             block = schur[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
             block += hcc[k] + np.diag(damping * np.diag(hcc[k]) + 1e-9)
         rhs = -gc.ravel() + added
+        if ways is not None:
+            tied, pull = ways.normal_equations(rotation, translation, n_var)
+            schur += tied
+            rhs -= pull
         try:
             dc = cho_solve(cho_factor(schur, check_finite=False), rhs, check_finite=False)
         except np.linalg.LinAlgError:
@@ -118,6 +127,8 @@ def adjust(
         )
         if plumb is not None:
             new_cost += plumb.cost(new_rotation, told)
+        if ways is not None:
+            new_cost += ways.cost(new_rotation, new_translation)
         accepted = new_cost < cost
         if accepted:
             gain = (cost - new_cost) / max(cost, 1e-12)

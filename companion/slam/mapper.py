@@ -19,7 +19,7 @@ from companion.slam.matching import match_epipolar
 from companion.slam.patches import image_levels
 from companion.slam.refinement import refine_features
 from companion.slam.triangulation import consistent, triangulate
-from companion.slam.whole_map import parts_of, put_back, put_back_later, take
+from companion.slam.whole_map import WaysOf, no_ways, parts_of, put_back, put_back_later, take
 from companion.slam.worker import MapTurn
 
 MIN_PARALLAX_RAD = np.radians(0.8)
@@ -32,8 +32,10 @@ class Mapper:
     """Owns the work done once for each keyframe."""
 
     def __init__(
-        self, config: MappingConfig, camera: Camera, slam_map: SlamMap, turn: MapTurn
-    ) -> None:
+        self, config: MappingConfig, camera: Camera, slam_map: SlamMap, turn: MapTurn,
+        ways_of: WaysOf = no_ways,
+    ) -> None:  # fmt: skip
+        self._ways_of = ways_of
         self._config = config
         self._turn = turn
         self._map = slam_map
@@ -253,7 +255,9 @@ class Mapper:
                 variable = [k for k in variable if k.keyframe_id in stayed]
                 fixed = [k for k in fixed if k.keyframe_id in stayed]
                 mask = np.r_[mask, np.zeros(self._map.n_points - len(mask), bool)]
-                taken = take(self._map, variable, fixed, mask) if variable and fixed else None
+                if not (variable and fixed):
+                    continue
+                taken = take(self._map, variable, fixed, mask, self._ways_of)
             if taken is None:
                 continue
             result = adjust(taken.bundle, iterations, meanwhile)
@@ -269,7 +273,7 @@ class Mapper:
         mask: Bools,
         iterations: int | None = None,
     ) -> None:
-        taken = take(self._map, variable, fixed, mask)
+        taken = take(self._map, variable, fixed, mask, self._ways_of)
         if taken is None:
             return
         if iterations is None:

@@ -6,7 +6,7 @@ adjusted, so that putting back is one step and nothing tears.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from companion.slam.bundle import Adjusted, Bundle
 from companion.slam.features import Bools, Ints
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.plumb import Plumb, plumb_of
+from companion.slam.ways import Ways
 
 MOST_TOGETHER, MOST_HOLDING = 500, 80
 """Keyframes adjusted at once, for which memory grows with the square, and those that hold them."""
@@ -36,9 +37,18 @@ class Taken:
     born: Ints
 
 
+WaysOf = Callable[[SlamMap, list[Keyframe]], Ways | None]
+"""What is told of how far a map's cameras are apart; None where nothing is."""
+
+
+def no_ways(slam_map: SlamMap, keyframes: list[Keyframe]) -> None:
+    """Nothing is told."""
+
+
 def take(
-    slam_map: SlamMap, variable: list[Keyframe], fixed: list[Keyframe], mask: Bools
-) -> Taken | None:
+    slam_map: SlamMap, variable: list[Keyframe], fixed: list[Keyframe], mask: Bools,
+    ways_of: WaysOf = no_ways,
+) -> Taken | None:  # fmt: skip
     """Keyframes and, of the points in `mask` (N,), those that two of them see; None if too few."""
     cameras, obs_cam, obs_feat, obs_id = [*variable, *fixed], [], [], []
     for i, k in enumerate(cameras):
@@ -59,7 +69,7 @@ def take(
         cam, index,
         np.concatenate([k.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
         np.concatenate([k.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
-        _plumb(slam_map, cameras),
+        _plumb(slam_map, cameras), ways_of(slam_map, cameras),
     )  # fmt: skip
     return Taken(bundle, cameras, feat, points, slam_map.born[points])
 
