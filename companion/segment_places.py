@@ -19,6 +19,8 @@ from companion.slam.ways import Ways, usual_error
 MAX_REUNION_OFF_M = 6.0
 """What the autopilot's own positions may be wrong by between two times."""
 MIN_DOWN_COSINE = np.cos(np.radians(8.0))
+ALIKE = 3.0
+"""Each window takes the same ways anew, and their errors are alike: sigmas are so much larger."""
 MAX_SIGMA_SCALE_TOLD = 0.05
 """A map whose scale is known no better is not told how far its cameras are apart."""
 MOST_PLACES, MOST_PLACES_FINAL = 120, 400
@@ -103,7 +105,7 @@ class SegmentPlaces:
         ways = None if error is None else self._ways(placed, keyframes)
         if ways is None or error is None:
             return None
-        return replace(ways, sigma_m=ways.sigma_m * max(error, 1.0))
+        return replace(ways, sigma_m=ALIKE * ways.sigma_m * max(error, 1.0))
 
     def _ways(self, placed: Georeference, keyframes: list[Keyframe]) -> Ways | None:
         t_ns = np.array([k.t_ns for k in keyframes])
