@@ -13,7 +13,15 @@ import numpy as np
 
 from companion.geometry import quaternion_from_rotation, rotation_from_quaternion
 from companion.geometry import rotation_from_vector as turn_by
-from companion.messages import AttitudeSample, Bytes, Frame, ImuSample, Telemetry, Warned
+from companion.messages import (
+    AttitudeSample,
+    Bytes,
+    Frame,
+    ImuSample,
+    PositionSample,
+    Telemetry,
+    Warned,
+)
 
 Samples = list[Telemetry]
 Pictures = Iterable[Frame | Warned]
@@ -28,6 +36,8 @@ DROPPED_SHARE = 0.3
 EXPOSURE_GAINS = (1.0, 0.45, 1.5, 0.7)
 EXPOSURE_STEP_S = 2.0
 BLUR_PX = 9
+FAINT_SHARE, FAINT_NOISE = 0.15, 1.5
+VELOCITY_SCALE, VELOCITY_TURN_RAD = 1.1, np.radians(8.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +97,17 @@ def _silent(samples: Samples, span: Span) -> Samples:
     return [s for s in samples if not span.fault_ns <= s.t_ns < until_ns]
 
 
+def _wrong_velocity(samples: Samples, span: Span) -> Samples:
+    """The autopilot's compass is off, and its velocity too large."""
+    turn = VELOCITY_SCALE * turn_by(np.array([0.0, 0.0, VELOCITY_TURN_RAD]))
+
+    def wrong(sample: PositionSample) -> PositionSample:
+        velocity = sample.velocity_ned_m_s
+        return sample if velocity is None else replace(sample, velocity_ned_m_s=turn @ velocity)
+
+    return [wrong(s) if isinstance(s, PositionSample) else s for s in samples]
+
+
 def _edited(
     edit: Callable[[Bytes, int], Bytes],
 ) -> Callable[[Pictures, Span], Iterator[Frame | Warned]]:
@@ -130,6 +151,13 @@ def _exposed(grey: Bytes, since_ns: int) -> Bytes:
     return np.asarray(np.clip(grey * EXPOSURE_GAINS[step], 0, 255), np.uint8)
 
 
+def _faint(grey: Bytes, since_ns: int) -> Bytes:
+    """Hardly any contrast, and the camera's own noise on it."""
+    rng = np.random.default_rng(since_ns)
+    noise = rng.normal(scale=FAINT_NOISE, size=grey.shape)
+    return np.asarray(np.clip(128 + FAINT_SHARE * (grey - 128.0) + noise, 0, 255), np.uint8)
+
+
 def _blurred(grey: Bytes, since_ns: int) -> Bytes:
     """Smeared along a direction that turns, for half a second in every two."""
     if (since_ns * 1e-9) % 2.0 > 0.5:
@@ -152,8 +180,11 @@ FAULTS = (
     Fault("telemetry 60 ms late", telemetry=_late),
     Fault("telemetry silent for 3 s", telemetry=_silent),
     Fault("blind for 2 s", pictures=_blinded, blind_s=BLIND_S),
+    Fault("blind for 2 s, telemetry silent for 3 s", _silent, _blinded, BLIND_S),
+    Fault("velocity 10 % and 8 degrees off", telemetry=_wrong_velocity),
     Fault("30 % of frames dropped", pictures=_dropped),
     Fault("two of three frames dropped", pictures=_every_third),
     Fault("exposure steps", pictures=_edited(_exposed)),
     Fault("motion blur", pictures=_edited(_blurred)),
+    Fault("faint pictures", pictures=_edited(_faint)),
 )

@@ -6,7 +6,15 @@ import numpy as np
 
 from companion.faults import FAULTS, Fault, Span
 from companion.geometry import angle_between, rotation_from_quaternion
-from companion.messages import AttitudeSample, Frame, HeightSample, Telemetry, Warned
+from companion.messages import (
+    AttitudeSample,
+    Frame,
+    HeightSample,
+    PositionSample,
+    PositionSource,
+    Telemetry,
+    Warned,
+)
 
 SPAN = Span(1_000_000_000, 11_000_000_000)
 LEVEL = np.array([1.0, 0, 0, 0])
@@ -79,3 +87,24 @@ def test_dropped_frames_are_the_same_each_time() -> None:
 def test_exposure_steps_and_blur_change_images_only() -> None:
     assert {int(f.grey[0, 0]) for f in filmed("exposure steps")} == {100, 45, 150, 70}
     assert len(filmed("motion blur")) == 100
+
+
+def test_a_wrong_velocity_is_turned_and_too_large() -> None:
+    right = PositionSample(5, PositionSource.GPS, np.zeros(3), np.array([2.0, 0.0, -1.0]))
+    untold = PositionSample(6, PositionSource.GPS, np.zeros(3))
+    wrong, same = fault("velocity 10 % and 8 degrees off").telemetry([right, untold], SPAN)
+    assert same is untold
+    assert isinstance(wrong, PositionSample) and wrong.velocity_ned_m_s is not None
+    turned = np.radians(8.0)
+    expected = [2.2 * np.cos(turned), 2.2 * np.sin(turned), -1.1]
+    assert np.allclose(wrong.velocity_ned_m_s, expected)
+
+
+def test_faint_pictures_have_little_contrast_and_noise() -> None:
+    steps = np.repeat(np.array([[28, 228]], np.uint8), 300, 0)
+    frame = Frame(0, SPAN.start_ns, steps, np.repeat(steps[..., None], 3, 2))
+    (seen,) = fault("faint pictures").pictures([frame], SPAN)
+    assert isinstance(seen, Frame)
+    dark, light = seen.grey[:, 0], seen.grey[:, 1]
+    assert abs(light.mean() - dark.mean() - 30.0) < 1.0
+    assert 1.0 < dark.std() < 2.0
