@@ -143,9 +143,10 @@ class LocalisationStage:
         update = self._map_update() if other_map and self._segments() else None
         for message in tracked:
             if isinstance(message, Track) and message.map_from_camera is not None:
+                told = self._attitude.at(message.t_ns)
+                self._motion.correct(message.t_ns, message.map_from_camera, told)
                 if message.seq == frame.seq:
                     self._last = message
-                    self._motion.correct(frame.t_ns, message.map_from_camera, attitude)
                     self._attitude.compare(frame.t_ns, message.map_from_camera.rotation)
                     yield self._odometry_of(message)
                 placed = self._places.main_from_newest.apply_to_pose(message.map_from_camera)
@@ -232,18 +233,18 @@ class LocalisationStage:
     def _judge_attitude(self, t_ns: int) -> list[Warned]:
         judged = self._attitude.judge(t_ns, self._motion.attitude_disagreement_rad)
         if judged.now_from_before is not None:
-            self._turn_downs(judged.now_from_before)
+            self._turn_attitudes(judged.now_from_before)
         if judged.before_from_now_ned is not None:
             self._motion.attitude_corrected(judged.before_from_now_ned)
         return judged.warnings
 
-    def _turn_downs(self, turn: Array) -> None:
-        """What keyframes were told of the vertical was told by the mount as it was stated."""
+    def _turn_attitudes(self, turn: Array) -> None:
+        """What keyframes were told of their attitude was told by the mount as it was stated."""
         with self._tracker.turn.tracking():
             for segment in self._tracker.segments:
                 for keyframe in segment.keyframes.values():
-                    if keyframe.down_camera is not None:
-                        keyframe.down_camera = turn @ keyframe.down_camera
+                    if keyframe.ned_from_camera is not None:
+                        keyframe.ned_from_camera = keyframe.ned_from_camera @ turn.T
 
     def _allowed(self, keyframe: Keyframe, other: Keyframe, found: Reunion) -> bool:
         return self._places.allowed(self._tracker.map, keyframe, other, found)

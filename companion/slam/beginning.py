@@ -62,26 +62,37 @@ def carry_on(atlas: Atlas, ashore: View, first: Keyframe, start: Start, across: 
 
 
 def place_earlier(
-    placer: Placer, views: Iterable[View], first: Keyframe, second: Keyframe
+    placer: Placer, views: Iterable[View], first: View, second: View, reference: Keyframe
 ) -> list[View]:
-    """Place the frames that came before the map: from the first keyframe outwards."""
+    """Place the frames that came before the map: from the first view outwards.
+
+    `reference` is the first view's keyframe.
+    """
     views = [v for v in views if v.seq != second.seq]
     placed: list[View] = []
     before = [v for v in views if v.seq <= first.seq][::-1]
     after = [v for v in views if v.seq > first.seq]
-    for run, start, end in ((before, first, None), (after, first, second)):
-        pose, misses, last = start.camera_from_map, 0, start.t_ns
+    for run, between in ((before, False), (after, True)):
+        last, other, misses = first, second, 0
         for v in run:
-            guess = pose
-            if end is not None:
-                share = (v.t_ns - start.t_ns) / max(end.t_ns - start.t_ns, 1)
-                centre = (1 - share) * start.centre + share * end.centre
-                guess = Pose(pose.rotation, -pose.rotation @ centre)
-            if placer.place_near(v, guess) or placer.locate_by(v, start):
-                pose, misses, last = v.camera_from_map, 0, v.t_ns
+            guess = _on_the_way(last, other, v)
+            found = placer.place_near(v, guess) or placer.locate_by(v, reference)
+            if found or placer.follow(v, guess, last):
+                other = second if between or v.seq == first.seq else last
+                last, misses = v, 0
                 placed.append(v)
             else:
                 misses += 1
-                if misses > 5 or abs(v.t_ns - last) > 1e9:
+                if misses > 5 or abs(v.t_ns - last.t_ns) > 1e9:
                     break
     return sorted(placed, key=lambda v: v.seq)
+
+
+def _on_the_way(last: View, other: View, view: View) -> Pose:
+    """Where a view is that is between or beyond two with poses, by time; turned as is told."""
+    share = (view.t_ns - last.t_ns) / ((other.t_ns - last.t_ns) or 1)
+    centre = last.centre + share * (other.centre - last.centre)
+    rotation = last.camera_from_map.rotation
+    if view.ned_from_camera is not None and last.ned_from_camera is not None:
+        rotation = view.ned_from_camera.T @ last.ned_from_camera @ rotation
+    return Pose(rotation, -rotation @ centre)

@@ -6,8 +6,9 @@ window of ten cameras and a whole flight of hundreds are the same code and littl
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -21,15 +22,25 @@ from companion.slam.compiled.bundle_sums import (
 )
 from companion.slam.compiled.pose import CHI2_2D
 from companion.slam.features import Bools, Ints
-from companion.slam.plumb import Plumb
-from companion.slam.ways import Ways
+
+
+class Tie(Protocol):
+    """What is told of cameras beside the images, by their `camera_from_map` poses (C, …)."""
+
+    def cost(self, rotation: Array, translation: Array) -> float:
+        """What it costs that the cameras do not agree with it."""
+
+    def add_to(
+        self, information: Array, gradient: Array, rotation: Array, translation: Array
+    ) -> None:
+        """Add its information (n, 6, n, 6) and gradient (n, 6) of the first n cameras."""
 
 
 @dataclass(slots=True, eq=False)
 class Bundle:
     """Cameras (C), points (P, 3) and observations (O): which camera sees which point where.
 
-    `plumb` is what is told of the vertical, of all cameras, and `ways` of how far they are apart.
+    `ties` is what is told beside the images.
 
     The first `n_variable` cameras move, the others hold the gauge. `normalised` (O, 2) and
     `whitening` (O, 2, 2) are as in Features. No camera sees a point twice.
@@ -42,8 +53,7 @@ class Bundle:
     point: Ints
     normalised: Array
     whitening: Array
-    plumb: Plumb | None = None
-    ways: Ways | None = None
+    ties: Sequence[Tie] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,13 +79,7 @@ def adjust(
     p, residual, cost = errors(
         rotation, translation, points, b.camera, b.point, b.normalised, b.whitening
     )
-    plumb, told = b.plumb, np.zeros(0, np.int64)
-    if plumb is not None:
-        told = plumb.told(n_var)
-        cost += plumb.cost(rotation, told)
-    ways = b.ways
-    if ways is not None:
-        cost += ways.cost(rotation, translation)
+    cost += sum(tie.cost(rotation, translation) for tie in b.ties)
     first_cost = cost
     damping = 1e-4
     moving = np.flatnonzero(b.camera < n_var)
@@ -87,10 +91,6 @@ def adjust(
             hcc, gc, hpp, gp, hcp = normal_equations(
                 rotation, p, residual, b.camera, b.point, b.whitening, n_var, n_points
             )
-            if plumb is not None:
-                information, gradient = plumb.normal_equations(rotation, told)
-                hcc[told, :3, :3] += information
-                gc[told, :3] += gradient
         between()
         damped = hpp + (damping * np.einsum("nii->ni", hpp) + 1e-9)[..., None] * np.eye(3)
         inverse = np.linalg.inv(damped)
@@ -101,11 +101,10 @@ def adjust(
         for k in range(n_var):
             block = schur[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
             block += hcc[k] + np.diag(damping * np.diag(hcc[k]) + 1e-9)
-        rhs = -gc.ravel() + added
-        if ways is not None:
-            tied, pull = ways.normal_equations(rotation, translation, n_var)
-            schur += tied
-            rhs -= pull
+        pull = gc.copy()
+        for tie in b.ties:
+            tie.add_to(schur.reshape(n_var, 6, n_var, 6), pull, rotation, translation)
+        rhs = added - pull.ravel()
         try:
             dc = cho_solve(cho_factor(schur, check_finite=False), rhs, check_finite=False)
         except np.linalg.LinAlgError:
@@ -125,10 +124,7 @@ def adjust(
         new_p, new_residual, new_cost = errors(
             new_rotation, new_translation, new_points, b.camera, b.point, b.normalised, b.whitening
         )
-        if plumb is not None:
-            new_cost += plumb.cost(new_rotation, told)
-        if ways is not None:
-            new_cost += ways.cost(new_rotation, new_translation)
+        new_cost += sum(tie.cost(new_rotation, new_translation) for tie in b.ties)
         accepted = new_cost < cost
         if accepted:
             gain = (cost - new_cost) / max(cost, 1e-12)

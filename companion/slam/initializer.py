@@ -16,6 +16,7 @@ from companion.geometry import Array, Pose, angle_between
 from companion.slam.bundle import Bundle, adjust
 from companion.slam.features import Features, Ints
 from companion.slam.triangulation import consistent, triangulate
+from companion.slam.turns import Turns
 
 MAX_PRIOR_DISAGREEMENT_RAD = np.radians(8.0)
 MIN_POINTS = 60
@@ -85,7 +86,7 @@ def initialise(
     best = _best(candidates, a, b, index_a, index_b, rotation_prior is not None)
     if best is None:
         return None
-    return _refined(best, a, b, index_a, index_b, min_parallax_rad, planar)
+    return _refined(best, a, b, index_a, index_b, rotation_prior, min_parallax_rad, planar)
 
 
 def _turned_only(xa: Array, xb: Array, focal_px: float, told: Array | None) -> bool:
@@ -249,9 +250,13 @@ def _unexplained(pose: Pose, a: Features, b: Features, index_a: Ints, index_b: I
 
 
 def _adjusted(
-    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints, limit: float
-) -> Pose | None:
-    """A pose, its baseline of length one, adjusted to the matches that agree with it."""
+    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints, limit: float,
+    told: Array | None = None,
+) -> Pose | None:  # fmt: skip
+    """A pose, its baseline of length one, adjusted to the matches that agree with it.
+
+    And to the turn that was `told`.
+    """
     points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
     ok = consistent(
         points, pose, a.normalised[index_a], b.normalised[index_b],
@@ -261,10 +266,12 @@ def _adjusted(
     n = len(ia)
     if n < MIN_POINTS // 2:
         return None
+    turn = None if told is None else Turns.told(np.array([1]), np.array([0]), told[None])
     bundle = Bundle(
         [pose, Pose.identity()], 1, pts,
         np.repeat(np.array([0, 1]), n), np.tile(np.arange(n), 2),
         np.r_[b.normalised[ib], a.normalised[ia]], np.r_[b.whitening[ib], a.whitening[ia]],
+        () if turn is None else (turn,),
     )  # fmt: skip
     adjusted = adjust(bundle, 12)
     scale = 1.0 / max(float(np.linalg.norm(adjusted.poses[0].translation)), 1e-12)
@@ -272,11 +279,11 @@ def _adjusted(
 
 
 def _refined(
-    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints,
+    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints, told: Array | None,
     min_parallax_rad: float, planar: bool,
 ) -> TwoView | None:  # fmt: skip
     for limit in (16.0, 5.991):
-        adjusted = _adjusted(pose, a, b, index_a, index_b, limit)
+        adjusted = _adjusted(pose, a, b, index_a, index_b, limit, told)
         if adjusted is None:
             return None
         pose = adjusted

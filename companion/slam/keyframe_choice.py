@@ -74,5 +74,5 @@ def keyframe_of(view: View, keyframe_id: int) -> Keyframe:
         view.features.normalised.copy() if view.normalised is None else view.normalised,
         view.features.whitening.copy() if view.whitening is None else view.whitening,
         np.full(len(view.features), -1) if view.refined_for is None else view.refined_for,
-        view.grey, None if view.ned_from_camera is None else view.ned_from_camera[2],
+        view.grey, view.ned_from_camera,
     )  # fmt: skip

@@ -47,8 +47,8 @@ class Keyframe:
     """(N,) the point with whose patch each feature was refined, -1 where it was not"""
     grey: Bytes | None = None
     """the image, while it may be looked at again"""
-    down_camera: Array | None = None
-    """(3,) by the autopilot, where it told"""
+    ned_from_camera: Array | None = None
+    """(3, 3) by the autopilot, where it told"""
 
     @property
     def centre(self) -> Array:

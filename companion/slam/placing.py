@@ -9,6 +9,7 @@ from companion.config import TrackingConfig
 from companion.geometry import Pose
 from companion.slam.atlas import Atlas
 from companion.slam.features import Ints
+from companion.slam.following import follow
 from companion.slam.local_map import Projector, local_points
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.patches import image_levels
@@ -29,7 +30,7 @@ class Placer:
     def __init__(self, config: TrackingConfig, camera: Camera, atlas: Atlas) -> None:
         self._config = config
         self._atlas = atlas
-        self._projector = Projector(camera)
+        self._camera, self._projector = camera, Projector(camera)
         self.local: Ints = np.zeros(0, np.int64)
         """The points around the last view that was placed."""
 
@@ -86,6 +87,25 @@ class Placer:
         return self.match(view, guess, self.local, 25.0) or self.match(
             view, guess, self.local, 60.0
         )
+
+    def follow(self, view: View, guess: Pose, last: View) -> bool:
+        """Follow the points around from a view that was placed; whether the view is there.
+
+        It has a pose then, but shows points only as far as its features do.
+        """
+        if last.grey.shape != view.grey.shape:
+            return False
+        turn_told = last.ned_from_camera is not None and view.ned_from_camera is not None
+        pose = follow(
+            self._camera, self._map.positions[self.local], last.grey, last.camera_from_map,
+            view.grey, guess, turn_told,
+        )  # fmt: skip
+        if pose is None:
+            return False
+        if not self.match(view, pose, self.local, 5.0):
+            view.camera_from_map, view.information = pose, None
+            view.point_ids = np.full(len(view.features), -1)
+        return True
 
     def locate_by(self, view: View, keyframe: Keyframe) -> bool:
         """Place a view as a lost camera would, by what one keyframe shows."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.geometry import Array, skew
-from companion.slam.features import Ints
 
 LEAST_SIGMA_RAD, MOST_SIGMA_RAD = np.radians(0.3), np.radians(1.0)
 """More is not the attitude's error but the map's,"""
@@ -34,27 +33,30 @@ class Plumb:
     down_map: Array
     sigma_rad: float
 
-    def told(self, n: int) -> Ints:
-        """Which of the first `n` cameras something was told of."""
-        return np.flatnonzero(np.isfinite(self.down_camera[:n, 0]))
-
-    def errors(self, rotation: Array, told: Ints) -> tuple[Array, Array]:
-        """Whitened errors (T, 3) of cameras with `camera_from_map` rotations, and their sizes."""
-        off = (rotation[told] @ self.down_map - self.down_camera[told]) / self.sigma_rad
+    def errors(self, rotation: Array) -> tuple[Array, Array]:
+        """Whitened errors (C, 3) of cameras with `camera_from_map` rotations, and their sizes."""
+        off = np.nan_to_num((rotation @ self.down_map - self.down_camera) / self.sigma_rad)
         return off, np.linalg.norm(off, axis=1)
 
-    def cost(self, rotation: Array, told: Ints) -> float:
+    def cost(self, rotation: Array, translation: Array) -> float:
         """Huber's loss of all of them."""
-        _, size = self.errors(rotation, told)
+        _, size = self.errors(rotation)
         return float(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).sum())
 
-    def normal_equations(self, rotation: Array, told: Ints) -> tuple[Array, Array]:
-        """What it adds to the rotations' information (T, 3, 3) and gradient (T, 3)."""
-        off, size = self.errors(rotation, told)
+    def add_to(
+        self, information: Array, gradient: Array, rotation: Array, translation: Array
+    ) -> None:
+        """Add its information (n, 6, n, 6) and gradient (n, 6) of the first n cameras.
+
+        A camera moves as in bundle adjustment, by a turn and then a shift (6,).
+        """
+        told = np.flatnonzero(np.isfinite(self.down_camera[: len(gradient), 0]))
+        off, size = self.errors(rotation)
         jacobian = -skew(rotation[told] @ self.down_map) / self.sigma_rad
-        weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-9))
+        weight = np.minimum(1.0, HUBER / np.maximum(size[told], 1e-9))
         weighted = jacobian.transpose(0, 2, 1) * weight[:, None, None]
-        return weighted @ jacobian, (weighted @ off[..., None])[..., 0]
+        information[told, :3, told, :3] += weighted @ jacobian
+        gradient[told, :3] += (weighted @ off[told, :, None])[..., 0]
 
 
 def plumb_of(rotation: Array, down_camera: Array) -> tuple[Array, float] | None:

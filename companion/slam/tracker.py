@@ -148,7 +148,7 @@ class Tracker:
             begin_map(self.atlas, start, first, second)
         self._placer.refresh_local(start.second)
         self.state, self._lost_since_ns = TrackState.TRACKING, None
-        out = self._placed_earlier(first, second)
+        out = self._placed_earlier(start.first, start.second, first)
         out += [track_of(self.map, start.second, second)]
         out += [keyframe_added(self.map, first), keyframe_added(self.map, second)]
         return out
@@ -156,18 +156,19 @@ class Tracker:
     def _go_on(self, start: Start, across: Bridge) -> list[Told]:
         """Take two views into the map that the first of them was the last to be tracked in."""
         assert self._ashore is not None
-        first, view = self._keyframe(self._ashore), start.second
-        carry_on(self.atlas, self._ashore, first, start, across)
+        ashore, view = self._ashore, start.second
+        first = self._keyframe(ashore)
+        carry_on(self.atlas, ashore, first, start, across)
         self._last, self._ashore = view, None
         self._placer.refresh_local(view)
         second = self._insert(view)
-        between = self._placed_earlier(first, second)
+        between = self._placed_earlier(ashore, view, first)
         self.state, self._lost_since_ns = TrackState.TRACKING, None
         return [keyframe_added(self.map, first), *between, track_of(self.map, view, second)]
 
-    def _placed_earlier(self, first: Keyframe, second: Keyframe) -> list[Told]:
-        views = place_earlier(self._placer, self._bootstrap.pending, first, second)
-        return [track_of(self.map, view, first, backfilled=True) for view in views]
+    def _placed_earlier(self, first: View, second: View, reference: Keyframe) -> list[Told]:
+        views = place_earlier(self._placer, self._bootstrap.pending, first, second, reference)
+        return [track_of(self.map, view, reference, backfilled=True) for view in views]
 
     # -- tracking -------------------------------------------------------------------------------
 
@@ -190,6 +191,7 @@ class Tracker:
             found = found or placer.match(view, guess, placer.local, 25.0, at_least=firm)
             if not found and turn_known:
                 found = self._by_reference(view)
+                found = found or placer.follow(view, guess, last)
         if not found and not self._relocalise(view):
             return False
         placer.refresh_local(view)

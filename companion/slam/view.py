@@ -33,6 +33,12 @@ class View:
     """(6, 6) of the pose: rotation, translation in the camera frame"""
 
     @property
+    def centre(self) -> Array:
+        """Position of the camera in the map."""
+        out: Array = -self.camera_from_map.rotation.T @ self.camera_from_map.translation
+        return out
+
+    @property
     def n_inliers(self) -> int:
         """Features that show a map point."""
         return int(np.count_nonzero(self.point_ids >= 0))

@@ -46,16 +46,19 @@ class Ways:
         _, size = self.errors(rotation, translation)
         return float((0.5 * SOFT**2 * np.log1p((size / SOFT) ** 2)).sum())
 
-    def normal_equations(self, rotation: Array, translation: Array, n: int) -> tuple[Array, Array]:
-        """What they add to information (6n, 6n) and gradient (6n,) of the first `n` cameras.
+    def add_to(
+        self, information: Array, gradient: Array, rotation: Array, translation: Array
+    ) -> None:
+        """Add their information (n, 6, n, 6) and gradient (n, 6) of the first n cameras.
 
         A camera moves as in bundle adjustment, by a turn and then a shift (6,).
         """
+        n = len(gradient)
         off, size = self.errors(rotation, translation)
         root = 1.0 / np.hypot(1.0, size / SOFT)
         known = np.isfinite(self.way_m) * (root / self.sigma_m)[:, None]
         off = off * root[:, None]
-        information, gradient = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
+        shifted = information[:, 3:, :, 3:].transpose(0, 2, 1, 3)
         ends = []
         for camera, sign in ((self.first, 1.0), (self.second, -1.0)):
             turned = self.world_from_map @ rotation[camera].transpose(0, 2, 1)
@@ -66,8 +69,7 @@ class Ways:
             for b, of_b, moves_b in ends:
                 both = moves_a & moves_b
                 tied = np.matmul(of_a.transpose(0, 2, 1), of_b)[both]
-                np.add.at(information[:, 3:, :, 3:].transpose(0, 2, 1, 3), (a[both], b[both]), tied)
-        return information.reshape(6 * n, 6 * n), gradient.ravel()
+                np.add.at(shifted, (a[both], b[both]), tied)
 
 
 def usual_error(ways: Ways, rotation: Array, translation: Array) -> float | None:

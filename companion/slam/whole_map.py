@@ -12,14 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.geometry import Array, Pose
-from companion.slam.bundle import Adjusted, Bundle
+from companion.slam.bundle import Adjusted, Bundle, Tie
 from companion.slam.features import Bools, Ints
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.plumb import Plumb, plumb_of
+from companion.slam.turns import turns_of
 from companion.slam.ways import Ways
 
 MOST_TOGETHER, MOST_HOLDING = 500, 80
 """Keyframes adjusted at once, for which memory grows with the square, and those that hold them."""
+MAX_TURN_NS = 2_000_000_000
+"""Gyroscopes tell a turn that took longer no better than the vertical and the compass do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,21 +72,29 @@ def take(
         cam, index,
         np.concatenate([k.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
         np.concatenate([k.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
-        _plumb(slam_map, cameras), ways_of(slam_map, cameras),
+        _ties(slam_map, cameras, ways_of(slam_map, cameras)),
     )  # fmt: skip
     return Taken(bundle, cameras, feat, points, slam_map.born[points])
 
 
-def _plumb(slam_map: SlamMap, cameras: list[Keyframe]) -> Plumb | None:
-    everywhere = list(slam_map.keyframes.values())
+def _ties(slam_map: SlamMap, cameras: list[Keyframe], ways: Ways | None) -> list[Tie]:
+    """What the autopilot tells of cameras: the vertical, or first their turns, and ways between."""
+    everywhere, attitudes = list(slam_map.keyframes.values()), _attitudes(cameras)
     rotation = np.stack([k.camera_from_map.rotation for k in everywhere])
-    found = plumb_of(rotation, _downs(everywhere))
-    return None if found is None else Plumb(_downs(cameras), *found)
+    down = plumb_of(rotation, _attitudes(everywhere)[:, 2])
+    if down is not None:
+        told: Tie | None = Plumb(attitudes[:, 2], *down)
+    else:
+        t_ns = np.array([k.t_ns for k in cameras])
+        order = np.argsort(t_ns, kind="stable")
+        soon = np.diff(t_ns[order]) < MAX_TURN_NS
+        told = turns_of(order[:-1][soon], order[1:][soon], attitudes)
+    return [tie for tie in (told, ways) if tie is not None]
 
 
-def _downs(keyframes: list[Keyframe]) -> Array:
-    untold = np.full(3, np.nan)
-    return np.stack([untold if k.down_camera is None else k.down_camera for k in keyframes])
+def _attitudes(keyframes: list[Keyframe]) -> Array:
+    untold = np.full((3, 3), np.nan)
+    return np.stack([untold if k.ned_from_camera is None else k.ned_from_camera for k in keyframes])
 
 
 def put_back(slam_map: SlamMap, taken: Taken, result: Adjusted) -> None:

@@ -145,6 +145,25 @@ def test_two_views_start_a_map(rng: np.random.Generator, flat: bool, prior: bool
     assert len(result.points_a) > 250
 
 
+def test_what_two_coarse_pictures_of_the_ground_leave_open_a_told_turn_tells(
+    rng: np.random.Generator,
+) -> None:
+    points = np.c_[rng.uniform(-0.35, 0.35, (140, 2)), rng.normal(1.0, 0.08, 140)]
+    climb = Pose(rotation_from_vector(np.array([0.0, 0.01, 0.0])), np.array([0.0, -0.05, 0.14]))
+    xa = project(Pose.identity(), points) + rng.normal(scale=1.0 / FOCAL, size=(140, 2))
+    xb = project(climb, points) + rng.normal(scale=1.0 / FOCAL, size=(140, 2))
+    found = []
+    for off_deg in (-0.5, 0.5):
+        told = rotation_from_vector(np.radians([off_deg, 0.0, 0.0])) @ climb.rotation
+        index = np.arange(140)
+        result = initialise(
+            features(xa), features(xb), index, index, FOCAL, 5, told, np.radians(1.0)
+        )
+        assert result is not None
+        found.append(result.b_from_a.rotation)
+    assert 0.1 < np.degrees(angle_between(found[0], found[1])) < 1.0
+
+
 def test_pure_rotation_and_tiny_parallax_start_nothing(rng: np.random.Generator) -> None:
     points = scene(rng, 300)
     a = Pose.identity()

@@ -23,17 +23,18 @@ def test_the_gradient_is_that_of_the_cost(rng: np.random.Generator) -> None:
     down = np.stack([turned(rng, 0.03) @ r @ DOWN for r in rotation])
     down[2] = np.nan
     plumb = Plumb(down, DOWN, 0.02)
-    told = plumb.told(6)
-    assert told.tolist() == [0, 1, 3, 4, 5]
-    information, gradient = plumb.normal_equations(rotation, told)
-    assert np.linalg.eigvalsh(information).min() > -1e-6
+    still = np.zeros((6, 3))
+    information, gradient = np.zeros((5, 6, 5, 6)), np.zeros((5, 6))
+    plumb.add_to(information, gradient, rotation, still)
+    assert not information[2].any()
+    assert np.linalg.eigvalsh(information.reshape(30, 30)).min() > -1e-6
     step = 1e-6
-    for k, camera in enumerate(told.tolist()):
+    for camera in range(5):
         for axis in range(3):
             moved = rotation.copy()
             moved[camera] = rotation_from_vector(step * np.eye(3)[axis]) @ rotation[camera]
-            slope = (plumb.cost(moved, told) - plumb.cost(rotation, told)) / step
-            assert gradient[k, axis] == pytest.approx(slope, rel=1e-3, abs=1e-2)
+            slope = (plumb.cost(moved, still) - plumb.cost(rotation, still)) / step
+            assert gradient[camera, axis] == pytest.approx(slope, rel=1e-3, abs=1e-2)
 
 
 def test_the_map_s_own_down_is_what_most_agree_on(rng: np.random.Generator) -> None:
@@ -83,7 +84,8 @@ def test_a_climb_over_a_plane_stays_upright(rng: np.random.Generator, wrong: boo
         bundle = Bundle(
             [leaning[k] for k in order], 8, ground + rng.normal(scale=0.02, size=ground.shape),
             camera, np.tile(np.arange(60), 10), np.concatenate([seen[k] for k in order]),
-            np.broadcast_to(np.eye(2) * FOCAL, (600, 2, 2)), plumb,
+            np.broadcast_to(np.eye(2) * FOCAL, (600, 2, 2)),
+            () if plumb is None else (plumb,),
         )  # fmt: skip
         result = adjust(bundle, 15)
         assert result.cost_after < result.cost_before
