@@ -14,7 +14,7 @@ from companion.output.run_folder import read_run
 def compare(run_a: Path, run_b: Path, out: Path | None) -> Comparison:
     """Compare the folders of two runs; with `out`, write compare.html and compare.json there.
 
-    InputError where one of them is no run.
+    InputError where one of them is no run, or they are not of one flight.
     """
     found = compare_runs(read_run(run_a), read_run(run_b))
     if out is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from companion.errors import InputError
 from companion.geometry import Array
 from companion.output.cloud import Cloud
 from companion.output.run_folder import FinishedRun
@@ -74,7 +75,13 @@ class Comparison:
 
 
 def compare_runs(a: FinishedRun, b: FinishedRun) -> Comparison:
-    """Compare two finished runs."""
+    """Compare two finished runs; InputError where no frame of one is in the other."""
+    times = [{pose.t_ns for pose in run.poses} for run in (a, b)]
+    if all(times) and times[0].isdisjoint(times[1]):
+        raise InputError(
+            f"{a.path} and {b.path} have no frame in common: they are not of one flight, or of "
+            "other parts of it"
+        )
     same = {
         name: (a.path / name).read_bytes() == (b.path / name).read_bytes()
         for name in ("trajectory.tum", "cloud.ply")

@@ -87,3 +87,13 @@ def test_what_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     for other in ("missing", "empty"):
         assert compared(a, tmp_path / other) == 2
         assert other in capsys.readouterr().err
+
+
+def test_runs_of_two_flights_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = run(tmp_path / "a"), run(tmp_path / "b")
+    path = b / "trajectory.tum"
+    path.write_text(path.read_text().replace("\n17", "\n18"))
+    assert compared(a, b) == 2
+    assert "no frame in common" in capsys.readouterr().err
