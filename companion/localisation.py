@@ -144,7 +144,9 @@ class LocalisationStage:
         for message in tracked:
             if isinstance(message, Track) and message.map_from_camera is not None:
                 told = self._attitude.at(message.t_ns)
-                self._motion.correct(message.t_ns, message.map_from_camera, told)
+                if message.seq == frame.seq or told is not None:
+                    # untold turns would be carried on, and those of a start are rough
+                    self._motion.correct(message.t_ns, message.map_from_camera, told)
                 if message.seq == frame.seq:
                     self._last = message
                     self._attitude.compare(frame.t_ns, message.map_from_camera.rotation)

@@ -14,24 +14,23 @@ from companion.camera import Camera
 from companion.geometry import Array, Pose
 from companion.messages import Bytes
 from companion.slam.features import Bools
-from companion.slam.pose_refinement import refine_pose
 
 WINDOW_PX, N_LEVELS = 41, 4
 MARGIN_PX = 8.0
 MIN_POINTS, MIN_AGREE_SHARE = 15, 0.6
 MAX_RETURN_PX = 2.0
 """A point that was followed and followed back must be near where it began."""
-SIGMA_PX, MAX_OFF_PX = 2.0, 5.0
+MAX_OFF_PX = 5.0
 
 
 def follow(
     camera: Camera, points_map: Array, grey: Bytes, camera_from_map: Pose, next_grey: Bytes,
-    guess: Pose, turn_told: bool,
+    guess: Pose,
 ) -> Pose | None:  # fmt: skip
     """The pose of the next image from points (N, 3) that are in one with a pose; None if unsure.
 
-    `guess` is where the camera of the next image is expected; its rotation is taken as it is where
-    that was told.
+    `guess` is where the camera of the next image is expected; its rotation must be right: over a
+    plane a coarse picture cannot tell a shift from a turn.
     """
     here = camera.project(camera_from_map.apply(points_map))
     expected = camera.project(guess.apply(points_map))
@@ -51,12 +50,7 @@ def follow(
     points, there = points[kept], there[kept]
     if len(points) < MIN_POINTS:
         return None
-    normalised = camera.normalise(there)
-    if turn_told:
-        pose = _shifted(guess, points, normalised, camera.focal_px)
-    else:
-        whitening = camera.pixel_from_normalised_jacobian(normalised) / SIGMA_PX
-        pose, _, _ = refine_pose(guess, points, normalised, np.ascontiguousarray(whitening))
+    pose = _shifted(guess, points, camera.normalise(there), camera.focal_px)
     off_px = np.linalg.norm(camera.project(pose.apply(points)) - there, axis=1)
     n = np.count_nonzero(off_px < MAX_OFF_PX)  # nan: behind
     return pose if n >= max(MIN_POINTS, MIN_AGREE_SHARE * len(points)) else None

@@ -20,6 +20,7 @@ from companion.slam.view import View
 
 MOST_REFINED = 150
 """Points laid over each image by their patches: no pose needs more of them, and they take time."""
+MOST_FOLLOWED = 200
 MIN_DUE_SHARE, ENOUGH = 0.08, 30
 """Without attitude what is found is at least this share of what should be seen, or so many."""
 
@@ -91,14 +92,15 @@ class Placer:
     def follow(self, view: View, guess: Pose, last: View) -> bool:
         """Follow the points around from a view that was placed; whether the view is there.
 
-        It has a pose then, but shows points only as far as its features do.
+        It has a pose then, but shows points only as far as its features do. The turn between the
+        two must have been told.
         """
-        if last.grey.shape != view.grey.shape:
+        if last.ned_from_camera is None or view.ned_from_camera is None:
             return False
-        turn_told = last.ned_from_camera is not None and view.ned_from_camera is not None
+        some = self.local[:: -(-len(self.local) // MOST_FOLLOWED) or 1]
         pose = follow(
-            self._camera, self._map.positions[self.local], last.grey, last.camera_from_map,
-            view.grey, guess, turn_told,
+            self._camera, self._map.positions[some], last.grey, last.camera_from_map,
+            view.grey, guess,
         )  # fmt: skip
         if pose is None:
             return False

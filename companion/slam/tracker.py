@@ -191,7 +191,8 @@ class Tracker:
             found = found or placer.match(view, guess, placer.local, 25.0, at_least=firm)
             if not found and turn_known:
                 found = self._by_reference(view)
-                found = found or placer.follow(view, guess, last)
+                if not found and self.state is TrackState.TRACKING:
+                    found = placer.follow(view, guess, last)
         if not found and not self._relocalise(view):
             return False
         placer.refresh_local(view)
