@@ -23,7 +23,8 @@ from companion.geometry import (
 from companion.messages import AttitudeSample
 
 MAX_GAP_NS = 500_000_000
-MAX_EXTRAPOLATION_NS = 250_000_000
+MAX_EXTRAPOLATION_NS = 120_000_000
+"""Beyond, a craft in gusts turns otherwise by degrees, and what images tell goes on more truly."""
 ACCELERATION, SIGMA_POSITION = 0.3, 0.003
 ACCELERATION_UNTOLD, SIGMA_POSITION_UNTOLD = 1.5, 0.002
 """In map units, one of which is about the distance of what is seen, with and without attitude."""

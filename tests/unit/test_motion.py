@@ -86,3 +86,12 @@ def test_an_attitude_that_is_not_the_cameras_is_seen_to_be_none() -> None:
     assert steady.attitude_disagreement_rad < np.radians(0.5)
     assert gimballed.attitude_disagreement_rad > np.radians(4)
     assert MotionFilter().predict(0, None) is None
+
+
+def test_an_attitude_is_carried_on_for_a_tenth_of_a_second_and_no_longer() -> None:
+    """In gusts a craft has turned otherwise by degrees after two tenths."""
+    history = AttitudeHistory()
+    history.add(sample(0, 0.0))
+    assert history.at(100_000_000) is not None
+    assert history.at(-100_000_000) is not None
+    assert history.at(150_000_000) is None
