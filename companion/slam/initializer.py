@@ -14,14 +14,14 @@ import numpy as np
 
 from companion.geometry import Array, Pose, angle_between
 from companion.slam.bundle import Bundle, adjust
-from companion.slam.features import Features, Ints
+from companion.slam.features import Bools, Features, Ints
 from companion.slam.triangulation import consistent, triangulate
 from companion.slam.turns import Turns
 
 MAX_PRIOR_DISAGREEMENT_RAD = np.radians(8.0)
 MIN_POINTS = 60
 GAMMA = 5.991
-TURNED_PX = 2.0
+TURNED_PX, MAX_TURNED_SHARE = 2.0, 0.5
 TOLD_TURN_RAD, TOLD_TURN_SHARE = np.radians(0.5), 0.1
 """What the autopilot's turn between two views may be off by, at least and as a share of it."""
 RIVAL_SHARE = 0.6
@@ -56,7 +56,8 @@ def initialise(
     if len(index_a) < MIN_POINTS:
         return None
     xa, xb = a.normalised[index_a], b.normalised[index_b]
-    if _turned_only(xa, xb, focal_px, rotation_prior):
+    turned = _turned(xa, xb, focal_px, rotation_prior)
+    if np.mean(turned) > MAX_TURNED_SHARE:
         return None
     candidates: list[tuple[Pose, bool]] = []
     essential, homography = _models(xa * focal_px, xb * focal_px, focal_px, seed)
@@ -86,13 +87,20 @@ def initialise(
     best = _best(candidates, a, b, index_a, index_b, rotation_prior is not None)
     if best is None:
         return None
-    return _refined(best, a, b, index_a, index_b, rotation_prior, min_parallax_rad, planar)
+    found = _refined(best, a, b, index_a, index_b, rotation_prior, min_parallax_rad)
+    if found is None:
+        return None
+    pose, points, agree, shown, parallax_rad = found
+    # wrong matches speak for no turn either, and are known only now; untold turns have met rivals
+    if rotation_prior is not None and np.sum(turned) > MAX_TURNED_SHARE * np.sum(turned | agree):
+        return None
+    return TwoView(pose, points[shown], index_a[shown], index_b[shown], parallax_rad, planar)
 
 
-def _turned_only(xa: Array, xb: Array, focal_px: float, told: Array | None) -> bool:
-    """Whether a rotation alone explains most of what moved: then any baseline would be made up.
+def _turned(xa: Array, xb: Array, focal_px: float, told: Array | None) -> Bools:
+    """Which matches (N,) are explained by a rotation alone: a baseline would be made up for them.
 
-    A short way over a plane looks like a turn, but not like the one that was `told`.
+    None where it is not the one that was `told`: a short way over a plane looks like a turn.
     """
     rays_a, rays_b = _unit_rays(xa), _unit_rays(xb)
     weight = np.ones(len(rays_a))
@@ -103,12 +111,11 @@ def _turned_only(xa: Array, xb: Array, focal_px: float, told: Array | None) -> b
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         error_px = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1) * focal_px
         weight = 1.0 / (1.0 + (error_px / TURNED_PX) ** 2) ** 2
-    if float(np.mean(error_px < TURNED_PX)) <= 0.5:
-        return False
-    if told is None:
-        return True
-    off_rad = float(TOLD_TURN_RAD) + TOLD_TURN_SHARE * angle_between(told, np.eye(3))
-    return angle_between(rotation, told) < off_rad
+    if told is not None:
+        off_rad = float(TOLD_TURN_RAD) + TOLD_TURN_SHARE * angle_between(told, np.eye(3))
+        if angle_between(rotation, told) >= off_rad:
+            return np.zeros(len(xa), bool)
+    return np.asarray(error_px < TURNED_PX, bool)
 
 
 def _unit_rays(normalised: Array) -> Array:
@@ -280,8 +287,9 @@ def _adjusted(
 
 def _refined(
     pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints, told: Array | None,
-    min_parallax_rad: float, planar: bool,
-) -> TwoView | None:  # fmt: skip
+    min_parallax_rad: float,
+) -> tuple[Pose, Array, Bools, Bools, float] | None:  # fmt: skip
+    """Pose, points (N, 3), which of them agree and which show their depth, parallax in rad."""
     for limit in (16.0, 5.991):
         adjusted = _adjusted(pose, a, b, index_a, index_b, limit, told)
         if adjusted is None:
@@ -297,5 +305,5 @@ def _refined(
     parallax = float(np.arccos(np.clip(np.quantile(cosine[ok], 0.3), -1, 1)))
     if parallax < min_parallax_rad:
         return None
-    ok &= cosine < np.cos(min(0.3 * min_parallax_rad, np.radians(0.3)))
-    return TwoView(pose, points[ok], index_a[ok], index_b[ok], parallax, planar)
+    shown = ok & (cosine < np.cos(min(0.3 * min_parallax_rad, np.radians(0.3))))
+    return pose, points, ok, shown, parallax
