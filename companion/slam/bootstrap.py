@@ -72,12 +72,12 @@ class Bootstrap:
         shift = np.linalg.norm(reference.features.pixels[ia] - features.pixels[ib], axis=1)
         if np.median(shift) < 3.0:
             return None
-        rotation_prior = None
+        attitudes = None
         if ned_from_camera is not None and reference.ned_from_camera is not None:
-            rotation_prior = ned_from_camera.T @ reference.ned_from_camera
+            attitudes = reference.ned_from_camera, ned_from_camera
         focal_px = self._camera.focal_px
         result = initialise(
-            reference.features, features, ia, ib, focal_px, seq + 1, rotation_prior,
+            reference.features, features, ia, ib, focal_px, seq + 1, attitudes,
             max(np.radians(self._config.min_init_parallax_deg), MIN_PARALLAX_PX / focal_px),
         )  # fmt: skip
         if result is None:

@@ -1,24 +1,22 @@
 """The first two keyframes: motion and points from two images alone.
 
-An essential matrix explains a scene with depth, a homography a plane (a survey seen from straight
-above); the one that explains more is taken (after Mur-Artal et al., 2015). Their several solutions
-are told apart by cheirality, and by the autopilot's rotation where there is one.
+The motion is one of several that the images allow; which one is told by the points that it gives,
+and by the autopilot's turn.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from companion.geometry import Array, Pose, angle_between
 from companion.slam.bundle import Bundle, adjust
 from companion.slam.features import Bools, Features, Ints
+from companion.slam.possible_motions import possible_motions
 from companion.slam.triangulation import consistent, triangulate
 from companion.slam.turns import Turns
 
-MAX_PRIOR_DISAGREEMENT_RAD = np.radians(8.0)
 MIN_POINTS = 60
 GAMMA = 5.991
 TURNED_PX, MAX_TURNED_SHARE = 2.0, 0.5
@@ -49,42 +47,22 @@ def initialise(
     index_b: Ints,
     focal_px: float,
     seed: int,
-    rotation_prior: Array | None,
+    attitudes: tuple[Array, Array] | None,
     min_parallax_rad: float,
 ) -> TwoView | None:
-    """Motion and points from matches `index_a`, `index_b`; None when it would not be certain."""
+    """Motion and points from matches `index_a`, `index_b`; None when it would not be certain.
+
+    `attitudes` are `ned_from_camera` of a and b, where the autopilot told them.
+    """
     if len(index_a) < MIN_POINTS:
         return None
     xa, xb = a.normalised[index_a], b.normalised[index_b]
+    rotation_prior = None if attitudes is None else attitudes[1].T @ attitudes[0]
     turned = _turned(xa, xb, focal_px, rotation_prior)
     if np.mean(turned) > MAX_TURNED_SHARE:
         return None
-    candidates: list[tuple[Pose, bool]] = []
-    essential, homography = _models(xa * focal_px, xb * focal_px, focal_px, seed)
-    planar = False
-    if homography is not None and essential is not None:
-        score_e = _score_essential(essential, xa, xb, focal_px)
-        score_h = _score_homography(homography, xa, xb, focal_px)
-        planar = score_h > 0.45 * (score_h + score_e)
-    if essential is not None:
-        r1, r2, t = cv2.decomposeEssentialMat(essential)
-        direction = np.asarray(t, np.float64).ravel()
-        rotations = (np.asarray(r1, np.float64), np.asarray(r2, np.float64))
-        candidates += [(Pose(r, s * direction), False) for r in rotations for s in (1.0, -1.0)]
-    if homography is not None and (planar or essential is None or rotation_prior is None):
-        _, turns, shifts, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
-        for r, t in zip(turns, shifts, strict=True):
-            norm = float(np.linalg.norm(t))
-            if norm > 1e-6 and np.linalg.det(r) > 0:
-                unit = np.asarray(t, np.float64).ravel() / norm
-                candidates.append((Pose(np.asarray(r, np.float64), unit), True))
-    if rotation_prior is not None:
-        candidates += [(c, False) for c in _with_known_rotation(rotation_prior, xa, xb)]
-        candidates = [
-            c for c in candidates
-            if angle_between(c[0].rotation, rotation_prior) < MAX_PRIOR_DISAGREEMENT_RAD
-        ]  # fmt: skip
-    best = _best(candidates, a, b, index_a, index_b, rotation_prior is not None)
+    candidates, planar = possible_motions(xa, xb, focal_px, seed, attitudes)
+    best = _best(candidates, a, b, index_a, index_b, rotation_prior)
     if best is None:
         return None
     found = _refined(best, a, b, index_a, index_b, rotation_prior, min_parallax_rad)
@@ -124,78 +102,12 @@ def _unit_rays(normalised: Array) -> Array:
     return out
 
 
-def _models(pa: Array, pb: Array, focal_px: float, seed: int) -> tuple[Array | None, Array | None]:
-    params = cv2.UsacParams()
-    params.randomGeneratorState = seed
-    params.confidence = 0.999
-    params.maxIterations = 500
-    params.threshold = 1.5
-    params.score = cv2.SCORE_METHOD_MAGSAC
-    params.sampler = cv2.SAMPLING_UNIFORM
-    k = np.diag([focal_px, focal_px, 1.0])
-    zero = np.zeros(5)
-    found_e, _ = cv2.findEssentialMat(pa, pb, k, k, zero, zero, params)
-    found_h, _ = cv2.findHomography(pa, pb, params)
-    essential = homography = None
-    if found_e is not None and found_e.shape == (3, 3):
-        essential = np.asarray(found_e, np.float64)
-    if found_h is not None:
-        homography = (
-            np.diag([1 / focal_px, 1 / focal_px, 1.0]) @ np.asarray(found_h, np.float64) @ k
-        )
-    return essential, homography
-
-
-def _score_essential(e: Array, xa: Array, xb: Array, focal_px: float) -> float:
-    ha, hb = np.c_[xa, np.ones(len(xa))], np.c_[xb, np.ones(len(xb))]
-    score = 0.0
-    for m, p, q in ((e, ha, hb), (e.T, hb, ha)):
-        line = p @ m.T
-        error = (line * q).sum(1) / np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12)
-        chi2 = (error * focal_px / 1.2) ** 2
-        score += float(np.where(chi2 < 3.841, GAMMA - chi2, 0.0).sum())
-    return score
-
-
-def _score_homography(h: Array, xa: Array, xb: Array, focal_px: float) -> float:
-    score = 0.0
-    try:
-        inverse = np.linalg.inv(h)
-    except np.linalg.LinAlgError:
-        return 0.0
-    for m, p, q in ((h, xa, xb), (inverse, xb, xa)):
-        moved = np.c_[p, np.ones(len(p))] @ m.T
-        z = np.where(np.abs(moved[:, 2]) < 1e-9, 1e-9, moved[:, 2])
-        error = (moved[:, :2] / z[:, None] - q) * focal_px / 1.2
-        chi2 = (error * error).sum(1)
-        score += float(np.where(chi2 < GAMMA, GAMMA - chi2, 0.0).sum())
-    return score
-
-
-def _with_known_rotation(rotation: Array, xa: Array, xb: Array) -> list[Pose]:
-    """Both signs of the translation that, with this rotation, fits most rays."""
-    rays_a = np.c_[xa, np.ones(len(xa))] @ rotation.T
-    normals = np.cross(rays_a, np.c_[xb, np.ones(len(xb))])
-    length = np.linalg.norm(normals, axis=1)
-    weight = np.ones(len(normals))
-    t = np.array([0.0, 0.0, 1.0])
-    for _ in range(10):  # iteratively reweighted: robust to wrong matches
-        scatter = (normals * weight[:, None]).T @ normals
-        t = np.linalg.eigh(scatter)[1][:, 0]
-        error = np.abs(normals @ t)
-        scale = max(float(np.median(error)), 1e-6)
-        weight = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2) ** 2
-    if float(np.median(length)) < 1e-5:
-        return []
-    return [Pose(rotation, t), Pose(rotation, -t)]
-
-
 def _best(
-    candidates: list[tuple[Pose, bool]],
-    a: Features, b: Features, index_a: Ints, index_b: Ints, with_prior: bool,
+    candidates: list[Pose], a: Features, b: Features, index_a: Ints, index_b: Ints,
+    told: Array | None,
 ) -> Pose | None:  # fmt: skip
     scored = []
-    for pose, _ in candidates:
+    for pose in candidates:
         points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
         ok = consistent(
             points, pose, a.normalised[index_a], b.normalised[index_b],
@@ -208,8 +120,14 @@ def _best(
     top, pose = scored[0]
     if top < MIN_POINTS // 2:
         return None
-    if with_prior:
-        return pose
+    if told is not None:
+        turn = Turns.told(np.array([1]), np.array([0]), told[None])
+
+        def cost(pose: Pose) -> float:
+            _, off = turn.errors(np.stack([np.eye(3), pose.rotation]))
+            return _unexplained(pose, a, b, index_a, index_b) + float(off[0]) ** 2
+
+        return min((p for n, p in scored if n > RIVAL_SHARE * top), key=cost)
     return _most_likely([p for n, p in scored if n > RIVAL_SHARE * top], a, b, index_a, index_b)
 
 

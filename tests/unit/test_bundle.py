@@ -130,9 +130,10 @@ def test_two_views_start_a_map(rng: np.random.Generator, flat: bool, prior: bool
     xa = project(a, points) + rng.normal(scale=0.3 / FOCAL, size=(400, 2))
     xb = project(b, points) + rng.normal(scale=0.3 / FOCAL, size=(400, 2))
     xb[:60] += rng.uniform(-0.2, 0.2, (60, 2))
-    turn = rotation_from_vector(np.radians([1.0, -0.7, 1.0])) @ b_from_a.rotation if prior else None
+    turn = rotation_from_vector(np.radians([1.0, -0.7, 1.0])) @ b_from_a.rotation
+    told = (turn, np.eye(3)) if prior else None
     index = np.arange(400)
-    result = initialise(features(xa), features(xb), index, index, FOCAL, 5, turn, np.radians(1.0))
+    result = initialise(features(xa), features(xb), index, index, FOCAL, 5, told, np.radians(1.0))
     if flat and not prior:  # a plane allows two motions: none may be taken for certain
         assert result is None or angle_between(
             result.b_from_a.rotation, b_from_a.rotation
@@ -157,7 +158,7 @@ def test_what_two_coarse_pictures_of_the_ground_leave_open_a_told_turn_tells(
         told = rotation_from_vector(np.radians([off_deg, 0.0, 0.0])) @ climb.rotation
         index = np.arange(140)
         result = initialise(
-            features(xa), features(xb), index, index, FOCAL, 5, told, np.radians(1.0)
+            features(xa), features(xb), index, index, FOCAL, 5, (told, np.eye(3)), np.radians(1.0)
         )
         assert result is not None
         found.append(result.b_from_a.rotation)
@@ -171,7 +172,7 @@ def test_pure_rotation_and_tiny_parallax_start_nothing(rng: np.random.Generator)
     xa = project(a, points) + rng.normal(scale=0.3 / FOCAL, size=(300, 2))
     xb = project(b, points) + rng.normal(scale=0.3 / FOCAL, size=(300, 2))
     index = np.arange(300)
-    for prior in (None, b.rotation):
+    for prior in (None, (b.rotation, np.eye(3))):
         assert (
             initialise(features(xa), features(xb), index, index, FOCAL, 5, prior, np.radians(1.0))
             is None

@@ -36,8 +36,9 @@ def begun(way: float, wrong_share: float, seed: int) -> TwoView | None:
     seen_a, seen_b = (s + rng.normal(scale=0.5 / FOCAL_PX, size=s.shape) for s in (seen_a, seen_b))
     index = np.arange(N)
     return initialise(
-        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, TURN, np.radians(1.0)
-    )
+        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, (TURN, np.eye(3)),
+        np.radians(1.0),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.3])
