@@ -77,6 +77,16 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def _whole(got: list[Item]) -> bool:
+    """Whether the last state, all points and a picture are there; they come in any order."""
+    points = {item.keyframe_id for item in got if isinstance(item, PointsItem)}
+    return (
+        points == set(range(12))
+        and any(isinstance(item, PictureItem) for item in got)
+        and any(isinstance(item, StatusItem) and item.facts.get("reduced") for item in got)
+    )
+
+
 def test_who_connects_sees_the_flight_of_all_of_it_the_newest() -> None:
     stream = StreamConfig(listen=f"127.0.0.1:{free_port()}")
     got: list[Item] = []
@@ -92,15 +102,11 @@ def test_who_connects_sees_the_flight_of_all_of_it_the_newest() -> None:
             viewer.take(message)
         viewer.take(Health(flown.time_ns(flown.N_FRAMES + 100), degraded="viewer off"))
         end = time.monotonic() + 20
-        while time.monotonic() < end and not any(
-            isinstance(item, StatusItem) and item.facts.get("reduced") for item in got
-        ):
+        while time.monotonic() < end and not _whole(got):
             time.sleep(0.02)
         stop.set()
         reader.join()
-    points = {item.keyframe_id for item in got if isinstance(item, PointsItem)}
-    assert points == set(range(12))
-    assert any(isinstance(item, PictureItem) for item in got)
+    assert _whole(got)
     last = [item for item in got if isinstance(item, PoseItem)][-1]
     assert last.t_ns == flown.time_ns(flown.N_FRAMES - 1)
     true = flown.world_from_camera(flown.N_FRAMES - 1)
