@@ -69,7 +69,7 @@ class HttpCamera:
         self._scene = PatternScene()
         self._last: Bytes | None = None
         self._random, self._noise = random.Random(1), np.random.default_rng(1)
-        self._stop = threading.Event()
+        self._stop, self._there = threading.Event(), threading.Event()
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self._port = int(probe.getsockname()[1])
@@ -79,6 +79,8 @@ class HttpCamera:
 
     def __enter__(self) -> HttpCamera:
         self._thread.start()
+        if self.on:
+            self._there.wait(10.0)
         return self
 
     def __exit__(
@@ -120,6 +122,7 @@ class HttpCamera:
             door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             door.bind(("127.0.0.1", self._port))
             door.listen(1)
+            self._there.set()
             door.settimeout(0.05)
             while self.on and not self._stop.is_set():
                 try:
