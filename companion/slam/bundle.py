@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -22,18 +21,7 @@ from companion.slam.compiled.bundle_sums import (
 )
 from companion.slam.compiled.pose import CHI2_2D
 from companion.slam.features import Bools, Ints
-
-
-class Tie(Protocol):
-    """What is told of cameras beside the images, by their `camera_from_map` poses (C, …)."""
-
-    def cost(self, rotation: Array, translation: Array) -> float:
-        """What it costs that the cameras do not agree with it."""
-
-    def add_to(
-        self, information: Array, gradient: Array, rotation: Array, translation: Array
-    ) -> None:
-        """Add its information (n, 6, n, 6) and gradient (n, 6) of the first n cameras."""
+from companion.slam.ties import Tie
 
 
 @dataclass(slots=True, eq=False)

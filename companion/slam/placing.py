@@ -97,7 +97,7 @@ class Placer:
         """
         if last.ned_from_camera is None or view.ned_from_camera is None:
             return False
-        some = self.local[:: -(-len(self.local) // MOST_FOLLOWED) or 1]
+        some = self.local[:: max(1, -(-len(self.local) // MOST_FOLLOWED))]
         pose = follow(
             self._camera, self._map.positions[some], last.grey, last.camera_from_map,
             view.grey, guess,

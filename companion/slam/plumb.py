@@ -46,10 +46,7 @@ class Plumb:
     def add_to(
         self, information: Array, gradient: Array, rotation: Array, translation: Array
     ) -> None:
-        """Add its information (n, 6, n, 6) and gradient (n, 6) of the first n cameras.
-
-        A camera moves as in bundle adjustment, by a turn and then a shift (6,).
-        """
+        """As of a Tie."""
         told = np.flatnonzero(np.isfinite(self.down_camera[: len(gradient), 0]))
         off, size = self.errors(rotation)
         jacobian = -skew(rotation[told] @ self.down_map) / self.sigma_rad

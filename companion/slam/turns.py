@@ -12,11 +12,10 @@ import numpy as np
 
 from companion.geometry import Array, angle_between
 from companion.slam.features import Ints
+from companion.slam.ties import add_pairs, soft_cost, soft_root
 
 LEAST_SIGMA_RAD, SIGMA_SHARE = np.radians(0.3), 0.1
 """What a told turn is off by: attitudes have errors that change, and clocks make turns late."""
-SOFT = 3.0
-"""Standard deviations beyond which a turn pulls ever less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,31 +46,19 @@ class Turns:
         return vector, np.linalg.norm(vector, axis=1)
 
     def cost(self, rotation: Array, translation: Array) -> float:
-        """Cauchy's loss of all of them."""
-        _, size = self.errors(rotation)
-        return float((0.5 * SOFT**2 * np.log1p((size / SOFT) ** 2)).sum())
+        """As of a Tie."""
+        return soft_cost(self.errors(rotation)[1])
 
     def add_to(
         self, information: Array, gradient: Array, rotation: Array, translation: Array
     ) -> None:
-        """Add their information (n, 6, n, 6) and gradient (n, 6) of the first n cameras.
-
-        A camera moves as in bundle adjustment, by a turn and then a shift (6,).
-        """
-        n = len(gradient)
+        """As of a Tie."""
         off, size = self.errors(rotation)
-        root = 1.0 / np.hypot(1.0, size / SOFT)
-        known, off = (root / self.sigma_rad)[:, None, None], off * root[:, None]
+        root = soft_root(size)
+        known = (root / self.sigma_rad)[:, None, None]
         seen = rotation[self.second] @ rotation[self.first].transpose(0, 2, 1)
         ends = ((self.second, known * np.eye(3)), (self.first, -known * seen))
-        turned = information[:, :3, :, :3].transpose(0, 2, 1, 3)
-        for a, of_a in ends:
-            pulled = np.matmul(of_a.transpose(0, 2, 1), off[..., None])[..., 0]
-            np.add.at(gradient[:, :3], a[a < n], pulled[a < n])
-            for b, of_b in ends:
-                both = (a < n) & (b < n)
-                tied = np.matmul(of_a.transpose(0, 2, 1), of_b)[both]
-                np.add.at(turned, (a[both], b[both]), tied)
+        add_pairs(information[:, :3, :, :3], gradient[:, :3], ends, off * root[:, None])
 
 
 def turns_of(first: Ints, second: Ints, ned_from_camera: Array) -> Turns | None:

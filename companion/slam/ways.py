@@ -12,9 +12,8 @@ import numpy as np
 
 from companion.geometry import Array
 from companion.slam.features import Ints
+from companion.slam.ties import add_pairs, soft_cost, soft_root
 
-SOFT = 3.0
-"""Standard deviations beyond which a way pulls ever less: where one is wrong it is quite wrong."""
 MIN_TOLD = 5
 USELESS = 4.0
 """Standard deviations by which ways usually miss that are not the camera's."""
@@ -42,34 +41,22 @@ class Ways:
         return off, np.linalg.norm(off, axis=1)
 
     def cost(self, rotation: Array, translation: Array) -> float:
-        """Cauchy's loss of all of them."""
-        _, size = self.errors(rotation, translation)
-        return float((0.5 * SOFT**2 * np.log1p((size / SOFT) ** 2)).sum())
+        """As of a Tie."""
+        return soft_cost(self.errors(rotation, translation)[1])
 
     def add_to(
         self, information: Array, gradient: Array, rotation: Array, translation: Array
     ) -> None:
-        """Add their information (n, 6, n, 6) and gradient (n, 6) of the first n cameras.
-
-        A camera moves as in bundle adjustment, by a turn and then a shift (6,).
-        """
-        n = len(gradient)
+        """As of a Tie."""
         off, size = self.errors(rotation, translation)
-        root = 1.0 / np.hypot(1.0, size / SOFT)
-        known = np.isfinite(self.way_m) * (root / self.sigma_m)[:, None]
-        off = off * root[:, None]
-        shifted = information[:, 3:, :, 3:].transpose(0, 2, 1, 3)
-        ends = []
-        for camera, sign in ((self.first, 1.0), (self.second, -1.0)):
-            turned = self.world_from_map @ rotation[camera].transpose(0, 2, 1)
-            ends.append((camera, sign * known[..., None] * turned, camera < n))
-        for a, of_a, moves_a in ends:
-            pulled = np.matmul(of_a.transpose(0, 2, 1), off[..., None])[..., 0]
-            np.add.at(gradient[:, 3:], a[moves_a], pulled[moves_a])
-            for b, of_b, moves_b in ends:
-                both = moves_a & moves_b
-                tied = np.matmul(of_a.transpose(0, 2, 1), of_b)[both]
-                np.add.at(shifted, (a[both], b[both]), tied)
+        root = soft_root(size)
+        known = (np.isfinite(self.way_m) * (root / self.sigma_m)[:, None])[..., None]
+        first, second = (
+            self.world_from_map @ rotation[camera].transpose(0, 2, 1)
+            for camera in (self.first, self.second)
+        )
+        ends = ((self.first, known * first), (self.second, -known * second))
+        add_pairs(information[:, 3:, :, 3:], gradient[:, 3:], ends, off * root[:, None])
 
 
 def usual_error(ways: Ways, rotation: Array, translation: Array) -> float | None:

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.geometry import Array, Pose
-from companion.slam.bundle import Adjusted, Bundle, Tie
+from companion.slam.bundle import Adjusted, Bundle
 from companion.slam.features import Bools, Ints
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.plumb import Plumb, plumb_of
+from companion.slam.ties import Tie
 from companion.slam.turns import turns_of
 from companion.slam.ways import Ways
 

@@ -5,16 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.geometry import Array, Pose, angle_between, rotation_from_vector
+from companion.geometry import Pose, angle_between, rotation_from_vector
 from companion.slam.bundle import Bundle, adjust
 from companion.slam.turns import Turns, turns_of
-
-FOCAL = 400.0
-LOOKING_DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def turned(rng: np.random.Generator, sigma_rad: float) -> Array:
-    return rotation_from_vector(rng.normal(scale=sigma_rad, size=3))
+from tests.support.told_cameras import FOCAL, LOOKING_DOWN, turned
 
 
 def test_the_gradient_is_that_of_the_cost(rng: np.random.Generator) -> None:

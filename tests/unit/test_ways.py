@@ -8,9 +8,8 @@ import pytest
 from companion.geometry import Array, Pose, rotation_from_vector
 from companion.slam.bundle import Bundle, adjust
 from companion.slam.ways import USELESS, Ways, usual_error
+from tests.support.told_cameras import FOCAL, LOOKING_DOWN
 
-FOCAL = 400.0
-LOOKING_DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 TO_WORLD = 2.0 * rotation_from_vector(np.array([0.1, -0.2, 0.7]))
 N = 24
 
