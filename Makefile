@@ -7,13 +7,13 @@ BIN := $(VENV)/bin
 FLIGHT ?= sample/survey
 OUT ?= out/demo
 
-.PHONY: demo test lint clean reference regression deb system-test
+.PHONY: demo test lint opencl clean reference regression deb system-test
 
-demo: $(VENV)/.installed
+demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
 
 # First what only computes, on all cores; then, with nothing beside them, tests that measure times.
-test: lint
+test: lint opencl
 	$(BIN)/pytest -m "not alone" -n logical --maxprocesses 4 --dist loadfile
 	$(BIN)/pytest -m alone
 
@@ -23,16 +23,20 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
 
 # What a change does to the sample flight, against the results that are kept of it.
-regression: $(VENV)/.installed
+regression: opencl
 	$(BIN)/companion replay sample/survey --out out/regression --set cloud.voxel_m=0.5
 	$(BIN)/companion compare sample/reference out/regression --out out/regression \
 	  --max-apart 0.3 --max-cloud 0.5
 
 # Keep the results of this version instead.
-reference: $(VENV)/.installed
+reference: opencl
 	$(BIN)/companion replay sample/survey --out out/reference --set cloud.voxel_m=0.5
 	mkdir -p sample/reference
 	cp out/reference/trajectory.tum out/reference/cloud.ply out/reference/report.json sample/reference
+
+# A device for the dense map: nothing is installed where one works.
+opencl: $(VENV)/.installed
+	@sh packaging/opencl.sh $(VENV)
 
 deb:
 	sh packaging/build_deb.sh
@@ -43,11 +47,11 @@ system-test: $(VENV)/.installed-dev
 
 # A stamp beside the environment: reinstalled only when the dependencies may have changed.
 $(VENV)/.installed: pyproject.toml | $(BIN)/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[cpu]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[cpu,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@ $(VENV)/.installed
 
 $(BIN)/python:

@@ -22,10 +22,6 @@ python=/usr/bin/$minor # not python3, which is another one after an upgrade of t
 architecture=$(dpkg --print-architecture)
 version=$(sed -n 's/^__version__ = "\(.*\)"$/\1/p' companion/__init__.py | sed 's/\.\{0,1\}\(dev\|rc\|a\|b\)/~\1/')
 [ -n "$version" ] || fail "companion/__init__.py states no __version__"
-case $architecture in
-  amd64) extras='[cpu]' needs='gcc, libc6-dev, ' recommends='' ;; # PoCL links kernels with them
-  *) extras='' needs='' recommends='pocl-opencl-icd | opencl-icd' ;;
-esac
 
 root=$(mktemp -d "${TMPDIR:-/tmp}/companion-deb.XXXXXX")
 trap 'rm -rf "$root"' EXIT INT TERM
@@ -33,7 +29,7 @@ chmod 755 "$root"
 prefix=$root/opt/companion
 
 "$python" -m venv "$prefix"
-"$prefix/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile ".$extras"
+"$prefix/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile .
 "$prefix/bin/python" -m pip uninstall --quiet --yes pip setuptools
 rm -f "$prefix"/lib/python*/site-packages/companion-*.dist-info/direct_url.json
 # Where it was made is not where it will be.
@@ -52,7 +48,7 @@ mkdir -p "$root/usr/bin" "$root/DEBIAN"
 ln -s /opt/companion/bin/companion "$root/usr/bin/companion"
 
 sed -e "s/@VERSION@/$version/" -e "s/@ARCHITECTURE@/$architecture/" -e "s/@PYTHON@/$minor/" \
-  -e "s/@NEEDS@/$needs/" -e "s/@RECOMMENDS@/$recommends/" -e "/^Recommends: \$/d" -e "s/@INSTALLED_KB@/$(du -sk "$root" | cut -f1)/" \
+  -e "s/@INSTALLED_KB@/$(du -sk "$root" | cut -f1)/" \
   packaging/deb/control >"$root/DEBIAN/control"
 install -m 644 packaging/deb/conffiles "$root/DEBIAN/conffiles"
 install -m 755 packaging/deb/postinst packaging/deb/prerm packaging/deb/postrm "$root/DEBIAN"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import stat
 import subprocess
@@ -60,11 +59,10 @@ def environment_made(folder: Path, unit_user: str) -> list[Step]:
         command(PYTHON, "-m", "venv", folder)
 
     def fill() -> None:
-        extras = "[cpu]" if os.uname().machine == "x86_64" else ""
         command(
             folder / "bin/python", "-m", "pip", "install", "--quiet",
             "--disable-pip-version-check", "--force-reinstall" if _version(folder) else "--upgrade",
-            f"{source}{extras}",
+            source,
         )  # fmt: skip
 
     return [

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from companion.config import Config
 from companion.config_file import load_config
-from companion.errors import InputError
+from companion.errors import InputError, InstallError
 from companion.service.environment import (
     MARK,
     environment_made,
@@ -33,7 +33,7 @@ from companion.service.places import (
     Places,
     user_places,
 )
-from companion.service.shipped import shipped, unit_for
+from companion.service.shipped import clone, shipped, unit_for
 from companion.service.steps import Step, carry_out, command, file_written, removed
 from drivers.login_console import login_console_on, login_consoles
 from drivers.mavlink_url import link_endpoint
@@ -58,6 +58,8 @@ def install(
         steps += _rules_read()
     steps += _enabled(places, now)
     carry_out(steps, told, dry_run)
+    if not dry_run and settings.depth.enabled:
+        _have_opencl_device(environment, told)
     for remark in _remarks(settings, user):
         told(f"note: {remark}")
     if not dry_run:
@@ -174,6 +176,17 @@ def _configuration(places: Places, given: Path | None) -> list[Step]:
         old = places.config.with_name(places.config.name + ".old")
         steps.append(file_written(old, places.config.read_bytes()))
     return [*steps, file_written(places.config, content)]
+
+
+def _have_opencl_device(environment: Path, told: Told) -> None:
+    """Install a driver where no device works; without one the service maps nothing, and flies."""
+    source = clone()
+    if source is None:
+        return
+    try:
+        command("sh", source / "packaging/opencl.sh", environment)
+    except InstallError as error:
+        told(f"note: {error}")
 
 
 def _rules_read() -> list[Step]:
