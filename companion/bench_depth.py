@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.clock import StageTimes, cpu_s, monotonic_s
+from companion.clock import StageTimes, cpu_s
+from companion.compute_devices import choose_device
 from companion.config import Config
-from companion.depth.device_choice import choose_device
 from companion.depth.engine import DepthEngine
 from companion.depth.undistortion import Undistortion
 from companion.depth.views import Intrinsics
@@ -108,7 +108,7 @@ def bench_depth(
     """Measure, and write depth_bench.json and pictures into `out`; FlightError without truth."""
     images = open_posed_images(path)
     scene = _scene(images, reference, frames)
-    device = choose_device(config.opencl, monotonic_s)
+    device = choose_device(config.opencl)
     full = replace(config.depth, stride=1)
     height, width = scene.grey.shape
     engine = DepthEngine(device, width, height, scene.intrinsics, full)

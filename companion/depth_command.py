@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from companion.clock import StageTimes, monotonic_s
+from companion.clock import StageTimes
+from companion.compute_devices import choose_device
 from companion.config import Config
 from companion.depth.consensus import Consensus
 from companion.depth.depth_range import depth_range
-from companion.depth.device_choice import choose_device
 from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion, chunk_alone
 from companion.depth.opencl import ComputeDevice
@@ -141,7 +141,7 @@ def reconstruct(
 ) -> list[DepthMap]:
     """Write depth of the wanted references, their cloud and depth.json into the folder `out`."""
     images = open_posed_images(path)
-    device = choose_device(config.opencl, monotonic_s)
+    device = choose_device(config.opencl)
     work = Reconstruction(images, config, device)
     positions = _positions(images, wanted.frames)
     first = positions[0] if wanted.reference is None else _position(images, wanted.reference)

@@ -7,22 +7,22 @@ import json
 from itertools import groupby
 from typing import Any
 
-from companion.depth.device_choice import MeasuredDevice
-from companion.device_probe import probed_devices
+from companion.compute_devices import measured_anew
+from companion.depth.device_choice import MeasuredDevice, in_order, why_taken
 from drivers.camera_devices import CameraControl, CameraDevice, CameraFormat, cameras
 from drivers.serial_devices import SerialDevice, serial_devices
 
 
-def devices(as_json: bool) -> str:
+def devices(as_json: bool, verbose: bool) -> str:
     """Cameras, serial ports and OpenCL devices, as text for people or as JSON."""
-    found_cameras, found_ports, compute = cameras(), serial_devices(), probed_devices()
+    found_cameras, found_ports, compute = cameras(), serial_devices(), measured_anew()
     if as_json:
         document = {
             "cameras": [_plain(each) for each in found_cameras],
             "serial_ports": [_plain(each) for each in found_ports],
-            "opencl_devices": [dataclasses.asdict(device) for device in compute],
+            **_as_document(compute),
         }
-        return json.dumps(document, indent=2, ensure_ascii=False)
+        return _as_json(document)
     lines = ["Cameras (camera.device)"]
     for camera in found_cameras:
         lines += _camera(camera)
@@ -33,14 +33,48 @@ def devices(as_json: bool) -> str:
         lines += _port(port)
     if not found_ports:
         lines.append("  none")
-    lines.append("OpenCL devices (opencl.device)")
-    lines += [_compute(device) for device in compute] or ["  none"]
-    return "\n".join(lines)
+    return "\n".join([*lines, *_compute_lines(compute, verbose)])
 
 
-def _compute(device: MeasuredDevice) -> str:
-    speed = device.problem or f"{device.frames_per_s:.0f} frames/s of 640 x 480"
-    return f"  {device.number}  {device.name} ({device.platform}): {speed}"
+def opencl_devices(as_json: bool, verbose: bool) -> tuple[str, bool]:
+    """OpenCL devices only, and whether one of them works."""
+    compute = measured_anew()
+    works = bool(in_order(compute))
+    if as_json:
+        return _as_json(_as_document(compute)), works
+    return "\n".join(_compute_lines(compute, verbose)), works
+
+
+def _as_document(compute: list[MeasuredDevice]) -> dict[str, Any]:
+    taken = in_order(compute)[:1]
+    return {
+        "opencl_devices": [dataclasses.asdict(device) for device in compute],
+        "opencl_auto": {"number": taken[0].number, "why": why_taken(taken[0], compute)}
+        if taken else None,
+    }  # fmt: skip
+
+
+def _as_json(document: dict[str, Any]) -> str:
+    return json.dumps(document, indent=2, ensure_ascii=False)
+
+
+def _compute_lines(compute: list[MeasuredDevice], verbose: bool) -> list[str]:
+    lines = ["OpenCL devices (opencl.device)"]
+    for device in compute:
+        speed = device.problem or f"{device.frames_per_s:.0f} frames/s of 640 x 480"
+        lines.append(f"  {device.number}  {device.named}: {speed}")
+        if verbose:
+            said = [device.driver, *device.detail.splitlines()]
+            lines += [f"       {line}" for line in said if line.strip()]
+    taken = in_order(compute)[:1]
+    if not compute:
+        lines.append("  none")
+    elif not taken:
+        lines.append("  auto takes none of them")
+    else:
+        why = why_taken(taken[0], compute).partition(": ")[0]
+        lines.append(f"  auto takes {taken[0].number}: {why}")
+    return lines
 
 
 def _plain(device: CameraDevice | SerialDevice) -> dict[str, Any]:

@@ -31,7 +31,14 @@ class FlightError(InputError):
 
 
 class DeviceError(InputError):
-    """The OpenCL device asked for is not there or does not compute correctly."""
+    """The OpenCL device asked for is not there or does not compute correctly.
+
+    `detail` is what a driver or its compiler said of it, on as many lines as that took.
+    """
+
+    def __init__(self, text: str, detail: str = "") -> None:
+        super().__init__(text)
+        self.detail = detail
 
 
 class SourceError(CompanionError):

@@ -8,11 +8,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from companion.clock import StageTimes, monotonic_s
+from companion.compute_devices import choose_devices
 from companion.config import Config
 from companion.config_file import command_shown, shown
-from companion.depth.device_choice import choose_device
-from companion.depth.opencl import ComputeDevice
 from companion.depth.stage import DepthStage
+from companion.depth.takeover import Devices
 from companion.errors import FlightError
 from companion.gaps import with_gaps_named
 from companion.localisation import LocalisationStage
@@ -46,7 +46,8 @@ def replay(
 ) -> FlightResult:
     """Replay a flight into the folder `out`; InputError when it cannot begin.
 
-    `told` hears how the telemetry was read, and where a viewer shows it.
+    `told` hears how the telemetry was read, which OpenCL devices were refused, and where a viewer
+    shows it.
 
     What was done so far is written also when it is interrupted or fails on the way.
     """
@@ -55,7 +56,7 @@ def replay(
     log = flight.telemetry()
     for remark in log.remarks:
         told(f"telemetry: {remark}")
-    device = choose_device(config.opencl, monotonic_s) if config.depth.enabled else None
+    devices = choose_devices(config.opencl, told) if config.depth.enabled else None
     out.mkdir(parents=True, exist_ok=True)
     times = StageTimes()
     result = FlightResult(out, config.cloud.memory_mb)
@@ -76,7 +77,7 @@ def replay(
             sinks.append(live)
             if live.page:
                 told(f"viewer: open {live.page}")
-        depth = _depth_stage(config, flight, device, times)
+        depth = _depth_stage(config, flight, devices, times)
         pipeline = Pipeline(
             LocalisationStage(config, flight.camera, times, beside=paced), depth, sinks,
             lossless=not paced,
@@ -93,7 +94,7 @@ def replay(
             facts = RunFacts(
                 stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
                 origin=log.origin if _has_origin(result) else None,
-                device=device.described if device else "none (depth.enabled = false)",
+                device=devices.described if devices else "none (depth.enabled = false)",
                 config=shown(config), versions=versions(),
                 command=command_shown(sys.argv),
                 peak_memory_mb=peak_memory_mb(), camera=flight.camera,
@@ -124,11 +125,11 @@ def _span(flight: Flight, start_s: float | None, stop_s: float | None) -> tuple[
 
 
 def _depth_stage(
-    config: Config, flight: Flight, device: ComputeDevice | None, times: StageTimes
+    config: Config, flight: Flight, devices: Devices | None, times: StageTimes
 ) -> DepthStage | None:
-    if device is None:
+    if devices is None:
         return None
-    return DepthStage(config.depth, config.cloud, flight.camera, device, times)
+    return DepthStage(config.depth, config.cloud, flight.camera, devices, times)
 
 
 def _run(

@@ -15,10 +15,18 @@ from companion.stopping import StopSignals
 
 
 def _devices(arguments: argparse.Namespace, signals: StopSignals) -> int:
-    from companion.devices import devices
+    from companion.devices import devices, opencl_devices
 
-    print(devices(arguments.json))
-    return 0
+    if not arguments.opencl:
+        print(devices(arguments.json, arguments.verbose))
+        return 0
+    from companion.depth.opencl import WANT
+
+    text, works = opencl_devices(arguments.json, arguments.verbose)
+    print(text)
+    if not works:
+        print(f"companion: error: no OpenCL device that works: {WANT}", file=sys.stderr)
+    return 0 if works else 1
 
 
 def _calibrate(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -57,8 +65,17 @@ COMMANDS: dict[str, Command] = {"devices": _devices, "calibrate": _calibrate, "d
 
 def add_parsers(commands: Any) -> None:
     """Add them to the subparsers of the program."""
-    commands.add_parser(
-        "devices", parents=[json_option()], help="list cameras, serial ports and OpenCL devices"
+    devices = commands.add_parser(
+        "devices", parents=[json_option()], help="list cameras, serial ports and OpenCL devices",
+        description="List what a configuration can name. OpenCL devices are tested and measured "
+        "anew, and the result is kept for opencl.device = auto.",
+    )  # fmt: skip
+    devices.add_argument(
+        "--opencl", action="store_true",
+        help="only OpenCL devices; exit status 1 where none of them works",
+    )  # fmt: skip
+    devices.add_argument(
+        "--verbose", action="store_true", help="with what drivers and their compilers say"
     )
 
     calibrate = commands.add_parser(

@@ -1,4 +1,4 @@
-"""The OpenCL device: chosen, named, its program built once."""
+"""OpenCL devices: listed, opened, programs built for them."""
 
 from __future__ import annotations
 
@@ -6,22 +6,53 @@ import os
 import shutil
 import warnings
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from companion.config import OpenclConfig
 from companion.errors import DeviceError
 
+# Both are read by libraries when they are first called.
+# PoCL: one thread of work per core, and no spinning while waiting.
+os.environ.setdefault("POCL_AFFINITY", "0")
+# ocl-icd would begin every driver's devices to sort platforms by them, and one of them may abort.
+os.environ.setdefault("OCL_ICD_PLATFORM_SORT", "none")
+
 WANT = (
-    "install PoCL (pip install 'companion[cpu]' on x86-64, apt install pocl-opencl-icd elsewhere),"
-    " or set depth.enabled=false"
+    "sudo apt install pocl-opencl-icd (without root, on x86-64: pip install 'companion[cpu]'), "
+    "or the driver of your GPU; or set depth.enabled=false"
 )
 POCL, LINKERS = "Portable Computing Language", ("ld", "ld.lld")
+GPU, ACCELERATOR, PROCESSOR = "GPU", "accelerator", "processor"
 UPLOAD, READ_BACK = "upload", "read-back"
 MAX_COPIES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class ListedDevice:
+    """A device as its driver names it; `number` is PLATFORM:DEVICE."""
+
+    number: str
+    name: str
+    platform: str
+    kind: str = PROCESSOR
+    """GPU, ACCELERATOR or PROCESSOR."""
+    driver: str = ""
+    """Versions of platform and driver."""
+
+    @property
+    def named(self) -> str:
+        """Name and platform."""
+        return f"{self.name} ({self.platform})" if self.name else self.platform
+
+    @property
+    def identity(self) -> str:
+        """Told apart from every other device there is, and from itself after an update."""
+        return f"{self.number} {self.kind} {self.named} {self.driver}"
 
 
 class ComputeDevice:
@@ -54,7 +85,11 @@ class ComputeDevice:
                 program: cl.Program = cl.Program(self.context, source).build(options=options)
                 return program
         except cl.RuntimeError as error:
-            raise DeviceError(f"{self.name}: kernels do not build: {error}") from error
+            kind = _kind(self.device)
+            what = f"this {kind}" if kind == PROCESSOR else "it"
+            raise DeviceError(
+                f"{self.name}: kernels do not build for {what}", str(error)
+            ) from error
 
     def buffer(self, n_bytes: int) -> cl.Buffer:
         """A read-write buffer."""
@@ -79,51 +114,70 @@ def event_ms(event: cl.Event) -> float:
     return float(event.profile.end - event.profile.start) * 1e-6
 
 
-def _devices() -> list[tuple[str, cl.Device]]:
+def platform_names() -> list[str]:
+    """All platforms, without a look at their devices."""
     try:
-        platforms = cl.get_platforms()
-    except cl.LogicError:
+        return [platform.name.strip() for platform in cl.get_platforms()]
+    except cl.Error:
+        return []  # which is how a loader without a driver answers
+
+
+def devices_of(platform: int) -> list[ListedDevice]:
+    """All devices of a platform by its number; no other driver's are begun."""
+    try:
+        return [
+            _listed(f"{platform}:{i}", device)
+            for i, device in enumerate(cl.get_platforms()[platform].get_devices())
+        ]
+    except cl.Error:
         return []
-    return [
-        (f"{i}:{j}", device)
-        for i, platform in enumerate(platforms)
-        for j, device in enumerate(platform.get_devices())
-    ]
 
 
-def device_names() -> list[tuple[str, str, str]]:
-    """Number, name and platform of every device there is, as `opencl.device` takes them."""
-    return [(n, d.name.strip(), d.platform.name.strip()) for n, d in _devices()]
+def _listed(number: str, device: cl.Device) -> ListedDevice:
+    driver = f"{device.platform.version.strip()}, {device.driver_version.strip()}"
+    return ListedDevice(
+        number, device.name.strip(), device.platform.name.strip(), _kind(device), driver
+    )
 
 
-def open_device(config: OpenclConfig) -> ComputeDevice:
-    """The device that the configuration names; "auto" prefers a GPU; DeviceError if none."""
-    # PoCL: one thread of work per core, and no spinning while waiting
-    os.environ.setdefault("POCL_AFFINITY", "0")
-    found = _devices()
-    if not found:
-        raise DeviceError(f"no OpenCL device on this machine: {WANT}")
-    if config.device == "auto":
-        found.sort(key=lambda d: (not d[1].type & cl.device_type.GPU, d[0]))
-        return _usable(found[0][1])
-    wanted = config.device.lower()
-    for number, device in found:
-        if (
-            wanted == number
-            or wanted in device.name.lower()
-            or wanted in device.platform.name.lower()
-        ):
-            return _usable(device)
-    names = "; ".join(f"{n} {d.name.strip()} ({d.platform.name.strip()})" for n, d in found)
-    raise DeviceError(f"opencl.device = {config.device!r} is none of: {names}")
+def _kind(device: cl.Device) -> str:
+    if device.type & cl.device_type.GPU:
+        return GPU
+    return ACCELERATOR if device.type & cl.device_type.ACCELERATOR else PROCESSOR
 
 
-def _usable(device: Any) -> ComputeDevice:
+def device_asked_for(asked: str, listed: Sequence[ListedDevice]) -> ListedDevice:
+    """The one that `opencl.device` names; DeviceError if none is."""
+    wanted = asked.lower()
+    for each in listed:
+        if wanted == each.number or wanted in each.name.lower() or wanted in each.platform.lower():
+            return each
+    names = "; ".join(f"{each.number} {each.named}" for each in listed)
+    raise DeviceError(f"opencl.device = {asked!r} is none of: {names}")
+
+
+def open_device(listed: ListedDevice) -> ComputeDevice:
+    """Open it in this process; DeviceError where it is not there as listed, or lacks something."""
+    try:
+        platform, device = (int(part) for part in listed.number.split(":"))
+        found = cl.get_platforms()[platform].get_devices()[device]
+        if _listed(listed.number, found).identity != listed.identity:
+            raise DeviceError(f"{listed.named}: is not there any more")
+        return _usable(found)
+    except (cl.Error, IndexError) as error:
+        raise DeviceError(f"{listed.named}: cannot be opened", str(error)) from error
+
+
+def linkers() -> list[str]:
+    """Which of the linkers that PoCL can use are installed, by their paths."""
+    return [path for path in map(shutil.which, LINKERS) if path is not None]
+
+
+def _usable(device: cl.Device) -> ComputeDevice:
     """PoCL ends the whole process where it finds no linker: better to say so before."""
-    on_processor = device.type & cl.device_type.CPU
-    if POCL in device.platform.name and on_processor and not any(map(shutil.which, LINKERS)):
+    if POCL in device.platform.name and _kind(device) == PROCESSOR and not linkers():
         raise DeviceError(
-            f"{device.name.strip()}: PoCL links kernels with `ld`, which is not installed: "
-            "apt install gcc libc6-dev"
+            f"{device.name.strip()} ({device.platform.name.strip()}): PoCL links kernels with "
+            "`ld`, which is not installed: apt install gcc libc6-dev"
         )
     return ComputeDevice(device)

@@ -74,37 +74,43 @@ def _pattern(width: int, height: int) -> Bytes:
     return out.astype(np.uint8)
 
 
-def reconstruct(device: ComputeDevice, it: Scene) -> DepthMap:
-    """The scene's depth by this device."""
+def engine_for(device: ComputeDevice, it: Scene) -> DepthEngine:
+    """An engine for every pixel of the scene."""
     height, width = it.images[0].shape
     # so small an image tells depths no better than by some percent
     config = DepthConfig(stride=1, converged_sigma=0.1)
-    engine = DepthEngine(device, width, height, it.intrinsics, config, eager=False)
-    return _once(engine, it)
+    return DepthEngine(device, width, height, it.intrinsics, config, eager=False)
 
 
-def _once(engine: DepthEngine, it: Scene) -> DepthMap:
+def reconstruct(engine: DepthEngine, it: Scene) -> DepthMap:
+    """The scene's depth by this engine."""
     engine.begin(it.images[0], 0.7 * NEAR, 2.0 * FAR)
     for image, pose in zip(it.images[1:], it.poses, strict=True):
         engine.update(image, pose)
     return engine.finish(0, 0, np.repeat(it.images[0][..., None], 3, 2))
 
 
-def check(device: ComputeDevice) -> None:
-    """DeviceError where this device's result is not the one that the program is shipped with."""
-    with (resources.files("companion.depth") / VALUES).open("rb") as file:
-        values = np.load(file)
-        want_depth, want_state = values["depth"].astype(np.float64), values["state"]
-    found = reconstruct(device, scene(*SIZE))
-    if not np.isfinite(found.depth).all() or not np.isfinite(found.sigma).all():
-        raise DeviceError(f"{device.name}: self-test failed: results that are not numbers")
-    near = np.abs(found.depth - want_depth) <= NOISE * want_depth
-    same = found.state == want_state
-    worst = float(min(near.mean(), same.mean()))
-    if worst < LEAST_AGREEING:
-        raise DeviceError(
-            f"{device.name}: self-test failed: only {100 * worst:.1f} % of its depths are right"
-        )
+class SelfTest:
+    """The small scene on a device, as often as wanted. Raises DeviceError where it cannot be."""
+
+    def __init__(self, device: ComputeDevice) -> None:
+        self._device = device
+        self._scene = scene(*SIZE)
+        self._engine = engine_for(device, self._scene)
+        with (resources.files("companion.depth") / VALUES).open("rb") as file:
+            values = np.load(file)
+            self._depth, self._state = values["depth"].astype(np.float64), values["state"]
+
+    def run(self) -> None:
+        """DeviceError where the result is not the one that the program is shipped with."""
+        found = reconstruct(self._engine, self._scene)
+        failed = f"{self._device.name}: self-test failed"
+        if not np.isfinite(found.depth).all() or not np.isfinite(found.sigma).all():
+            raise DeviceError(f"{failed}: results that are not numbers")
+        near = np.abs(found.depth - self._depth) <= NOISE * self._depth
+        worst = float(min(near.mean(), (found.state == self._state).mean()))
+        if worst < LEAST_AGREEING:
+            raise DeviceError(f"{failed}: only {100 * worst:.1f} % of its depths are right")
 
 
 def frames_per_s(device: ComputeDevice, seconds: Callable[[], float]) -> float:
@@ -112,9 +118,9 @@ def frames_per_s(device: ComputeDevice, seconds: Callable[[], float]) -> float:
     it = scene(*SPEED_SIZE)
     height, width = it.images[0].shape
     engine = DepthEngine(device, width, height, it.intrinsics, DepthConfig(), eager=False)
-    _once(engine, it)  # compilers are done after the first
+    reconstruct(engine, it)  # compilers are done after the first
     begun, n = seconds(), 0
     while seconds() - begun < SPEED_S:
-        _once(engine, it)
+        reconstruct(engine, it)
         n += len(it.images)
     return n / (seconds() - begun)

@@ -16,11 +16,12 @@ from companion.clock import Timer
 from companion.config import CloudConfig, DepthConfig
 from companion.depth.engine import DepthEngine
 from companion.depth.fusion import Fusion, measured_only
-from companion.depth.opencl import ComputeDevice
+from companion.depth.takeover import Devices, TestedEngine
 from companion.depth.undistortion import Undistortion
 from companion.geometry import Pose, Similarity
 from companion.messages import (
     Bytes,
+    DepthMap,
     Frame,
     KeyframeAdded,
     MapUpdate,
@@ -42,22 +43,28 @@ class _Held:
 
 
 class DepthStage:
-    """Frames, tracks, keyframes and map updates in; DepthMaps and PointChunks out."""
+    """Frames, tracks, keyframes and map updates in; DepthMaps and PointChunks out.
+
+    A Warned says when its device has failed, and which one has taken over if one was left.
+    """
 
     def __init__(
         self,
         config: DepthConfig,
         cloud: CloudConfig,
         camera: Camera,
-        device: ComputeDevice,
+        devices: Devices,
         times: Timer,
     ) -> None:
         self._config = config
         self._fusion = Fusion(cloud)
         self._undistortion = Undistortion(camera)
         intrinsics = self._undistortion.intrinsics
-        self._engine = DepthEngine(
-            device, camera.width, camera.height, intrinsics, config, eager=False
+        self._engine = TestedEngine(
+            devices,
+            lambda device: DepthEngine(
+                device, camera.width, camera.height, intrinsics, config, eager=False
+            ),
         )
         self._times = times
         self._held: OrderedDict[int, _Held] = OrderedDict()
@@ -74,7 +81,8 @@ class DepthStage:
     def step(self, message: Message) -> list[Message]:
         """Take one message, in order of time."""
         if isinstance(message, Frame):
-            self._hold(message)
+            if not self._engine.off:
+                self._hold(message)
         elif isinstance(message, Track):
             held = self._held.get(message.seq)
             if held is not None:
@@ -87,7 +95,7 @@ class DepthStage:
             while len(self._waiting) > self._config.lag_keyframes:
                 with self._times("depth"):
                     out += self._process(self._waiting.pop(0))
-            return out
+            return [*self._engine.announced(message.t_ns), *out]
         return []
 
     def flush(self) -> list[Message]:
@@ -99,6 +107,7 @@ class DepthStage:
         self._waiting.clear()
         if self._update is not None:
             out += self._fusion.flush(self._update)
+            out += self._engine.announced(self._update.t_ns)
         return out
 
     def _hold(self, frame: Frame) -> None:
@@ -125,13 +134,20 @@ class DepthStage:
         if len(chosen) < 3 or not self._may():
             return []
         self._last_reference = keyframe.keyframe_id
-        self._engine.begin(held.grey, near, far)
-        for seq, current_from_reference in chosen:
-            self._engine.update(self._held[seq].grey, current_from_reference)
         assert held.rgb is not None
         rgb = self._undistortion.image(held.rgb)
-        depth_map = measured_only(self._engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb))
+
+        def depth(engine: DepthEngine) -> DepthMap:
+            engine.begin(held.grey, near, far)
+            for seq, current_from_reference in chosen:
+                engine.update(self._held[seq].grey, current_from_reference)
+            return engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb)
+
+        found = self._engine.run(keyframe.t_ns, depth)
         self._forget(keyframe)
+        if found is None:
+            return []
+        depth_map = measured_only(found)
         chunks: list[PointChunk] = self._fusion.add(depth_map, update)
         return [depth_map, *chunks]
 

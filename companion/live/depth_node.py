@@ -13,8 +13,8 @@ from pathlib import Path
 
 from companion.camera import Camera
 from companion.clock import monotonic_s, wait_s
+from companion.compute_devices import choose_devices
 from companion.config import Config
-from companion.depth.device_choice import choose_device
 from companion.errors import StreamError
 from companion.live.journal import WARNING, Journal
 from companion.live.remote_flight import RemoteFlight
@@ -48,7 +48,7 @@ class DepthNode:
     def __init__(self, config: Config, is_stopped: Callable[[], bool]) -> None:
         self._config, self._is_stopped = config, is_stopped
         self._journal = Journal()
-        self._device = choose_device(config.opencl, monotonic_s)
+        self._devices = choose_devices(config.opencl, self._journal.say)
         self._bus = ZenohBus(config.distributed)
         for topic in ("depth", "cloud"):
             self._bus.announce(topic, LAST)
@@ -110,7 +110,7 @@ class DepthNode:
             vehicle = self._config.distributed.vehicle
             folder = Path(self._config.daemon.flights) / f"{vehicle}-{flight}"
             self._flight = RemoteFlight(
-                self._config, flight, camera, self._device, folder, self._publish, self._journal
+                self._config, flight, camera, self._devices, folder, self._publish, self._journal
             )
             before = len(self._flight.kept.found)
             more = f", going on with {before} keyframes" if before else ""

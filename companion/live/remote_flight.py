@@ -11,12 +11,12 @@ from companion.camera import Camera
 from companion.clock import StageTimes, monotonic_s
 from companion.config import Config
 from companion.config_file import command_shown, shown
-from companion.depth.opencl import ComputeDevice
 from companion.depth.stage import DepthStage
+from companion.depth.takeover import Devices
 from companion.live.journal import WARNING, Journal
 from companion.live.kept_chunks import KeptChunks
 from companion.live.viewing import Viewing
-from companion.messages import DepthMap, MapUpdate, Message, PointChunk
+from companion.messages import DepthMap, MapUpdate, Message, PointChunk, Warned
 from companion.output.flight_result import FlightResult, RunFacts
 from companion.output.surroundings import peak_memory_mb, versions
 from companion.output.write import write_results
@@ -38,18 +38,19 @@ class RemoteFlight:
     """
 
     def __init__(
-        self, config: Config, flight: str, camera: Camera, device: ComputeDevice, folder: Path,
+        self, config: Config, flight: str, camera: Camera, devices: Devices, folder: Path,
         publish: Publish, journal: Journal,
     ) -> None:  # fmt: skip
         self.flight, self.camera, self.folder = flight, camera, folder
         self.n_missed = 0
         """Bundles that were gone before they could be fetched."""
-        self._config, self._device, self._publish, self._journal = config, device, publish, journal
+        self._config, self._devices = config, devices
+        self._publish, self._journal = publish, journal
         folder.mkdir(parents=True, exist_ok=True)
         self.kept = KeptChunks(folder)
         self._times = StageTimes()
         self._began_s = monotonic_s()
-        self._depth = DepthStage(config.depth, config.cloud, camera, device, self._times)
+        self._depth = DepthStage(config.depth, config.cloud, camera, devices, self._times)
         self._result = FlightResult(folder, config.cloud.memory_mb)
         self._mirror = MapMirror()
         self._update: MapUpdate | None = None
@@ -111,7 +112,7 @@ class RemoteFlight:
     def _write(self, page: bool) -> None:
         facts = RunFacts(
             stage_times=self._times.summary(), wall_s=monotonic_s() - self._began_s, clock=None,
-            origin=None, device=self._device.described, config=shown(self._config),
+            origin=None, device=self._devices.described, config=shown(self._config),
             versions=versions(), command=command_shown(sys.argv),
             peak_memory_mb=peak_memory_mb(), camera=self.camera,
             n_frames_total=self._result.n_frames, completed=True,
@@ -131,6 +132,8 @@ class RemoteFlight:
             self._publish("cloud", lambda: cloud_envelope(self.flight, message, self._update))
         elif isinstance(message, DepthMap):
             self._publish("depth", lambda: depth_envelope(self.flight, message, self._update))
+        elif isinstance(message, Warned):
+            self._warn(message.what, message.detail, message.good)
         self._show(message)
 
     def _show(self, message: Message) -> None:

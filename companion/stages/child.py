@@ -74,6 +74,7 @@ def _serve(
 ) -> None:
     ring = FrameRing(setup.camera.width, setup.camera.height, ring_fd)
     work = module.work(setup)
+    work.begin(send)
     send(Progress(device=work.device))
     inbox: LatestWins[Any] = LatestWins(work.may_skip)
     n_overwritten = 0

@@ -2,34 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from companion.clock import monotonic_s
-from companion.depth.device_choice import choose_device
+from companion.compute_devices import choose_devices, say_on_stderr
+from companion.depth.opencl import ListedDevice
 from companion.depth.stage import DepthStage
-from companion.messages import Message
-from companion.stages.protocol import Finish, SetShare, Setup
+from companion.depth.takeover import Devices
+from companion.messages import DepthMap, Message
+from companion.stages.protocol import DriverAtWork, Finish, SetShare, Setup
 from companion.stages.work import Work
+
+FIRST_PATIENCE_S = 120.0
+"""Drivers may compile kernels when they first run: on a small processor that takes most of a
+minute."""
+PATIENCE_S = 30.0
+"""A depth map takes 0.1 to 2 s, on a processor that has ten times as much else to do 20 s."""
 
 
 class _Depth(Work):
     def __init__(self, setup: Setup) -> None:
         super().__init__()
-        opened = choose_device(setup.config.opencl, monotonic_s)
-        self.device = opened.described
-        self._stage = DepthStage(
-            setup.config.depth, setup.config.cloud, setup.camera, opened, self.times
+        self._setup = setup
+        self._tell: Callable[[Any], None] = lambda _: None
+        self._patience_s = FIRST_PATIENCE_S
+        self._devices: Devices | None = None
+        self._stage: DepthStage | None = None
+
+    def begin(self, tell: Callable[[Any], None]) -> None:
+        """Find the device, which may take long."""
+        self._tell = tell
+        setup = self._setup
+        self._devices = choose_devices(
+            setup.config.opencl, say_on_stderr, setup.failed_devices, self._watched
         )
+        self._stage = DepthStage(
+            setup.config.depth, setup.config.cloud, setup.camera, self._devices, self.times
+        )
+        self.device = self._devices.described
 
     def step(self, message: Any) -> Iterable[Message]:
+        assert self._stage is not None and self._devices is not None
         if isinstance(message, SetShare):
             self._stage.set_share(message.share)
             return []
-        return self._stage.step(message)
+        out = self._stage.step(message)
+        if any(isinstance(each, DepthMap) for each in out):
+            self._patience_s = PATIENCE_S
+        self.device = self._devices.described
+        return out
 
     def finish(self, finish: Finish) -> Iterable[Message]:
+        assert self._stage is not None
         return [] if finish.hurry else self._stage.flush()
+
+    @contextmanager
+    def _watched(self, device: ListedDevice) -> Iterator[None]:
+        """SIGALRM ends the process where the driver does not come back.
+
+        The kernel sends it, so that it does not matter what the driver holds meanwhile.
+        """
+        self._tell(DriverAtWork(device.identity, device.named))
+        signal.setitimer(signal.ITIMER_REAL, self._patience_s)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            self._tell(DriverAtWork())
 
 
 def work(setup: Setup) -> Work:

@@ -19,6 +19,8 @@ class Setup:
     config: Config
     camera: Camera
     folder: Path | None = None
+    failed_devices: Mapping[str, str] = field(default_factory=dict)
+    """OpenCL devices that have failed in this flight, by identity, and how, in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,17 @@ class Progress:
     n_dropped: int = 0
     times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     device: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DriverAtWork:
+    """From now on a device's driver is at work, in which it may end the process; or no more ("").
+
+    `identity` and `named` are those of the device.
+    """
+
+    identity: str = ""
+    named: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 from companion.clock import StageTimes
@@ -42,6 +42,9 @@ class Work(ABC):
     def may_skip(self, message: Any) -> bool:
         """Whether a message gives way to a newer one of its kind."""
         return self.latest_only and isinstance(message, FrameInRing)
+
+    def begin(self, tell: Callable[[Any], None]) -> None:  # noqa: B027 - most have nothing to do
+        """Before the first message; `tell` takes what the daemon is to know at once."""
 
     @abstractmethod
     def step(self, message: Any) -> Iterable[Message | Snapshot]:

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from companion.clock import StageTimes, monotonic_s
+from companion.clock import StageTimes
 from companion.config import Config, DistributedConfig
-from companion.depth.device_choice import choose_device
 from companion.depth.stage import DepthStage
 from companion.localisation import LocalisationStage
 from companion.messages import Frame, KeyframeAdded, MapUpdate, Message, Track
@@ -21,6 +20,7 @@ from companion.topics.bundle import MapMirror, bundle_of, frame_of
 from companion.topics.envelope import unpack
 from companion.topics.gatherer import Gatherer
 from drivers.open_flight import open_flight
+from tests.support import compute
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
 STOP_S = 8.0
@@ -54,9 +54,9 @@ def made() -> Made:
     config = Config()
     flight = open_flight(FLIGHT, config.camera, config.telemetry)
     stop_ns = flight.start_ns + int(STOP_S * 1e9)
-    device = choose_device(config.opencl, monotonic_s)
+    devices = compute.devices()
     here, there = (
-        _Stage(DepthStage(config.depth, config.cloud, flight.camera, device, StageTimes()))
+        _Stage(DepthStage(config.depth, config.cloud, flight.camera, devices, StageTimes()))
         for _ in range(2)
     )
     localisation = LocalisationStage(config, flight.camera, StageTimes())

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from companion.config import DepthConfig, OpenclConfig
+from companion.config import DepthConfig
 from companion.depth.engine import DepthEngine
-from companion.depth.opencl import open_device
+from companion.depth.opencl import device_asked_for, devices_of, open_device, platform_names
 from companion.depth.self_test import FAR, NEAR, scene
 
 PLATFORM = "Oclgrind"
@@ -25,7 +25,8 @@ SHUFFLED = ("aggregate", "winner", "blocks")
 
 def main() -> None:
     width, height, stride, n_views = map(int, sys.argv[1:])
-    device = open_device(OpenclConfig(device=PLATFORM))
+    listed = [each for n in range(len(platform_names())) for each in devices_of(n)]
+    device = open_device(device_asked_for(PLATFORM, listed))
     it = scene(width, height)
     config = DepthConfig(stride=stride, regularise_iterations=1)
     engine = DepthEngine(device, width, height, it.intrinsics, config, eager=False)

@@ -17,8 +17,8 @@ import numpy as np
 
 from companion.camera import Camera
 from companion.clock import StageTimes
+from companion.compute_devices import choose_devices
 from companion.config import Config
-from companion.depth.opencl import open_device
 from companion.depth.stage import DepthStage
 from companion.localisation import LocalisationStage
 from companion.messages import (
@@ -77,11 +77,11 @@ def make_tape(flight_path: Path, path: Path, config: Config) -> None:
     """Replay a flight once, and keep all that a viewer is shown."""
     flight = open_flight(flight_path, config.camera, config.telemetry)
     log = flight.telemetry()
-    times, device = StageTimes(), open_device(config.opencl)
+    times, devices = StageTimes(), choose_devices(config.opencl)
     with Keeper(path, flight.camera, log.origin) as keeper:
         pipeline = Pipeline(
             LocalisationStage(config, flight.camera, times, beside=False),
-            DepthStage(config.depth, config.cloud, flight.camera, device, times), [keeper],
+            DepthStage(config.depth, config.cloud, flight.camera, devices, times), [keeper],
             lossless=True,
         )  # fmt: skip
         start_ns, stop_ns = flight.start_ns, flight.stop_ns

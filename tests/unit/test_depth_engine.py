@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from companion.camera import Camera
-from companion.config import DepthConfig, OpenclConfig
+from companion.config import DepthConfig
 from companion.depth import verification
 from companion.depth.engine import DepthEngine
-from companion.depth.opencl import ComputeDevice, open_device
+from companion.depth.opencl import ComputeDevice, device_asked_for
 from companion.depth.verification import MOST_NOISE_GREY, image_noise
 from companion.depth.views import Intrinsics
 from companion.errors import DeviceError
 from companion.geometry import Pose, rotation_from_vector
 from companion.messages import Bytes, DepthMap, PixelState
+from tests.support import compute
 from tests.support.scene import DOWN_LOOKING, PlaneWorld, texture
 
 STATES = {state.value for state in PixelState}
@@ -25,7 +26,7 @@ STATES = {state.value for state in PixelState}
 
 @pytest.fixture(scope="module")
 def device() -> ComputeDevice:
-    return open_device(OpenclConfig())
+    return compute.best()
 
 
 def engine(device: ComputeDevice, width: int, height: int, **keys: float) -> DepthEngine:
@@ -205,11 +206,10 @@ def test_what_no_device_can_hold_is_an_error(device: ComputeDevice) -> None:
 
 
 def test_a_device_is_found_by_number_and_by_name_and_never_replaced() -> None:
-    number, name = (
-        open_device(OpenclConfig(device="0:0")),
-        open_device(OpenclConfig(device="auto")).name,
-    )
-    part = name.split("(")[-1].rstrip(")")
-    assert part in number.name or part in open_device(OpenclConfig(device=part)).name
+    listed = [each.listed for each in compute.known()]
+    for each in listed:
+        assert device_asked_for(each.number, listed) is each
+        assert device_asked_for(each.name, listed).name == each.name
+        assert device_asked_for(each.platform.upper(), listed).platform == each.platform
     with pytest.raises(DeviceError, match=r"no-such-device.*is none of"):
-        open_device(OpenclConfig(device="no-such-device"))
+        device_asked_for("no-such-device", listed)

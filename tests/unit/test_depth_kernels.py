@@ -9,11 +9,11 @@ import pyopencl as cl
 import pytest
 from numpy.typing import NDArray
 
-from companion.config import OpenclConfig
-from companion.depth.opencl import ComputeDevice, device_names, open_device
+from companion.depth.opencl import ComputeDevice
 from companion.depth.regularisation import HUBER, Regularisation
 from companion.depth.views import Intrinsics, Views
 from companion.geometry import Pose, rotation_from_vector
+from tests.support import compute
 from tests.support import reference_depth as reference
 from tests.support.scene import texture
 
@@ -23,9 +23,9 @@ MOST_APART = 9000.0
 """What the sum of squared differences of a window may be where it is alike."""
 
 
-@pytest.fixture(scope="module", params=[number for number, _, _ in device_names()])
+@pytest.fixture(scope="module", params=compute.working())
 def device(request: pytest.FixtureRequest) -> ComputeDevice:
-    return open_device(OpenclConfig(device=request.param))
+    return compute.opened(request.param)
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from companion.camera import Camera, Distortion
-from companion.config import CloudConfig, DepthConfig, OpenclConfig
-from companion.depth.opencl import open_device
+from companion.config import CloudConfig, DepthConfig
 from companion.depth.stage import MAX_HELD, DepthStage
 from companion.geometry import Pose, rotation_from_vector
 from companion.messages import (
@@ -22,6 +21,7 @@ from companion.messages import (
     Track,
     TrackState,
 )
+from tests.support import compute
 from tests.support.scene import DOWN_LOOKING, PlaneWorld
 
 RADTAN = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
@@ -34,8 +34,9 @@ def at(k: int) -> Pose:
 
 
 def stage(camera: Camera) -> DepthStage:
-    device = open_device(OpenclConfig())
-    return DepthStage(DepthConfig(), CloudConfig(), camera, device, lambda _: nullcontext())
+    return DepthStage(
+        DepthConfig(), CloudConfig(), camera, compute.devices(), lambda _: nullcontext()
+    )
 
 
 def fly(camera: Camera, n: int = 34, unit_of: dict[int, float] | None = None) -> list[Message]:

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.clock import StageTimes, monotonic_s
+from companion.clock import StageTimes
 from companion.config import Config
-from companion.depth.device_choice import choose_device
 from companion.depth.stage import DepthStage
 from companion.errors import StreamError
 from companion.live.kept_chunks import NAME, KeptChunks
@@ -32,7 +31,7 @@ from companion.topics.encoding import (
     pose_of_envelope,
 )
 from companion.topics.envelope import LENGTH, Envelope, unpack
-from tests.support import flown, topic_flight
+from tests.support import compute, flown, topic_flight
 
 N = 400
 NASTY: list[Any] = [
@@ -114,8 +113,9 @@ def test_noise_is_refused() -> None:
 
 def test_what_is_well_formed_but_wrong_does_not_bring_the_depth_stage_down() -> None:
     config, luck = Config(), random.Random(8)
-    device = choose_device(config.opencl, monotonic_s)
-    stage = DepthStage(config.depth, config.cloud, topic_flight.CAMERA, device, StageTimes())
+    stage = DepthStage(
+        config.depth, config.cloud, topic_flight.CAMERA, compute.devices(), StageTimes()
+    )
     mirror = MapMirror()
     packed = [bundle.pack() for bundle in topic_flight.bundles(48)]
     n_taken = n_maps = 0
