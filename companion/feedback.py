@@ -1,14 +1,16 @@
 """Which poses the autopilot is given: those that it may fly on, and none else.
 
 A pose must be metric, of a tracked frame, certain and good enough, as level as the autopilot itself
-finds its body, and young. That must have held for a while before the first is sent; afterwards a
-gap is bridged by prediction, shorter than an autopilot takes to notice, and then nothing is sent
-until belief has held again.
+finds its body, and young. What cannot be checked is not sent. All that must have held for a while
+before the first is sent; afterwards a gap is bridged by prediction, shorter than an autopilot takes
+to notice, and then nothing is sent until belief has held again. So it is after every discontinuity,
+whatever led to it: nothing of the new place is sent before that.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +18,8 @@ import numpy as np
 from companion.config import FeedbackConfig
 from companion.geometry import Array, Pose
 from companion.messages import AttitudeSample, Odometry, TrackState
-from companion.motion import AttitudeHistory
+from companion.motion import MAX_EXTRAPOLATION_NS, AttitudeHistory
+from companion.reset_counter import ResetCounter
 
 MAX_TILT_APART_RAD = np.radians(8.0)
 MAX_AGE_NS = 300_000_000
@@ -26,6 +29,8 @@ EASE = 0.8
 MAX_EXTENT_M = 1e5
 MIN_SPACING_NS = 4_000_000
 STEADY_PERIODS = 20
+MAX_ATTITUDE_GAP_NS = 2 * MAX_EXTRAPOLATION_NS
+"""Between two samples of attitude: no time between them is further from one than extrapolation."""
 
 OFF = "off"
 NOT_YET = "no pose yet"
@@ -37,7 +42,11 @@ POOR = "quality too low"
 TILTED = "tilt differs from the autopilot's"
 LATE = "poses come too late"
 SILENT = "no frames"
+NO_ATTITUDE = "no autopilot attitude"
 BEGUN_ANEW = "localisation begins anew"
+RESET = "position reset"
+REBOOTED = "autopilot rebooted"
+NO_HEIGHT = "no autopilot height"
 PROVING = "belief must hold first"
 
 
@@ -57,13 +66,27 @@ class PoseToSend:
 
 
 class PoseGate:
-    """Odometry and attitude in; poses to send out. `now_ns` is the time of the call."""
+    """Odometry and attitude in; poses to send out. `now_ns` is the time of the call.
 
-    def __init__(self, config: FeedbackConfig, n_resets: int = 0) -> None:
+    `start_down_m` gives the autopilot's own place along the world's down axis at the time of a
+    frame, None where poses must not begin for want of it; without it poses stay in our world.
+    `may_begin` gives what else stands against the first pose of a row, "" if nothing does.
+    """
+
+    def __init__(
+        self,
+        config: FeedbackConfig,
+        counter: ResetCounter | None = None,
+        start_down_m: Callable[[int], float | None] | None = None,
+        may_begin: Callable[[int], str] = lambda _now_ns: "",
+    ) -> None:
         self._config = config
-        self._attitude = AttitudeHistory(400)
-        self._resets_before = n_resets
-        self._resets = 0
+        self._attitude = AttitudeHistory(400, MAX_ATTITUDE_GAP_NS)
+        self._counter = counter or ResetCounter()
+        self._start_down_m, self._may_begin = start_down_m, may_begin
+        self._down_shift_m: float | None = None
+        """Added to our down axis; fixed with the first pose, until a discontinuity."""
+        self._resets_seen: int | None = None
         self._good: Odometry | None = None
         self._good_at_ns = 0
         self._believed_since_ns: int | None = None
@@ -77,18 +100,24 @@ class PoseGate:
 
     @property
     def n_resets(self) -> int:
-        """Discontinuities so far."""
-        return self._resets_before + self._resets
+        """Discontinuities that the autopilot has been told of, or will be with the next pose."""
+        return self._counter.value
 
     def restart(self) -> None:
         """Localisation begins anew: nothing ties its poses to those before."""
         if self.sending:
             self._stop(BEGUN_ANEW)
-        self._resets_before += self._resets + 1
-        self._resets = 0
+        self._discontinuity()
+        self._resets_seen = None
         self._good, self._believed_since_ns = None, None
         self._periods_ns.clear()
         self._newest_ns = 0
+
+    def autopilot_booted(self, last_sent: int | None) -> None:
+        """Another boot of the autopilot: the reset counter that it was last sent, None if none."""
+        self._counter.booted(last_sent)
+        self._down_shift_m = None
+        self._stop(REBOOTED if self.sending else self.why_not)
 
     def reconfigure(self, config: FeedbackConfig) -> None:
         """Take over other limits; what is believed and what was sent stay as they are."""
@@ -99,7 +128,12 @@ class PoseGate:
         self._stop(why_not)
 
     def take_attitude(self, sample: AttitudeSample) -> None:
-        """Take the autopilot's attitude, on which predictions turn."""
+        """Take the autopilot's attitude: poses are checked against it, predictions turn with it."""
+        if not 0.5 < float(np.linalg.norm(sample.ned_from_body)) < 2.0:  # nan neither
+            return
+        rates = sample.rates_body_rad_s
+        if rates is not None and not np.isfinite(rates).all():
+            sample = replace(sample, rates_body_rad_s=None)
         self._attitude.add(sample)
 
     def take(self, odometry: Odometry, now_ns: int) -> PoseToSend | None:
@@ -109,23 +143,29 @@ class PoseGate:
         if self._newest_ns:
             self._periods_ns.append(odometry.t_ns - self._newest_ns)
         self._newest_ns = odometry.t_ns
-        self._resets = max(self._resets, odometry.reset_counter)
+        was_reset = self._resets_seen not in (None, odometry.reset_counter)
+        self._resets_seen = odometry.reset_counter
+        if was_reset:
+            self._discontinuity()
+            self._stop(RESET)
+            return None
+        if now_ns - self._good_at_ns > self._max_gap_ns:
+            self._cease()
         why_not = self._doubt(odometry, now_ns)
         if why_not:
             self._believed_since_ns = None
             self.why_not = why_not if not self.sending else ""
-            if self.sending and now_ns - self._good_at_ns > self._max_gap_ns:
-                self._stop(why_not)
             self._last_doubt = why_not
             return None
         self._good, self._good_at_ns, self._n_predicted = odometry, now_ns, 0
+        self._last_doubt = ""
         if not self.sending:
             if self._believed_since_ns is None:
                 self._believed_since_ns = now_ns
-            if now_ns - self._believed_since_ns < self._config.resume_after_s * 1e9:
-                self.why_not = PROVING
+            proven = now_ns - self._believed_since_ns >= self._config.resume_after_s * 1e9
+            self.why_not = self._begin(odometry, now_ns) if proven else PROVING
+            if self.why_not:
                 return None
-            self.sending, self.why_not = True, ""
         return self._stamped(self._pose_of(odometry))
 
     def due(self, now_ns: int) -> PoseToSend | None:
@@ -138,7 +178,7 @@ class PoseGate:
             return None
         since_ns = now_ns - self._good_at_ns
         if since_ns > self._max_gap_ns:
-            self._stop(self._last_doubt or SILENT)
+            self._cease()
             return None
         period_ns = self._period_ns()
         n_steps = max(1, int(np.ceil(period_ns * 1e-9 * self._config.rate_hz - 0.1)))
@@ -149,7 +189,8 @@ class PoseGate:
         if since_ns < number * step_ns + slack_ns:
             return None
         self._n_predicted = number
-        return self._stamped(self._predicted(good, number * step_ns))
+        predicted = self._predicted(good, number * step_ns)
+        return self._stamped(predicted) if predicted is not None else None
 
     @property
     def _max_gap_ns(self) -> int:
@@ -180,11 +221,37 @@ class PoseGate:
         if now_ns - odometry.t_ns > MAX_AGE_NS:
             return LATE
         attitude = self._attitude.at(odometry.t_ns)
-        if attitude is not None:
-            cosine = float(np.clip(attitude[2] @ pose.rotation[2], -1.0, 1.0))
-            if np.arccos(cosine) > MAX_TILT_APART_RAD * ease:
-                return TILTED
+        if attitude is None:
+            return NO_ATTITUDE
+        cosine = float(np.clip(attitude[2] @ pose.rotation[2], -1.0, 1.0))
+        if not np.arccos(cosine) <= MAX_TILT_APART_RAD * ease:
+            return TILTED
         return ""
+
+    def _begin(self, odometry: Odometry, now_ns: int) -> str:
+        """Begin to send with a pose that has been proven; why not, if it may not be."""
+        assert odometry.world_from_body is not None
+        shift_m = self._down_shift_m
+        if shift_m is None and self._start_down_m is not None:
+            start_m = self._start_down_m(odometry.t_ns)
+            if start_m is None or not np.isfinite(start_m):
+                return NO_HEIGHT
+            shift_m = start_m - float(odometry.world_from_body.translation[2])
+        why_not = self._may_begin(now_ns)
+        if not why_not:
+            self._down_shift_m = shift_m or 0.0
+            self.sending = self._counter.sent = True
+        return why_not
+
+    def _discontinuity(self) -> None:
+        self._counter.discontinuity()
+        self._down_shift_m = None
+
+    def _cease(self) -> None:
+        """No pose has been believed for too long."""
+        if self.sending:
+            self._stop(self._last_doubt or SILENT)
+        self._believed_since_ns = None
 
     def _stop(self, why_not: str) -> None:
         self.sending, self.why_not = False, why_not
@@ -192,20 +259,24 @@ class PoseGate:
 
     def _pose_of(self, odometry: Odometry) -> PoseToSend:
         assert odometry.world_from_body is not None and odometry.velocity_world_m_s is not None
-        self._last_doubt = ""
+        pose, down_m = odometry.world_from_body, self._down_shift_m or 0.0
         return PoseToSend(
-            odometry.t_ns, odometry.world_from_body, odometry.velocity_world_m_s,
-            odometry.sigma_position_m, odometry.sigma_velocity_m_s, odometry.sigma_attitude_rad,
-            odometry.quality, self.n_resets & 0xFF,
+            odometry.t_ns, Pose(pose.rotation, pose.translation + [0.0, 0.0, down_m]),
+            odometry.velocity_world_m_s, odometry.sigma_position_m, odometry.sigma_velocity_m_s,
+            odometry.sigma_attitude_rad, odometry.quality, self._counter.value & 0xFF,
         )  # fmt: skip
 
-    def _predicted(self, good: Odometry, ahead_ns: int) -> PoseToSend:
-        """The pose a while after a good one: on by its velocity, turned as the autopilot turned."""
+    def _predicted(self, good: Odometry, ahead_ns: int) -> PoseToSend | None:
+        """The pose a while after a good one: on by its velocity, turned as the autopilot turned.
+
+        None where nobody knows how it turned.
+        """
+        before, now = self._attitude.at(good.t_ns), self._attitude.at(good.t_ns + ahead_ns)
+        if before is None or now is None:
+            self._last_doubt = self._last_doubt or NO_ATTITUDE
+            return None
         pose = replace(self._pose_of(good), t_ns=good.t_ns + ahead_ns, predicted=True)
-        before, now = self._attitude.at(good.t_ns), self._attitude.at(pose.t_ns)
-        rotation = pose.world_from_body.rotation
-        if before is not None and now is not None:
-            rotation = rotation @ before.T @ now
+        rotation = pose.world_from_body.rotation @ before.T @ now
         ahead_s = ahead_ns * 1e-9
         position = pose.world_from_body.translation + pose.velocity_world_m_s * ahead_s
         sigma_m = float(np.hypot(pose.sigma_position_m, pose.sigma_velocity_m_s * ahead_s))

@@ -33,8 +33,8 @@ ACCELERATION_UNTOLD, SIGMA_POSITION_UNTOLD = 1.5, 0.002
 class AttitudeHistory:
     """The recent past of the autopilot's attitude, read at any time within it."""
 
-    def __init__(self, keep: int = 4000) -> None:
-        self._keep = keep
+    def __init__(self, keep: int = 4000, max_gap_ns: int = MAX_GAP_NS) -> None:
+        self._keep, self._max_gap_ns = keep, max_gap_ns
         self._samples: list[AttitudeSample] = []
         self._times: list[int] = []
 
@@ -73,7 +73,7 @@ class AttitudeHistory:
         if 0 < i < len(self._times):
             before, after = self._samples[i - 1], self._samples[i]
             span = after.t_ns - before.t_ns
-            if span > MAX_GAP_NS:
+            if span > self._max_gap_ns:
                 return None
             return interpolate_rotation(
                 rotation_from_quaternion(before.ned_from_body),

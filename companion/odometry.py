@@ -19,8 +19,10 @@ from companion.messages import Georeference, Odometry, Track, TrackState
 MAX_WORKED_IN_M_S = 0.15
 MAX_WORKED_IN_RAD_S = np.radians(0.5)
 MAX_ACCELERATION_M_S2 = 4.0
-DOUBTED_FRAMES = 6
-"""A pose where motion cannot have brought the camera is believed when so many others agree."""
+DOUBTED_NS, MIN_DOUBTED_FRAMES = 500_000_000, 3
+"""Poses where motion cannot have brought the body are believed, as a reset, when they have agreed
+with each other for so long: longer than any gap is bridged (feedback.max_gap_ms is 300 at most),
+whatever the rate of the camera; and never by fewer frames."""
 WAY_KEPT_NS = 10_000_000_000
 SIGMA_COASTING_M_S = 0.3
 """Of the velocity by which a pose is carried on where nothing is recognised."""
@@ -42,6 +44,20 @@ class _Waypoint(NamedTuple):
     worked_in: Array
 
 
+class _Doubt(NamedTuple):
+    """Poses where motion cannot have brought the body, since the last that was believed.
+
+    The newest `n` of them, from `agreed_since_ns` to `t_ns`, agree with each other; the newest is
+    at `place`.
+    """
+
+    since_ns: int
+    agreed_since_ns: int
+    t_ns: int
+    place: Array
+    n: int
+
+
 class SmoothOdometry:
     """Tracks of the newest map and its georeference in, Odometry out; one for each frame."""
 
@@ -57,7 +73,7 @@ class SmoothOdometry:
         """time, `map_from_camera`, `odometry_from_body` of the last frame that was believed"""
         self._anchored = False
         self._velocity = np.zeros(3)
-        self._n_doubted = 0
+        self._doubt: _Doubt | None = None
         self._coasting = False
         self._way: deque[_Waypoint] = deque()
         self._worked_in = np.zeros(3)
@@ -88,15 +104,18 @@ class SmoothOdometry:
             return self._coast(track, raw)
         if self._coasting:
             self._land(raw, track.t_ns)
+        before = self._odometry_from_world, self._worked_in
         self._work_in(raw, track.t_ns)
         placed = self._odometry_from_world @ raw
-        if not self._believable(placed, track.t_ns):
-            self._n_doubted += 1
-            if self._n_doubted < DOUBTED_FRAMES:
-                return self._unknown(track)
+        believable = self._believable(placed, track.t_ns)
+        if not believable and not self._agreed(placed, track.t_ns):
+            self._odometry_from_world, self._worked_in = before
+            return self._unknown(track)
+        doubted_ns = track.t_ns - self._doubt.since_ns if self._doubt is not None else 0
+        if not believable or doubted_ns >= DOUBTED_NS:
             self.reset_counter += 1
             self._way.clear()
-        self._n_doubted = 0
+        self._doubt = None
         sigma_velocity = float("inf")
         if velocity_map is not None:
             to_world = georeference.world_from_map
@@ -182,6 +201,7 @@ class SmoothOdometry:
         self._anchored = georeference.has_origin
         self._segment, self._georeference = segment, georeference
         self._last = None
+        self._doubt = None
         self._coasting = False
         self._way.clear()
 
@@ -229,10 +249,22 @@ class SmoothOdometry:
         """Whether motion can have brought the body here."""
         if self._last is None:
             return True
-        dt_s = (t_ns - self._last[0]) * 1e-9
-        before = self._last[2]
-        expected = before.translation + self._velocity * min(dt_s, 1.0)
-        away_m = float(np.linalg.norm(placed.translation - expected))
+        return self._reached(self._last[2].translation, placed.translation, t_ns - self._last[0])
+
+    def _agreed(self, placed: Pose, t_ns: int) -> bool:
+        """Take a pose where motion cannot have brought the body; whether enough others agree."""
+        place, doubt = placed.translation, self._doubt
+        if doubt is None or not self._reached(doubt.place, place, t_ns - doubt.t_ns):
+            self._doubt = _Doubt(doubt.since_ns if doubt else t_ns, t_ns, t_ns, place, 1)
+            return False
+        self._doubt = doubt = doubt._replace(t_ns=t_ns, place=place, n=doubt.n + 1)
+        return t_ns - doubt.agreed_since_ns >= DOUBTED_NS and doubt.n >= MIN_DOUBTED_FRAMES
+
+    def _reached(self, before: Array, after: Array, dt_ns: int) -> bool:
+        """Whether motion can have brought the body from one place (3,) to another in a time."""
+        dt_s = dt_ns * 1e-9
+        expected = before + self._velocity * min(dt_s, 1.0)
+        away_m = float(np.linalg.norm(after - expected))
         speed = float(np.linalg.norm(self._velocity))
         beyond_s = max(dt_s - 1.0, 0.0)
         return away_m < self._max_jump_m + 0.5 * MAX_ACCELERATION_M_S2 * dt_s**2 + speed * beyond_s
