@@ -92,8 +92,9 @@ OUR_BODY = (
 
 ARDUPILOT_RULES = (
     Rule(
-        "VISO_TYPE", _always(Among((3, 1))), "0 takes no visual odometry at all, 2 ignores it for "
-        "1 s after a reset; 3 follows our resets, 1 (MAVLink) will do",
+        "VISO_TYPE", _always(Among((1,))), "1 (MAVLink) takes our pose as it is; 0 takes none, 2 "
+        "ignores it for 1 s after a reset, and 3 (VOXL) moves our pose to zero by resets of its "
+        "own: flown in ArduPilot's simulator, vehicles jumped by metres or fell with it",
         reboot=True,
         lacking="this firmware was built without visual odometry (HAL_VISUALODOM_ENABLED); boards "
         "with 1 MB of flash lack it",

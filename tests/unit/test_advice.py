@@ -17,7 +17,7 @@ NEW = {
 }
 FEEDBACK = FeedbackConfig()
 ARDUPILOT_READY = {
-    "VISO_TYPE": 3, "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6,
+    "VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6,
 }  # fmt: skip
 PX4_READY = {"EKF2_EV_CTRL": 7, "EKF2_HGT_REF": 3}
 READY = {"ardupilot": ARDUPILOT_READY, "px4": PX4_READY}
@@ -54,7 +54,7 @@ def test_following_the_advice_leaves_none(firmware: str, mode: str) -> None:
 @pytest.mark.parametrize(
     ("name", "good", "bad"),
     [
-        ("VISO_TYPE", [1, 3], [0, 2]),
+        ("VISO_TYPE", [1], [0, 2, 3]),
         ("EK3_SRC1_POSXY", [6], [0, 3]),
         ("EK3_SRC1_VELXY", [0, 6], [3, 5]),
         ("EK3_SRC1_POSZ", [1, 6], [3]),
@@ -68,6 +68,13 @@ def test_following_the_advice_leaves_none(firmware: str, mode: str) -> None:
 def test_values_of_ardupilot(name: str, good: list[float], bad: list[float]) -> None:
     assert not any(name in in_the_way("ardupilot", {name: value}) for value in good)
     assert all(name in in_the_way("ardupilot", {name: value}) for value in bad)
+
+
+@pytest.mark.parametrize("mode", ["odometry", "vision_position"])
+def test_the_type_that_moves_our_pose_is_in_the_way(mode: str) -> None:
+    found = in_the_way("ardupilot", {"VISO_TYPE": 3}, mode)["VISO_TYPE"]
+    assert (found.wanted, found.set_to, found.reboot) == ("1", 1, True)
+    assert "3 (VOXL) moves our pose to zero" in found.why
 
 
 @pytest.mark.parametrize(

@@ -117,8 +117,17 @@ def test_what_the_autopilot_keeps_is_said(config: Config) -> None:
         autopilot.parameters.refused.add("VISO_TYPE")
         status, text = examine(config, autopilot.url, write=True, yes=True)
         assert status == 1
-        assert "not set: VISO_TYPE: the autopilot keeps 0, 3 was set" in text
+        assert "not set: VISO_TYPE: the autopilot keeps 0, 1 was set" in text
         assert autopilot.parameters["EK3_SRC1_POSXY"] == 6
+
+
+def test_a_type_set_to_3_before_is_set_to_1(config: Config) -> None:
+    with quick_autopilot("ardupilot", "udpin:127.0.0.1:0") as autopilot:
+        autopilot.parameters["VISO_TYPE"] = 3
+        status, text = examine(config, autopilot.url, write=True, yes=True)
+        assert status == 0
+        assert "VISO_TYPE: 3 -> 1, read back" in text
+        assert autopilot.parameters["VISO_TYPE"] == 1
 
 
 def test_lost_packets_are_asked_for_again(config: Config) -> None:
@@ -184,7 +193,7 @@ def test_beside_a_daemon_it_goes_through_its_router(config: Config, tmp_path: Pa
             await daemon.stop()
 
     with quick_autopilot("ardupilot", f"udpout:127.0.0.1:{link}") as autopilot:
-        autopilot.parameters["VISO_TYPE"] = 3
+        autopilot.parameters["VISO_TYPE"] = 1
         status, text = asyncio.run(run())
     assert status == 1
     assert f"by tcp:127.0.0.1:{place}" in text
