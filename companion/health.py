@@ -21,7 +21,10 @@ MAX_EVENTS = 2048
 MIN_BETWEEN_LINES_S = 1.0
 """Changes are told at once, but no more often than this, whatever flaps."""
 
-SourceState = Literal["missing", "opening", "running", "silent", "frozen", "ended"]
+SourceState = Literal[
+    "missing", "opening", "running", "silent", "frozen", "ended", "driver fault"
+]
+"""`driver fault` is a bug of ours, not of the device; its traceback is in the journal."""
 
 
 @dataclass(frozen=True, slots=True)

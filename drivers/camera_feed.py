@@ -11,10 +11,11 @@ import numpy as np
 
 from companion.clock import FlightClock
 from companion.config import CameraConfig
-from companion.errors import CompanionError, ConfigError, SourceError
+from companion.errors import CompanionError, ConfigError
 from companion.health import SourceHealth, SourceMeter, SourceState
 from companion.messages import Frame, Warned
 from drivers.camera_source import CameraSource, EndOfPictures, Picture
+from drivers.fault_trace import FaultTraces
 
 MISSING = "the camera is not there"
 GONE = "the camera has gone"
@@ -25,7 +26,10 @@ WRONG_SIZE = "pictures of another size are refused"
 WRONG_STAMP = "pictures with wrong stamps are refused"
 NOT_AS_ASKED = "the camera does not do as asked"
 ENDED = "the camera's pictures have ended"
+DRIVER_FAULT = "the camera's driver has a fault"
 
+EXPECTED = (CompanionError, OSError)
+"""What a camera or its connection may do at any time; anything else is a bug of its driver."""
 RETRY_S = 0.5
 """Between two attempts to open a camera that is not there."""
 READ_S = 0.1
@@ -80,6 +84,8 @@ class CameraFeed:
         self._source = source
         self._clock = clock
         self._rate_hz = config.rate_hz
+        self._secrets = {config.url: "camera.url", config.pipeline: "camera.pipeline"}
+        self._faults = FaultTraces()
         self._offset_ns = round(config.stamp_offset_ms * 1e6)
         self._deliver = deliver
         self._warn = warn
@@ -111,14 +117,17 @@ class CameraFeed:
     def _run(self) -> None:
         n_opened = 0
         while not self._stop.is_set():
-            if self._open(n_opened > 0):
-                n_opened += 1
-                self._meter.n_reopened = n_opened - 1
-                self._read_on()
+            try:
+                if self._open(n_opened > 0):
+                    n_opened += 1
+                    self._meter.n_reopened = n_opened - 1
+                    self._read_on()
+            except Exception as error:  # a driver's bug must not end the flight
+                self._set_fault(error)
             self._close()
             if self.fault is not None or self._meter.state == "ended":
                 return
-            if self._meter.state == "missing":
+            if self._meter.state in ("missing", "driver fault"):
                 self._stop.wait(RETRY_S)
 
     def _open(self, opened_before: bool) -> bool:
@@ -131,11 +140,8 @@ class CameraFeed:
             if not opened_before:
                 self.fault = error
             return False
-        except SourceError as error:
-            self._set("missing", MISSING, str(error))
-            return False
-        except Exception as error:  # a driver's bug must not end the flight
-            self._set("missing", MISSING, f"{self._source.name}: {type(error).__name__}: {error}")
+        except EXPECTED as error:
+            self._set("missing", MISSING, self._in_words(error))
             return False
         if self._meter.state == "opening":  # else what was amiss may still be
             self._meter.detail = self._source.name
@@ -144,8 +150,10 @@ class CameraFeed:
     def _close(self) -> None:
         try:
             self._source.close()
+        except EXPECTED as error:
+            self._meter.detail = self._in_words(error)
         except Exception as error:  # likewise
-            self._meter.detail = f"{self._source.name}: {type(error).__name__}: {error}"
+            self._set_fault(error)
 
     def _read_on(self) -> None:
         """Hand on pictures until the camera has gone, or should be opened anew."""
@@ -156,12 +164,8 @@ class CameraFeed:
             except EndOfPictures as error:
                 self._set("ended", ENDED, str(error))
                 return
-            except SourceError as error:
-                self._set("missing", GONE, str(error))
-                return
-            except Exception as error:  # a driver's bug must not end the flight
-                detail = f"{self._source.name}: {type(error).__name__}: {error}"
-                self._set("missing", GONE, detail)
+            except EXPECTED as error:
+                self._set("missing", GONE, self._in_words(error))
                 return
             now_s = time.monotonic()
             while self._source.remarks:
@@ -241,6 +245,17 @@ class CameraFeed:
             detail = f"{self._source.name}: it was {before}"
             self._warn(Warned(self._clock.now_ns(), BACK, detail, good=True))
         self._warned_s.clear()
+
+    def _in_words(self, error: Exception) -> str:
+        if isinstance(error, OSError):
+            return f"{self._source.name}: {error.strerror or error}"
+        return str(error)
+
+    def _set_fault(self, error: Exception) -> None:
+        """A bug: where it lies goes to the journal whole, what it is to whoever asks."""
+        self._faults.tell(error, self._secrets)
+        name = type(error).__name__
+        self._set("driver fault", DRIVER_FAULT, f"{self._source.name}: {name}, see the journal")
 
     def _set(self, state: SourceState, what: str, detail: str) -> None:
         """Note what is amiss, and tell of it where that is new."""

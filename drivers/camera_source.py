@@ -15,6 +15,10 @@ class EndOfPictures(SourceError):  # noqa: N818 - an end, not a fault
     """The source has shown all that there is; it will show no more."""
 
 
+class DriverFault(Exception):  # noqa: N818 - nothing that a camera can do
+    """A bug of a driver, found by a process of its own; the text is the traceback from there."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
     """One picture of a camera, as it came.
@@ -45,7 +49,10 @@ class CameraSource(Protocol):
     """What it does otherwise than asked; the reader takes them out."""
 
     def open(self) -> None:
-        """Begin. SourceError: it is not there now. ConfigError: as configured it never will be."""
+        """Begin. SourceError: it is not there now. ConfigError: as configured it never will be.
+
+        OSError is taken for a SourceError. Whatever else it or `read` raises is a bug.
+        """
 
     def read(self, timeout_s: float) -> Picture | None:
         """The newest picture, None if none came in time; SourceError when the camera has gone."""

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from companion.config import CameraConfig
 from companion.errors import ConfigError, SourceError
-from drivers.camera_source import EndOfPictures, Picture
-from drivers.gstreamer_child import ENDED, GONE, HEADER, NEVER, OPENED
+from drivers.camera_source import DriverFault, EndOfPictures, Picture
+from drivers.gstreamer_child import ENDED, FAULT, GONE, HEADER, NEVER, OPENED
 from drivers.pixel_formats import to_grey_and_rgb
 
 CHILD = Path(__file__).with_name("gstreamer_child.py")
@@ -162,6 +162,8 @@ class GstreamerCamera:
 
     def _raise_what_it_says(self, answer: Answer) -> None:
         kind, why = answer[0], answer[5]
+        if kind == FAULT:
+            raise DriverFault(why.decode(errors="replace"))
         if kind not in (NEVER, GONE, ENDED, OPENED):
             return
         text = f"{self.name}: {why.decode(errors='replace')}"

@@ -14,11 +14,13 @@ import select
 import signal
 import struct
 import sys
+import traceback
 
 HEADER = struct.Struct("<4sIIIqI")
 """What it is, width, height, bytes in a row, CLOCK_MONOTONIC in ns or 0, bytes that follow."""
-OPENED, NEVER, GONE, ENDED = b"open", b"nevr", b"gone", b"ends"
-"""Running; cannot be, for the reason that follows; has failed, likewise; no more pictures."""
+OPENED, NEVER, GONE, ENDED, FAULT = b"open", b"nevr", b"gone", b"ends", b"bugs"
+"""Running; cannot be, for the reason that follows; has failed, likewise; no more pictures; a bug
+of this program, whose traceback follows."""
 CODES = {"NV12": b"NV12", "YUY2": b"YUYV", "GRAY8": b"GREY"}
 APPSINK = (
     " ! videoconvert ! video/x-raw,format=(string){" + ",".join(CODES) + "}"
@@ -46,10 +48,19 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one that asks
     answers = Answers()
     try:
+        _serve_one(answers)
+    except BrokenPipeError:
+        pass  # nobody is left
+    except Exception:
+        answers.send(FAULT, traceback.format_exc().encode())
+
+
+def _serve_one(answers: Answers) -> None:
+    try:
         import gi
 
         gi.require_version("Gst", "1.0")
-        from gi.repository import Gst
+        from gi.repository import GLib, Gst
     except (ImportError, ValueError) as error:
         answers.send(NEVER, b"PyGObject or GStreamer is missing (%s)" % str(error).encode())
         return
@@ -59,13 +70,11 @@ def main() -> None:
     try:
         pipeline = Gst.parse_launch(text + APPSINK)
         sink = pipeline.get_by_name("companion_sink")
-    except Exception as error:  # GLib.Error, which cannot be named where gi is missing
+    except GLib.Error as error:
         answers.send(NEVER, str(getattr(error, "message", error)).encode())
         return
     try:
         _serve(Gst, pipeline, sink, answers)
-    except BrokenPipeError:
-        pass  # nobody is left
     finally:
         pipeline.set_state(Gst.State.NULL)
 

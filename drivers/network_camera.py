@@ -94,7 +94,8 @@ class _Receiver:
 
     def __init__(self, config: CameraConfig, name: str) -> None:
         self.opened = threading.Event()
-        self.error: SourceError | ConfigError | None = None
+        self.error: Exception | None = None
+        """SourceError or ConfigError, or else a bug, with the place where it lies."""
         self._config = config
         self._name = name
         self._ended = threading.Event()
@@ -123,7 +124,7 @@ class _Receiver:
         self.thread.join(0.3)
 
     def _run(self) -> None:
-        error: SourceError | ConfigError = EndOfPictures(f"{self._name}: closed")
+        error: Exception = EndOfPictures(f"{self._name}: closed")
         self._heard_s = time.monotonic()
         try:
             with av.open(
@@ -146,8 +147,10 @@ class _Receiver:
             silent = time.monotonic() - self._heard_s >= 0.9 * limit_s
             reason = "nothing came in time" if silent else _reason(raised)
             error = SourceError(f"{self._name}: {reason}")
-        except Exception as raised:
-            error = SourceError(f"{self._name}: {type(raised).__name__} in the decoder")
+        except OSError as raised:
+            error = SourceError(f"{self._name}: {raised.strerror or type(raised).__name__}")
+        except Exception as raised:  # handed to the camera's thread, which raises it
+            error = raised
         finally:
             with self._changed:
                 self.error = error

@@ -10,6 +10,7 @@ import asyncio
 import socket
 from collections.abc import Awaitable, Callable
 
+from drivers.fault_trace import FaultTraces
 from drivers.within import within
 
 MAX_CLIENTS = 8
@@ -34,6 +35,7 @@ class ShortAnswers:
         self._warn = warn
         self._server: asyncio.AbstractServer | None = None
         self._clients: set[asyncio.Task[None]] = set()
+        self._faults = FaultTraces()
         self.n_answered = 0
         self.n_refused = 0
 
@@ -72,8 +74,9 @@ class ShortAnswers:
             self.n_answered += 1
         except (OSError, EOFError, asyncio.TimeoutError):
             self.n_refused += 1
-        except Exception as error:
+        except Exception as error:  # a bug in making an answer, which must not end the daemon
             self.n_refused += 1
+            self._faults.tell(error)
             self._warn(f"{type(error).__name__}: {error}")
         finally:
             writer.transport.abort()

@@ -6,7 +6,7 @@ from companion.health import Health
 
 BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, POWEROFF = 1, 2, 3, 4, 5, 7
 """Of MAV_STATE."""
-NO_CAMERA = ("missing", "opening", "silent", "frozen", "ended")
+NO_CAMERA = ("missing", "opening", "silent", "frozen", "ended", "driver fault")
 
 
 def component_state(health: Health) -> int:

@@ -56,6 +56,8 @@ from drivers.origin_keeper import OriginKeeper
 from drivers.service_manager import ServiceManager
 from drivers.status_socket import StatusSocket, own_socket_path
 
+NOT_THERE = ("missing", "driver fault")
+"""States of sources that are tried again."""
 WATCH_S = 0.2
 START_S = 180.0
 """Stages have so long to come up once nothing is missing any more; the first time they compile."""
@@ -316,7 +318,7 @@ class Daemon:
             if not self._is_ready and self._watch.up:
                 self._is_ready = True
                 self._service.ready(health.tracker)
-            elif not self._is_ready and any(each.state == "missing" for each in health.sources):
+            elif not self._is_ready and any(each.state in NOT_THERE for each in health.sources):
                 self._service.extend_timeout(START_S)
             if not self._watch.pose_loop_alive:
                 self._watch.kill_stuck()

@@ -15,7 +15,7 @@ class Missing:
     def step(self, health: Health, now_s: float, armed: bool) -> str:
         """What is to end the daemon, in words; "" as long as nothing is."""
         for source in health.sources:
-            there = source.state not in ("missing", "opening", "silent")
+            there = source.state not in ("missing", "opening", "silent", "driver fault")
             if there or armed or not self._limit_s:
                 self._since_s.pop(source.name, None)
                 continue

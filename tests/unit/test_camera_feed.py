@@ -13,7 +13,7 @@ import pytest
 
 from companion.clock import FlightClock
 from companion.config import CameraConfig
-from companion.errors import ConfigError, SourceError
+from companion.errors import ConfigError, FlightError, SourceError
 from companion.messages import Frame, Warned
 from drivers import camera_feed
 from drivers.camera_feed import CameraFeed
@@ -78,7 +78,7 @@ class Run:
 
 
 @contextmanager
-def running(source: ToldSource | None = None, **keys: float) -> Iterator[Run]:
+def running(source: ToldSource | None = None, **keys: float | str) -> Iterator[Run]:
     source, clock = source or ToldSource(), FlightClock()
     config = CameraConfig(**{"rate_hz": 100.0, **keys})  # type: ignore[arg-type]
     frames: list[Frame] = []
@@ -144,8 +144,10 @@ def test_a_camera_that_can_never_be_ends_the_thread() -> None:
     assert source.n_opened == 0
 
 
-@pytest.mark.parametrize("error", [SourceError("told: unplugged"), ValueError("a driver's bug")])
-def test_gone_and_back(error: Exception) -> None:
+@pytest.mark.parametrize(
+    "error", [SourceError("told: unplugged"), OSError(19, "No such device"), FlightError("told: x")]
+)
+def test_gone_and_back(error: Exception, capfd: pytest.CaptureFixture[str]) -> None:
     with running() as run:
         run.more()
 
@@ -159,7 +161,50 @@ def test_gone_and_back(error: Exception) -> None:
         health = run.feed.health
     assert (health.state, health.n_reopened) == ("running", run.source.n_opened - 1)
     assert run.told() == [camera_feed.GONE, camera_feed.BACK]
-    assert str(error) in run.warned[0].detail
+    assert str(getattr(error, "strerror", error)) in run.warned[0].detail
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def a_drivers_bug(_: Picture) -> Picture:
+    raise ValueError("seen at rtsp://me:secret@camera/")
+
+
+@pytest.mark.parametrize("where", ["open", "read", "picture", "close"])
+def test_a_drivers_own_bug_is_told_with_its_place(
+    where: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+    source = ToldSource()
+    close = source.close
+    with running(source, url="rtsp://me:secret@camera/") as run:
+        run.more()
+
+        def fail() -> None:
+            close()
+            a_drivers_bug(Picture(0, np.zeros((1, 1), np.uint8), np.zeros((1, 1, 3), np.uint8)))
+
+        if where == "read":
+            source.making = a_drivers_bug
+        elif where == "picture":  # one of which nothing can be made
+            source.making = lambda p: Picture(p.monotonic_ns, None, p.rgb)  # type: ignore[arg-type]
+        else:
+            source.making = lambda _: None  # so that it is closed and opened anew
+            setattr(source, "opening" if where == "open" else "close", fail)
+        run.until(lambda: run.feed.health.state == "driver fault")
+        assert "see the journal" in run.feed.health.detail
+        n = source.n_opened
+        run.until(lambda: where == "open" or source.n_opened > n + 2)  # it is tried again and again
+        source.making, source.opening = lambda picture: picture, lambda: None
+        source.close = close  # type: ignore[method-assign]
+        run.more()
+        assert run.feed.health.state == "running"
+    assert run.told().count(camera_feed.DRIVER_FAULT) == 1
+    assert camera_feed.GONE not in run.told() and camera_feed.MISSING not in run.told()
+    printed = capfd.readouterr().err
+    assert printed.count("Traceback") == 1
+    assert ("_amiss" if where == "picture" else "in a_drivers_bug") in printed
+    assert "secret" not in printed and (where == "picture" or "camera.url" in printed)
+    assert all(line.startswith("companion: ") for line in printed.splitlines())
 
 
 def test_a_silent_camera_is_opened_anew() -> None:

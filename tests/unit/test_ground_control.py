@@ -201,6 +201,7 @@ def test_a_kept_file_that_no_ground_has_written_is_refused(tmp_path: Path, text:
         ("running", "f", "lost", True, CRITICAL),
         ("running", "f", "tracking", False, CRITICAL),
         ("frozen", "f", "tracking", True, CRITICAL),
+        ("driver fault", "f", "tracking", True, CRITICAL),
     ],
 )
 def test_the_heartbeat_says_how_it_is(

@@ -20,7 +20,13 @@ from companion.messages import Bytes
 from drivers import gstreamer_camera
 from drivers.arrival_clock import ArrivalClock
 from drivers.calibration import live_camera
-from drivers.camera_source import CameraSource, EndOfPictures, Picture, camera_source
+from drivers.camera_source import (
+    CameraSource,
+    DriverFault,
+    EndOfPictures,
+    Picture,
+    camera_source,
+)
 from drivers.pattern_camera import PatternScene, pattern_optics, world_from_body, world_from_camera
 from drivers.pixel_formats import to_grey_and_rgb
 
@@ -280,6 +286,25 @@ def test_a_python_without_gstreamer_says_what_to_install(
         gstreamer("videotestsrc").open()
     monkeypatch.setattr(gstreamer_camera, "SYSTEM_PYTHON", str(tmp_path / "none"))
     with pytest.raises(ConfigError, match="apt install python3-gi"):
+        gstreamer("videotestsrc").open()
+
+
+def test_a_bug_in_the_pipelines_process_comes_with_its_traceback(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "gi").mkdir()
+    (tmp_path / "gi" / "__init__.py").write_text(
+        "def require_version(*_):\n    raise RuntimeError('a bug')\n"
+    )
+    child = tmp_path / "child.py"
+    child.write_text(
+        f"import runpy, sys\nsys.path.insert(0, {str(tmp_path)!r})\n"
+        f"runpy.run_path({str(gstreamer_camera.CHILD)!r}, run_name='__main__')\n"
+    )
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    monkeypatch.setattr(gstreamer_camera, "SYSTEM_PYTHON", sys.executable)
+    monkeypatch.setattr(gstreamer_camera, "CHILD", child)
+    with pytest.raises(DriverFault, match=r"(?s)Traceback.*require_version.*RuntimeError: a bug"):
         gstreamer("videotestsrc").open()
 
 

@@ -251,3 +251,18 @@ def test_pictures_without_stamps_are_stamped_as_they_come() -> None:
     newest = pictures[-1]
     assert newest is not None
     assert (sent_ns - newest.monotonic_ns) * 1e-9 < 0.2
+
+
+def test_a_bug_in_the_decoders_thread_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise AttributeError("a bug")
+
+    monkeypatch.setattr(network_camera, "_Newest", broken)
+    with HttpCamera() as sender:
+        network = NetworkCamera(CameraConfig(source="network", url=sender.url))
+        with pytest.raises(AttributeError) as raised:
+            network.open()
+            for _ in range(30):
+                network.read(0.1)
+        network.close()
+    assert any(each.name == "_decode" for each in raised.traceback)

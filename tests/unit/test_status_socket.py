@@ -142,7 +142,9 @@ def test_a_client_that_sends_garbage_or_leaves_does_no_harm(path: Path) -> None:
     run(test)
 
 
-def test_a_fault_in_the_document_is_told_and_survived(path: Path) -> None:
+def test_a_fault_in_the_document_is_told_and_survived(
+    path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     documents: Iterator[dict[str, Any]] = iter([{"bad": float("nan")}, {"good": 1}])
 
     async def test() -> None:
@@ -150,6 +152,7 @@ def test_a_fault_in_the_document_is_told_and_survived(path: Path) -> None:
             with pytest.raises(SourceError, match="incomplete"):
                 await ask(path)
             assert len(warned) == 1
+            assert capfd.readouterr().err.count("Traceback") == 1
             assert await ask(path) == {"good": 1}
 
     run(test)

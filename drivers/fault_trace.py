@@ -1,0 +1,52 @@
+"""Where a bug of a driver lies: its traceback in the journal, once for each place.
+
+For loops that have to go on whatever is wrong in what they call. Failures that are to be expected
+are named where they happen and never come here.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import traceback
+from collections.abc import Mapping
+
+PRIORITY = "<3>"
+"""Before each line that systemd reads: an error (sd-daemon(3))."""
+MOST_PLACES = 64
+"""A driver that fails in more places than this fills no disk with them."""
+
+
+class FaultTraces:
+    """Writes tracebacks to standard error, which is the journal; may be used from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._told: set[tuple[str, str, int]] = set()
+
+    def tell(self, error: BaseException, secrets: Mapping[str, str] | None = None) -> bool:
+        """Write the traceback, unless it was of this kind at this place before; whether it was new.
+
+        `secrets` is what may not be printed, and what to print instead.
+        """
+        place = _place_of(error)
+        with self._lock:
+            if place in self._told or len(self._told) >= MOST_PLACES:
+                return False
+            self._told.add(place)
+        text = "".join(traceback.format_exception(error))
+        for secret, instead in (secrets or {}).items():
+            text = text.replace(secret, instead) if secret else text
+        prefix = PRIORITY if "JOURNAL_STREAM" in os.environ else "companion: "
+        try:
+            print("\n".join(prefix + line for line in text.splitlines()), file=sys.stderr)
+        except OSError:
+            pass  # nobody listens any more, which must not end a flight
+        return True
+
+
+def _place_of(error: BaseException) -> tuple[str, str, int]:
+    frames = traceback.extract_tb(error.__traceback__)
+    last = frames[-1] if frames else None
+    return type(error).__name__, last.filename if last else "", (last.lineno or 0) if last else 0
