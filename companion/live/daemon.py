@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
 from companion.camera import Camera
-from companion.clock import FlightClock
+from companion.clock import FlightClock, monotonic_s
 from companion.config import Config
 from companion.errors import CompanionError
 from companion.health import LatencyMeter
+from companion.live.armed_settings import ArmedFile, read_settings
+from companion.live.arming import Arming
 from companion.live.component_state import POWEROFF, component_state
 from companion.live.flight import Listener, LiveFlight, makes_depth
 from companion.live.flight_facts import facts_of
@@ -33,6 +35,7 @@ from companion.live.missing import Missing
 from companion.live.pose_sender import PoseSender
 from companion.live.reload import reloaded
 from companion.live.tape_notes import TapeNotes
+from companion.live.tightening import tightened, value_of_key, with_values
 from companion.live.vehicle_reports import VehicleReports
 from companion.messages import (
     ArmedSample,
@@ -65,6 +68,8 @@ FAULT, BAD_INPUT = 1, 2
 """Exit statuses."""
 NO_PROGRESS = "frames come and no pose, whatever is tried: left to the service manager's watchdog"
 SPARE_AGAIN_S = 1.0
+WRITE_S = 0.2
+"""What counts while armed may take so long to be written down at the end."""
 END_S = 2.6
 """A stop takes little longer, whatever hangs."""
 
@@ -74,11 +79,21 @@ class Daemon:
 
     def __init__(self, load: Callable[[], Config]) -> None:
         self._load = load
-        self._config, kept = kept_over(load)
-        config = self._config
+        read, kept = kept_over(load)
         self._clock = clock = FlightClock()
         self._journal = Journal()
         self._loop = asyncio.get_running_loop()
+        flights = Path(read.daemon.flights)
+        before, unreadable = read_settings(flights, read) if read.link.url else (None, "")
+        self._armed_file = ArmedFile(
+            flights, lambda what, why: self._on_warned(Warned(clock.now_ns(), what, why))
+        )
+        self._arming = Arming(self._armed_file, before, self._autopilot_boot_s, self._is_heard)
+        resumed = self._arming.resume(read)
+        self._config = config = resumed.config
+        kept |= resumed.by_ground
+        if before is not None:
+            self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
         self._stop = asyncio.Event()
         self._status = 0
         self._camera: Camera | None = None
@@ -119,7 +134,7 @@ class Daemon:
         )
         self._missing = Missing(config.daemon.missing_device_s)
         self._spare_later: asyncio.TimerHandle | None = None
-        self._watch.set_by_ground = kept
+        self._by_ground = self._watch.set_by_ground = kept
         self._ground: GroundControl | None = None
         if self._link is not None and self._reports is not None and config.control.enabled:
             self._ground = GroundControl(
@@ -183,6 +198,7 @@ class Daemon:
             await metrics.stop()
             await socket.stop()
             await asyncio.wait([feed_closed], timeout=0.2)
+            await loop.run_in_executor(None, self._armed_file.close, WRITE_S)
             self._service.close()
         self._journal.say("stopped")
         return self._status
@@ -278,6 +294,10 @@ class Daemon:
             self._flights.prepare(self._config, self._camera)
 
     def _set_armed(self, armed: bool) -> None:
+        if self._arming.take(armed, monotonic_s()):
+            self._let_go()
+        if armed:
+            self._hold()
         if armed == self._armed:
             return
         self._armed = armed
@@ -333,6 +353,8 @@ class Daemon:
                 self._service.status(line)
             if self._feed.fault is not None:
                 self._give_up(str(self._feed.fault), BAD_INPUT)
+            if self._arming.step(monotonic_s()):
+                self._let_go()
             gone = self._missing.step(health, now_s, self._armed)
             if gone:
                 self._give_up(gone)
@@ -347,12 +369,22 @@ class Daemon:
             self._journal.say(f"configuration not taken over: {error}", ERROR)
         else:
             config, cannot = reloaded(self._config, read)
-            self._watch.set_by_ground = kept
+            waiting: dict[str, Any] = {}
+            if self.armed:
+                config, waiting = tightened(self._config, config)
+            stays = {*cannot, *waiting}
+            kept |= {name: value for name, value in self._by_ground.items() if name in stays}
+            self._by_ground = self._watch.set_by_ground = kept
             if self._ground is not None:
                 self._ground.changed = kept
             self.take_over(config)
+            off_until = {k: v for k, v in self._arming.waiting.items() if k == "feedback.mode"}
+            self._arming.waiting = off_until | waiting
             text = f"; these need a restart: {', '.join(cannot)}" if cannot else ""
-            self._journal.say(f"configuration read again{text}", WARNING if cannot else INFO)
+            if waiting:
+                text += f"; these are looser and wait for disarming: {', '.join(waiting)}"
+                self._tell_pilot("looser limits wait for disarming")
+            self._journal.say(f"configuration read again{text}", WARNING if stays else INFO)
         if self._is_ready:
             self._service.ready()
 
@@ -365,18 +397,29 @@ class Daemon:
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are."""
-        return self._armed
+        """Whether the motors are; as they last were where nothing is heard."""
+        return self._arming.armed
 
     def take_over(self, config: Config) -> None:
         """Go on with another configuration: at once where that can be, else with the next map."""
         old, self._config = self._config, config
+        if self._arming.holds:
+            for name in list(self._arming.waiting):
+                if value_of_key(config, name) != value_of_key(old, name):
+                    del self._arming.waiting[name]  # whoever has set it since has the last word
+            if config.feedback.mode == "off" != old.feedback.mode and not config.control.keep:
+                self._arming.waiting["feedback.mode"] = old.feedback.mode
+            self._hold()
         if config.daemon != old.daemon:
             self._missing = Missing(config.daemon.missing_device_s)
         self._watch.reconfigure(config)
         if self._sender is not None:
             self._sender.reconfigure(config.feedback)
         flight = self._flights.current
+        if flight is not None and old.feedback.mode == "off" != config.feedback.mode:
+            self._flights.end()  # a map whose scale is the autopilot's own is none to fly on
+            self._begin_if_due()
+            return
         if flight is not None:
             flight.set_dense(makes_depth(config))
             flight.set_budget(config.stream.budget_kbit_s)
@@ -385,6 +428,47 @@ class Daemon:
         if self._spare_later is not None:
             self._spare_later.cancel()
         self._spare_later = self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+
+    # -- what holds until the motors are disarmed, see Arming ------------------------------------
+
+    def _hold(self) -> None:
+        """What counts now shall count if this ends in the air and is begun again."""
+        self._arming.hold(self._config, self._by_ground, monotonic_s())
+
+    def _let_go(self) -> None:
+        """The motors are disarmed: the configuration has its say again."""
+        waiting = {
+            name: value
+            for name, value in self._arming.let_go().items()
+            if value != value_of_key(self._config, name)
+        }
+        if not waiting:
+            return
+        for name in waiting:
+            self._by_ground.pop(name, None)
+        shown = ", ".join(f"{name} = {value}" for name, value in waiting.items())
+        self._journal.say(f"disarmed: what has waited for that counts now: {shown}", WARNING)
+        self.take_over(with_values(self._config, waiting))
+
+    def _say_resumed(
+        self, by_ground: Mapping[str, Any], waiting: Mapping[str, Any], unreadable: str
+    ) -> None:
+        text = "the daemon before ended while armed; until disarmed what counted then counts"
+        if unreadable:
+            text += f", which cannot be read, so that no pose is sent ({unreadable})"
+        else:
+            text += "".join(f"; {k} = {v} (by the ground)" for k, v in by_ground.items())
+        if waiting:
+            text += f"; these wait for disarming: {', '.join(waiting)}"
+        self._journal.say(text, WARNING)
+
+    def _autopilot_boot_s(self) -> float | None:
+        """When the autopilot was started, CLOCK_MONOTONIC; None while its clock is not known."""
+        report = self._link.clock_filter.report() if self._link is not None else None
+        return None if report is None else report.offset_s - self._clock.epoch_ns * 1e-9
+
+    def _is_heard(self) -> bool:
+        return self._link is not None and self._link.alive
 
     def prepare(self) -> None:
         """Have a flight at hand beside the one that goes on."""

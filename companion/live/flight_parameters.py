@@ -19,16 +19,11 @@ DIGITS = 7
 
 @dataclass(frozen=True, slots=True)
 class FlightParameter:
-    """A key under a name of at most 16 characters.
-
-    `stricter` is 1 where more of it, -1 where less of it makes poses harder to believe; 0 where it
-    has no say in that.
-    """
+    """A key under a name of at most 16 characters."""
 
     name: str
     section: str
     key: str
-    stricter: int = 0
     at_once: bool = False
     """Else it counts from the next map on."""
 
@@ -42,10 +37,10 @@ def _table() -> dict[str, FlightParameter]:
     found = (
         FlightParameter("FB_MODE", "feedback", "mode", at_once=True),
         FlightParameter("FB_RATE_HZ", "feedback", "rate_hz", at_once=True),
-        FlightParameter("FB_MAX_SIGMA_M", "feedback", "max_sigma_m", -1, at_once=True),
-        FlightParameter("FB_MIN_QUALITY", "feedback", "min_quality", 1, at_once=True),
-        FlightParameter("FB_MAX_GAP_MS", "feedback", "max_gap_ms", -1, at_once=True),
-        FlightParameter("FB_RESUME_S", "feedback", "resume_after_s", 1, at_once=True),
+        FlightParameter("FB_MAX_SIGMA_M", "feedback", "max_sigma_m", at_once=True),
+        FlightParameter("FB_MIN_QUALITY", "feedback", "min_quality", at_once=True),
+        FlightParameter("FB_MAX_GAP_MS", "feedback", "max_gap_ms", at_once=True),
+        FlightParameter("FB_RESUME_S", "feedback", "resume_after_s", at_once=True),
         FlightParameter("FB_MAX_JUMP_M", "feedback", "max_jump_m"),
         FlightParameter("MAP_DENSE", "depth", "enabled", at_once=True),
         FlightParameter("MAP_STRIDE", "depth", "stride"),
@@ -109,8 +104,3 @@ def value_of(config: Config, parameter: FlightParameter, number: float) -> Any:
         where = f"{parameter.name}: {parameter.full_key}"
         raise ConfigError(f"{where} wants {wants}, given is {number:g}")
     return float(f"{number:.{DIGITS}g}")
-
-
-def is_looser(parameter: FlightParameter, now: float, number: float) -> bool:
-    """Whether poses would be easier to believe by this value than by the one that is."""
-    return parameter.stricter * (number - now) < 0

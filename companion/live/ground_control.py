@@ -19,7 +19,6 @@ from companion.live.flight import depth_elsewhere
 from companion.live.flight_parameters import (
     PARAMETERS,
     FlightParameter,
-    is_looser,
     number_of,
     value_of,
 )
@@ -27,6 +26,7 @@ from companion.live.flights import Flights
 from companion.live.journal import INFO, WARNING, Journal
 from companion.live.new_map import NewMap
 from companion.live.snapshots import Snapshots
+from companion.live.tightening import may_change, value_of_key
 from companion.messages import Warned
 from companion.stages.protocol import Snapshot
 from drivers.autopilot_link import AutopilotLink
@@ -59,7 +59,7 @@ class Controlled(Protocol):
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are."""
+        """Whether the motors are; as they last were where nothing is heard."""
 
     def take_over(self, config: Config) -> None:
         """Go on with another configuration."""
@@ -141,7 +141,7 @@ class GroundControl:
             return OUT_OF_RANGE
         if changed == config:
             return SET
-        why_not = self._forbidden(parameter, number_of(config, parameter), value)
+        why_not = self._forbidden(parameter, wanted)
         if why_not:
             self._tell(f"not set: {name}: {why_not}", False)
             return NOT_NOW
@@ -150,27 +150,22 @@ class GroundControl:
         self._take_over(parameter, wanted, changed)
         return SET
 
-    def _forbidden(self, parameter: FlightParameter, now: float, value: float) -> str:
+    def _forbidden(self, parameter: FlightParameter, wanted: Any) -> str:
         """Why it must not be so now; "" if it may."""
         self._changes.refill(self._clock.now_ns())
         if self._changes.left < 1.0:
             return TOO_OFTEN
         if parameter.full_key == "depth.enabled" and depth_elsewhere(self._daemon.config):
             return ELSEWHERE
-        if not self._daemon.armed:
+        now = value_of_key(self._daemon.config, parameter.full_key)
+        if not self._daemon.armed or may_change(parameter.full_key, now, wanted):
             return ""
-        if parameter.full_key == "feedback.mode" and value != 0:
-            return NOT_ARMED
-        return NOT_LOOSER if is_looser(parameter, now, value) else ""
+        return NOT_ARMED if parameter.full_key == "feedback.mode" else NOT_LOOSER
 
     def _take_over(self, parameter: FlightParameter, value: Any, config: Config) -> None:
         self._changes.take(1.0)
-        was_off = self._daemon.config.feedback.mode == "off"
         self.changed[parameter.full_key] = value
         self._daemon.take_over(config)
-        if was_off and config.feedback.mode != "off" and self._flights.current is not None:
-            self._flights.end()  # a map whose scale is the autopilot's own is none to fly on
-            self._daemon.begin_flight()
         if config.control.keep:
             try:
                 kept_settings.keep(Path(config.control.keep), self.changed)

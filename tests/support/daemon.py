@@ -142,7 +142,7 @@ class Daemon:
 
     def flown(self) -> list[Path]:
         """Folders of flights, in order."""
-        return sorted(self.flights.iterdir()) if self.flights.exists() else []
+        return sorted(each for each in self.flights.glob("*") if each.is_dir())
 
     # -- what is done to it ----------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from companion.clock import FlightClock
-from companion.config import Config, ControlConfig, DistributedConfig, LinkConfig
+from companion.config import Config, ControlConfig, DistributedConfig, FeedbackConfig, LinkConfig
 from companion.config_file import to_toml
 from companion.errors import ConfigError
 from companion.health import Health, SourceHealth, StageHealth
@@ -29,6 +29,7 @@ from companion.live.ground_control import CHANGES_AT_ONCE, TEXTS_AT_ONCE, Ground
 from companion.live.journal import WARNING, Journal
 from companion.live.kept_settings import kept_over
 from companion.live.reload import FIXED_KEYS, FIXED_SECTIONS
+from companion.live.tightening import may_change, value_of_key
 from drivers.autopilot_link import AutopilotLink
 from drivers.command_server import BUSY
 from drivers.parameter_server import LONGEST_NAME, NOT_NOW, OUT_OF_RANGE, SET
@@ -118,6 +119,20 @@ def test_while_armed_poses_are_not_made_easier_to_believe() -> None:
         assert control.set(name, value) == SET
         assert control.value(name) == value
     assert control.set("MAP_DENSE", 0.0) == SET
+
+
+@pytest.mark.parametrize("name", [name for name in PARAMETERS if name.startswith("FB_")])
+def test_while_armed_no_parameter_makes_a_pose_easier_to_believe(name: str) -> None:
+    """Every value that a ground station may try, both ways from where it stands."""
+    control, daemon, _ = control_of(Config(feedback=FeedbackConfig(mode="odometry")))
+    daemon.armed = True
+    before = control.value(name)
+    for value in (0.5 * before, before + 1.0, 2.0 * before, 0.0, 1.0, 2.0, 50.0, 200.0):
+        now = value_of_key(daemon.config, PARAMETERS[name].full_key)
+        outcome = control.set(name, value)
+        after = value_of_key(daemon.config, PARAMETERS[name].full_key)
+        assert may_change(PARAMETERS[name].full_key, now, after)
+        assert outcome == SET or (after == now and control.value(name) != value)
 
 
 def test_while_armed_feedback_can_be_switched_off_only() -> None:

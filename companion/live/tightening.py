@@ -1,0 +1,92 @@
+"""What may change, while the motors are armed, of what decides which poses the autopilot gets.
+
+Limits become tighter, feedback is switched off; anything else waits for disarming. That holds
+however a change comes: by parameter, by command, with a configuration that is read again, or with
+one that is read by a daemon that starts in the air.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from companion.config import Config
+
+MayChange = Callable[[Any, Any], bool]
+"""Whether a value may give way to another while armed."""
+
+
+def _to_less(now: float, wanted: float) -> bool:
+    return wanted <= now
+
+
+def _to_more(now: float, wanted: float) -> bool:
+    return wanted >= now
+
+
+def _to_off(now: str, wanted: str) -> bool:
+    return wanted in (now, "off")
+
+
+def _not_at_all(now: Any, wanted: Any) -> bool:
+    return bool(wanted == now)
+
+
+def _freely(now: Any, wanted: Any) -> bool:
+    return True
+
+
+WHILE_ARMED: Mapping[str, MayChange] = {
+    "feedback.mode": _to_off,
+    # how often, not what is believed; every value that it can have is one that autopilots take
+    "feedback.rate_hz": _freely,
+    "feedback.max_sigma_m": _to_less,
+    "feedback.min_quality": _to_more,
+    "feedback.max_gap_ms": _to_less,
+    "feedback.resume_after_s": _to_more,
+    # what is further away than this is announced as a reset; a smaller one is announced sooner
+    "feedback.max_jump_m": _to_less,
+    # an origin that is given in the air moves what the autopilot takes for its place
+    "feedback.set_origin": _not_at_all,
+    "feedback.origin_latitude_deg": _not_at_all,
+    "feedback.origin_longitude_deg": _not_at_all,
+    "feedback.origin_altitude_m": _not_at_all,
+    # an autopilot that avoids obstacles counts on being told of them
+    "feedback.obstacle_distance": _not_at_all,
+    # a map that is begun in the air believes its scale, and its frames, by these
+    "georeference.min_travel_m": _to_more,
+    "georeference.max_sigma_scale": _to_less,
+    "tracking.min_inliers": _to_more,
+}
+"""Every key of [feedback], and those of other sections that poses are believed by."""
+
+
+def value_of_key(config: Config, name: str) -> Any:
+    """The value of `section.key`."""
+    section, key = name.split(".")
+    return getattr(getattr(config, section), key)
+
+
+def with_values(config: Config, values: Mapping[str, Any]) -> Config:
+    """The configuration with other values for keys `section.key`; they are taken as they are."""
+    for name, value in values.items():
+        section, key = name.split(".")
+        part = dataclasses.replace(getattr(config, section), **{key: value})
+        config = dataclasses.replace(config, **{section: part})
+    return config
+
+
+def may_change(name: str, now: Any, wanted: Any) -> bool:
+    """Whether a key may have another value while armed; keys that have no say in it always may."""
+    return WHILE_ARMED.get(name, _freely)(now, wanted)
+
+
+def tightened(running: Config, wanted: Config) -> tuple[Config, dict[str, Any]]:
+    """The configuration to go on with while armed, and by key what has to wait for disarming."""
+    waiting = {
+        name: value_of_key(wanted, name)
+        for name in WHILE_ARMED
+        if not may_change(name, value_of_key(running, name), value_of_key(wanted, name))
+    }
+    return with_values(wanted, {name: value_of_key(running, name) for name in waiting}), waiting
