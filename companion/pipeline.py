@@ -8,7 +8,8 @@
 
 Localisation runs in the caller's thread; depth in one of its own, fed in order through a bounded
 queue. In lockstep the queue makes the caller wait and nothing is lost, so that the results do not
-depend on anybody's speed. Live, a full queue turns a keyframe's depth away, never a pose.
+depend on anybody's speed. Live, a full queue turns a keyframe's depth away, never a pose. A depth
+stage that fails is left out from there on: trajectory, map and what there is of the cloud stay.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from typing import Protocol
 
+from companion.errors import CompanionError
 from companion.localisation import LocalisationStage
 from companion.messages import (
     Frame,
@@ -29,6 +31,7 @@ from companion.messages import (
 )
 
 DEPTH_QUEUE = 64
+DEPTH_FAILED = "the dense map ends here: the depth stage has failed"
 
 
 class Stage(Protocol):
@@ -49,22 +52,25 @@ class Sink(Protocol):
 
 
 class StageThread:
-    """A stage in its own thread; its results wait until they are collected."""
+    """A stage in its own thread; its results wait until they are collected.
+
+    A stage that raises is over: what comes after goes unheard, what it gave before can still be
+    collected, and `fault` says what it raised.
+    """
 
     def __init__(self, stage: Stage, lossless: bool) -> None:
         self._stage = stage
         self._lossless = lossless
         self._inbox: queue.Queue[Message | None] = queue.Queue(DEPTH_QUEUE)
         self._outbox: queue.SimpleQueue[Message] = queue.SimpleQueue()
-        self._fault: BaseException | None = None
+        self.fault: BaseException | None = None
+        """What the stage raised; None while it works."""
         self.n_dropped = 0
         self._thread = threading.Thread(target=self._work, name="depth", daemon=True)
         self._thread.start()
 
     def put(self, message: Message) -> None:
         """Hand over a message; waits for room in lockstep, else drops frames and keyframes."""
-        if self._fault is not None:
-            raise self._fault
         if self._lossless or not isinstance(message, Frame):
             self._inbox.put(message)
         elif self._inbox.qsize() < DEPTH_QUEUE // 2:
@@ -81,24 +87,24 @@ class StageThread:
                 return
 
     def close(self) -> Iterator[Message]:
-        """Finish, and yield the last results; raises what the stage raised."""
+        """Finish, and yield the last results."""
         self._inbox.put(None)
         self._thread.join()
         yield from self.collect()
-        if self._fault is not None:
-            raise self._fault
 
     def _work(self) -> None:
+        is_open = True
         try:
             while (message := self._inbox.get()) is not None:
                 for out in self._stage.step(message):
                     self._outbox.put(out)
+            is_open = False
             for out in self._stage.flush():
                 self._outbox.put(out)
-        except BaseException as fault:  # handed to the caller's thread, which raises it
-            self._fault = fault
-            while self._inbox.get() is not None:
-                pass
+        except BaseException as fault:  # handed to the caller's thread, which tells of it
+            self.fault = fault
+        while is_open and self._inbox.get() is not None:
+            pass  # whoever puts must not wait for ever
 
 
 class Pipeline:
@@ -113,12 +119,19 @@ class Pipeline:
     ) -> None:
         self._localisation = localisation
         self._depth = StageThread(depth, lossless) if depth is not None else None
+        self._fault_told = False
         self._sinks = list(sinks)
+        self._t_ns = 0
 
     @property
     def state(self) -> str:
         """The tracker's state in a word."""
         return self._localisation.state.value
+
+    @property
+    def depth_fault(self) -> BaseException | None:
+        """What the depth stage raised; None where it did not."""
+        return self._depth.fault if self._depth is not None else None
 
     @property
     def n_depth_frames_dropped(self) -> int:
@@ -130,6 +143,7 @@ class Pipeline:
         self._publish(message)
         if isinstance(message, Warned):
             return
+        self._t_ns = message.t_ns
         if isinstance(message, Frame) and self._depth is not None:
             self._depth.put(message)
         for out in self._localisation.step(message):
@@ -137,16 +151,26 @@ class Pipeline:
         if self._depth is not None:
             for out in self._depth.collect():
                 self._publish(out)
+            self._tell_fault()
 
     def finish(self) -> None:
         """Adjust the map, complete the depth, and pass on the rest."""
-        last = self._localisation.finish()
-        if self._depth is not None:
-            for out in self._depth.close():
-                self._publish(out)
-            self._depth = None
+        try:
+            last = self._localisation.finish()
+        finally:
+            if self._depth is not None:
+                for out in self._depth.close():
+                    self._publish(out)
+                self._tell_fault()
         for out in last:
             self._publish(out)
+
+    def _tell_fault(self) -> None:
+        """Have it among the warnings, once, that the dense map has ended early."""
+        fault = self.depth_fault
+        if fault is not None and not self._fault_told:
+            self._fault_told = True
+            self._publish(Warned(self._t_ns, DEPTH_FAILED, in_words(fault)))
 
     def _pass_on(self, message: Message) -> None:
         if self._depth is not None and isinstance(message, (Track, KeyframeAdded, MapUpdate)):
@@ -156,6 +180,14 @@ class Pipeline:
     def _publish(self, message: Message) -> None:
         for sink in self._sinks:
             sink.take(message)
+
+
+def in_words(fault: BaseException) -> str:
+    """A fault in one line: its own text where it was raised on purpose, else its kind as well."""
+    text = " ".join(str(fault).split())
+    if isinstance(fault, CompanionError):
+        return text
+    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
 def in_order_of_time(telemetry: Iterable[Message], frames: Iterable[Message]) -> Iterator[Message]:

@@ -13,7 +13,7 @@ from companion.config import Config
 from companion.config_file import command_shown, shown
 from companion.depth.stage import DepthStage
 from companion.depth.takeover import Devices
-from companion.errors import FlightError
+from companion.errors import FlightError, StageError
 from companion.gaps import with_gaps_named
 from companion.localisation import LocalisationStage
 from companion.messages import Frame, Message
@@ -21,7 +21,7 @@ from companion.output.flight_result import FlightResult, RunFacts
 from companion.output.surroundings import peak_memory_mb, versions
 from companion.output.write import write_results
 from companion.paced import PacedFeed
-from companion.pipeline import Pipeline, Sink, in_order_of_time
+from companion.pipeline import Pipeline, Sink, in_order_of_time, in_words
 from companion.progress import Progress
 from companion.viewer import FileViewer, LiveViewer
 from drivers.flight import ENDS_EARLY, Flight
@@ -49,7 +49,8 @@ def replay(
     `told` hears how the telemetry was read, which OpenCL devices were refused, and where a viewer
     shows it.
 
-    What was done so far is written also when it is interrupted or fails on the way.
+    What was done so far is written also when it is interrupted or fails on the way. Where only the
+    dense map failed, all frames are tracked and written with the cloud so far; StageError then.
     """
     flight = open_flight(flight_path, config.camera, config.telemetry)
     start_ns, stop_ns = _span(flight, start_s, stop_s)
@@ -87,22 +88,29 @@ def replay(
             completed = True
         finally:
             progress.finish()
-            pipeline.finish()
-            dropped["depth frames"] = pipeline.n_depth_frames_dropped
-            if live is not None:
-                dropped["viewer messages"] = live.n_dropped
-            facts = RunFacts(
-                stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
-                origin=log.origin if _has_origin(result) else None,
-                device=devices.described if devices else "none (depth.enabled = false)",
-                config=shown(config), versions=versions(),
-                command=command_shown(sys.argv),
-                peak_memory_mb=peak_memory_mb(), camera=flight.camera,
-                n_frames_total=flight.n_frames_between(start_ns, stop_ns),
-                completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
-            )  # fmt: skip
-            write_results(out, result, facts, config.cloud.voxel_m)
-            result.close()
+            try:
+                pipeline.finish()
+            finally:
+                dropped["depth frames"] = pipeline.n_depth_frames_dropped
+                if live is not None:
+                    dropped["viewer messages"] = live.n_dropped
+                facts = RunFacts(
+                    stage_times=times.summary(), wall_s=monotonic_s() - began_s, clock=log.clock,
+                    origin=log.origin if _has_origin(result) else None,
+                    device=devices.described if devices else "none (depth.enabled = false)",
+                    config=shown(config), versions=versions(),
+                    command=command_shown(sys.argv),
+                    peak_memory_mb=peak_memory_mb(), camera=flight.camera,
+                    n_frames_total=flight.n_frames_between(start_ns, stop_ns),
+                    completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
+                )  # fmt: skip
+                write_results(out, result, facts, config.cloud.voxel_m)
+                result.close()
+        if pipeline.depth_fault is not None:
+            raise StageError(
+                f"the dense map failed after {result.n_depth_maps} depth maps: "
+                f"{in_words(pipeline.depth_fault)}; path, report and the cloud so far are in {out}"
+            ) from pipeline.depth_fault
     return result
 
 

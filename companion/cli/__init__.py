@@ -1,19 +1,21 @@
 """The command line: what was asked, handed on; what came of it, as an exit status.
 
 0 done; 1 a fault; 2 bad input or usage; 130 and 143 stopped by Ctrl-C and SIGTERM. An error that
-the program raises on purpose is one line; anything else is a bug and shows its traceback.
+the program raises on purpose is one line; anything else is a bug and shows its traceback, that of
+a stage which was survived before the line that says so.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import traceback
 from collections.abc import Sequence
 
 from companion import __version__
 from companion.cli import flying, hardware, measuring, recordings, replaying, service
 from companion.cli.options import Command
-from companion.errors import CompanionError, InputError
+from companion.errors import CompanionError, InputError, StageError
 from companion.stopping import StopSignals
 
 # In a command libraries are loaded late: they take a second, and --help needs none of them.
@@ -33,6 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             print("companion: stopped", file=sys.stderr)
             return signals.exit_status
         except CompanionError as error:
+            cause = error.__cause__ if isinstance(error, StageError) else None
+            if cause is not None and not isinstance(cause, CompanionError | OSError):
+                traceback.print_exception(cause, file=sys.stderr)
             print(f"companion: error: {error}", file=sys.stderr)
             return 2 if isinstance(error, InputError) else 1
 
