@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+from array import array
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -33,16 +35,51 @@ class FlightClock:
         return monotonic_ns + self.epoch_ns
 
 
+STEP = 1.02
+"""Ratio of a bin's ends: a percentile is known to within one percent."""
+LEAST_MS, MOST_MS = 1e-3, 1e7
+"""A microsecond to some hours; what is shorter or longer counts to the first or last bin."""
+N_BINS = math.ceil(math.log(MOST_MS / LEAST_MS) / math.log(STEP)) + 1
+
+
+class _Durations:
+    """A histogram of durations with bins of equal ratio, and their sum: as large at any length."""
+
+    def __init__(self) -> None:
+        self.counts = array("q", bytes(8 * N_BINS))
+        self.n = 0
+        self.total_ms = 0.0
+        self.least_ms, self.most_ms = math.inf, 0.0
+
+    def add(self, ms: float) -> None:
+        place = math.log(max(ms, LEAST_MS) / LEAST_MS) / math.log(STEP)
+        self.counts[min(int(place), N_BINS - 1)] += 1
+        self.n += 1
+        self.total_ms += ms
+        self.least_ms, self.most_ms = min(self.least_ms, ms), max(self.most_ms, ms)
+
+    def percentiles_ms(self, percents: tuple[float, ...]) -> list[float]:
+        """To within one percent; between two durations linear, as numpy's are."""
+        ranks = [(self.n - 1) * percent / 100 for percent in percents]
+        wanted = [whole for rank in ranks for whole in (math.floor(rank), math.ceil(rank))]
+        bins = np.searchsorted(np.cumsum(np.frombuffer(self.counts, np.int64)), wanted, "right")
+        values = np.clip(LEAST_MS * STEP ** (bins + 0.5), self.least_ms, self.most_ms)
+        shares = np.array(ranks) - wanted[::2]
+        found: list[float] = (values[::2] + shares * (values[1::2] - values[::2])).tolist()
+        return found
+
+
 class StageTimes:
     """How long each named piece of work took, in milliseconds.
 
     A stage gets one and wraps its parts in `with times("features"):`; the stage itself never sees a
-    clock, so its results cannot depend on one.
+    clock, so its results cannot depend on one. It needs the same memory and time however long a
+    flight is; may be used from any thread.
     """
 
     def __init__(self) -> None:
-        self._ms: defaultdict[str, list[float]] = defaultdict(list)
-        self._total_ms: defaultdict[str, float] = defaultdict(float)
+        self._by_name: defaultdict[str, _Durations] = defaultdict(_Durations)
+        self._lock = threading.Lock()
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
@@ -55,24 +92,25 @@ class StageTimes:
 
     def add(self, name: str, ms: float) -> None:
         """Record a duration that was measured elsewhere (an OpenCL event)."""
-        self._ms[name].append(ms)
-        self._total_ms[name] += ms
+        with self._lock:
+            self._by_name[name].add(ms)
 
     def total_ms(self, name: str) -> float:
         """All of it so far under one name."""
-        return self._total_ms[name]
+        with self._lock:
+            return self._by_name[name].total_ms if name in self._by_name else 0.0
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """Per name: n, p50_ms, p95_ms, total_s."""
-        return {
-            name: {
-                "n": len(ms),
-                "p50_ms": round(float(np.percentile(ms, 50)), 3),
-                "p95_ms": round(float(np.percentile(ms, 95)), 3),
-                "total_s": round(float(np.sum(ms)) / 1e3, 3),
-            }
-            for name, ms in sorted(self._ms.items())
-        }
+        """Per name: n, p50_ms and p95_ms (to within one percent), total_s."""
+        out = {}
+        with self._lock:
+            for name, durations in sorted(self._by_name.items()):
+                p50_ms, p95_ms = durations.percentiles_ms((50, 95))
+                out[name] = {
+                    "n": durations.n, "p50_ms": round(p50_ms, 3), "p95_ms": round(p95_ms, 3),
+                    "total_s": round(durations.total_ms / 1e3, 3),
+                }  # fmt: skip
+        return out
 
 
 def monotonic_s() -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -100,7 +99,7 @@ class FlightResult:
         self._tracks: dict[int, Track] = {}
         self._chunks = ChunkStore(folder, memory_mb)
         self._median_depths: dict[int, float] = {}
-        self._kernel_ms: defaultdict[str, list[float]] = defaultdict(list)
+        self._kernel_times = StageTimes()
         self._positions: dict[PositionSource, list[tuple[int, Array]]] = {}
         self._pictures = DepthPictures()
 
@@ -124,7 +123,7 @@ class FlightResult:
         elif isinstance(message, DepthMap):
             self._pictures.take(message)
             for name, ms in message.kernel_ms.items():
-                self._kernel_ms[name].append(ms)
+                self._kernel_times.add(name, ms)
         elif isinstance(message, PositionSample):
             path = self._positions.setdefault(message.source, [])
             if not path or message.t_ns - path[-1][0] >= POSITION_STEP_NS:
@@ -179,11 +178,7 @@ class FlightResult:
 
     def kernel_times(self) -> dict[str, dict[str, float]]:
         """What each kernel took for one depth map, in the form of `StageTimes.summary()`."""
-        times = StageTimes()
-        for name, durations in self._kernel_ms.items():
-            for ms in durations:
-                times.add(name, ms)
-        return times.summary()
+        return self._kernel_times.summary()
 
     @property
     def tracks(self) -> list[Track]:
