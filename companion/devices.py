@@ -13,7 +13,7 @@ from drivers.camera_devices import CameraControl, CameraDevice, CameraFormat, ca
 from drivers.serial_devices import SerialDevice, serial_devices
 
 
-def devices(as_json: bool, verbose: bool) -> str:
+def devices(as_json: bool, verbose: bool = False) -> str:
     """Cameras, serial ports and OpenCL devices, as text for people or as JSON."""
     found_cameras, found_ports, compute = cameras(), serial_devices(), measured_anew()
     if as_json:

@@ -62,7 +62,8 @@ def container(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
     mnt = {"/mnt/sample": REPOSITORY / "sample", "/mnt/tests": REPOSITORY / "tests"}
     with Container(
         tmp_path_factory.mktemp("container"), platform.freedesktop_os_release()["VERSION_CODENAME"],
-        tuple(name.split("|")[0].strip() for name in needs.split(",")), kept=REPOSITORY / "build", mounts=mnt,
+        tuple(name.split("|")[0].strip() for name in needs.split(",")), kept=REPOSITORY / "build",
+        mounts=mnt,
     ) as made:  # fmt: skip
         told("dpkg:", made.install(package).splitlines()[-1])
         (made.root / "etc/companion/companion.toml").write_text(CONFIG)
