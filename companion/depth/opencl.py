@@ -23,7 +23,7 @@ os.environ.setdefault("POCL_AFFINITY", "0")
 os.environ.setdefault("OCL_ICD_PLATFORM_SORT", "none")
 
 WANT = (
-    "sudo apt install pocl-opencl-icd (without root, on x86-64: pip install 'companion[cpu]'), "
+    "sudo apt install pocl-opencl-icd (without root, on x86-64: make opencl), "
     "or the driver of your GPU; or set depth.enabled=false"
 )
 POCL, LINKERS = "Portable Computing Language", ("ld", "ld.lld")
