@@ -44,7 +44,7 @@ works && exit 0
 
 if may_install_packages; then
   says "no device works here; installing pocl-opencl-icd, which runs the kernels on the processor"
-  install_pocl >/dev/null || says "pocl-opencl-icd could not be installed"
+  said=$(install_pocl 2>&1) || says "pocl-opencl-icd could not be installed: $(echo "$said" | tail -1)"
   works && exit 0
 fi
 if [ "$(uname -m)" = x86_64 ]; then
