@@ -63,7 +63,8 @@ def choose_devices(
     asked_for = config.device != "auto"
     wanted = [device_asked_for(config.device, listed)] if asked_for else list(listed)
     wanted = [each for each in wanted if each.identity not in failed]
-    known = _known(wanted, listed)
+    # in flight what was refused stays refused
+    known = _known(wanted if asked_for and not failed else listed, listed)
     found = [*_measured(wanted, known, listed, say, program), *([] if asked_for else unlisted)]
     order = in_order(found)
     if not order and not failed:

@@ -55,10 +55,10 @@ def listed_devices(
 
 
 def probed(
-    listed: ListedDevice, program: Sequence[str] = PROGRAM, patience_s: float = PATIENCE_S
+    listed: ListedDevice, program: Sequence[str] = PROGRAM, patience_s: float | None = None
 ) -> MeasuredDevice:
     """A device as `program` finds it, or what became of that."""
-    said, ended, detail = _said(["measure", listed.number], program, patience_s)
+    said, ended, detail = _said(["measure", listed.number], program, patience_s or PATIENCE_S)
     for line in reversed(said):
         try:
             found = MeasuredDevice(**line)

@@ -106,6 +106,8 @@ def replay(
                 )  # fmt: skip
                 write_results(out, result, facts, config.cloud.voxel_m)
                 result.close()
+        if devices is not None and devices.failures:
+            told(f"dense map: {devices.described}")
         if pipeline.depth_fault is not None:
             raise StageError(
                 f"the dense map failed after {result.n_depth_maps} depth maps: "

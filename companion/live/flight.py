@@ -101,6 +101,10 @@ class LiveFlight:
         self._origin: GeoOrigin | None = None
         self._dense = makes_depth(config)
         self._dense_share = 1.0
+        self._failed_devices: dict[str, str] = {}
+        """OpenCL devices that have ended the depth stage in this flight, by identity, and how."""
+        self._interrupted_at: set[str] = set()
+        """Those that were at work when it was ended for not answering."""
         self._began_later: set[str] = set()
         """Stages that were not wanted at first."""
         kinds = ["localisation", "recorder"]
@@ -287,7 +291,8 @@ class LiveFlight:
                 return  # what it records is yet to begin
             if kind in IN_FOLDER and self.n_restarted[kind]:
                 folder = folder / f"part-{self.n_restarted[kind] + 1}"
-        self.stages[kind].begin(Setup(self._config, self.camera, folder))
+        failed = dict(self._failed_devices)
+        self.stages[kind].begin(Setup(self._config, self.camera, folder, failed))
 
     def _ended(self, kind: str, why: str) -> None:
         """A stage's process is gone; called from its own thread."""
@@ -304,6 +309,7 @@ class LiveFlight:
             return
         self._warn(RESTARTED, f"{kind}: {why}")
         gone, n_before = self.stages[kind], self.n_restarted[kind]
+        self._blame_driver(gone, why)
         never_up = not n_before and gone.progress is None and kind not in self._began_later
         if gone.failed is not None and gone.failed.by_input and never_up:
             self._listener.unusable(why)
@@ -317,6 +323,19 @@ class LiveFlight:
             gone.kill()
             self._set_up(kind)
         self._take_up(kind)
+
+    def _blame_driver(self, gone: StageProcess, why: str) -> None:
+        """A device whose driver has ended a stage is not used again in this flight.
+
+        A stage may have been too slow to answer for other reasons; that counts the second time.
+        """
+        driver = gone.driver
+        if driver is None:
+            return
+        if gone.was_interrupted and driver.identity not in self._interrupted_at:
+            self._interrupted_at.add(driver.identity)
+            return
+        self._failed_devices[driver.identity] = f"{driver.named}: {why}"
 
     def _take_up(self, kind: str) -> None:
         """A stage begins in mid-flight: it has to know what the others do."""
@@ -345,6 +364,8 @@ class LiveFlight:
             self._listener.mapped(message)
         elif isinstance(message, Warned):
             self._listener.warned(message)
+            if not self._over.is_set():
+                return  # the listener hands it back, see `take`
         if isinstance(message, (MapUpdate, PointChunk)) and self._config.recorder.point_cloud:
             self.keep(message)
         self._record(message)

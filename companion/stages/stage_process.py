@@ -19,9 +19,13 @@ from typing import Any
 from companion.clock import monotonic_s
 from companion.latest import LatestWins
 from companion.stages.frame_ring import FrameInRing, FrameRing
-from companion.stages.protocol import Failed, Finish, Finished, Progress, Setup
+from companion.stages.protocol import DriverAtWork, Failed, Finish, Finished, Progress, Setup
 
 CHILD = "companion.stages.child"
+BY_DRIVER = (
+    signal.SIGABRT, signal.SIGALRM, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV,
+)  # fmt: skip
+"""What ends a process from within; SIGALRM where a driver does not come back."""
 
 
 class StageProcess:
@@ -51,6 +55,8 @@ class StageProcess:
         self._deliver, self._ended = deliver, ended
         self.asked_to_end = False
         """Whether it was told to end, one way or the other."""
+        self.was_interrupted = False
+        self._driver = DriverAtWork()
         self._begun = False
         self._outbox: LatestWins[Any] = LatestWins(
             lambda message: not every_frame and isinstance(message, FrameInRing)
@@ -107,7 +113,17 @@ class StageProcess:
 
     def interrupt(self) -> None:
         """End it as if it had died by itself: `ended` hears of it."""
+        self.was_interrupted = True
         self._child.kill()
+
+    @property
+    def driver(self) -> DriverAtWork | None:
+        """The driver that was at work when the process ended of itself or was interrupted."""
+        status = self._child.poll()
+        if status is None or self.failed is not None or not self._driver.identity:
+            return None
+        by_itself = status >= 0 or -status in BY_DRIVER
+        return self._driver if by_itself or self.was_interrupted else None
 
     def kill(self) -> None:
         """End it now."""
@@ -135,6 +151,8 @@ class StageProcess:
                 if isinstance(message, Progress):
                     self.progress = message
                     self.heard_s = monotonic_s()
+                elif isinstance(message, DriverAtWork):
+                    self._driver = message
                 elif isinstance(message, Failed):
                     self.failed = message
                 elif isinstance(message, Finished):
@@ -150,6 +168,8 @@ class StageProcess:
 
 
 def _in_words(status: int) -> str:
+    if status == -signal.SIGALRM:
+        return "a driver does not come back"
     if status < 0:
         return f"killed by {signal.Signals(-status).name}"
     return f"ended with status {status}"

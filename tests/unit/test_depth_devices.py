@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 
 from companion.depth.opencl import POCL, PROCESSOR, ComputeDevice, ListedDevice, open_device
 from companion.depth.self_test import SIZE, SelfTest, engine_for, reconstruct, scene
-from companion.device_probe import probed
 from companion.devices import devices
 from companion.errors import DeviceError
 from companion.messages import PixelState
@@ -64,20 +62,3 @@ def test_devices_are_listed_with_their_speed() -> None:
     assert all((device["frames_per_s"] is None) == bool(device["problem"]) for device in listed)
     works = [each["number"] for each in listed if each["frames_per_s"]]
     assert document["opencl_auto"]["number"] in works
-
-
-@pytest.mark.parametrize(
-    ("program", "problem", "patience_s"),
-    [
-        ("import os; os.abort()", "its driver ends the program (SIGABRT)", 60.0),
-        ("import sys; sys.exit('why')", "its driver ends the program (status 1): why", 60.0),
-        ("import time; time.sleep(60)", "hangs for 1 s", 1.0),
-        ("print('[1]'); print('{\"number\": 1}'); print('{')", "its driver ends the program", 60),
-    ],
-)
-def test_a_driver_that_ends_its_process_is_named(
-    program: str, problem: str, patience_s: float
-) -> None:
-    found = probed(DEVICE, (sys.executable, "-c", program), patience_s)
-    assert (found.name, found.frames_per_s) == ("a device", None)
-    assert found.problem.startswith(problem)
