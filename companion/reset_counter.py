@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-TOLERANCE_S, DRIFT = 2.0, 0.02
+BACK_S = 2.0
+"""An autopilot's own time that goes back by more has begun anew; less is a clock put right."""
+TOLERANCE_S, DRIFT = 10.0, 0.02
 """Two estimates of when an autopilot was switched on agree within this, and this share of the time
-between them: what a link's clock filter may be off by when it begins, and `PRIOR_DRIFT` of
-`companion.timesync`. A boot takes longer."""
+between them: more than a link that gives out what had piled up makes of it at first, less than any
+autopilot has run when it gets its first pose; and `PRIOR_DRIFT` of `companion.timesync`."""
 WALL_TOLERANCE_S = 600.0
 """The same by the date, which is all there is where this computer was switched on anew as well. One
 without a battery clock takes up the date at which it was switched off: it lags by the time that
@@ -38,10 +40,10 @@ class BootIdentity:
 def same_boot(before: BootIdentity, now: BootIdentity) -> bool:
     """Whether an autopilot has not been switched on anew since `before` was noted.
 
-    Where it cannot be told, it has not: to count on is safe, to begin again at 0 may hide a jump.
+    Where that cannot be told, it has not: to count on is safe, to begin at 0 again may hide a jump.
     """
     passed_s = now.autopilot_s - before.autopilot_s
-    if now.system_id != before.system_id or passed_s < -TOLERANCE_S:
+    if now.system_id != before.system_id or passed_s < -BACK_S:
         return False
     if before.computer and before.computer == now.computer:
         apart_s, allowed_s = now.monotonic_s - before.monotonic_s, TOLERANCE_S

@@ -27,6 +27,7 @@ from companion.live.flights import Flights
 from companion.live.ground_control import GroundControl
 from companion.live.health_watch import HealthWatch
 from companion.live.journal import ERROR, INFO, WARNING, Journal
+from companion.live.kept_counter import counter_path
 from companion.live.kept_settings import kept_over
 from companion.live.left_overs import LeftOvers
 from companion.live.link_watch import LinkWatch
@@ -114,7 +115,10 @@ class Daemon:
             )
         self._sender: PoseSender | None = None
         if self._link is not None:
-            self._sender = PoseSender(config.feedback, self._link, clock)
+            self._sender = PoseSender(
+                config.feedback, self._link, clock, counter_path(config.daemon.flights),
+                self._on_warned,
+            )  # fmt: skip
         self._flights = Flights(
             clock, self._journal, self._listener,
             lambda flight: facts_of(flight, self._config, self._link),

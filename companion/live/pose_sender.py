@@ -6,12 +6,17 @@ Everything here runs in the event loop. What a pose must be to be sent `companio
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from pathlib import Path
 
 from companion.clock import FlightClock
 from companion.config import FeedbackConfig
 from companion.feedback import PoseGate, PoseToSend
 from companion.health import FeedbackHealth, LatencyMeter, RateMeter
-from companion.messages import AttitudeSample, Odometry
+from companion.live.sent_counter import SentCounter
+from companion.messages import AttitudeSample, Odometry, Warned
+from companion.reset_counter import ResetCounter
+from drivers.autopilot_height import AutopilotHeight
 from drivers.autopilot_link import AutopilotLink
 from drivers.pose_messages import odometry_message, vision_messages
 
@@ -23,11 +28,23 @@ SWITCHED_OFF = "switched off"
 
 
 class PoseSender:
-    """Odometry of the newest flight in; ODOMETRY or VISION_POSITION_ESTIMATE out, or nothing."""
+    """Odometry of the newest flight in; ODOMETRY or VISION_POSITION_ESTIMATE out, or nothing.
 
-    def __init__(self, config: FeedbackConfig, link: AutopilotLink, clock: FlightClock) -> None:
+    The file at `counter_path` keeps what reset counter was sent, for the process after this one.
+    """
+
+    def __init__(
+        self,
+        config: FeedbackConfig,
+        link: AutopilotLink,
+        clock: FlightClock,
+        counter_path: Path,
+        warn: Callable[[Warned], None],
+    ) -> None:
         self._config, self._link, self._clock = config, link, clock
-        self._gate = PoseGate(config)
+        counter, height = ResetCounter(), AutopilotHeight(link)
+        self._counter = SentCounter(counter_path, counter, height, link, clock, warn)
+        self._gate = PoseGate(config, counter, height.down_m, self._counter.may_begin)
         self._rate, self._latency = RateMeter(), LatencyMeter()
         self._n_sent = 0
         self._told: str | None = None
@@ -52,6 +69,7 @@ class PoseSender:
         """Take the odometry of a frame, and send it if it may be sent."""
         if self._config.mode == "off":
             return
+        self._counter.step(self._gate)
         self._send(self._gate.take(odometry, self._clock.now_ns()))
         self._tell()
 
@@ -59,9 +77,14 @@ class PoseSender:
         """Send predicted poses when they are due, and say when poses cease."""
         while True:
             await asyncio.sleep(TICK_S if self._gate.sending else IDLE_TICK_S)
-            if self._config.mode != "off" or self._told == "":
-                self._send(self._gate.due(self._clock.now_ns()))
-                self._tell()
+            self.step()
+
+    def step(self) -> None:
+        """Send a predicted pose if one is due; to be called every few milliseconds."""
+        self._counter.step(self._gate)
+        if self._config.mode != "off" or self._told == "":
+            self._send(self._gate.due(self._clock.now_ns()))
+            self._tell()
 
     def health(self) -> FeedbackHealth:
         """As it stands now."""

@@ -7,18 +7,31 @@ from collections.abc import Iterable
 from pathlib import Path
 
 
-def write_atomically(path: Path, data: bytes | Iterable[bytes]) -> None:
+def write_atomically(path: Path, data: bytes | Iterable[bytes], durable: bool = False) -> None:
     """Put `data`, whole or in parts, at `path`, replacing what was there in one step.
 
     Raises OSError. A write that fails half way leaves the old file as it was, and nothing of its
-    own.
+    own. With `durable` it waits until the disk has it, so that it outlasts a loss of power.
     """
     part = path.with_name(f".{path.name}.part")
     try:
         with part.open("wb") as file:
             for some in [data] if isinstance(data, bytes) else data:
                 file.write(some)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(part, path)
+        if durable:
+            _sync_folder(path.parent)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -25,6 +25,8 @@ class Flown:
 
     first_pose_s: float = 0.0
     """After take-off."""
+    begun: list[Moment] = field(default_factory=list)
+    """From just before that pose."""
     standing: list[Moment] = field(default_factory=list)
     corners: list[Moment] = field(default_factory=list)
     before_pull: Array = field(default_factory=lambda: np.zeros(3))
@@ -67,7 +69,9 @@ def flown(
             assert time.monotonic() - begun_s < 40, "no pose"
             time.sleep(0.05)
         out.first_pose_s = time.monotonic() - begun_s
+        n_before = len(drone.moments) - 50
         during(4.0)
+        out.begun = drone.moments[n_before:]
         out.standing = during(5.0)
         for corner in CORNERS:
             drone.go_to(*corner)
@@ -88,6 +92,14 @@ def flown(
         out.n_refused, out.texts = drone.n_refused, drone.texts()
         daemon.stop()
     yield out
+
+
+def test_its_height_does_not_jump_when_poses_begin(flown: Flown) -> None:
+    """What it holds is the height that it had, though the map began somewhere on the way up."""
+    down_m = np.array([each.believed[2] - each.place[2] for each in flown.begun])
+    jump_m = float(np.ptp(down_m))
+    print(f"believed height moved by {jump_m:.2f} m against the true one")
+    assert jump_m < 0.4
 
 
 def test_it_stands(flown: Flown) -> None:

@@ -22,7 +22,8 @@ known time, `fly(unix_ns=…, at_monotonic_ns=…)` keeps both together.
     max_rate_hz    of any message, whatever is asked
     lacks          names of messages that this firmware has not
     parameters     a Parameters (fake_parameters.py): parameters["EKF2_EV_CTRL"]
-    gps            False: no fix; local position then needs an origin and follows the vision it gets
+    gps            False: no fix; local position then needs an origin and follows the vision given,
+                   before that there is its own height alone, as each firmware tells it
     armed, mode, n_boots
     knows_do_set_origin, answers_timesync, asks_timesync_hz
 
@@ -434,7 +435,7 @@ class FakeAutopilot:
                 0, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0, 0, 0, 0, 0, 0, 0
             )
         elif kind in NEEDS_GPS and not self.gps:
-            message = self._by_vision(kind, now_ns)
+            message = self._by_vision(kind, now_ns) or self._by_itself(kind, flight_s)
             if message is None:
                 return None
             at_s = flight_s
@@ -450,6 +451,27 @@ class FakeAutopilot:
         elif hasattr(message, "time_usec"):
             message.time_usec = boot_ns // 1000
         return message
+
+    def _by_itself(self, kind: str, flight_s: float) -> Any | None:
+        """What it says that does not know where it is, but how high.
+
+        PX4 tells its local height; ArduCopter withholds its local position, and its place on Earth
+        stands still, but for the height above home.
+        """
+        tells = "LOCAL_POSITION_NED" if self.firmware == "px4" else "GLOBAL_POSITION_INT"
+        measured = self.flight.message("LOCAL_POSITION_NED", flight_s)
+        if kind != tells or measured is None:
+            return None
+        down_m, speed_m_s = self._down(measured[0])
+        if kind == "LOCAL_POSITION_NED":
+            return mavlink.MAVLink_local_position_ned_message(0, 0, 0, down_m, 0, 0, speed_m_s)
+        return mavlink.MAVLink_global_position_int_message(
+            0, 0, 0, 0, round(-1e3 * down_m), 0, 0, round(1e2 * speed_m_s), 65535
+        )
+
+    def _down(self, true: Any) -> tuple[float, float]:
+        """Its own height in its local frame, and how fast that changes; m, m/s, down."""
+        return true.z, true.vz
 
     def _by_vision(self, kind: str, now_ns: int) -> Any | None:
         """Where it takes itself to be without GPS: where it was told that it is."""

@@ -8,7 +8,7 @@
 Its physics are those of a point that leans into where it is told to go, in gusts. What flies it
 knows its attitude, its height by barometer, and the acceleration that it feels, with a bias.
 Position and velocity it takes from ODOMETRY alone, fused at the time of its stamp, as autopilots
-do.
+do. As ArduPilot it takes the height of the first pose for its own, and its barometer from there.
 """
 
 from __future__ import annotations
@@ -96,6 +96,8 @@ class FlownByVision(FakeAutopilot):
         self._goal = np.zeros(2)
         self._height_m = 0.0
         self._flying = False
+        self._baro_shift_m = 0.0
+        """What the barometer's height is taken to be off by, down."""
         self.n_refused = 0
         self.moments: list[Moment] = []
         self._stop_flying = threading.Event()
@@ -198,12 +200,15 @@ class FlownByVision(FakeAutopilot):
     def _believe(self, now_ns: int, felt: Array) -> None:
         self._believed[:3] += self._believed[3:] * STEP_S
         self._believed[3:] += felt * STEP_S
-        height_error = self._place[2] - self._believed[2]  # by barometer
+        height_error = self._place[2] + self._baro_shift_m - self._believed[2]  # by barometer
         self._believed[2] += BARO_GAIN * height_error
         self._believed[5] += BARO_GAIN * height_error
         if not self.knows_its_place:
             self._believed[3:5] *= 0.98  # nothing tells
         self._past.append((now_ns, self._believed.copy()))
+
+    def _down(self, true: Any) -> tuple[float, float]:
+        return float(self._believed[2]), float(self._believed[5])
 
     def _on_odometry(self, got: Received) -> None:
         super()._on_odometry(got)
@@ -222,6 +227,9 @@ class FlownByVision(FakeAutopilot):
             before = self._believed[:2].copy()
             self._believed[:2] += error[:2]
             self._believed[3:5] += error[3:5]
+            if begins and self.firmware == "ardupilot":
+                self._believed[2] += error[2]
+                self._baro_shift_m += float(error[2])
             if self._home is None:
                 self._home = self._believed[:2].copy()
             elif not begins:
