@@ -52,7 +52,10 @@ PROVING = "belief must hold first"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseToSend:
-    """A pose for the autopilot, at `t_ns`, in NED-aligned metres; see Odometry."""
+    """A pose for the autopilot, at `t_ns`, in NED-aligned metres; see Odometry.
+
+    Its down axis may be shifted against that of an Odometry, so that it begins at the autopilot's.
+    """
 
     t_ns: int
     world_from_body: Pose
@@ -60,6 +63,7 @@ class PoseToSend:
     sigma_position_m: float
     sigma_velocity_m_s: float
     sigma_attitude_rad: float
+    sigma_yaw_rad: float
     quality: int
     reset_counter: int
     predicted: bool = False
@@ -263,7 +267,8 @@ class PoseGate:
         return PoseToSend(
             odometry.t_ns, Pose(pose.rotation, pose.translation + [0.0, 0.0, down_m]),
             odometry.velocity_world_m_s, odometry.sigma_position_m, odometry.sigma_velocity_m_s,
-            odometry.sigma_attitude_rad, odometry.quality, self._counter.value & 0xFF,
+            odometry.sigma_attitude_rad, odometry.sigma_yaw_rad, odometry.quality,
+            self._counter.value & 0xFF,
         )  # fmt: skip
 
     def _predicted(self, good: Odometry, ahead_ns: int) -> PoseToSend | None:

@@ -150,8 +150,9 @@ class Odometry:
     metres from where the map began. It follows the camera smoothly: what the map learns later is
     worked in slowly, and only a real discontinuity, which raises `reset_counter`, moves it at once.
     None while lost or without a metric scale. `velocity_world_m_s` (3,); `sigma_position_m` is one
-    standard deviation of the position since the last reset, `sigma_attitude_rad` of the attitude;
-    `quality` is 1..100, or -1 while the pose is not known.
+    standard deviation of the position since the last reset, along each axis, `sigma_attitude_rad`
+    of the tilt about each level axis, `sigma_yaw_rad` of the heading, against north; `quality` is
+    1..100, or -1 while the pose is not known.
     """
 
     seq: int
@@ -164,6 +165,7 @@ class Odometry:
     sigma_position_m: float = float("inf")
     sigma_velocity_m_s: float = float("inf")
     sigma_attitude_rad: float = float("inf")
+    sigma_yaw_rad: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

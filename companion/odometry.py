@@ -135,7 +135,19 @@ class SmoothOdometry:
             float(np.linalg.norm([FLOOR_M, noise_m, way_sigma_m])),
             sigma_velocity,
             float(np.hypot(FLOOR_RAD, SIGMAS_BEYOND_NOISE * track.sigma_rotation_rad)),
+            self._sigma_yaw_rad(georeference, SIGMAS_BEYOND_NOISE * track.sigma_rotation_rad),
         )  # fmt: skip
+
+    def _sigma_yaw_rad(self, georeference: Georeference, noise_rad: float) -> float:
+        """What the heading is off by from north.
+
+        How well the map's is known, how far ours is known to be from the map's, by what was not
+        worked in, and noise.
+        """
+        apart_rad = _yaw(self._odometry_from_world.rotation)
+        return float(
+            np.linalg.norm([FLOOR_RAD, noise_rad, georeference.sigma_yaw_rad, apart_rad])
+        )
 
     def _way_sigma_m(self, t_ns: int, place: Array, sigma_scale: float) -> float:
         """What the way of the last seconds is off by, along each axis.
@@ -170,6 +182,7 @@ class SmoothOdometry:
             track.seq, track.t_ns, track.state, self.reset_counter, 1, placed,
             self._velocity.copy(), max(FLOOR_M, scale * track.sigma_position),
             SIGMA_COASTING_M_S, float(np.hypot(FLOOR_RAD, track.sigma_rotation_rad)),
+            self._sigma_yaw_rad(self._georeference, track.sigma_rotation_rad),
         )  # fmt: skip
 
     def _land(self, raw: Pose, t_ns: int) -> None:

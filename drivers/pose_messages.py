@@ -2,6 +2,10 @@
 
 The world of a pose is NED-aligned and metric. MAV_FRAME_LOCAL_FRD is that with a heading of its
 own, which both ArduPilot and PX4 take; MAV_FRAME_BODY_FRD is our body.
+
+Covariances are of the axes of a message's frame. Positions and velocities are as uncertain along
+each axis, so theirs are the same in any; of the attitude, tilt about the level axes stands in the
+places of roll and pitch, heading about the down axis in that of yaw.
 """
 
 from __future__ import annotations
@@ -34,8 +38,8 @@ def odometry_message(pose: PoseToSend) -> Any:
         q=[float(each) for each in quaternion_from_rotation(rotation)],
         vx=float(velocity_body[0]), vy=float(velocity_body[1]), vz=float(velocity_body[2]),
         rollspeed=math.nan, pitchspeed=math.nan, yawspeed=math.nan,
-        pose_covariance=_covariance(pose.sigma_position_m, pose.sigma_attitude_rad),
-        velocity_covariance=_covariance(pose.sigma_velocity_m_s, math.nan),
+        pose_covariance=_pose_covariance(pose),
+        velocity_covariance=_covariance(pose.sigma_velocity_m_s, math.nan, math.nan),
         reset_counter=pose.reset_counter,
         estimator_type=mavlink.MAV_ESTIMATOR_TYPE_VIO,
         quality=pose.quality,
@@ -52,7 +56,7 @@ def vision_messages(pose: PoseToSend) -> tuple[Any, Any]:
             usec=pose.t_ns // 1000,
             x=float(position[0]), y=float(position[1]), z=float(position[2]),
             roll=roll, pitch=pitch, yaw=yaw,
-            covariance=_covariance(pose.sigma_position_m, pose.sigma_attitude_rad),
+            covariance=_pose_covariance(pose),
             reset_counter=pose.reset_counter,
         ),
         mavlink.MAVLink_vision_speed_estimate_message(
@@ -71,11 +75,19 @@ def euler_of(rotation: Array) -> tuple[float, float, float]:
     return roll, pitch, math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
 
 
-def _covariance(sigma_linear: float, sigma_angular: float) -> list[float]:
-    """Upper triangle of a diagonal matrix; all unknown where the first is."""
+def _pose_covariance(pose: PoseToSend) -> list[float]:
+    return _covariance(pose.sigma_position_m, pose.sigma_attitude_rad, pose.sigma_yaw_rad)
+
+
+def _covariance(sigma_linear: float, sigma_level: float, sigma_down: float) -> list[float]:
+    """Upper triangle (21,) of a diagonal matrix; m^2 or (m/s)^2, and rad^2 about the axes.
+
+    nan for an angle that is not known, and for everything where the first is not.
+    """
     if not math.isfinite(sigma_linear):
         return list(UNKNOWN)
+    sigmas = [sigma_linear] * 3 + [sigma_level] * 2 + [sigma_down]
     out = [0.0] * N_COVARIANCE
-    for row, at in enumerate(ROW_STARTS):
-        out[at] = sigma_linear**2 if row < 3 else sigma_angular**2
+    for at, sigma in zip(ROW_STARTS, sigmas, strict=True):
+        out[at] = sigma**2 if math.isfinite(sigma) else math.nan
     return out

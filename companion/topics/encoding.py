@@ -53,6 +53,7 @@ def pose_envelope(flight: str, odometry: Odometry) -> Envelope:
         "sigma_position_m": finite_or_none(odometry.sigma_position_m),
         "sigma_velocity_m_s": finite_or_none(odometry.sigma_velocity_m_s),
         "sigma_attitude_rad": finite_or_none(odometry.sigma_attitude_rad),
+        "sigma_yaw_rad": finite_or_none(odometry.sigma_yaw_rad),
     }, {})  # fmt: skip
 
 
@@ -66,12 +67,14 @@ def pose_of_envelope(envelope: Envelope) -> Odometry:
         velocity = np.array(_row(envelope, "velocity_world_m_s", 3))
     sigmas = [
         envelope.number(name, 0) if envelope.known(name) else UNKNOWN
-        for name in ("sigma_position_m", "sigma_velocity_m_s", "sigma_attitude_rad")
-    ]
+        for name in (
+            "sigma_position_m", "sigma_velocity_m_s", "sigma_attitude_rad", "sigma_yaw_rad"
+        )
+    ]  # fmt: skip
     return Odometry(
         envelope.integer("seq"), envelope.integer("t_ns"), state_of(envelope.text("state")),
         envelope.integer("reset_counter"), envelope.integer("quality", -1, 100), pose, velocity,
-        sigmas[0], sigmas[1], sigmas[2],
+        *sigmas,
     )  # fmt: skip
 
 

@@ -131,6 +131,7 @@ TOPICS: dict[str, Any] = {
             "seq": INTEGER, "state": TEXT, "reset_counter": INTEGER, "quality": INTEGER,
             "position_m": NUMBERS, "world_from_body": NUMBERS, "velocity_world_m_s": NUMBERS,
             "sigma_position_m": NUMBER, "sigma_velocity_m_s": NUMBER, "sigma_attitude_rad": NUMBER,
+            "sigma_yaw_rad": NUMBER,
         },
     ),
     CLOUD: PointCloud,

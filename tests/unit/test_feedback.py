@@ -25,7 +25,7 @@ def odometry(t_ns: int, **changes: Any) -> Odometry:
     good = Odometry(
         t_ns // (50 * MS), t_ns, TrackState.TRACKING, 0, 80,
         Pose(rotation_from_quaternion(ATTITUDE), np.array([1.0 + t_ns * 1e-9 * 2, 2.0, -3.0])),
-        np.array([2.0, 0.0, 0.0]), 0.1, 0.2, 0.01,
+        np.array([2.0, 0.0, 0.0]), 0.1, 0.2, 0.01, 0.05,
     )  # fmt: skip
     return replace(good, **changes)
 
@@ -337,10 +337,25 @@ def test_no_scale_is_told() -> None:
     assert flight.gate.why_not == "no metric scale"
 
 
+def test_what_is_not_known_of_the_heading_is_said_to_be_unknown() -> None:
+    pose = PoseToSend(
+        10**12, Pose.identity(), np.zeros(3), 0.1, math.inf, 0.01, math.inf, 80, 0
+    )  # fmt: skip
+    message = odometry_message(pose)
+    assert message.pose_covariance[18] == pytest.approx(1e-4)
+    assert math.isnan(message.pose_covariance[20])
+    assert math.isnan(message.velocity_covariance[0])
+
+
+def test_the_headings_uncertainty_is_sent() -> None:
+    flight = Flight()
+    assert {pose.sigma_yaw_rad for pose in flight.run(2)} == {0.05}
+
+
 def test_odometry_message() -> None:
     pose = PoseToSend(
         1_234_567_890_123, Pose(rotation_from_quaternion(ATTITUDE), np.array([1.0, 2.0, -3.0])),
-        np.array([1.0, 0.5, -0.2]), 0.1, 0.2, 0.01, 80, 7,
+        np.array([1.0, 0.5, -0.2]), 0.1, 0.2, 0.01, 0.05, 80, 7,
     )  # fmt: skip
     message = odometry_message(pose)
     assert (message.frame_id, message.child_frame_id) == (20, 12)
@@ -349,7 +364,9 @@ def test_odometry_message() -> None:
     body = pose.world_from_body.rotation.T @ pose.velocity_world_m_s
     assert np.allclose([message.vx, message.vy, message.vz], body)
     diagonal = [message.pose_covariance[i] for i in (0, 6, 11, 15, 18, 20)]
-    assert np.allclose(diagonal, [0.01] * 3 + [1e-4] * 3)
+    assert np.allclose(diagonal, [0.01] * 3 + [1e-4] * 2 + [2.5e-3])
+    assert sum(message.pose_covariance) == pytest.approx(sum(diagonal)), "nothing beside it"
     position, speed = vision_messages(pose)
+    assert np.allclose(position.covariance, message.pose_covariance)
     assert np.allclose([position.roll, position.pitch, position.yaw], [0.1, -0.2, 0.7])
     assert (speed.x, speed.y, speed.z) == (1.0, 0.5, -0.2)

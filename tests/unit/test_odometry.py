@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.camera import Camera
-from companion.geometry import Pose, Similarity
+from companion.geometry import Pose, Similarity, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
 from companion.odometry import SmoothOdometry
 
@@ -62,6 +62,30 @@ def test_what_is_worked_in_is_no_way_flown_and_says_so() -> None:
     assert max(after) == pytest.approx(np.hypot(before, 1.5 / np.sqrt(3)), rel=0.02)
     assert after[150] > 0.85 * max(after)
     assert after[-1] == pytest.approx(before, rel=0.02)
+
+
+def test_the_heading_is_as_certain_as_the_maps_and_less_where_it_is_not_the_maps() -> None:
+    """What the map learns of north is worked in slowly; until then the pose is off by the rest."""
+    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    for k in range(10):
+        before = give(odometry, track(k))
+    noise_rad = 3 * 0.001
+    floor_rad = np.radians(0.3)
+    assert before.sigma_yaw_rad == pytest.approx(np.linalg.norm([0.01, noise_rad, floor_rad]))
+    assert before.sigma_attitude_rad == pytest.approx(np.hypot(noise_rad, floor_rad))
+    north_rad = np.radians(4.0)
+    turned = Georeference(
+        Similarity(2.0, yaw_rotation(north_rad), np.zeros(3)), 0.01, 0.002, "GPS", 90, 0.3
+    )
+    velocity = (np.array([SPEED, 0.0, 0.0]), 0.1)
+    after = odometry.step(track(10), 0, turned, velocity)
+    assert after.world_from_body is not None
+    assert abs(np.arctan2(*after.world_from_body.rotation[[1, 0], [0, 0]])) < np.radians(0.1)
+    assert after.sigma_yaw_rad == pytest.approx(north_rad, rel=0.05)
+    later = [odometry.step(track(k), 0, turned, velocity) for k in range(11, 200)][-1]
+    assert later.sigma_yaw_rad == pytest.approx(
+        np.linalg.norm([0.002, noise_rad, floor_rad]), rel=0.01
+    )
 
 
 def test_a_jump_that_no_correction_explains_is_a_reset() -> None:

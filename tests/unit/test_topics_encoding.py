@@ -49,13 +49,14 @@ def test_what_is_no_envelope_is_refused() -> None:
 def test_a_pose_is_as_it_was() -> None:
     where = Pose(flown.WORLD_FROM_MAP.rotation, np.array([1.0, 2.0, -3.5]))
     sent = Odometry(
-        5, 123, TrackState.TRACKING, 2, 80, where, np.array([0.1, 0.2, 0.3]), 0.05, 0.02, 0.01
+        5, 123, TrackState.TRACKING, 2, 80, where, np.array([0.1, 0.2, 0.3]), 0.05, 0.02, 0.01, 0.04
     )
     back = pose_of_envelope(unpack(pose_envelope("f", sent).pack()))
     assert back.world_from_body is not None and back.velocity_world_m_s is not None
     assert np.allclose(back.world_from_body.matrix(), where.matrix(), atol=1e-12)
     assert np.allclose(back.velocity_world_m_s, [0.1, 0.2, 0.3])
     assert (back.seq, back.quality, back.sigma_position_m) == (5, 80, 0.05)
+    assert (back.sigma_attitude_rad, back.sigma_yaw_rad) == (0.01, 0.04)
     lost = pose_of_envelope(unpack(pose_envelope("f", Odometry(6, 124, TrackState.LOST, 2)).pack()))
     assert lost.world_from_body is None and lost.sigma_position_m == float("inf")
 
