@@ -19,6 +19,7 @@ from companion.clock import FlightClock
 from companion.config import LinkConfig
 from companion.health import RateMeter, SourceHealth, SourceMeter
 from companion.messages import ArmedSample, GeoOrigin, Telemetry, Warned
+from companion.pilot_messages import PilotText
 from companion.timesync import ClockFilter
 from drivers.commands import NO_ANSWER, TRIES, Commands
 from drivers.live_samples import LiveSamples
@@ -26,7 +27,7 @@ from drivers.mavlink_port import MavlinkPort
 from drivers.mavlink_samples import SAMPLE_OF
 from drivers.mavlink_wire import run_together
 from drivers.message_rates import MessageRates, wanted
-from drivers.status_text import StatusTexts, TextLimit
+from drivers.status_text import TextLimit, status_text
 from drivers.timesync_message import TimesyncMessage, timesync_target
 from drivers.vehicle import Vehicle, is_autopilot, vehicle_of
 from drivers.within import within
@@ -71,7 +72,6 @@ class AutopilotLink:
         self._rates: defaultdict[str, RateMeter] = defaultdict(RateMeter)
         self._wanted = MessageRates(wanted(config))
         self._commands = Commands(self.send)
-        self._texts = StatusTexts()
         self._text_limit = TextLimit()
         self.system_status: int = mavlink.MAV_STATE_BOOT
         """What our HEARTBEAT states: a MAV_STATE."""
@@ -157,11 +157,11 @@ class AutopilotLink:
             self.system_status, 3,
         )  # fmt: skip
 
-    def say(self, severity: int, text: str) -> bool:
-        """Tell the pilot, by STATUSTEXT; MAV_SEVERITY. False for what comes too soon: not told."""
-        said = self._text_limit.passed(severity, text, self._clock.now_ns())
-        for message in self._texts.messages(severity, said) if said else ():
-            self.send(message)
+    def say(self, text: PilotText) -> bool:
+        """Tell the pilot, by STATUSTEXT. False for what comes too soon: not told."""
+        said = self._text_limit.passed(text, self._clock.now_ns())
+        for each in said:
+            self.send(status_text(each))
         return bool(said)
 
     async def command(

@@ -8,9 +8,7 @@ configuration meanwhile.
 from __future__ import annotations
 
 import json
-import os
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,13 +17,12 @@ from companion.config import Config
 from companion.config_file import with_value
 from companion.errors import ConfigError
 from companion.live.tightening import WHILE_ARMED, tightened, value_of_key, with_values
-from companion.output.atomic_file import write_atomically
 
 FILE = ".armed.json"
 """In the folder of flights, the one place that the daemon is sure to be able to write to."""
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """Another each time that the computer starts (random(4))."""
-NOT_KEPT = "what counts while armed cannot be written down"
+NOT_KEPT = "settings cannot be kept"
 MODE = "feedback.mode"
 
 
@@ -76,6 +73,11 @@ def resumed(read: Config, before: ArmedSettings) -> Resumed:
     return Resumed(config, waiting, by_ground)
 
 
+def encoded(settings: ArmedSettings) -> bytes:
+    """As the file has it."""
+    return json.dumps(asdict(settings)).encode()
+
+
 def computer_boot() -> str:
     """Which start of the computer this is; "" where it does not say."""
     try:
@@ -114,68 +116,3 @@ def read_settings(flights: Path, config: Config) -> tuple[ArmedSettings | None, 
 def _checked(config: Config, name: str, value: Any) -> Any:
     section, key = name.split(".")
     return value_of_key(with_value(config, section, key, value, FILE), name)
-
-
-class ArmedFile:
-    """Writes the file in a thread of its own: a disk that hangs holds up nothing.
-
-    `warn` is called in that thread with what went wrong.
-    """
-
-    def __init__(self, flights: Path, warn: Callable[[str, str], None]) -> None:
-        self._path, self._warn = flights / FILE, warn
-        self._changed = threading.Condition()
-        self._newest: ArmedSettings | None = None
-        self._due = self._busy = self._closed = False
-        threading.Thread(target=self._run, name="armed settings", daemon=True).start()
-
-    def put(self, settings: ArmedSettings | None) -> None:
-        """Have this in the file from now on; None: no file."""
-        with self._changed:
-            self._newest, self._due = settings, True
-            self._changed.notify_all()
-
-    def wait(self, seconds: float) -> bool:
-        """Wait until all is written, at most so long; whether it is."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not (self._due or self._busy), seconds)
-
-    def close(self, seconds: float) -> None:
-        """Write what is still to be written, as far as the disk does that in time."""
-        self.wait(seconds)
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._busy = False
-                self._changed.notify_all()
-                self._changed.wait_for(lambda: self._due or self._closed)
-                if not self._due:
-                    return
-                settings, self._due, self._busy = self._newest, False, True
-            try:
-                self._write(settings)
-            except OSError as error:
-                self._warn(NOT_KEPT, f"{self._path}: {error.strerror}")
-
-    def _write(self, settings: ArmedSettings | None) -> None:
-        if settings is None:
-            self._path.unlink(missing_ok=True)
-        else:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            # there for who comes after a crash at once, for who comes after a power cut a little
-            # later: a disk may take its time
-            write_atomically(self._path, json.dumps(asdict(settings)).encode())
-            _sync(self._path)
-        _sync(self._path.parent)
-
-
-def _sync(path: Path) -> None:
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

@@ -12,13 +12,14 @@ from typing import Any
 
 from companion.config import Config
 from companion.live.armed_settings import (
-    ArmedFile,
     ArmedSettings,
     Resumed,
     computer_boot,
+    encoded,
     resumed,
     settings_of,
 )
+from companion.live.newest_file import NewestFile
 
 CERTAIN_S = 2.5
 """An autopilot that says it is disarmed is believed after so long with the same clock: of another
@@ -36,7 +37,7 @@ class Arming:
     """
 
     def __init__(
-        self, file: ArmedFile, before: ArmedSettings | None,
+        self, file: NewestFile, before: ArmedSettings | None,
         boot_s: Callable[[], float | None], heard: Callable[[], bool],
     ) -> None:  # fmt: skip
         self._file, self._held, self._boot_s, self._heard = file, before, boot_s, heard
@@ -104,7 +105,7 @@ class Arming:
 
     def _put(self, settings: ArmedSettings) -> None:
         self._held = settings
-        self._file.put(settings)
+        self._file.put(encoded(settings))
 
     def _is_same_boot(self, now_s: float) -> bool:
         """Whether the autopilot's clock runs on that ran while it was armed."""

@@ -18,7 +18,7 @@ from companion.clock import FlightClock, monotonic_s
 from companion.config import Config
 from companion.errors import CompanionError
 from companion.health import LatencyMeter
-from companion.live.armed_settings import ArmedFile, read_settings
+from companion.live.armed_settings import FILE, NOT_KEPT, read_settings
 from companion.live.arming import Arming
 from companion.live.component_state import POWEROFF, component_state
 from companion.live.flight import Listener, LiveFlight, makes_depth
@@ -33,6 +33,7 @@ from companion.live.left_overs import LeftOvers
 from companion.live.link_watch import LinkWatch
 from companion.live.loop_delay import measure_loop_delay
 from companion.live.missing import Missing
+from companion.live.newest_file import NewestFile
 from companion.live.pose_sender import PoseSender
 from companion.live.reload import reloaded
 from companion.live.tape_notes import TapeNotes
@@ -48,6 +49,13 @@ from companion.messages import (
     Telemetry,
     Track,
     Warned,
+)
+from companion.pilot_messages import (
+    LIMITS_WAIT,
+    POSITION_ENABLED,
+    POSITION_STAYS_OFF,
+    PilotText,
+    of_warning,
 )
 from companion.stages.protocol import Snapshot
 from drivers.autopilot_link import AutopilotLink
@@ -86,13 +94,15 @@ class Daemon:
         self._loop = asyncio.get_running_loop()
         flights = Path(read.daemon.flights)
         before, unreadable = read_settings(flights, read) if read.link.url else (None, "")
-        self._armed_file = ArmedFile(
-            flights, lambda what, why: self._on_warned(Warned(clock.now_ns(), what, why))
+        self._armed_file = NewestFile(
+            flights / FILE, lambda why: self._on_warned(Warned(clock.now_ns(), NOT_KEPT, why))
         )
         self._arming = Arming(self._armed_file, before, self._autopilot_boot_s, self._is_heard)
         resumed = self._arming.resume(read)
         self._config = config = resumed.config
         kept |= resumed.by_ground
+        self._stays_off = resumed.by_ground.get("feedback.mode") == "off"
+        """Whether the pilot is still to be told so, once there is one to hear it."""
         if before is not None:
             self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
         self._stop = asyncio.Event()
@@ -203,6 +213,8 @@ class Daemon:
             await socket.stop()
             await asyncio.wait([feed_closed], timeout=0.2)
             await loop.run_in_executor(None, self._armed_file.close, WRITE_S)
+            if self._ground is not None:
+                await loop.run_in_executor(None, self._ground.close, WRITE_S)
             self._service.close()
         self._journal.say("stopped")
         return self._status
@@ -220,7 +232,9 @@ class Daemon:
     def _on_warned(self, warning: Warned) -> None:
         """Something to be told, in any thread."""
         if self._journal.warn(warning):
-            self._soon(self._tell_pilot, warning.what)
+            text = of_warning(warning.what, warning.detail, warning.good)
+            if text is not None:
+                self._soon(self._tell_pilot, text)
         self._soon(self._flights.take, warning)
 
     def _on_telemetry(self, sample: Telemetry) -> None:
@@ -302,6 +316,9 @@ class Daemon:
             self._let_go()
         if armed:
             self._hold()
+            if self._stays_off:
+                self._tell_pilot(POSITION_STAYS_OFF())
+        self._stays_off = False
         if armed == self._armed:
             return
         self._armed = armed
@@ -387,7 +404,7 @@ class Daemon:
             text = f"; these need a restart: {', '.join(cannot)}" if cannot else ""
             if waiting:
                 text += f"; these are looser and wait for disarming: {', '.join(waiting)}"
-                self._tell_pilot("looser limits wait for disarming")
+                self._tell_pilot(LIMITS_WAIT())
             self._journal.say(f"configuration read again{text}", WARNING if stays else INFO)
         if self._is_ready:
             self._service.ready()
@@ -452,6 +469,8 @@ class Daemon:
             self._by_ground.pop(name, None)
         shown = ", ".join(f"{name} = {value}" for name, value in waiting.items())
         self._journal.say(f"disarmed: what has waited for that counts now: {shown}", WARNING)
+        if waiting.get("feedback.mode", "off") != "off":
+            self._tell_pilot(POSITION_ENABLED())
         self.take_over(with_values(self._config, waiting))
 
     def _say_resumed(
@@ -489,9 +508,9 @@ class Daemon:
             self._status = status
         self._stop.set()
 
-    def _tell_pilot(self, what: str) -> None:
+    def _tell_pilot(self, text: PilotText) -> None:
         if self._link is not None:
-            self._link.say(WARNING, f"Companion: {what}")
+            self._link.say(text)
 
     def _problem(self, text: str) -> None:
         self._on_warned(Warned(self._clock.now_ns(), text))

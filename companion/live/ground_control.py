@@ -15,6 +15,7 @@ from companion.clock import FlightClock
 from companion.config import Config
 from companion.errors import ConfigError
 from companion.live import kept_settings
+from companion.live.armed_settings import NOT_KEPT
 from companion.live.flight import depth_elsewhere
 from companion.live.flight_parameters import (
     PARAMETERS,
@@ -25,9 +26,24 @@ from companion.live.flight_parameters import (
 from companion.live.flights import Flights
 from companion.live.journal import INFO, WARNING, Journal
 from companion.live.new_map import NewMap
+from companion.live.newest_file import NewestFile
 from companion.live.snapshots import Snapshots
 from companion.live.tightening import may_change, value_of_key
 from companion.messages import Warned
+from companion.pilot_messages import (
+    CLOUD_NO_MAP,
+    NEW_MAP_ARMED,
+    NEW_MAP_NO_MAP,
+    PARAMETER_NEXT_MAP,
+    PARAMETER_SET,
+    REFUSED_ARMED,
+    REFUSED_ELSEWHERE,
+    REFUSED_OFTEN,
+    REFUSED_VALUE,
+    PilotMessage,
+    PilotText,
+)
+from companion.pilot_messages import NEW_MAP as NEW_MAP_TEXT
 from companion.stages.protocol import Snapshot
 from drivers.autopilot_link import AutopilotLink
 from drivers.command_server import ACCEPTED, BUSY, DENIED, Command, CommandServer, Done, Job
@@ -44,10 +60,11 @@ CHANGES_HZ, CHANGES_AT_ONCE = 2.0, 40.0
 """As many as there are parameters may be set in a row; afterwards so many a second."""
 NO_FLIGHT = "there is no flight"
 POSES_SENT = "the autopilot may fly on these poses; param1 = 1 does it all the same"
-NOT_ARMED = "while armed it can be switched off only"
-ELSEWHERE = "another machine makes the dense map"
-TOO_OFTEN = "it is set too often"
-NOT_LOOSER = "while armed it can be made stricter only"
+NOT_ARMED = "while armed it can be switched off only", REFUSED_ARMED
+ELSEWHERE = "another machine makes the dense map", REFUSED_ELSEWHERE
+TOO_OFTEN = "it is set too often", REFUSED_OFTEN
+NOT_LOOSER = "while armed it can be made stricter only", REFUSED_ARMED
+"""Why a parameter is refused: for the journal, and for the pilot."""
 
 
 class Controlled(Protocol):
@@ -88,7 +105,8 @@ class GroundControl:
         self._daemon, self._link, self._journal = daemon, link, journal
         self._clock, self._changes = clock, RateLimit(CHANGES_HZ, CHANGES_AT_ONCE)
         self._texts = RateLimit(TEXTS_HZ, TEXTS_AT_ONCE)
-        self._flights, self.changed = flights, changed
+        self._flights, self.changed, self._warn = flights, changed, warn
+        self._kept: NewestFile | None = None
         self._new_map = NewMap(flights, daemon.prepare, daemon.begin_flight)
         self._snapshots = Snapshots(flights, self._tell)
         commands = {
@@ -137,21 +155,27 @@ class GroundControl:
             wanted = value_of(config, parameter, value)
             changed = kept_settings.checked(config, parameter, wanted)
         except ConfigError as error:
-            self._tell(f"not set: {error}", False)
+            self._tell(REFUSED_VALUE(name=name), f"not set: {error}", False)
             return OUT_OF_RANGE
         if changed == config:
             return SET
         why_not = self._forbidden(parameter, wanted)
         if why_not:
-            self._tell(f"not set: {name}: {why_not}", False)
+            self._tell(why_not[1](name=name), f"not set: {name}: {why_not[0]}", False)
             return NOT_NOW
         when = "" if parameter.at_once else ", from the next map on"
-        self._tell(f"{parameter.full_key} = {_shown(wanted)}{when}", True)
+        told = PARAMETER_SET if parameter.at_once else PARAMETER_NEXT_MAP
+        self._tell(
+            told(name=name, value=_shown(wanted, brief=True)),
+            f"{parameter.full_key} = {_shown(wanted)}{when}", True,
+        )  # fmt: skip
         self._take_over(parameter, wanted, changed)
         return SET
 
-    def _forbidden(self, parameter: FlightParameter, wanted: Any) -> str:
-        """Why it must not be so now; "" if it may."""
+    def _forbidden(
+        self, parameter: FlightParameter, wanted: Any
+    ) -> tuple[str, PilotMessage] | None:
+        """Why it must not be so now; None if it may."""
         self._changes.refill(self._clock.now_ns())
         if self._changes.left < 1.0:
             return TOO_OFTEN
@@ -159,7 +183,7 @@ class GroundControl:
             return ELSEWHERE
         now = value_of_key(self._daemon.config, parameter.full_key)
         if not self._daemon.armed or may_change(parameter.full_key, now, wanted):
-            return ""
+            return None
         return NOT_ARMED if parameter.full_key == "feedback.mode" else NOT_LOOSER
 
     def _take_over(self, parameter: FlightParameter, value: Any, config: Config) -> None:
@@ -167,10 +191,20 @@ class GroundControl:
         self.changed[parameter.full_key] = value
         self._daemon.take_over(config)
         if config.control.keep:
-            try:
-                kept_settings.keep(Path(config.control.keep), self.changed)
-            except OSError as error:
-                self._tell(f"{config.control.keep}: not kept: {error.strerror}", False)
+            self._kept_in(Path(config.control.keep)).put(kept_settings.encoded(self.changed))
+
+    def _kept_in(self, path: Path) -> NewestFile:
+        if self._kept is None or self._kept.path != path:
+            self.close()
+            self._kept = NewestFile(
+                path, lambda why: self._warn(Warned(self._clock.now_ns(), NOT_KEPT, why))
+            )
+        return self._kept
+
+    def close(self, seconds: float = 0.0) -> None:
+        """Keep what is still to be kept; waits for the disk at most so long."""
+        if self._kept is not None:
+            self._kept.close(seconds)
 
     # -- commands --------------------------------------------------------------------------------
 
@@ -188,11 +222,11 @@ class GroundControl:
         if all_the_same not in (0.0, 1.0) and not math.isnan(all_the_same):
             return Done(DENIED)
         if self._flights.current is None:
-            return self._refused("no new map", NO_FLIGHT, BUSY)
+            return self._refused(NEW_MAP_NO_MAP(), f"no new map: {NO_FLIGHT}", BUSY)
         is_fed = self._daemon.config.feedback.mode != "off"
         if self._daemon.armed and is_fed and all_the_same != 1.0:
-            return self._refused("no new map", POSES_SENT, DENIED)
-        self._tell("a new map begins", True)
+            return self._refused(NEW_MAP_ARMED(), f"no new map: {POSES_SENT}", DENIED)
+        self._tell(NEW_MAP_TEXT(), "a new map begins", True)
         job = Job()
         self._new_map.start(job)
         return job
@@ -200,27 +234,29 @@ class GroundControl:
     def _take_snapshot(self, _parameters: Sequence[float]) -> Done | Job:
         flight = self._flights.current
         if flight is None:
-            return self._refused("no cloud was written", NO_FLIGHT, BUSY)
+            return self._refused(CLOUD_NO_MAP(), f"no cloud was written: {NO_FLIGHT}", BUSY)
         job = Job()
         self._snapshots.start(flight, self._link.origin, job)
         return job
 
-    def _refused(self, what: str, why_not: str, result: int) -> Done:
-        self._tell(f"{what}: {why_not}", False)
+    def _refused(self, told: PilotText, what: str, result: int) -> Done:
+        self._tell(told, what, False)
         return Done(result)
 
-    def _tell(self, text: str, good: bool) -> None:
-        priority = INFO if good else WARNING
+    def _tell(self, told: PilotText, text: str, good: bool) -> None:
+        """Answer the pilot, unless that comes too often, and say it at length in the journal."""
         self._texts.refill(self._clock.now_ns())
-        told = self._texts.left >= 1.0
-        if told:
+        in_time = self._texts.left >= 1.0
+        if in_time:
             self._texts.take(1.0)
-            self._link.say(priority, f"Companion: {text}")
-        if told or good:
-            self._journal.say(f"ground: {text}", priority)
+            self._link.say(told)
+        if in_time or good:
+            self._journal.say(f"ground: {text}", INFO if good else WARNING)
 
 
-def _shown(value: Any) -> str:
+def _shown(value: Any, brief: bool = False) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.4g}" if brief else f"{value:g}"
+    return str(value)

@@ -10,7 +10,6 @@ from companion.config import Config
 from companion.config_file import changed_by, dump, toml_value, with_value
 from companion.errors import ConfigError
 from companion.live.flight_parameters import PARAMETERS, FlightParameter
-from companion.output.atomic_file import write_atomically
 
 HEAD = "# What the ground has set over MAVLink; control.keep names this file.\n"
 KEYS = [(parameter.section, parameter.key) for parameter in PARAMETERS.values()]
@@ -43,10 +42,10 @@ def differences(config: Config, other: Config) -> dict[str, Any]:
     }
 
 
-def keep(path: Path, changed: Mapping[str, Any]) -> None:
-    """Write the file; OSError where that cannot be."""
+def encoded(changed: Mapping[str, Any]) -> bytes:
+    """The file that keeps this."""
     lines = [f"{name} = {toml_value(value)}" for name, value in sorted(changed.items())]
-    write_atomically(path, (HEAD + "\n".join(lines) + "\n").encode())
+    return (HEAD + "\n".join(lines) + "\n").encode()
 
 
 def checked(config: Config, parameter: FlightParameter, value: Any) -> Config:

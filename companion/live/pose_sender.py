@@ -15,6 +15,7 @@ from companion.feedback import PoseGate, PoseToSend
 from companion.health import FeedbackHealth, LatencyMeter, RateMeter
 from companion.live.sent_counter import SentCounter
 from companion.messages import AttitudeSample, Odometry, Warned
+from companion.pilot_messages import POSITION_ON, position_lost
 from companion.reset_counter import ResetCounter
 from drivers.autopilot_height import AutopilotHeight
 from drivers.autopilot_link import AutopilotLink
@@ -22,7 +23,6 @@ from drivers.pose_messages import odometry_message, vision_messages
 
 TICK_S = 0.005
 IDLE_TICK_S = 0.05
-INFO, WARNING = 6, 4
 UNHEARD = "the autopilot is silent"
 SWITCHED_OFF = "switched off"
 
@@ -121,9 +121,9 @@ class PoseSender:
         """The pilot hears when poses begin and cease."""
         state = "" if self._gate.sending else self._gate.why_not
         if self._gate.sending and self._told != "":
-            told = self._link.say(INFO, "Companion: vision pose on")
+            told = self._link.say(POSITION_ON())
         elif not self._gate.sending and self._told == "":
-            told = self._link.say(WARNING, f"Companion: vision pose off: {state}")
+            told = self._link.say(position_lost(state))
         else:
             return
         if told:  # else it is tried again

@@ -8,6 +8,7 @@ from pathlib import Path
 from companion.live.flight import LiveFlight
 from companion.live.flights import Flights
 from companion.messages import GeoOrigin
+from companion.pilot_messages import CLOUD_NOT_SAVED, CLOUD_SAVED, PilotText
 from companion.stages.protocol import Snapshot
 from drivers.command_server import ACCEPTED, FAILED, Job
 
@@ -15,9 +16,12 @@ RECORDER_GONE = "its recorder is gone"
 
 
 class Snapshots:
-    """One at a time; to be used in the event loop. `tell` takes a text and whether it is good."""
+    """One at a time; to be used in the event loop.
 
-    def __init__(self, flights: Flights, tell: Callable[[str, bool], None]) -> None:
+    `tell` takes what the pilot hears, what the journal has, and whether it is good.
+    """
+
+    def __init__(self, flights: Flights, tell: Callable[[PilotText, str, bool], None]) -> None:
         self._flights, self._tell = flights, tell
         self._job: Job | None = None
         self._flight: LiveFlight | None = None
@@ -37,7 +41,10 @@ class Snapshots:
         self._job.percent = snapshot.percent
         if snapshot.path:
             path = Path(snapshot.path)
-            self._tell(f"cloud written: {path.name}, {snapshot.n_points} points", True)
+            self._tell(
+                CLOUD_SAVED(n=str(snapshot.n_points)),
+                f"cloud written: {path.name}, {snapshot.n_points} points", True,
+            )  # fmt: skip
             self._job.result, self._job = ACCEPTED, None
         elif snapshot.why_not:
             self._fail(snapshot.why_not)
@@ -57,5 +64,5 @@ class Snapshots:
 
     def _fail(self, why_not: str) -> None:
         assert self._job is not None
-        self._tell(f"no cloud was written: {why_not}", False)
+        self._tell(CLOUD_NOT_SAVED(), f"no cloud was written: {why_not}", False)
         self._job.result, self._job = FAILED, None

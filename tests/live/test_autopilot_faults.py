@@ -76,7 +76,7 @@ def test_rebooted(flying: Flying) -> None:
     booted_ns = began_ns + 500_000_000
     line = flying.daemon.line("autopilot rebooted", 20, began_ns)
     flying.assert_soon(booted_ns, line.monotonic_ns)
-    flying.until_told("autopilot rebooted", booted_ns)
+    flying.until_told("autopilot reboot detected", booted_ns)
     # it has forgotten what it was asked to send
     flying.daemon.until(
         lambda health: source(health, "autopilot")["state"] == "running"

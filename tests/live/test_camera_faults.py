@@ -93,7 +93,7 @@ def test_covered_for_two_seconds(flying: Flying) -> None:
     flying.daemon.until(lambda health: health["tracker"] == "tracking", 10, "it is found")
     flying.assert_soon(seen_ns, time.monotonic_ns())
     flying.assert_resumed(seen_ns)
-    flying.until_told("vision pose on", seen_ns)
+    flying.until_told("vision position on", seen_ns)
     flying.assert_true_poses()
 
 

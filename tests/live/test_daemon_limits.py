@@ -104,7 +104,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
         flying.until_source("camera", "running")
         flying.take_off()
         assert "a_file" in flying.daemon.line("is started again: recorder: ", 40).text
-        flying.until_told("a stage has died", 0)
+        flying.until_told(" restarted", 0)
         went_on_ns = time.monotonic_ns()
         flying.until_stage("recorder", lambda found: found["n_restarted"] >= 2)
         flying.until_sending()

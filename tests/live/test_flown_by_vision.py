@@ -128,4 +128,4 @@ def test_it_comes_back_when_its_cable_was_pulled(flown: Flown) -> None:
     print(f"a pose again after {flown.again_s:.2f} s; {away_m:.2f} m away")
     assert flown.again_s < 2.5
     assert away_m < 0.8
-    assert "Companion: vision pose on" in flown.texts
+    assert "Companion: vision position on" in flown.texts

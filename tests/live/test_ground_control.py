@@ -188,7 +188,7 @@ def test_the_pose_is_switched_off(flying: Flying, ground: GroundStation) -> None
     began_ns = time.monotonic_ns()
     assert ground.set("FB_MODE", 0.0) == 0.0
     flying.assert_ceased(began_ns)
-    flying.until_told("vision pose off: switched off", began_ns)
+    flying.until_told("vision position off: ground command", began_ns)
     assert flying.daemon.status()["feedback"]["mode"] == "off"
     assert ground.set("FB_MODE", 1.0) == 0.0  # until it has landed
     flying.autopilot.disarm()

@@ -53,7 +53,7 @@ def test_what_is_killed_begins_again(
     flying.until_stage(kind, lambda found: found["alive"] and found["n_restarted"] == 1)
     flying.assert_soon(named_ns, time.monotonic_ns())
     flying.until_stage(kind, lambda found: found["detail"] != "starting", 60)
-    flying.until_told("a stage has died", killed_ns)
+    flying.until_told(" restarted", killed_ns)
     flying.assert_went_on(killed_ns)
     flying.assert_true_poses()
 

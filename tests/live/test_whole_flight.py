@@ -188,7 +188,7 @@ def test_health_while_flying(flown: Flown) -> None:
 
 
 def test_the_pilot_is_told(flown: Flown) -> None:
-    assert "Companion: vision pose on" in flown.texts
+    assert "Companion: vision position on" in flown.texts
     heartbeats = [each for each in flown.received if each.kind == "HEARTBEAT"]
     assert {each.message.type for each in heartbeats} == {mavlink.MAV_TYPE_ONBOARD_CONTROLLER}
     assert {each.component for each in heartbeats} == {197}

@@ -169,16 +169,17 @@ class Flying:
         """After what happened at a time the poses cease, soon, and the pilot is told."""
         # which may have happened already, on a machine that has too much to do
         self.daemon.until(lambda health: not health["feedback"]["sending"], 10, "no poses")
-        self.daemon.until(lambda _: "off" in self._pose_is(), 10, "the pilot is told")
+        self.daemon.until(lambda _: not self._is_told_on(), 10, "the pilot is told")
         took_s = self.poses.last_before_pause_s(from_ns)
         late_s = 1e-3 * (self.daemon.status()["pose_latency_p95_ms"] or 0.0)
         allowed_s = self.strain.allowed_s(limit_s, from_ns) + max(0.0, late_s - LATENCY_S)
         print(f"ceased after {took_s:.3f} s of {allowed_s:.3f} s")
         assert took_s < allowed_s
 
-    def _pose_is(self) -> str:
-        """What the pilot was last told of the pose."""
-        return next((t for t in reversed(self.autopilot.texts()) if "vision pose" in t), "")
+    def _is_told_on(self) -> bool:
+        """Whether the pilot was last told that there are poses; so it is before the first."""
+        told = [t for t in self.autopilot.texts() if "vision position" in t]
+        return not told or told[-1].endswith(" on")
 
     def assert_resumed(self, from_ns: int) -> None:
         """What returned at a time soon leads to poses again."""

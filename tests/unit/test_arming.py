@@ -10,8 +10,9 @@ import pytest
 
 from companion.config import Config, FeedbackConfig
 from companion.live import armed_settings, arming
-from companion.live.armed_settings import FILE, ArmedFile, read_settings
+from companion.live.armed_settings import FILE, read_settings
 from companion.live.arming import CERTAIN_S, Arming
+from companion.live.newest_file import NewestFile
 from companion.live.tightening import WHILE_ARMED, with_values
 
 READ = Config(feedback=FeedbackConfig(mode="odometry"))
@@ -25,10 +26,10 @@ class Autopilot:
         self.boot_s: float | None = 100.0
         self.heard = True
 
-    def arming(self, flights: Path, read: Config = READ) -> tuple[Arming, ArmedFile]:
+    def arming(self, flights: Path, read: Config = READ) -> tuple[Arming, NewestFile]:
         """A daemon that begins."""
-        warned: list[Any] = []
-        file = ArmedFile(flights, lambda *what: warned.append(what))
+        failed: list[str] = []
+        file = NewestFile(flights / FILE, failed.append)
         before, _ = read_settings(flights, read)
         return Arming(file, before, lambda: self.boot_s, lambda: self.heard), file
 
@@ -169,7 +170,7 @@ def test_a_file_that_a_power_cut_has_damaged_sends_nothing(tmp_path: Path, data:
     (tmp_path / FILE).write_bytes(data)
     before, why = read_settings(tmp_path, READ)
     assert before is not None and FILE in why
-    file = ArmedFile(tmp_path, lambda *_: None)
+    file = NewestFile(tmp_path / FILE, lambda _: None)
     found = Arming(file, before, lambda: None, lambda: True).resume(READ)
     assert found.config == with_values(READ, OFF)
     file.close(0.0)
@@ -184,11 +185,11 @@ def test_what_is_written_is_read_back_and_a_full_disk_is_told(
         WHILE_ARMED
     )
     (tmp_path / "file").write_text("")
-    warned: list[Any] = []
-    file = ArmedFile(tmp_path / "file" / "below", lambda *what: warned.append(what))
-    file.put(read_settings(tmp_path, READ)[0])
+    failed: list[str] = []
+    file = NewestFile(tmp_path / "file" / "below" / FILE, failed.append)
+    file.put(b"{}")
     assert file.wait(5.0)
-    assert warned[0][0] == armed_settings.NOT_KEPT
+    assert FILE in failed[0]
     file.close(0.0)
 
 

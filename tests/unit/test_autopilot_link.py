@@ -26,13 +26,13 @@ from companion.messages import (
     Telemetry,
     Warned,
 )
+from companion.pilot_messages import CAMERA_RECOVERED, position_lost
 from drivers.autopilot_link import AutopilotLink
 from drivers.commands import NO_ANSWER
 from drivers.live_places import LivePlaces
 from drivers.mavlink_port import MavlinkPort
 from drivers.message_rates import MessageRates, Wanted, wanted
 from drivers.pymavlink_port import PymavlinkPort
-from drivers.status_text import StatusTexts
 from drivers.telemetry_log import GeodeticFix, kind_of
 from drivers.telemetry_tlog import read_tlog
 from drivers.timesync_message import TimesyncMessage, timesync_target
@@ -422,15 +422,18 @@ def test_without_gps_positions_are_those_that_the_autopilot_was_given(firmware: 
     run(test())
 
 
-def test_long_texts_reach_the_autopilot_whole() -> None:
+def test_texts_reach_the_autopilot_in_one_piece_each() -> None:
     async def test() -> None:
         with FakeAutopilot("px4", flight=circle()) as autopilot:
             async with linked(autopilot) as heard:
-                text = "vision pose off: " + "the camera is gone and nobody knows why " * 3
-                heard.link.say(4, text)
-                heard.link.say(6, "short")
-                await heard.until(lambda: "short" in autopilot.texts())
-                assert autopilot.texts() == [text, "short"]
+                heard.link.say(position_lost("tilt differs from the autopilot's"))
+                heard.link.say(CAMERA_RECOVERED())
+                await heard.until(lambda: len(autopilot.of("STATUSTEXT")) == 2)
+                assert autopilot.texts() == [
+                    "Companion: vision position lost: attitude mismatch",
+                    "Companion: camera recovered",
+                ]
+                assert [each.message.severity for each in autopilot.of("STATUSTEXT")] == [4, 6]
 
     run(test())
 
@@ -707,16 +710,6 @@ def test_a_rate_that_comes_is_not_asked_for_again() -> None:
 def test_what_is_set_to_zero_is_not_asked_for() -> None:
     ids = {each.ids[0] for each in wanted(LinkConfig(attitude_hz=0, position_hz=0, height_hz=0))}
     assert ids == {mavlink.MAVLINK_MSG_ID_SYSTEM_TIME}
-
-
-def test_texts_are_cut_where_ground_stations_expect_it() -> None:
-    texts = StatusTexts()
-    [one] = texts.messages(4, "x" * 50)
-    assert one.id == 0 and one.chunk_seq == 0
-    first = texts.messages(4, "y" * 100)
-    assert [len(each.text) for each in first] == [50, 50, 0]
-    assert {each.id for each in first} != {each.id for each in texts.messages(4, "z" * 60)}
-    assert sum(len(each.text) for each in texts.messages(4, "ä" * 1000)) == 254
 
 
 def test_modes_have_names() -> None:

@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.clock import FlightClock
 from companion.config import LinkConfig
 from companion.messages import Warned
+from companion.pilot_messages import PilotText
 from drivers.autopilot_link import AutopilotLink
 from drivers.command_server import ACCEPTED, Command, CommandServer, Done
 from drivers.component_messages import (
@@ -176,10 +177,16 @@ def test_versions_and_intervals() -> None:
 
 def test_texts_come_slowly_and_say_what_was_left_out() -> None:
     limit = TextLimit()
-    said = [limit.passed(INFO, f"text {n}", SECOND) for n in range(20)]
+    info = [PilotText(INFO, f"text {n}") for n in range(20)]
+    warnings = [PilotText(WARNING, f"warning {n}") for n in range(20)]
+    said = [limit.passed(each, SECOND) for each in info]
     assert sum(map(bool, said)) == TEXTS_AT_ONCE - WARNINGS_ONLY
-    warned = [limit.passed(WARNING, f"warning {n}", SECOND) for n in range(20)]
+    warned = [limit.passed(each, SECOND) for each in warnings]
     assert sum(map(bool, warned)) == WARNINGS_ONLY
-    assert warned[0].startswith("warning 0 (")
-    later = limit.passed(WARNING, "warning 19", 3 * SECOND)
-    assert later == "warning 19 (15 others not told)"
+    # what is left out is not told at the cost of the next warning
+    assert limit.passed(warnings[19], 3 * SECOND) == [warnings[19]]
+    last = limit.passed(warnings[18], 60 * SECOND)
+    assert [each.text for each in last] == [
+        "warning 18", "Companion: 26 messages left out, see its log",
+    ]  # fmt: skip
+    assert limit.passed(info[0], 61 * SECOND) == [info[0]]

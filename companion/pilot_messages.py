@@ -1,0 +1,226 @@
+"""All that is ever said to the pilot: one table, whose rows docs/pilot_messages.md explains.
+
+A STATUSTEXT holds 50 bytes, and longer ones are cut or come in pieces, of which one may be lost. So
+each text fits into one message, in words of aviation that cannot be taken for anything else. What
+is warned of within the program becomes one of these texts, or stays in the journal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+PREFIX = "Companion: "
+MOST_BYTES = 50
+"""Of the text of a STATUSTEXT (mavlink.io, common.xml)."""
+ERROR, WARNING, NOTICE, INFO = 3, 4, 5, 6
+"""Of MAV_SEVERITY."""
+OTHER_VALUE = "?"
+LONGEST_NAME, LONGEST_NUMBER, LONGEST_REASON = 16, 10, 17
+"""Characters of a parameter's name, of a number, and of a reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class PilotText:
+    """One STATUSTEXT. Only `PilotMessage` makes them."""
+
+    severity: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class PilotMessage:
+    """A row: what is said, with the names of what is filled in, and how long each may be."""
+
+    severity: int
+    text: str
+    longest: Mapping[str, int] = field(default_factory=dict)
+
+    def __call__(self, **values: str) -> PilotText:
+        """What is sent; a value that is too long is cut, and of what is not ASCII a ? is left."""
+        fitting = {
+            name: values.get(name, OTHER_VALUE).encode("ascii", "replace").decode("ascii")[:most]
+            for name, most in self.longest.items()
+        }
+        return PilotText(self.severity, PREFIX + self.text.format(**fitting))
+
+
+# -- vision position -----------------------------------------------------------------
+
+POSITION_ON = PilotMessage(INFO, "vision position on")
+POSITION_LOST = PilotMessage(
+    WARNING, "vision position lost: {reason}", {"reason": LONGEST_REASON}
+)
+POSITION_OFF = PilotMessage(NOTICE, "vision position off: ground command")
+POSITION_STAYS_OFF = PilotMessage(WARNING, "vision position still off: by ground")
+POSITION_ENABLED = PilotMessage(NOTICE, "vision position enabled: disarmed")
+LIMITS_WAIT = PilotMessage(NOTICE, "looser limits wait for disarming")
+SETTINGS_NOT_SAVED = PilotMessage(WARNING, "disk error: settings not saved")
+TRACKING_FAILED = PilotMessage(WARNING, "visual tracking failed: restarting")
+ATTITUDE_MISMATCH = PilotMessage(WARNING, "attitude mismatch: no vision position")
+MOUNT_CORRECTED = PilotMessage(NOTICE, "camera mount angle corrected")
+
+# -- camera and autopilot -----------------------------------------------------------------
+
+CAMERA_NOT_FOUND = PilotMessage(WARNING, "camera not found")
+CAMERA_LOST = PilotMessage(WARNING, "camera lost")
+CAMERA_RECOVERED = PilotMessage(INFO, "camera recovered")
+CAMERA_NO_VIDEO = PilotMessage(WARNING, "camera sends no video")
+CAMERA_FROZEN = PilotMessage(WARNING, "camera image frozen")
+CAMERA_SIZE = PilotMessage(WARNING, "camera image size wrong")
+CAMERA_TIME = PilotMessage(WARNING, "camera time stamps wrong")
+CAMERA_SETTINGS = PilotMessage(NOTICE, "camera settings not accepted")
+CAMERA_ENDED = PilotMessage(WARNING, "video file ended")
+CAMERA_FAULT = PilotMessage(WARNING, "camera driver fault")
+AUTOPILOT_CONNECTED = PilotMessage(INFO, "autopilot connected")
+AUTOPILOT_LOST = PilotMessage(WARNING, "autopilot link lost")
+AUTOPILOT_RECOVERED = PilotMessage(INFO, "autopilot link recovered")
+AUTOPILOT_REBOOT = PilotMessage(WARNING, "autopilot reboot detected")
+SECOND_VEHICLE = PilotMessage(NOTICE, "second vehicle on link ignored")
+NO_SUCH_TELEMETRY = PilotMessage(NOTICE, "autopilot lacks a telemetry message")
+TELEMETRY_ORDER = PilotMessage(WARNING, "telemetry out of order")
+TELEMETRY_TIME = PilotMessage(WARNING, "telemetry time stamps wrong")
+TELEMETRY_LATE = PilotMessage(WARNING, "telemetry late")
+TELEMETRY_INVALID = PilotMessage(WARNING, "telemetry values invalid")
+LINK_ERRORS = PilotMessage(WARNING, "telemetry link errors")
+CLIENT_REFUSED = PilotMessage(NOTICE, "ground link client refused")
+CLIENT_OVERLOAD = PilotMessage(NOTICE, "ground link client sends too much")
+CLIENT_SLOW = PilotMessage(NOTICE, "ground link client too slow")
+CLIENT_ERRORS = PilotMessage(NOTICE, "ground link client sends errors")
+
+# -- map and recording -----------------------------------------------------------------
+
+PART_RESTARTED = PilotMessage(NOTICE, "{part} restarted", {"part": 16})
+RESULTS_INCOMPLETE = PilotMessage(NOTICE, "flight results incomplete")
+DISK_FULL = PilotMessage(WARNING, "disk full: recording stopped")
+RECORDING_FAILED = PilotMessage(WARNING, "recording failed")
+RECORDING_INCOMPLETE = PilotMessage(NOTICE, "disk slow: recording incomplete")
+RECORDING_DELETED = PilotMessage(NOTICE, "disk full: oldest recording deleted")
+RECORDING_REPAIRED = PilotMessage(INFO, "earlier recording repaired")
+MAP_INCOMPLETE = PilotMessage(NOTICE, "disk full: dense map incomplete")
+REMOTE_MAP_LOST = PilotMessage(NOTICE, "remote dense map computer lost")
+
+# -- answers to the ground -----------------------------------------------------------------
+
+NAME = {"name": LONGEST_NAME}
+PARAMETER_SET = PilotMessage(INFO, "{name}: {value}", {**NAME, "value": 20})
+PARAMETER_NEXT_MAP = PilotMessage(
+    INFO, "{name}: {value} (next map)", {**NAME, "value": LONGEST_NUMBER}
+)
+REFUSED_ARMED = PilotMessage(NOTICE, "{name} refused: armed", NAME)
+REFUSED_VALUE = PilotMessage(NOTICE, "{name} refused: out of range", NAME)
+REFUSED_OFTEN = PilotMessage(NOTICE, "{name} refused: too often", NAME)
+REFUSED_ELSEWHERE = PilotMessage(NOTICE, "{name} refused: not made here", NAME)
+NEW_MAP = PilotMessage(NOTICE, "new map: vision position restarts")
+NEW_MAP_NO_MAP = PilotMessage(NOTICE, "new map refused: no map yet")
+NEW_MAP_ARMED = PilotMessage(NOTICE, "new map refused: armed, position in use")
+CLOUD_SAVED = PilotMessage(INFO, "point cloud saved: {n} points", {"n": LONGEST_NUMBER})
+CLOUD_NO_MAP = PilotMessage(NOTICE, "point cloud refused: no map yet")
+CLOUD_NOT_SAVED = PilotMessage(NOTICE, "point cloud not saved, see its log")
+GROUND_TOO_OFTEN = PilotMessage(NOTICE, "too many ground requests")
+
+# -- of messages themselves -----------------------------------------------------------------
+
+LEFT_OUT = PilotMessage(NOTICE, "{n} messages left out, see its log", {"n": 3})
+OTHER = PilotMessage(NOTICE, "warning, see its log")
+"""For what is warned of and has no row of its own."""
+
+TABLE: Mapping[str, PilotMessage] = {
+    name: each for name, each in globals().items() if isinstance(each, PilotMessage)
+}
+"""All rows, by name."""
+
+REASONS: Mapping[str, str] = {
+    "no pose yet": "no position yet",
+    "initialising": "map starting",
+    "lost": "tracking lost",
+    "no metric scale": "no scale",
+    "position too uncertain": "uncertain",
+    "quality too low": "low quality",
+    "tilt differs from the autopilot's": "attitude mismatch",
+    "poses come too late": "too late",
+    "no frames": "no video",
+    "localisation begins anew": "restarting",
+    "belief must hold first": "being checked",
+    "the autopilot is silent": "autopilot silent",
+    "no autopilot attitude": "no attitude",
+    "no autopilot height": "no height",
+    "position reset": "position reset",
+    "autopilot rebooted": "autopilot reboot",
+}
+"""Why no pose is sent, as `companion.feedback` and `companion.live.pose_sender` have it."""
+OTHER_REASON = "see its log"
+SWITCHED_OFF = ("off", "switched off")
+"""Reasons that are the pilot's own, or the ground's."""
+PARTS: Mapping[str, str] = {
+    "depth": "dense map", "tape": "recording", "recorder": "results", "topics": "remote map link",
+}  # fmt: skip
+
+OF_WARNING: Mapping[str, PilotMessage] = {
+    "localisation has died: the flight ends, and another begins": TRACKING_FAILED,
+    "the autopilot's attitude is not the camera's and is not used": ATTITUDE_MISMATCH,
+    "camera and autopilot were found to disagree, corrected": MOUNT_CORRECTED,
+    "settings cannot be kept": SETTINGS_NOT_SAVED,
+    "the camera is not there": CAMERA_NOT_FOUND,
+    "the camera has gone": CAMERA_LOST,
+    "the camera is back": CAMERA_RECOVERED,
+    "the camera is silent": CAMERA_NO_VIDEO,
+    "the camera is frozen": CAMERA_FROZEN,
+    "pictures of another size are refused": CAMERA_SIZE,
+    "pictures with wrong stamps are refused": CAMERA_TIME,
+    "the camera does not do as asked": CAMERA_SETTINGS,
+    "the camera's pictures have ended": CAMERA_ENDED,
+    "the camera's driver has a fault": CAMERA_FAULT,
+    "autopilot found": AUTOPILOT_CONNECTED,
+    "autopilot silent": AUTOPILOT_LOST,
+    "autopilot heard again": AUTOPILOT_RECOVERED,
+    "autopilot rebooted": AUTOPILOT_REBOOT,
+    "another vehicle on the link": SECOND_VEHICLE,
+    "autopilot does not send a message": NO_SUCH_TELEMETRY,
+    "telemetry out of order": TELEMETRY_ORDER,
+    "telemetry stamped wildly": TELEMETRY_TIME,
+    "telemetry from the future": TELEMETRY_TIME,
+    "telemetry late": TELEMETRY_LATE,
+    "telemetry that is not usable": TELEMETRY_INVALID,
+    "damaged data on the autopilot's link": LINK_ERRORS,
+    "a client of the router is refused": CLIENT_REFUSED,
+    "a client of the router sends more than the link takes": CLIENT_OVERLOAD,
+    "a client of the router is too slow": CLIENT_SLOW,
+    "a client of the router sends damaged data": CLIENT_ERRORS,
+    "more is asked of the companion over MAVLink than it answers": GROUND_TOO_OFTEN,
+    "a stage has died and is started again": PART_RESTARTED,
+    "a stage did not give its last results in time": RESULTS_INCOMPLETE,
+    "the disk is full: the flight is no longer recorded": DISK_FULL,
+    "the recording cannot be written": RECORDING_FAILED,
+    "the disk is too slow: parts of the flight are not recorded": RECORDING_INCOMPLETE,
+    "an old flight was deleted": RECORDING_DELETED,
+    "an earlier recording was cut short": RECORDING_REPAIRED,
+    "points were given up, as the disk does not take them": MAP_INCOMPLETE,
+    "no node elsewhere makes depth any more": REMOTE_MAP_LOST,
+}
+"""By what a `Warned` is of."""
+JOURNAL_ONLY = frozenset({
+    "a node elsewhere makes the depth", "questions came over the network that cannot be read",
+    "the flight can be seen", "the viewer cannot be shown", "the viewer has gone",
+    "the viewer does not keep up", "viewers cannot connect",
+})  # fmt: skip
+"""What a `Warned` may be of that no pilot has to do with."""
+
+
+def of_warning(what: str, detail: str = "", good: bool = False) -> PilotText | None:
+    """What the pilot is told of a `Warned`; None where that is nothing."""
+    if what in JOURNAL_ONLY:
+        return None
+    message = OF_WARNING.get(what)
+    if message is None:
+        return None if good else OTHER()
+    if message is PART_RESTARTED:
+        return message(part=PARTS.get(detail.split(":")[0], "a process"))
+    return message()
+
+
+def position_lost(why_not: str) -> PilotText:
+    """No poses are sent any more, for a reason of `companion.feedback`."""
+    if why_not in SWITCHED_OFF:
+        return POSITION_OFF()
+    return POSITION_LOST(reason=REASONS.get(why_not, OTHER_REASON))
