@@ -33,7 +33,7 @@ def devices(as_json: bool, verbose: bool = False) -> str:
         lines += _port(port)
     if not found_ports:
         lines.append("  none")
-    return "\n".join([*lines, *_compute_lines(compute, verbose)])
+    return "\n".join([*lines, *opencl_lines(compute, verbose)])
 
 
 def opencl_devices(as_json: bool, verbose: bool) -> tuple[str, bool]:
@@ -42,7 +42,7 @@ def opencl_devices(as_json: bool, verbose: bool) -> tuple[str, bool]:
     works = bool(in_order(compute))
     if as_json:
         return _as_json(_as_document(compute)), works
-    return "\n".join(_compute_lines(compute, verbose)), works
+    return "\n".join(opencl_lines(compute, verbose)), works
 
 
 def _as_document(compute: list[MeasuredDevice]) -> dict[str, Any]:
@@ -58,7 +58,8 @@ def _as_json(document: dict[str, Any]) -> str:
     return json.dumps(document, indent=2, ensure_ascii=False)
 
 
-def _compute_lines(compute: list[MeasuredDevice], verbose: bool) -> list[str]:
+def opencl_lines(compute: list[MeasuredDevice], verbose: bool) -> list[str]:
+    """Each device with its speed or what is wrong, and which one is taken."""
     lines = ["OpenCL devices (opencl.device)"]
     for device in compute:
         speed = device.problem or f"{device.frames_per_s:.0f} frames/s of 640 x 480"

@@ -9,10 +9,11 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
+import pyopencl as cl
 import pytest
 
 from companion.depth.device_choice import MeasuredDevice, measured
-from companion.depth.opencl import POCL
+from companion.depth.opencl import POCL, ComputeDevice
 from companion.device_probe import listed_devices
 from companion.device_verdict import circumstances, keep_verdict, verdict_path
 from tests.support import compute
@@ -20,6 +21,15 @@ from tests.support import compute
 SOURCE = Path(__file__).with_suffix(".c")
 SPEEDS = (100.0, 50.0)
 NOT_HERE = "not wanted in this test"
+
+
+class WrongDevice(ComputeDevice):
+    """Counts bits as a broken compiler might."""
+
+    def build(self, source_name: str, constants: dict[str, int]) -> cl.Program:
+        if source_name != "sweep.cl":
+            return super().build(source_name, constants)
+        return super().build(source_name, {**constants, "UNRELATED": 2})
 
 
 def two_devices(
@@ -35,8 +45,7 @@ def two_devices(
     if good.platform != POCL:
         pytest.skip("another OpenCL than PoCL has one device only here")
     monkeypatch.setenv("POCL_DEVICES", "pthread basic")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
+    monkeypatch.setenv("CACHE_DIRECTORY", str(folder / "cache"))  # PoCL's kernels stay elsewhere
     listed, _ = listed_devices()
     pair = [each for each in listed if each.driver == good.driver]
     assert len(pair) == 2

@@ -6,26 +6,15 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pyopencl as cl
 import pytest
 
-from companion.depth.opencl import POCL, PROCESSOR, ComputeDevice, ListedDevice, open_device
+from companion.depth.opencl import POCL, PROCESSOR, open_device
 from companion.depth.self_test import SIZE, SelfTest, engine_for, reconstruct, scene
 from companion.devices import devices
 from companion.errors import DeviceError
 from companion.messages import PixelState
 from tests.support import compute
-
-DEVICE = ListedDevice("0:0", "a device", "a platform")
-
-
-class WrongDevice(ComputeDevice):
-    """Counts bits as a broken compiler might."""
-
-    def build(self, source_name: str, constants: dict[str, int]) -> cl.Program:
-        if source_name != "sweep.cl":
-            return super().build(source_name, constants)
-        return super().build(source_name, {**constants, "UNRELATED": 2})
+from tests.support.failing_driver import WrongDevice
 
 
 @pytest.mark.parametrize("number", compute.working())

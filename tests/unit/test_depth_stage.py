@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from companion.camera import Camera, Distortion
 from companion.config import CloudConfig, DepthConfig
+from companion.depth import takeover
+from companion.depth.self_test import SelfTest
 from companion.depth.stage import MAX_HELD, DepthStage
+from companion.depth.takeover import NONE_LEFT, TOOK_OVER, Devices
 from companion.geometry import Pose, rotation_from_vector
 from companion.messages import (
     DepthMap,
@@ -20,8 +25,10 @@ from companion.messages import (
     PointChunk,
     Track,
     TrackState,
+    Warned,
 )
 from tests.support import compute
+from tests.support.failing_driver import WrongDevice
 from tests.support.scene import DOWN_LOOKING, PlaneWorld
 
 RADTAN = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
@@ -33,18 +40,25 @@ def at(k: int) -> Pose:
     return Pose(turn, np.array([0.05 * k, 0.2 * k - 3, -12.0]))
 
 
-def stage(camera: Camera) -> DepthStage:
+def stage(camera: Camera, devices: Devices | None = None) -> DepthStage:
     return DepthStage(
-        DepthConfig(), CloudConfig(), camera, compute.devices(), lambda _: nullcontext()
+        DepthConfig(), CloudConfig(), camera, devices or compute.devices(), lambda _: nullcontext()
     )
 
 
-def fly(camera: Camera, n: int = 34, unit_of: dict[int, float] | None = None) -> list[Message]:
-    """A flight with true poses and a keyframe every fourth frame; all that the stage gives."""
+def fly(
+    camera: Camera, n: int = 34, unit_of: dict[int, float] | None = None, *,
+    devices: Devices | None = None, before: Callable[[int], object] = int,
+) -> list[Message]:  # fmt: skip
+    """A flight with true poses and a keyframe every fourth frame; all that the stage gives.
+
+    `before` is told each frame's number before the stage gets it.
+    """
     world = PlaneWorld(np.random.default_rng(21))
-    it, out = stage(camera), []
+    it, out = stage(camera, devices), []
     poses: dict[int, Pose] = {}
     for k in range(n):
+        before(k)
         grey, depth = world.render(camera, at(k))
         out += it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
         if k % 4 == 0:
@@ -102,3 +116,84 @@ def test_images_do_not_pile_up_while_hovering() -> None:
         it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
         it.step(Track(k, k, TrackState.TRACKING, Pose.identity(), 0, Pose.identity(), 50))
     assert len(it._held) <= MAX_HELD + 1
+
+
+# -- devices that fail in flight -----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> list[Message]:
+    return fly(RADTAN)
+
+
+def twice() -> Devices:
+    """The best device, and once more to take over from itself."""
+    best = next(each for each in compute.known() if each.number == compute.working()[0])
+    return Devices([best, best], lambda _: "")
+
+
+def lose(devices: Devices) -> None:
+    """Whatever is asked of the device in use is refused by its driver from now on."""
+    assert devices.current is not None
+    devices.current.queue = cl.CommandQueue(cl.Context([devices.current.device]))
+
+
+def spoil(devices: Devices) -> None:
+    """The next test of the device in use finds that it computes wrongly."""
+    assert devices.current is not None and devices._taken is not None
+    listed, _ = devices._taken
+    devices._taken = (listed, SelfTest(WrongDevice(devices.current.device)))
+
+
+def points(out: list[Message]) -> list[bytes]:
+    return [m.points_camera.tobytes() for m in out if isinstance(m, PointChunk)]
+
+
+@pytest.mark.parametrize(
+    ("fault", "in_words"),
+    [(lose, "fails while it computes"), (spoil, "self-test failed: only")],
+)
+def test_the_next_device_takes_over_and_nothing_is_missing(
+    fault: Callable[[Devices], None], in_words: str, undisturbed: list[Message],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(takeover, "TEST_EVERY_NS", 1)
+    devices = twice()
+    out = fly(RADTAN, devices=devices, before=lambda k: fault(devices) if k == 18 else None)
+    (warned,) = [m for m in out if isinstance(m, Warned)]
+    assert (warned.what, warned.good) == (TOOK_OVER, False) and 18 <= warned.t_ns < 24
+    assert devices.current is not None
+    assert warned.detail.startswith(f"{devices.current.name}; {devices.current.name}: {in_words}")
+    assert ("may be wrong" in warned.detail) == (fault is spoil)
+    assert points(out) == points(undisturbed) != []
+    assert f"failed: {devices.current.name}: {in_words}" in devices.described
+
+
+@pytest.mark.parametrize("fault", [lose, spoil])
+def test_without_another_device_depth_ends_and_the_stage_goes_on(
+    fault: Callable[[Devices], None], undisturbed: list[Message], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(takeover, "TEST_EVERY_NS", 1)
+    devices = twice()
+    out = fly(RADTAN, devices=devices, before=lambda k: fault(devices) if k in (12, 26) else None)
+    assert [m.what for m in out if isinstance(m, Warned)] == [TOOK_OVER, NONE_LEFT]
+    maps = [m.depth.tobytes() for m in out if isinstance(m, DepthMap)]
+    whole = [m.depth.tobytes() for m in undisturbed if isinstance(m, DepthMap)]
+    assert 0 < len(maps) < len(whole) and maps == whole[: len(maps)]
+    assert devices.described.startswith("none is left; failed: ")
+
+
+def test_a_stage_that_begins_with_a_failed_device_says_so() -> None:
+    """As one does that is started again in flight."""
+    best = next(each for each in compute.known() if each.number == compute.working()[0])
+    out = fly(RADTAN, 12, devices=Devices([best], lambda _: "", ["another: was lost"]))
+    (warned,) = [m for m in out if isinstance(m, Warned)]
+    assert (warned.what, warned.detail) == (TOOK_OVER, f"{best.named}; another: was lost")
+    out = fly(RADTAN, 12, devices=Devices([], lambda _: "", ["another: was lost"]))
+    assert len(out) == 1 and isinstance(out[0], Warned)  # and nothing else
+    warned = out[0]
+    assert (warned.what, warned.detail) == (NONE_LEFT, "another: was lost")
+
+
+def test_the_autopilot_can_be_told_in_one_message() -> None:
+    assert all(len(f"Companion: {what}") <= 50 for what in (TOOK_OVER, NONE_LEFT))

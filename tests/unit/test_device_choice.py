@@ -24,6 +24,7 @@ from companion.device_verdict import (
     processor,
     verdict_path,
 )
+from companion.devices import opencl_lines
 from companion.errors import DeviceError
 from tests.support import compute
 from tests.support.failing_driver import fail, two_devices
@@ -146,15 +147,28 @@ def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
 def test_a_script_can_ask_whether_a_device_works(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    bad, _ = two_devices(monkeypatch, tmp_path)
+    bad, good = two_devices(monkeypatch, tmp_path)
     fail(monkeypatch, tmp_path, "build", bad)
     asked = [sys.executable, "-m", "companion", "devices", "--opencl"]
-    run = subprocess.run(asked, capture_output=True, text=True)
+    run = subprocess.run([*asked, "--json"], capture_output=True, text=True)
     assert run.returncode == 0
-    assert f"{bad.named}: kernels do not build for this processor\n" in run.stdout
-    assert "auto takes" in run.stdout and "BUILD_PROGRAM_FAILURE" not in run.stdout
-    verbose = subprocess.run([*asked, "--verbose"], capture_output=True, text=True)
-    assert "BUILD_PROGRAM_FAILURE" in verbose.stdout
+    document = json.loads(run.stdout)
+    (found,) = [each for each in document["opencl_devices"] if each["name"] == bad.name]
+    assert found["problem"] == "kernels do not build for this processor"
+    assert "BUILD_PROGRAM_FAILURE" in found["detail"]
+    assert document["opencl_auto"]["number"] not in (bad.number, None)
+    assert good.name in {each["name"] for each in document["opencl_devices"]}
+
+
+def test_what_a_compiler_says_is_shown_where_it_is_asked_for() -> None:
+    bad = dataclasses.replace(at("0:0", None), problem="kernels do not build", detail="a\nb\nc")
+    told = [line.strip() for line in opencl_lines([bad, at("1:0", 40)], verbose=False)]
+    assert told[1:] == [
+        "0:0  0:0 (P): kernels do not build", "1:0  1:0 (P): 40 frames/s of 640 x 480",
+        "auto takes 1:0: the only one of 2 that works",
+    ]  # fmt: skip
+    told = [line.strip() for line in opencl_lines([bad], verbose=True)]
+    assert told[2:] == ["1", "a", "b", "c", "auto takes none of them"]
 
 
 @pytest.mark.parametrize(
