@@ -30,6 +30,10 @@ ACCELERATION_UNTOLD, SIGMA_POSITION_UNTOLD = 1.5, 0.002
 """In map units, one of which is about the distance of what is seen, with and without attitude."""
 
 
+VARIANCE_TIED_RAD2 = 1e-4
+"""Of how the map's axes lie to the autopilot's, when one image has told: 0.6 degrees."""
+
+
 class AttitudeHistory:
     """The recent past of the autopilot's attitude, read at any time within it."""
 
@@ -92,19 +96,22 @@ class AttitudeHistory:
 
 
 class MotionFilter:
-    """Kalman filter over position, velocity (map units) and attitude error (rad).
+    """Error-state Kalman filter over position, velocity (map units) and the attitude's error.
 
-    State x = [position (3), velocity (3), attitude error (3)]: constant velocity, and an attitude
-    error that wanders slowly, so that the autopilot's attitude predicts the camera's rotation even
-    where its yaw has drifted. Without attitude the last turn rate is held.
+    Constant velocity, and a rotation `map_from_ned` that wanders slowly, by which the autopilot's
+    attitude predicts the camera's rotation even where its yaw has drifted. That rotation is kept
+    apart; x = [position (3), velocity (3), turn (3)] holds what an update turns it by, a rotation
+    vector (rad) in the map's axes: composed with it, and zero again (Sola, Quaternion kinematics
+    for the error-state Kalman filter, 2017). Without attitude the last turn rate is held.
     """
 
     def __init__(self) -> None:
         self._t_ns: int | None = None
         self._poses: deque[tuple[int, Pose]] = deque(maxlen=2)
         self._filter: KalmanFilter | None = None
+        self._map_from_ned = np.eye(3)
         self._tied = False
-        """Whether the attitude error is known: how the map's axes lie to the autopilot's."""
+        """Whether `map_from_ned` is known: how the map's axes lie to the autopilot's."""
         self._disagreement_rad: deque[float] = deque(maxlen=60)
         self.unit = 1.0
 
@@ -141,7 +148,7 @@ class MotionFilter:
         x = self._filter.x.ravel()
         position = x[:3] + np.clip(dt, 0.0, 1.0) * x[3:6]
         if ned_from_camera is not None and self._tied:
-            return Pose(rotation_from_vector(x[6:9]) @ ned_from_camera, position)
+            return Pose(self._map_from_ned @ ned_from_camera, position)
         (t0, a), (t1, b) = self._poses[0], self._poses[-1]
         if t1 == t0 or dt > 1.0:
             return Pose(b.rotation, position)
@@ -155,8 +162,12 @@ class MotionFilter:
         x = self._filter.x.ravel().copy()
         x[:3] = after.translation + scale * turn @ (x[:3] - before.translation)
         x[3:6] = scale * turn @ x[3:6]
-        x[6:9] = vector_from_rotation(turn @ rotation_from_vector(x[6:9]))
+        self._map_from_ned = nearest_rotation(turn @ self._map_from_ned)
         self._filter.x = x.reshape(-1, 1)
+        change = np.zeros((9, 9))
+        change[:3, :3] = change[3:6, 3:6] = scale * turn
+        change[6:, 6:] = turn
+        self._filter.P = change @ self._filter.P @ change.T
         moved = [
             (t_ns, Pose(
                 turn @ pose.rotation,
@@ -169,19 +180,16 @@ class MotionFilter:
 
     def attitude_corrected(self, old_from_new: Array) -> None:
         """The attitude was given as `old`; what it is now takes this turn before the old error."""
-        if self._filter is not None:
-            x = self._filter.x.ravel().copy()
-            x[6:9] = vector_from_rotation(rotation_from_vector(x[6:9]) @ old_from_new)
-            self._filter.x = x.reshape(-1, 1)
+        self._map_from_ned = nearest_rotation(self._map_from_ned @ old_from_new)
 
     def correct(self, t_ns: int, map_from_camera: Pose, ned_from_camera: Array | None) -> None:
         """Take the pose that the image gave."""
-        error = np.zeros(3)
+        seen = np.eye(3)
         if ned_from_camera is not None:
-            error = vector_from_rotation(map_from_camera.rotation @ ned_from_camera.T)
+            seen = nearest_rotation(map_from_camera.rotation @ ned_from_camera.T)
         if self._filter is None or self._t_ns is None or t_ns - self._t_ns > 2_000_000_000:
-            self._filter = self._fresh(map_from_camera.translation, error)
-            self._tied = ned_from_camera is not None
+            self._filter = self._fresh(map_from_camera.translation)
+            self._map_from_ned, self._tied = seen, ned_from_camera is not None
         else:
             dt = max((t_ns - self._t_ns) * 1e-9, 1e-3)
             f = self._filter
@@ -205,21 +213,23 @@ class MotionFilter:
             if ned_from_camera is not None:
                 h[3:, 6:] = np.eye(3)
                 r[3:, 3:] = np.eye(3) * np.radians(0.3) ** 2
-                previous = rotation_from_vector(f.x.ravel()[6:9])
                 if not self._tied:  # told for the first time in this map
-                    f.x[6:9, 0], previous = error, rotation_from_vector(error)
-                    self._tied = True
-                turn = vector_from_rotation(
-                    map_from_camera.rotation @ ned_from_camera.T @ previous.T
-                )
+                    self._map_from_ned, self._tied = seen, True
+                    f.P[6:], f.P[:, 6:] = 0.0, 0.0
+                    f.P[6:, 6:] = VARIANCE_TIED_RAD2 * np.eye(3)
+                turn = vector_from_rotation(seen @ self._map_from_ned.T)
                 self._disagreement_rad.append(float(np.linalg.norm(turn)))
-                z = np.r_[z, f.x.ravel()[6:9] + turn]
+                z = np.r_[z, turn]
             f.update(z.reshape(-1, 1), R=r, H=h)
+            turned = rotation_from_vector(f.x[6:9, 0])
+            self._map_from_ned = nearest_rotation(turned @ self._map_from_ned)
+            f.x[6:9] = 0.0
         self._t_ns = t_ns
         self._poses.append((t_ns, map_from_camera))
 
-    def _fresh(self, position: Array, error: Array) -> KalmanFilter:
+    def _fresh(self, position: Array) -> KalmanFilter:
         f = KalmanFilter(dim_x=9, dim_z=6)
-        f.x = np.r_[position, np.zeros(3), error].reshape(-1, 1)
-        f.P = np.diag(np.r_[np.full(3, 1e-4), np.full(3, 1.0), np.full(3, 1e-4)] * self.unit**2)
+        f.x = np.r_[position, np.zeros(6)].reshape(-1, 1)
+        lengths = np.r_[np.full(3, 1e-4), np.ones(3)] * self.unit**2
+        f.P = np.diag(np.r_[lengths, np.full(3, VARIANCE_TIED_RAD2)])
         return f
