@@ -44,7 +44,8 @@ class BenchRow:
     `live_ate_m` is of the poses as they were first given, aligned by similarity; `worst_step_m`
     is the largest error of the motion between two consecutive poses of smooth odometry; `nees` is
     the mean square of its position's error since its last reset over the variance that it states,
-    1 where that is true.
+    1 where that is true; `nees_yaw` likewise of its heading against north, which errs slowly, so
+    that a flight is one or a few throws of the dice.
     `longest_gap_s` is the longest time without a pose beyond what could not be seen; `cost_growth`
     is the ratio of the median work per frame in the last fifth of the flight to the second fifth.
     """
@@ -57,6 +58,7 @@ class BenchRow:
     live_ate_m: float | None
     worst_step_m: float | None
     nees: float | None
+    nees_yaw: float | None
     resets: int
     longest_gap_s: float
     coasted: int
@@ -191,6 +193,7 @@ def _row(
         name, fault.name, len(frame_t_ns), round(float(known.mean()), 4) if len(due) else 0.0,
         path_errors(estimate, truth), live_errors.ate_sim3_m if live_errors else None,
         _worst_step(listener.odometry, truth, stage), _nees(listener.odometry, truth, stage),
+        _nees_yaw(listener.odometry, truth, stage),
         max((o.reset_counter for o in listener.odometry), default=0),
         _longest_gap_s(due, known),
         sum(o.state is TrackState.COASTING for o in listener.odometry),
@@ -256,6 +259,19 @@ def _nees(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> fl
         variance = known[j].sigma_position_m ** 2
         ratios.append(float(((way - true) ** 2).sum()) / (3.0 * variance))
     return round(float(np.mean(ratios)), 2) if ratios else None
+
+
+def _nees_yaw(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
+    """Of the heading of every pose against the truth's."""
+    body_from_camera = stage.camera_from_body.inverse()
+    ratios = []
+    for o in odometry:
+        if o.world_from_body is None:
+            continue
+        camera = (o.world_from_body @ body_from_camera).rotation
+        off = camera @ truth.rotations[int(np.abs(truth.t_ns - o.t_ns).argmin())].T
+        ratios.append(float(np.arctan2(off[1, 0], off[0, 0])) ** 2 / o.sigma_yaw_rad**2)
+    return round(float(np.mean(ratios)), 3) if ratios else None
 
 
 def _worst_step(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:

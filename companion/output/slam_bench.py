@@ -20,7 +20,7 @@ COLUMNS = (
     ("ATE sim3", "ate_sim3_m"), ("se3", "ate_se3_m"), ("yaw", "ate_yaw_m"),
     ("live", "live_ate_m"), ("RPE", "rpe_m"), ("scale", "scale_error"),
     ("heading", "heading_error_deg"), ("worst step", "worst_step_m"),
-    ("NEES", "nees"), ("gap s", "longest_gap_s"),
+    ("NEES", "nees"), ("NEES yaw", "nees_yaw"), ("gap s", "longest_gap_s"),
     ("coasted", "coasted"),
     ("resets", "resets"), ("segments", "segments"), ("loops", "loops"), ("keyframes", "keyframes"),
     ("ms", "frame_ms_median"), ("p95", "frame_ms_p95"), ("mapping", "mapping_ms_median"),

@@ -16,6 +16,8 @@ from tests.support.flying_vehicle import FlownByVision, Moment
 from tests.support.http_camera import HttpCamera
 
 HEIGHT_M, SIDE_M = 7.0, 4.0
+HEIGHT_OF = {"ardupilot": "GLOBAL_POSITION_INT", "px4": "LOCAL_POSITION_NED"}
+"""What tells its height before it has a position."""
 CORNERS = ((SIDE_M, 0.0), (SIDE_M, SIDE_M), (0.0, SIDE_M), (0.0, 0.0))
 
 
@@ -63,6 +65,9 @@ def flown(
         daemon.until(
             lambda health: {each["state"] for each in health["sources"]} == {"running"}, 30
         )
+        while drone.rates_hz.get(HEIGHT_OF[request.param], 0.0) < 5:
+            time.sleep(0.05)
+        during(1.0)  # it tells its height on the ground
         begun_s = time.monotonic()
         drone.take_off(HEIGHT_M)
         while not drone.knows_its_place:

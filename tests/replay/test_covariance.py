@@ -22,4 +22,8 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     )
     assert row.nees is not None
     assert 0.1 < row.nees < 1.5
+    # the heading's error hardly changes in a flight: within two standard deviations, and not said
+    # to be so large that an autopilot would leave it aside
+    assert row.nees_yaw is not None
+    assert 0.02 < row.nees_yaw < 4.0
     assert row.resets == 0
