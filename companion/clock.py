@@ -30,6 +30,10 @@ class FlightClock:
         """Now."""
         return time.monotonic_ns() + self.epoch_ns
 
+    def behind_ns(self) -> int:
+        """By how much the system's clock has been set forward since, or the other way round."""
+        return time.time_ns() - self.now_ns()
+
     def from_monotonic_ns(self, monotonic_ns: int) -> int:
         """The time of the flight at a time by CLOCK_MONOTONIC."""
         return monotonic_ns + self.epoch_ns

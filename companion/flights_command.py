@@ -14,6 +14,7 @@ from companion.errors import FlightError, InputError
 from companion.output.trajectory import exact_seconds
 from companion.progress import Progress
 from drivers.recording.exporting import export
+from drivers.recording.flight_date import named_by_date, read_date
 from drivers.recording.flight_summary import FlightSummary, summarise
 from drivers.recording.flights_folder import (
     KEEP,
@@ -49,13 +50,26 @@ def recordings_meant(given: Sequence[str], folder: Path) -> list[Path]:
     return [found_recording(each, folder) for each in given]
 
 
+def correct_names(folder: Path) -> None:
+    """Name flights by their dates that a daemon had no time for; those recorded now stay."""
+    for flight in flights_in(folder):
+        named_by_date(flight.path)
+
+
+def correction_ns(path: Path) -> int:
+    """What is to be added to the times of a recording for the clock's having been wrong."""
+    flight = path.parent.parent if path.parent.name.startswith("part-") else path.parent
+    date = read_date(flight)
+    return 0 if date is None else round(date.correction_s * 1e9)
+
+
 def list_flights(folder: Path, as_json: bool) -> str:
     """A line for each recording, the oldest first."""
     rows = [
         {
             "path": os.fspath(path),
             "flight": flight.path.name + ("" if path.parent == flight.path else f"/{part}"),
-            "start": _when(summary.start_ns) if summary.start_ns else None,
+            "start": _when(summary.start_ns + correction_ns(path)) if summary.start_ns else None,
             "duration_s": round(summary.duration_s, 1),
             "pictures": summary.n_pictures,
             "mb": round(flight.n_bytes / MB, 1),
@@ -67,10 +81,10 @@ def list_flights(folder: Path, as_json: bool) -> str:
         return json.dumps(rows, indent=2)
     if not rows:
         return f"{folder}: no recorded flight"
-    lines = [f"{'flight':<26}{'minutes':>8}{'pictures':>10}{'MB':>9}  state"]
+    lines = [f"{'flight':<34}{'minutes':>8}{'pictures':>10}{'MB':>9}  state"]
     for row in rows:
         lines.append(
-            f"{row['flight']!s:<26}{float(str(row['duration_s'])) / 60:>8.1f}{row['pictures']:>10}"
+            f"{row['flight']!s:<34}{float(str(row['duration_s'])) / 60:>8.1f}{row['pictures']:>10}"
             f"{row['mb']:>9}  {row['state']}"
         )
     free = free_bytes(folder) / MB
@@ -79,14 +93,16 @@ def list_flights(folder: Path, as_json: bool) -> str:
 
 def show_flight(path: Path, as_json: bool) -> str:
     """All that a recording says of itself."""
-    summary = summarise(path)
+    summary, correction = summarise(path), correction_ns(path)
     if as_json:
-        return json.dumps(_document(summary), indent=2)
+        return json.dumps(_document(summary, correction), indent=2)
     lines = [
         f"{path}: {summary.state}",
-        f"  from {_when(summary.start_ns)}, {summary.duration_s:.1f} s, "
+        f"  from {_when(summary.start_ns + correction)}, {summary.duration_s:.1f} s, "
         f"{summary.n_bytes / MB:.1f} MB",
     ]
+    if correction:
+        lines.append(f"  the clock was not set: its times are {correction * 1e-9:+.0f} s off")
     if summary.n_lost_bytes:
         lines.append(f"  {summary.n_lost_bytes} bytes cannot be read")
     lines += [
@@ -213,10 +229,11 @@ def _summaries(
             yield flight, path, path.parent.name, summary
 
 
-def _document(summary: FlightSummary) -> dict[str, Any]:
+def _document(summary: FlightSummary, correction: int) -> dict[str, Any]:
     return {
         "path": os.fspath(summary.path), "state": summary.state, "bytes": summary.n_bytes,
-        "start_unix_s": exact_seconds(summary.start_ns), "duration_s": summary.duration_s,
+        "start_unix_s": exact_seconds(summary.start_ns + correction),
+        "clock_correction_s": correction * 1e-9, "duration_s": summary.duration_s,
         "pictures": summary.n_pictures, "lost_bytes": summary.n_lost_bytes,
         "topics": summary.counts, "metadata": summary.metadata,
         "attachments": sorted(summary.attachments),
@@ -234,13 +251,10 @@ def _enough(going: Sequence[FlightPlace], needed: float) -> list[FlightPlace]:
 
 
 def _age_s(flight: FlightPlace, now_ns: int) -> float:
-    """Since the time in its name."""
-    stamp = flight.path.name[: len("2026-01-01T00-00-00Z")]
-    try:
-        began = datetime.strptime(stamp, "%Y-%m-%dT%H-%M-%SZ").replace(tzinfo=timezone.utc)
-    except ValueError:
+    """Since its date, or the latest of a flight before it; 0 where no clock was ever right."""
+    if flight.not_before_s is None:
         return 0.0
-    return now_ns * 1e-9 - began.timestamp()
+    return now_ns * 1e-9 - flight.not_before_s
 
 
 def _when(t_ns: int) -> str:

@@ -46,6 +46,8 @@ def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
         print(text)
         return 0 if well else 1
     elif what == "repair":
+        if not arguments.flights_named:
+            flights.correct_names(folder)
         paths = flights.recordings_meant(arguments.flights_named, folder)
         return _repair(paths, arguments.gently, megabytes)
     else:

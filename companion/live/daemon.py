@@ -22,6 +22,7 @@ from companion.live.armed_settings import FILE, NOT_KEPT, read_settings
 from companion.live.arming import Arming
 from companion.live.component_state import POWEROFF, component_state
 from companion.live.flight import Listener, LiveFlight, makes_depth
+from companion.live.flight_dates import FlightDates
 from companion.live.flight_facts import facts_of
 from companion.live.flights import Flights
 from companion.live.ground_control import GroundControl
@@ -58,10 +59,12 @@ from companion.pilot_messages import (
     of_warning,
 )
 from companion.stages.protocol import Snapshot
+from drivers.autopilot_date import AutopilotDate
 from drivers.autopilot_link import AutopilotLink
 from drivers.calibration import live_camera
 from drivers.camera_feed import CameraFeed
 from drivers.camera_source import camera_source
+from drivers.clock_is_set import clock_is_set
 from drivers.link_port import link_port
 from drivers.metrics import Metrics
 from drivers.origin_keeper import OriginKeeper
@@ -129,9 +132,13 @@ class Daemon:
                 config.feedback, self._link, clock, counter_path(config.daemon.flights),
                 self._on_warned,
             )  # fmt: skip
+        date = AutopilotDate(self._link) if self._link is not None else None
+        self._dates = FlightDates(
+            clock, lambda: date.ahead_ns if date is not None else None, clock_is_set
+        )
         self._flights = Flights(
             clock, self._journal, self._listener,
-            lambda flight: facts_of(flight, self._config, self._link),
+            lambda flight: facts_of(flight, self._config, self._link), self._dates,
         )  # fmt: skip
         self._watch = HealthWatch(
             config, clock, self._journal, self._feed, self._link, self._sender, self._flights,
@@ -374,6 +381,8 @@ class Daemon:
                 self._service.status(line)
             if self._feed.fault is not None:
                 self._give_up(str(self._feed.fault), BAD_INPUT)
+            if self._dates.step():
+                self._loop.run_in_executor(None, self._dates.write)
             if self._arming.step(monotonic_s()):
                 self._let_go()
             gone = self._missing.step(health, now_s, self._armed)

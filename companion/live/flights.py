@@ -5,17 +5,19 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable
-from datetime import datetime, timezone
 from pathlib import Path
 
 from companion.camera import Camera
 from companion.clock import FlightClock
 from companion.config import Config
 from companion.live.flight import Listener, LiveFlight
-from companion.live.journal import Journal
+from companion.live.flight_dates import FlightDates
+from companion.live.journal import WARNING, Journal
+from companion.live.newest_file import NewestFile
 from companion.messages import Frame, Telemetry, Warned
 from companion.output.flight_result import RunFacts
 from drivers.recording.content import HealthNote, LinkBytes
+from drivers.recording.flights_folder import COUNTER, flight_name, next_number
 
 
 class Flights:
@@ -27,7 +29,11 @@ class Flights:
         journal: Journal,
         listener: Callable[[LiveFlight], Listener],
         facts: Callable[[LiveFlight], RunFacts],
+        dates: FlightDates,
     ) -> None:
+        self._dates = dates
+        self._counter: NewestFile | None = None
+        self._last_number = 0
         self._clock, self._journal, self._listener, self._facts = clock, journal, listener, facts
         self.current: LiveFlight | None = None
         self._spare: LiveFlight | None = None
@@ -54,7 +60,7 @@ class Flights:
         self.prepare(config, camera)
         flight, self._spare = self._spare, None
         assert flight is not None and self.current is None
-        folder = _free(Path(config.daemon.flights), self._clock.now_ns())
+        folder = self._named(Path(config.daemon.flights))
         flight.begin(folder)
         self.current = flight
         self._journal.say(f"flight {folder.name} begins; its results go to {folder}")
@@ -108,12 +114,22 @@ class Flights:
 
     def _finish(self, flight: LiveFlight) -> None:
         flight.finish(self._facts)
+        folder = self._dates.ended(flight.folder) if flight.folder is not None else None
         self._ending.pop(flight, None)
-        self._journal.say(f"flight over: {flight.folder} ({flight.n_frames} frames)")
+        self._journal.say(f"flight over: {folder} ({flight.n_frames} frames)")
 
+    def _named(self, parent: Path) -> Path:
+        """The next flight's folder, with a number that none had before, and the time, UTC."""
+        if self._counter is None or self._counter.path.parent != parent:
+            if self._counter is not None:
+                self._counter.close()
+            self._counter, self._last_number = NewestFile(parent / COUNTER, self._not_counted), 0
+        self._last_number = max(next_number(parent), self._last_number + 1)
+        self._counter.put(b"%d\n" % self._last_number)
+        t_ns = self._clock.now_ns()
+        folder = parent / flight_name(self._last_number, self._dates.unix_s(t_ns))
+        self._dates.begun(folder, t_ns)
+        return folder
 
-def _free(parent: Path, t_ns: int) -> Path:
-    """A folder named for the time, UTC, that does not exist yet."""
-    when = datetime.fromtimestamp(t_ns * 1e-9, tz=timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
-    names = [when, *(f"{when}-{number}" for number in range(2, 1000))]
-    return next(parent / name for name in names if not (parent / name).exists())
+    def _not_counted(self, why: str) -> None:
+        self._journal.say(f"warning: the number of the flight is not kept: {why}", WARNING)

@@ -1,11 +1,16 @@
-"""The folder of all flights: which there are, how old, and which may go to make room."""
+"""The folder of all flights: which there are, in what order, and which may go to make room.
+
+Flights are numbered, and the number is what orders them: a computer without a battery clock names
+them by whatever time it has. Those without a number are older than numbered ones.
+"""
 
 from __future__ import annotations
 
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,8 +20,13 @@ from drivers.recording.growing_file import is_growing
 RECORDING, TLOG = "flight.mcap", "flight.tlog"
 KEEP = "keep"
 """A file of this name in a flight's folder keeps it from being deleted."""
-STAMPED = re.compile(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ(-\d+)?")
+COUNTER = ".last-number"
+"""Has the number of the newest flight, which may have been deleted or taken elsewhere since."""
+STAMPED = re.compile(r"(?:(\d{5,})-)?(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-\d+)?")
 """What the daemon calls a flight; nothing else is ever deleted."""
+STAMP = "%Y-%m-%dT%H-%M-%SZ"
+PROGRAM_UNIX_S = 1767225600.0
+"""2026-01-01: no flight was recorded before; an earlier date is of a clock that was not set."""
 
 
 class FlightPlace(NamedTuple):
@@ -27,12 +37,15 @@ class FlightPlace(NamedTuple):
     kept: bool
     growing: bool
     """Whether it is still being recorded."""
+    not_before_s: float | None = None
+    """Unix time before which it cannot have begun, by its name and those before it in order; None
+    where no clock was ever right."""
 
 
 def flights_in(folder: Path) -> list[FlightPlace]:
     """All flights, the oldest first; FlightError where the folder cannot be read."""
     try:
-        names = sorted(each.name for each in os.scandir(folder) if each.is_dir())
+        names = in_order(each.name for each in os.scandir(folder) if each.is_dir())
     except FileNotFoundError as error:
         raise FlightError(f"{folder}: not there; --flights names a folder of flights") from error
     except PermissionError as error:
@@ -40,7 +53,55 @@ def flights_in(folder: Path) -> list[FlightPlace]:
         raise FlightError(f"{folder}: may not be read by this user; {hint}") from error
     except OSError as error:
         raise FlightError(f"{folder}: cannot be read: {error.strerror}") from error
-    return [_place(folder / name) for name in names if STAMPED.fullmatch(name)]
+    out: list[FlightPlace] = []
+    newest_s: float | None = None
+    for name in names:
+        newest_s = max(filter(None, (newest_s, began_unix_s(name))), default=None)
+        out.append(_place(folder / name, newest_s))
+    return out
+
+
+def flight_name(number: int, unix_s: float) -> str:
+    """What a flight is called."""
+    when = datetime.fromtimestamp(unix_s, tz=timezone.utc).strftime(STAMP)
+    return f"{number:05d}-{when}"
+
+
+def number_of(name: str) -> int | None:
+    """The number in a flight's name; None in one of an older version, or of something else."""
+    found = STAMPED.fullmatch(name)
+    return int(found[1]) if found is not None and found[1] else None
+
+
+def began_unix_s(name: str) -> float | None:
+    """When a flight began, by its name; None where the clock was not set then."""
+    found = STAMPED.fullmatch(name)
+    if found is None:
+        return None
+    try:
+        began_s = datetime.strptime(found[2], STAMP).replace(tzinfo=timezone.utc).timestamp()
+    except ValueError:
+        return None
+    return began_s if began_s >= PROGRAM_UNIX_S else None
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Names of flights, the oldest first; what else there is is left out."""
+    return sorted(
+        (name for name in names if STAMPED.fullmatch(name)),
+        key=lambda name: (number_of(name) or 0, name),
+    )
+
+
+def next_number(folder: Path) -> int:
+    """A number higher than that of any flight that there is or was."""
+    numbers = [0]
+    try:
+        numbers += [number_of(each.name) or 0 for each in os.scandir(folder)]
+        numbers.append(int((folder / COUNTER).read_bytes()[:20]))
+    except (OSError, ValueError):
+        pass  # lost or damaged, or there was no flight yet: those that there are tell
+    return max(numbers) + 1
 
 
 def recordings_in(flight: Path) -> list[Path]:
@@ -65,7 +126,12 @@ def delete(flight: FlightPlace) -> None:
     shutil.rmtree(flight.path)
 
 
-def _place(path: Path) -> FlightPlace:
+def is_recorded_now(flight: Path) -> bool:
+    """Whether somebody still writes a recording in a flight's folder."""
+    return any(map(_is_growing, recordings_in(flight)))
+
+
+def _place(path: Path, not_before_s: float | None) -> FlightPlace:
     n_bytes = 0
     for folder, _, names in os.walk(path):
         for name in names:
@@ -73,8 +139,9 @@ def _place(path: Path) -> FlightPlace:
                 n_bytes += os.stat(os.path.join(folder, name)).st_blocks * 512
             except OSError:
                 continue  # gone meanwhile
-    growing = any(map(_is_growing, recordings_in(path)))
-    return FlightPlace(path, n_bytes, (path / KEEP).exists(), growing)
+    return FlightPlace(
+        path, n_bytes, (path / KEEP).exists(), is_recorded_now(path), not_before_s
+    )
 
 
 def _is_growing(path: Path) -> bool:

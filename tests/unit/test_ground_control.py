@@ -23,6 +23,7 @@ from companion.live.component_state import (
     STANDBY,
     component_state,
 )
+from companion.live.flight_dates import FlightDates
 from companion.live.flight_parameters import PARAMETERS, number_of, value_of
 from companion.live.flights import Flights
 from companion.live.ground_control import CHANGES_AT_ONCE, TEXTS_AT_ONCE, GroundControl
@@ -59,7 +60,8 @@ def control_of(config: Config) -> tuple[GroundControl, Controlled, MemoryPort]:
     def never(*_: Any) -> Any:
         raise AssertionError
 
-    flights = Flights(clock, journal, never, never)
+    dates = FlightDates(clock, lambda: None, lambda: True)
+    flights = Flights(clock, journal, never, never, dates)
     return (
         GroundControl(daemon, link, clock, journal, flights, {}, {}, lambda _: None), daemon, port,
     )  # fmt: skip

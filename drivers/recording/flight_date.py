@@ -1,0 +1,75 @@
+"""When a flight really was, where the computer's clock was wrong at its beginning.
+
+`date.json` in the flight's folder has what is to be added to all times of its recording, which stay
+as they are. The folder is named by it when nobody writes there any more; one step that a power cut
+leaves done or not done, and that is made up for later.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.recording.flights_folder import (
+    STAMPED,
+    flight_name,
+    is_recorded_now,
+    number_of,
+)
+
+FILE = "date.json"
+
+
+@dataclass(frozen=True, slots=True)
+class FlightDate:
+    """When a flight began, Unix time, and what is to be added to the times in its recording."""
+
+    began_unix_s: float
+    correction_s: float
+    by: str
+    """Who told it."""
+
+
+def write_date(flight: Path, date: FlightDate) -> None:
+    """Put it into a flight's folder, whole or not at all; OSError where that cannot be."""
+    document = {
+        "began_unix_s": date.began_unix_s, "correction_s": date.correction_s, "by": date.by,
+    }  # fmt: skip
+    part = flight / f".{FILE}.part"
+    with part.open("wb") as file:
+        file.write(json.dumps(document).encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, flight / FILE)
+
+
+def read_date(flight: Path) -> FlightDate | None:
+    """What there is of it; None where the computer's clock was right, as far as is known."""
+    try:
+        document = json.loads((flight / FILE).read_bytes())
+        return FlightDate(
+            float(document["began_unix_s"]), float(document["correction_s"]), str(document["by"])
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def named_by_date(flight: Path) -> Path:
+    """Name a flight's folder for when it really was; where it lies now.
+
+    Nothing is done while it is recorded, nor to a folder that has no number, by which flights are
+    in order whatever their names say.
+    """
+    date, number = read_date(flight), number_of(flight.name)
+    if date is None or number is None or not STAMPED.fullmatch(flight.name):
+        return flight
+    named = flight.with_name(flight_name(number, date.began_unix_s))
+    if named == flight or named.exists() or is_recorded_now(flight):
+        return flight
+    try:
+        os.rename(flight, named)
+    except OSError:
+        return flight
+    return named
