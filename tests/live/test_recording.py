@@ -50,7 +50,7 @@ def kill(victims: list[psutil.Process]) -> None:
 
 
 def recorded(folder: Path) -> RecordedFlight:
-    (flight,) = (folder / "flights").iterdir()
+    (flight,) = (folder / "flights").glob("[!.]*")
     opened = open_flight(flight, CameraConfig())
     assert isinstance(opened, RecordedFlight)
     return opened
@@ -78,7 +78,7 @@ def test_killed_at_once_with_all_that_it_started_it_loses_less_than_a_second(
         finally:
             daemon.__exit__(None, None, None)
         allowed_s = strain.allowed_s(OLDER_S, before_ns - round(OLDER_S * 1e9))
-    (flight,) = (tmp_path / "flights").iterdir()
+    (flight,) = (tmp_path / "flights").glob("[!.]*")
     with McapFile(flight / "flight.mcap") as file:
         assert summary(file) is None
     opened = recorded(tmp_path)
@@ -99,7 +99,7 @@ def test_without_its_daemon_the_recording_ends_whole(tmp_path: Path) -> None:
         assert not psutil.wait_procs(children, 20)[1]
     finally:
         daemon.__exit__(None, None, None)
-    (flight,) = (tmp_path / "flights").iterdir()
+    (flight,) = (tmp_path / "flights").glob("[!.]*")
     with McapFile(flight / "flight.mcap") as file:
         assert summary(file) is not None
     assert recorded(tmp_path).warnings == ()
@@ -115,7 +115,7 @@ def test_two_replays_of_a_live_flight_give_the_same_bytes(tmp_path: Path) -> Non
             daemon.until(lambda health: health["tracker"] == "tracking", 60)
             time.sleep(8)
             daemon.stop()
-    (folder,) = (tmp_path / "flights").iterdir()
+    (folder,) = (tmp_path / "flights").glob("[!.]*")
     opened = recorded(tmp_path)
     sources = {s.source for s in opened.telemetry().samples if isinstance(s, PositionSample)}
     assert opened.n_frames > 60 and len(sources) == 3
@@ -137,7 +137,7 @@ def test_a_recorder_that_dies_goes_on_in_another_part(tmp_path: Path) -> None:
         daemon.stop()
     finally:
         daemon.__exit__(None, None, None)
-    (folder,) = (tmp_path / "flights").iterdir()
+    (folder,) = (tmp_path / "flights").glob("[!.]*")
     parts = [open_flight(p, CameraConfig()) for p in recordings_in(folder)]
     assert [p.path.parent.name for p in parts] == [folder.name, "part-2"]
     assert parts[0].stop_ns < parts[1].start_ns and min(p.n_frames for p in parts) > 5
