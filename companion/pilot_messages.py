@@ -58,6 +58,10 @@ LIMITS_WAIT = PilotMessage(NOTICE, "looser limits wait for disarming")
 SETTINGS_NOT_SAVED = PilotMessage(WARNING, "disk error: settings not saved")
 TRACKING_FAILED = PilotMessage(WARNING, "visual tracking failed: restarting")
 ATTITUDE_MISMATCH = PilotMessage(WARNING, "attitude mismatch: no vision position")
+ATTITUDE_USED = PilotMessage(INFO, "attitude matches again")
+MAP_TILTED = PilotMessage(WARNING, "map tilted: restarting")
+MAP_RESUMED = PilotMessage(NOTICE, "map resumed after restart")
+MAP_NOT_RESUMED = PilotMessage(NOTICE, "old map not recognised: new map")
 MOUNT_CORRECTED = PilotMessage(NOTICE, "camera mount angle corrected")
 
 # -- camera and autopilot -----------------------------------------------------------------
@@ -91,6 +95,8 @@ CLIENT_ERRORS = PilotMessage(NOTICE, "ground link client sends errors")
 # -- map and recording -----------------------------------------------------------------
 
 PART_RESTARTED = PilotMessage(NOTICE, "{part} restarted", {"part": 16})
+MAP_OTHER_DEVICE = PilotMessage(NOTICE, "dense map on another processor")
+MAP_NO_DEVICE = PilotMessage(NOTICE, "dense map off: no working processor")
 RESULTS_INCOMPLETE = PilotMessage(NOTICE, "flight results incomplete")
 DISK_FULL = PilotMessage(WARNING, "disk full: recording stopped")
 RECORDING_FAILED = PilotMessage(WARNING, "recording failed")
@@ -146,6 +152,8 @@ REASONS: Mapping[str, str] = {
     "no autopilot attitude": "no attitude",
     "no autopilot height": "no height",
     "position reset": "position reset",
+    "no autopilot clock": "no clock",
+    "disk is slow": "disk slow",
     "autopilot rebooted": "autopilot reboot",
 }
 """Why no pose is sent, as `companion.feedback` and `companion.live.pose_sender` have it."""
@@ -159,8 +167,17 @@ PARTS: Mapping[str, str] = {
 OF_WARNING: Mapping[str, PilotMessage] = {
     "localisation has died: the flight ends, and another begins": TRACKING_FAILED,
     "the autopilot's attitude is not the camera's and is not used": ATTITUDE_MISMATCH,
+    "camera does not turn with the body: attitude not used, no vision position": ATTITUDE_MISMATCH,
+    "camera mount disagrees with the autopilot's attitude: no vision position": ATTITUDE_MISMATCH,
+    "camera turns with the body again: attitude used": ATTITUDE_USED,
+    "map tilted against the autopilot's attitude: begun anew": MAP_TILTED,
+    "map resumed after restart": MAP_RESUMED,
+    "old map not recognised: new map": MAP_NOT_RESUMED,
     "camera and autopilot were found to disagree, corrected": MOUNT_CORRECTED,
     "settings cannot be kept": SETTINGS_NOT_SAVED,
+    "reset counter is not kept": SETTINGS_NOT_SAVED,
+    "dense map on another OpenCL device": MAP_OTHER_DEVICE,
+    "dense map off: no OpenCL device": MAP_NO_DEVICE,
     "the camera is not there": CAMERA_NOT_FOUND,
     "the camera has gone": CAMERA_LOST,
     "the camera is back": CAMERA_RECOVERED,

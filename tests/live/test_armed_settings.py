@@ -34,8 +34,8 @@ def begun_again(flying: Flying) -> Iterator[Daemon]:
 def test_what_the_ground_has_switched_off_stays_off(tmp_path: Path) -> None:
     port = free_port(socket.SOCK_STREAM)
     with Flying(tmp_path, f'router.clients=["tcpin:127.0.0.1:{port}"]') as flying:
-        flying.until_source("camera", "running")
-        flying.until_source("autopilot", "running")
+        flying.until_source("camera", "running", timeout_s=60)
+        flying.until_source("autopilot", "running", timeout_s=60)
         flying.autopilot.arm()
         flying.daemon.until(lambda health: health["flight"], 30, "armed")
         with GroundStation(port) as ground:
@@ -51,7 +51,7 @@ def test_what_the_ground_has_switched_off_stays_off(tmp_path: Path) -> None:
             flying.autopilot.unplug()
             flying.until_source("autopilot", "silent")
             flying.autopilot.plug()
-            flying.until_source("autopilot", "running")
+            flying.until_source("autopilot", "running", timeout_s=60)
             rebooted_ns = time.monotonic_ns()
             flying.autopilot.reboot()  # in the air, which is no disarming
             daemon.line("autopilot rebooted", 10, rebooted_ns)
@@ -77,8 +77,8 @@ def test_limits_wait_for_disarming(tmp_path: Path) -> None:
     with Flying(tmp_path, *settings, start=False) as flying:
         flying.daemon._command += ["--config", str(config)]
         flying.start()
-        flying.until_source("camera", "running")
-        flying.until_source("autopilot", "running")
+        flying.until_source("camera", "running", timeout_s=60)
+        flying.until_source("autopilot", "running", timeout_s=60)
         flying.autopilot.arm()
         flying.daemon.until(lambda health: health["flight"], 30, "armed")
         config.write_text("[feedback]\nmin_quality = 5\nmax_sigma_m = 0.5\nmax_jump_m = 9.0\n")

