@@ -5,6 +5,7 @@ Mount and clock are corrected in flight; an attitude that is not the camera's (a
 
 from __future__ import annotations
 
+from collections.abc import Set
 from typing import NamedTuple
 
 import numpy as np
@@ -75,6 +76,10 @@ class CameraAttitude:
             return None
         attitude, rates = kept
         return attitude @ rotation_from_vector(rates * (self._late_ns * 1e-9)) @ self._mount
+
+    def let_go(self, living: Set[int]) -> None:
+        """Forget what was kept of keyframes that are no more among these."""
+        self._kept = {key: kept for key, kept in self._kept.items() if key in living}
 
     def compare(self, t_ns: int, map_from_camera: Array) -> None:
         """Take the rotation (3, 3) of a tracked frame."""

@@ -87,6 +87,11 @@ class Georeferencer:
         elif isinstance(sample, RangeSample):
             self._range.add(sample.t_ns, np.array([sample.distance_m]))
 
+    def let_go(self, before_ns: int, keyframes_ns: Array) -> None:
+        """Forget what was said before a time, save at the times of keyframes (N,), sorted."""
+        for each in (*self._positions.values(), *self._travel.values(), self._height, self._range):
+            each.let_go(before_ns, keyframes_ns)
+
     def _integrate(self, series: SampleSeries, t_ns: int, velocity: Array) -> None:
         # rows: velocity, and the way travelled so far by it; a GPS may not tell the vertical part
         if series.newest is None:

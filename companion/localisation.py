@@ -42,6 +42,9 @@ MIN_COAST_NS = 150_000_000
 MAX_COAST_NS, MAX_COAST_UNTOLD_NS = 4_000_000_000, 400_000_000
 """A pose is carried on for so long where nothing is recognised, with and without attitude."""
 SIGMA_COASTING_RAD_S = np.radians(0.2)
+REMEMBERED_NS = 600_000_000_000
+"""What telemetry told longer ago is only asked for at the times of keyframes."""
+LET_GO_EVERY_NS = 60_000_000_000
 
 
 class LocalisationStage:
@@ -68,6 +71,7 @@ class LocalisationStage:
         self._last: Track | None = None
         """The last frame with a pose, in the newest segment's own frame."""
         self._t_ns = 0
+        self._let_go_ns: int | None = None
         self._tracker.atlas.allowed = self._allowed
         self._tracker.atlas.ways_of = self._places.ways_of
 
@@ -164,6 +168,18 @@ class LocalisationStage:
         if update is not None:
             yield update
         yield from self._judge_attitude(frame.t_ns)
+        self._let_go(frame.t_ns)
+
+    def _let_go(self, t_ns: int) -> None:
+        """Now and then forget telemetry that nothing will ask for: a flight may last for hours."""
+        if self._let_go_ns is not None and t_ns < self._let_go_ns + LET_GO_EVERY_NS:
+            return
+        self._let_go_ns = t_ns
+        with self._tracker.turn.tracking():
+            living = {k.keyframe_id: k.t_ns for s in self._segments() for k in s.keyframes.values()}
+        self._attitude.let_go(living.keys())
+        when_ns: Array = np.array(sorted(living.values()))
+        self._georeferencer.let_go(t_ns - REMEMBERED_NS, when_ns)
 
     def _map_update(self) -> MapUpdate:
         with self._times("georeference"), self._tracker.turn.tracking():

@@ -41,6 +41,23 @@ class SampleSeries:
         self._times[self._n], self._values[self._n] = t_ns, value
         self._n += 1
 
+    def let_go(self, before_ns: int, but_at: Array) -> None:
+        """Drop samples from before a time, save those next to the times `but_at` (N,), sorted.
+
+        At these times, and after `before_ns`, all reads as before.
+        """
+        times = self._times[: self._n]
+        old = int(np.searchsorted(times, before_ns)) - 1  # what follows may lie between two
+        if old <= 0:
+            return
+        keep = np.zeros(self._n, bool)
+        keep[old:] = True
+        i = np.clip(np.searchsorted(times, but_at), 1, max(self._n - 1, 1))
+        keep[i] = keep[i - 1] = True
+        n = int(np.count_nonzero(keep))
+        self._times[:n], self._values[:n] = times[keep], self._values[: self._n][keep]
+        self._n = n
+
     def at(self, t_ns: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Interpolated values, and where samples on both sides are near enough."""
         times, values = self._times[: self._n], self._values[: self._n]

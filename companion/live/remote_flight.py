@@ -55,7 +55,7 @@ class RemoteFlight:
         self._mirror = MapMirror()
         self._update: MapUpdate | None = None
         self._numbers: OrderedDict[int, tuple[str, int]] = OrderedDict()
-        self._recording = FileViewer(config.viewer, camera, _free(folder))
+        self._recording = FileViewer(config.viewer, camera, _free(folder), indexed=False)
         self._recording.__enter__()
         self._viewing: Viewing | None = None
         if config.stream.listen or config.daemon.viewer != "none":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,13 +27,13 @@ from companion.messages import (
     PositionSource,
     Reunited,
     Track,
-    TrackState,
     Warned,
 )
 from companion.output.chunk_store import ChunkStore
 from companion.output.cloud import Cloud, no_cloud, placed
 from companion.output.depth_pictures import DepthPicture, DepthPictures
 from companion.output.gathered_cloud import gathered
+from companion.output.track_store import TrackStore
 from companion.stretch import stretch_of_points
 
 POSITION_STEP_NS = 100_000_000
@@ -96,11 +97,12 @@ class FlightResult:
         self.warnings: dict[str, WarningCount] = {}
         self.update: MapUpdate | None = None
         self.reunions: list[Reunited] = []
-        self._tracks: dict[int, Track] = {}
+        self._tracks = TrackStore()
         self._chunks = ChunkStore(folder, memory_mb)
         self._median_depths: dict[int, float] = {}
         self._kernel_times = StageTimes()
-        self._positions: dict[PositionSource, list[tuple[int, Array]]] = {}
+        self._positions: dict[PositionSource, tuple[array[int], array[float]]] = {}
+        """times, and the coordinates of one place after the other"""
         self._pictures = DepthPictures()
 
     def take(self, message: Message) -> None:
@@ -111,9 +113,7 @@ class FlightResult:
                 self.first_t_ns = message.t_ns
             self.last_t_ns = message.t_ns
         elif isinstance(message, Track):
-            held = self._tracks.get(message.seq)
-            if held is None or message.state is TrackState.TRACKING or not _tracking(held):
-                self._tracks[message.seq] = replace(message, keypoints_px=None)
+            self._tracks.put(message)
         elif isinstance(message, MapUpdate):
             self.update = message
         elif isinstance(message, Reunited):
@@ -125,9 +125,10 @@ class FlightResult:
             for name, ms in message.kernel_ms.items():
                 self._kernel_times.add(name, ms)
         elif isinstance(message, PositionSample):
-            path = self._positions.setdefault(message.source, [])
-            if not path or message.t_ns - path[-1][0] >= POSITION_STEP_NS:
-                path.append((message.t_ns, message.position_ned_m))
+            times, places = self._positions.setdefault(message.source, (array("q"), array("d")))
+            if not times or message.t_ns - times[-1] >= POSITION_STEP_NS:
+                times.append(message.t_ns)
+                places.extend(message.position_ned_m.tolist())
         elif isinstance(message, Warned) and not message.good:
             self._warn(message)
 
@@ -182,13 +183,13 @@ class FlightResult:
 
     @property
     def tracks(self) -> list[Track]:
-        """One track for each frame, without key points, in order of frames."""
-        return [self._tracks[seq] for seq in sorted(self._tracks)]
+        """One track for each frame, in order of frames; of its poses the one by its keyframe."""
+        return list(self._tracks)
 
     def poses(self) -> list[WorldPose]:
         """All frames whose place is known, in order, by the map as it ended."""
         out = []
-        for track in self.tracks:
+        for track in self._tracks:
             if track.keyframe_id is None or track.keyframe_from_camera is None:
                 continue
             place = self.update.place_of(track.keyframe_id) if self.update is not None else None
@@ -251,9 +252,9 @@ class FlightResult:
     def autopilot_path(self) -> tuple[PositionSource, Array, Array] | None:
         """The autopilot's own path from its best source: t_ns (N,), NED metres (N, 3)."""
         for source in PositionSource:
-            path = self._positions.get(source, [])
-            if len(path) >= 2:
-                return source, np.array([t for t, _ in path]), np.stack([p for _, p in path])
+            times, places = self._positions.get(source, (array("q"), array("d")))
+            if len(times) >= 2:
+                return source, np.array(times), np.array(places).reshape(-1, 3)
         return None
 
     def depth_pictures(self, n: int) -> list[DepthPicture]:
@@ -269,7 +270,3 @@ def _stretch(chunk: PointChunk, update: MapUpdate) -> float:
     in_camera = place.inverse().apply(update.points_map)
     ratio = stretch_of_points(chunk.points_camera.astype(np.float64), in_camera)
     return update.stretch_of(chunk.keyframe_id, chunk.spans) if ratio is None else ratio
-
-
-def _tracking(track: Track) -> bool:
-    return track.state is TrackState.TRACKING

@@ -27,7 +27,9 @@ class _Recorder(Work):
         self._result = FlightResult(self._folder, setup.config.cloud.memory_mb)
         self._snapshots = CloudSnapshots(self._folder, self._result, self._voxel_m)
         self._recording = self._open.enter_context(
-            FileViewer(setup.config.viewer, setup.camera, self._folder / "flight.rrd")
+            FileViewer(
+                setup.config.viewer, setup.camera, self._folder / "flight.rrd", indexed=False
+            )
         )
 
     def step(self, message: Any) -> Iterable[Message | Snapshot]:

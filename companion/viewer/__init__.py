@@ -1,5 +1,10 @@
 """What a person looks at: a flight becomes a Rerun recording. The only room that knows Rerun."""
 
+import os
+
+# before rerun loads: that recordings have no list of their chunks is meant, see rrd_files
+os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
+
 from companion.stream.story import Watched
 from companion.viewer.colours import Colours
 from companion.viewer.file_viewer import FileViewer

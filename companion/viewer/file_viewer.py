@@ -24,13 +24,15 @@ class FileViewer:
     """Everything, into a .rrd file: the caller waits when the file cannot keep up.
 
     No more than `rrd_mb` of it is kept, the newest, in several files. What goes wrong in the thread
-    is raised when the file is closed, and not before.
+    is raised when the file is closed, and not before. `indexed` is not for long flights, see
+    RrdFiles.
     """
 
     def __init__(
-        self, config: ViewerConfig, camera: Camera, path: Path, origin: GeoOrigin | None = None
-    ) -> None:
-        self._files = RrdFiles(path, config.rrd_mb << 20)
+        self, config: ViewerConfig, camera: Camera, path: Path, origin: GeoOrigin | None = None,
+        indexed: bool = True,
+    ) -> None:  # fmt: skip
+        self._files = RrdFiles(path, config.rrd_mb << 20, indexed)
         self._config = config
         self._story = Story(FlightItem(path.parent.name, path.parent.name, camera, origin))
         self._inbox = Inbox(ROOM_BYTES)

@@ -20,9 +20,15 @@ LOOK_EVERY = 16
 
 
 class RrdFiles:
-    """`path` and its followers: flight.rrd, flight-2.rrd, …; `most_bytes` is 0 for no limit."""
+    """`path` and its followers: flight.rrd, flight-2.rrd, …; `most_bytes` is 0 for no limit.
 
-    def __init__(self, path: Path, most_bytes: int) -> None:
+    With `indexed` each ends with a list of its chunks, by which programs find what they look for
+    without reading all of it. Until then that is in memory, and grows by some kilobytes with each
+    frame: not for flights of hours.
+    """
+
+    def __init__(self, path: Path, most_bytes: int, indexed: bool) -> None:
+        self._indexed = indexed
         self._first, self._each = path, most_bytes // N_FILES
         self._id = str(uuid.uuid4())
         self._paths: list[Path] = []
@@ -62,5 +68,7 @@ class RrdFiles:
         path = self._first.with_name(f"{self._first.stem}{number}{self._first.suffix}")
         self._paths.append(path)
         recording = rr.RecordingStream(APPLICATION, recording_id=self._id)
-        recording.save(path, default_blueprint=layout(live=False))
+        recording.save(
+            path, default_blueprint=layout(live=False), write_footer=self._indexed
+        )  # fmt: skip
         return recording

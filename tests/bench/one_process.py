@@ -1,12 +1,13 @@
 """Two hours of one flight in one process for each stage: does a pose cost more, does memory grow?
 
     python -m tests.bench.one_process [--flight sample/survey] [--minutes 120] [--rate-hz 10]
-        [--out FOLDER] [--set SECTION.KEY=VALUE ...]
+        [--shrink 2] [--out FOLDER] [--set SECTION.KEY=VALUE ...]
 
-`soak` flies laps, each of which has processes of its own. Here a short flight goes to and fro as one
-long one, with time stamps that only grow, as fast as localisation answers: the next frame is given
-when the pose of the last has come. All else is as in flight: LiveFlight with localisation, recorder,
-tape and exporter as processes, its health asked each second of the flight. Depth is off unless set.
+`soak` flies laps, each of which has processes of its own. Here a short flight goes to and fro as
+one long one, with time stamps that only grow, as fast as localisation answers: the next frame is
+given when the pose of the last has come. All else is as in flight: LiveFlight with localisation,
+recorder, tape and exporter as processes, its health asked each second of the flight. Depth is off
+unless set.
 
 A row for every minute of flight: processor time of localisation's main thread for a frame (50 and
 99 %), which other programs on the machine hardly touch, and memory of every process
@@ -23,14 +24,15 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
+import cv2
 import numpy as np
 import psutil
 from matplotlib.figure import Figure
 
+from companion.camera import Camera
 from companion.clock import FlightClock
 from companion.config import Config
 from companion.config_file import load_config
@@ -67,7 +69,7 @@ class Seen:
 class Flown:
     """A live flight whose frames are given one by one."""
 
-    def __init__(self, config: Config, camera: Any, seen: Seen) -> None:
+    def __init__(self, config: Config, camera: Camera, seen: Seen) -> None:
         self.clock, self.journal, self._seen = FlightClock(), Journal({}), seen
         self._answered = threading.Event()
         self._seq = -1
@@ -148,6 +150,25 @@ def row_of(flown: Flown, seen: Seen, t_s: float) -> dict[str, float]:
     return row
 
 
+def shrunk(frame: Frame, times: int) -> Frame:
+    """A frame whose sides are so many times shorter."""
+    if times == 1:
+        return frame
+    height, width = (n // times for n in frame.grey.shape)
+    rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
+    grey = cv2.resize(frame.grey, (width, height), interpolation=cv2.INTER_AREA)
+    return Frame(frame.seq, frame.t_ns, np.asarray(grey, np.uint8), np.asarray(rgb, np.uint8))
+
+
+def shrunk_camera(camera: Camera, times: int) -> Camera:
+    """The camera of such frames; pixel centres are at integers."""
+    return replace(
+        camera, width=camera.width // times, height=camera.height // times,
+        fx=camera.fx / times, fy=camera.fy / times,
+        cx=(camera.cx + 0.5) / times - 0.5, cy=(camera.cy + 0.5) / times - 0.5,
+    )  # fmt: skip
+
+
 def messages_of(arguments: argparse.Namespace, config: Config) -> Iterator[Frame | Telemetry]:
     flight = open_flight(arguments.flight, config.camera, config.telemetry)
     frames: list[Frame] = []
@@ -155,7 +176,7 @@ def messages_of(arguments: argparse.Namespace, config: Config) -> Iterator[Frame
         if isinstance(f, Frame) and (
             not frames or f.t_ns - frames[-1].t_ns > 0.9e9 / arguments.rate_hz
         ):
-            frames.append(f)
+            frames.append(shrunk(f, arguments.shrink))
     each_s = (frames[-1].t_ns - frames[0].t_ns) * 1e-9 / (len(frames) - 1)
     n = int(arguments.minutes * 60 / each_s)
     return flown_again(frames, flight.telemetry().samples, walk(0, len(frames) - 1, n))
@@ -163,6 +184,7 @@ def messages_of(arguments: argparse.Namespace, config: Config) -> Iterator[Frame
 
 def fly(arguments: argparse.Namespace, config: Config, seen: Seen, rows_file: Path) -> None:
     camera = open_flight(arguments.flight, config.camera, config.telemetry).camera
+    camera = shrunk_camera(camera, arguments.shrink)
     flown = Flown(config, camera, seen)
     start_ns, row_ns, second_ns = -1, 0, 0
     before_ms = flown.cpu_ms()
@@ -205,7 +227,8 @@ def verdict(seen: Seen) -> tuple[list[str], list[str]]:
     last = float(np.percentile(np.concatenate(times[-n:]), 99))
     said = [
         f"{rows[-1]['minute']:.0f} minutes of flight, {sum(map(len, times))} frames",
-        f"a frame's processor time, p99: {first:.1f} ms in the second quarter, {last:.1f} in the last",
+        f"a frame's processor time, p99: {first:.1f} ms in the second quarter, "
+        f"{last:.1f} in the last",
     ]
     if last > MOST_SLOWER * first:
         wrong.append(f"a frame takes {last / first:.2f} times as long in the end")
@@ -213,9 +236,10 @@ def verdict(seen: Seen) -> tuple[list[str], list[str]]:
     hours = [row["minute"] / 60 for row in warm]
     for key in [key for key in rows[0] if key.endswith("_mb")]:
         grown = float(np.polyfit(hours, [row[key] for row in warm], 1)[0])
-        said.append(f"{key.removesuffix('_mb')}: {rows[-1][key]:.0f} MB at the end, {grown:+.1f} MB/h")
+        name = key.removesuffix("_mb")
+        said.append(f"{name}: {rows[-1][key]:.0f} MB at the end, {grown:+.1f} MB/h")
         if grown > MOST_MB_PER_HOUR:
-            wrong.append(f"{key.removesuffix('_mb')} grows by {grown:.0f} MB an hour")
+            wrong.append(f"{name} grows by {grown:.0f} MB an hour")
     if rows[-1]["restarts"]:
         wrong.append("a stage was started again")
     return said, wrong
@@ -245,6 +269,7 @@ def main() -> int:
     parser.add_argument("--flight", type=Path, default=Path("sample/survey"))
     parser.add_argument("--minutes", type=float, default=120.0)
     parser.add_argument("--rate-hz", type=float, default=10.0)
+    parser.add_argument("--shrink", type=int, default=1, help="so many times smaller pictures")
     parser.add_argument("--out", type=Path, default=Path("one_process"))
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     arguments = parser.parse_args()

