@@ -155,7 +155,7 @@ def reconstruct(
     alone = wanted.reference is not None
     references = [first] if alone else _references(images, positions, middle_m, config)
     out.mkdir(parents=True, exist_ok=True)
-    fusion, consensus = Fusion(config.cloud), Consensus(config.depth.converged_sigma)
+    fusion, consensus = Fusion(config.cloud), Consensus(config.depth)
     n_written = 0
     chunks: list[PointChunk] = []
     done: list[DepthMap] = []
