@@ -81,6 +81,23 @@ class CameraAttitude:
         """Forget what was kept of keyframes that are no more among these."""
         self._kept = {key: kept for key, kept in self._kept.items() if key in living}
 
+    @property
+    def correction(self) -> tuple[Array, int]:
+        """The mount's rotation `body_from_camera` (3, 3), and how late stamps are, ns; as found."""
+        return self._mount, self._late_ns
+
+    def take_up(
+        self, body_from_camera: Array, late_ns: int, ned_from_camera: dict[int, Array | None]
+    ) -> None:
+        """Use a correction that was found before, and what keyframes were told by their ids.
+
+        To be called before the first frame.
+        """
+        self._mount, self._late_ns = body_from_camera, late_ns
+        for keyframe_id, told in ned_from_camera.items():
+            still = np.zeros(3)
+            self._kept[keyframe_id] = None if told is None else (told @ self._mount.T, still)
+
     def compare(self, t_ns: int, map_from_camera: Array) -> None:
         """Take the rotation (3, 3) of a tracked frame."""
         if self.used:

@@ -13,6 +13,7 @@ import numpy as np
 
 from companion.camera import Camera
 from companion.camera_attitude import CameraAttitude
+from companion.checkpoint import MOST_BYTES, Checkpoint
 from companion.clock import Timer
 from companion.config import Config
 from companion.geometry import Array, Pose
@@ -33,8 +34,10 @@ from companion.messages import (
 )
 from companion.motion import MotionFilter
 from companion.odometry import SIGMA_COASTING_M_S, SmoothOdometry
+from companion.resumption import Resumption, Verdict
 from companion.segment_places import SegmentPlaces
 from companion.slam.map import Keyframe, SlamMap
+from companion.slam.map_part import map_of, part_around
 from companion.slam.reunion import Reunion
 from companion.slam.tracker import Prior, Tracker
 
@@ -45,6 +48,8 @@ SIGMA_COASTING_RAD_S = np.radians(0.2)
 REMEMBERED_NS = 600_000_000_000
 """What telemetry told longer ago is only asked for at the times of keyframes."""
 LET_GO_EVERY_NS = 60_000_000_000
+TAKEN_UP = "map resumed after restart"
+NOT_TAKEN_UP = "old map not recognised: new map"
 
 
 class LocalisationStage:
@@ -72,6 +77,8 @@ class LocalisationStage:
         """The last frame with a pose, in the newest segment's own frame."""
         self._t_ns = 0
         self._let_go_ns: int | None = None
+        self._resumption: Resumption | None = None
+        """While a map from before is in question."""
         self._tracker.atlas.allowed = self._allowed
         self._tracker.atlas.ways_of = self._places.ways_of
 
@@ -113,6 +120,43 @@ class LocalisationStage:
         """Look for this share of the features from now on, where time is short."""
         self._tracker.set_effort(share)
 
+    def checkpoint(self) -> Checkpoint | None:
+        """What another process needs to go on from the last frame; None unless it was tracked.
+
+        It does not change with the map. A map from before that is in question gives none.
+        """
+        last, segment = self._last, self._tracker.map
+        if self._resumption is not None or last is None or last.map_from_camera is None:
+            return None
+        if last.t_ns != self._t_ns or self.state is not TrackState.TRACKING:
+            return None
+        with self._times("checkpoint"), self._tracker.turn.tracking():
+            place = last.map_from_camera.translation
+            (nearest,) = segment.nearest(place, 1, set())
+            part = part_around(segment, segment.keyframes[nearest], MOST_BYTES)
+        told = self._attitude.at(last.t_ns)
+        mount, late_ns = self._attitude.correction
+        georeference = self._places.of(segment)
+        return Checkpoint(
+            last.t_ns, part, self._tracker.next_keyframe_id,
+            None if told is None else told @ last.map_from_camera.rotation.T, georeference,
+            self._odometry.kept if georeference is not None else None, mount, late_ns,
+        )  # fmt: skip
+
+    def take_up(self, kept: Checkpoint, t_ns: int, absent_ns: int) -> None:
+        """Begin with a map from before, if what is seen agrees; before the first frame, of `t_ns`.
+
+        Its scale and place count once several frames have agreed with it. The last frame before
+        was `absent_ns` ago.
+        """
+        shift_ns = t_ns - absent_ns - kept.t_ns  # clocks of two processes may differ
+        features = self._config.features
+        segment = map_of(kept.part, features.scale_factor, features.n_levels, shift_ns)
+        self._resumption = Resumption(kept, t_ns, absent_ns)
+        told = {k.keyframe_id: k.ned_from_camera for k in kept.part.keyframes}
+        self._attitude.take_up(kept.body_from_camera, kept.late_ns, told)
+        self._tracker.take_up(segment, kept.next_keyframe_id, self._resumption.until_ns)
+
     def finish(self, adjust: bool = True) -> list[Message]:
         """Give the map as it is at the end of a flight, all of it adjusted once more or not."""
         out: list[Message] = [*self._tracker.close()]
@@ -140,9 +184,7 @@ class LocalisationStage:
             tracked = self._tracker.step(frame, Prior(predicted, attitude, in_map))
         other_map = self._tracker.map is not before
         if other_map or self.state is TrackState.INITIALISING:
-            self._motion.reset()
-            self._attitude.forget()
-            self._last = None
+            self._forget_frames()
         # where another map lies must be known before the first pose in it is told
         update = self._map_update() if other_map and self._segments() else None
         for message in tracked:
@@ -163,10 +205,13 @@ class LocalisationStage:
                 yield message if coasting is None else replace(coasting, map_from_camera=None)
             else:
                 yield message
-        if update is None and any(isinstance(m, KeyframeAdded) for m in tracked):
+        added = any(isinstance(m, KeyframeAdded) for m in tracked)
+        if update is None and added and self._segments():
             update = self._map_update()
         if update is not None:
             yield update
+        if self._resumption is not None:
+            yield from self._judge_map(self._resumption, frame.t_ns, other_map)
         yield from self._judge_attitude(frame.t_ns)
         self._let_go(frame.t_ns)
 
@@ -180,6 +225,40 @@ class LocalisationStage:
         self._attitude.let_go(living.keys())
         when_ns: Array = np.array(sorted(living.values()))
         self._georeferencer.let_go(t_ns - REMEMBERED_NS, when_ns)
+
+    def _judge_map(
+        self, resumption: Resumption, t_ns: int, other_map: bool
+    ) -> Iterator[MapUpdate | Warned]:
+        """See whether the map from before is what is seen, and take it up or leave it."""
+        last = self._last if self._last is not None and self._last.t_ns == t_ns else None
+        verdict = Verdict.REFUSED
+        if not other_map:
+            attitude = self._attitude.at(t_ns)
+            verdict = resumption.judge(t_ns, last, attitude, self.camera_from_body)
+        if verdict is Verdict.TRYING:
+            return
+        self._resumption = None
+        kept, segment = resumption.kept, self._tracker.map
+        if verdict is Verdict.REFUSED:
+            with self._tracker.turn.tracking():
+                self._tracker.leave(kept.part.first_keyframe_id)
+            if not other_map:
+                self._forget_frames()
+            yield Warned(t_ns, NOT_TAKEN_UP, resumption.why_not)
+            return
+        if kept.georeference is not None:
+            self._places.take_up(segment, kept.georeference)
+            if kept.odometry is not None:
+                self._odometry.take_up(segment.first_keyframe_id, kept.georeference, kept.odometry)
+        away_s = resumption.absent_ns * 1e-9
+        yield Warned(t_ns, TAKEN_UP, f"its last frame was {away_s:.1f} s before the first", True)
+        yield self._map_update()
+
+    def _forget_frames(self) -> None:
+        """Another map is in use: where the last frames were is not of it."""
+        self._motion.reset()
+        self._attitude.forget()
+        self._last = None
 
     def _map_update(self) -> MapUpdate:
         with self._times("georeference"), self._tracker.turn.tracking():

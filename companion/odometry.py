@@ -58,6 +58,17 @@ class _Doubt(NamedTuple):
     n: int
 
 
+class OdometryState(NamedTuple):
+    """What another odometry needs to go on in the same frame: see `SmoothOdometry.take_up`."""
+
+    odometry_from_world: Pose
+    anchored: bool
+    place_m: Array
+    """(3,) of the body in the frame of odometry, when last seen,"""
+    velocity_m_s: Array
+    """and its velocity (3,)."""
+
+
 class SmoothOdometry:
     """Tracks of the newest map and its georeference in, Odometry out; one for each frame."""
 
@@ -226,6 +237,26 @@ class SmoothOdometry:
             turn = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
             self._odometry_from_world = Pose(turn, placed.translation - turn @ raw.translation)
         self._georeference = georeference
+
+    @property
+    def kept(self) -> OdometryState | None:
+        """What it takes to go on from here; None before there was a pose."""
+        if self._last is None:
+            return None
+        return OdometryState(
+            self._odometry_from_world, self._anchored, self._last[2].translation.copy(),
+            self._velocity.copy(),
+        )  # fmt: skip
+
+    def take_up(self, segment: int, georeference: Georeference, kept: OdometryState) -> None:
+        """Go on in a frame from before; `segment` and `georeference` are of the map kept with it.
+
+        The next pose is taken as it is: nothing tells how the body moved meanwhile.
+        """
+        self._segment, self._georeference = segment, georeference
+        self._odometry_from_world, self._anchored = kept.odometry_from_world, kept.anchored
+        self._last, self._doubt, self._coasting = None, None, False
+        self._way.clear()
 
     def map_moved(self, map_from_camera: Pose) -> None:
         """The map was corrected: where in it the last believed frame is now.

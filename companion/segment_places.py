@@ -10,7 +10,7 @@ import numpy as np
 from companion.camera_attitude import CameraAttitude
 from companion.geometry import Array, Pose, Similarity
 from companion.georeference import Georeferencer, Place
-from companion.map_fit import MAX_STEP_S, SIGMA_VELOCITY_M_S, VELOCITY_TAU_S
+from companion.map_fit import DISAGREE, MAX_STEP_S, SIGMA_VELOCITY_M_S, VELOCITY_TAU_S
 from companion.messages import Georeference, MapUpdate
 from companion.slam.map import Keyframe, SlamMap
 from companion.slam.reunion import Reunion
@@ -41,12 +41,39 @@ class SegmentPlaces:
         self._attitude = attitude
         self._body_from_camera = body_from_camera
         self._known: dict[int, Georeference] = {}
+        self._kept: tuple[int, Georeference] | None = None
+        """A segment from before, and how it was known to lie."""
         self._main: int | None = None
         self._revision = 0
 
     def of(self, segment: SlamMap) -> Georeference | None:
         """How a segment lies in the world; None until that is known."""
         return self._known.get(segment.first_keyframe_id)
+
+    def take_up(self, segment: SlamMap, kept: Georeference) -> None:
+        """Place a segment as it was known to lie before this process began."""
+        self._known[segment.first_keyframe_id] = kept
+        self._kept = segment.first_keyframe_id, kept
+
+    def _surer(self, segment: SlamMap, found: Georeference) -> Georeference:
+        """What was found of a segment, or what was known of it before, if that is surer.
+
+        What it was found by is not kept: it takes as long again until as much is known. A scale
+        that both cannot have is the newly measured one.
+        """
+        if self._kept is None or self._kept[0] != segment.first_keyframe_id:
+            return found
+        kept = self._kept[1]
+        apart = abs(float(np.log(found.world_from_map.scale / kept.world_from_map.scale)))
+        if (
+            found.sigma_scale <= kept.sigma_scale
+            or found.n_positions >= kept.n_positions
+            or found.has_origin > kept.has_origin
+            or apart > DISAGREE * float(np.hypot(found.sigma_scale, kept.sigma_scale))
+        ):
+            self._kept = None
+            return found
+        return kept
 
     def update(self, segments: Sequence[SlamMap], t_ns: int, final: bool) -> MapUpdate:
         """The map, all segments in the frame of the main one."""
@@ -57,7 +84,7 @@ class SegmentPlaces:
                     [self._place(segment, keyframe) for keyframe in _spread(segment, final)]
                 )
                 if found is not None:
-                    self._known[segment.first_keyframe_id] = found
+                    self._known[segment.first_keyframe_id] = self._surer(segment, found)
         main = self._main_of(segments, final)
         anchor = self.of(main)
         poses: dict[int, Pose] = {}

@@ -84,6 +84,20 @@ class Atlas:
         fresh = SlamMap(self._features.scale_factor, self._features.n_levels, level=level)
         self.segments.append(fresh)
 
+    def take_up(self, kept: SlamMap) -> None:
+        """Use a map from before, and know its places again; no other may have begun."""
+        self.segments = [kept]
+        for keyframe in kept.keyframes.values():
+            self.remember(keyframe)
+
+    def leave(self, first_keyframe_id: int) -> bool:
+        """Let go of a map by its name; whether it was in use, and a fresh one now is."""
+        in_use = self.map.first_keyframe_id == first_keyframe_id
+        self.segments = [s for s in self.segments if s.first_keyframe_id != first_keyframe_id]
+        if in_use:
+            self.begin(level=False)
+        return in_use
+
     def find(
         self, features: Features, level_from_camera: Array | None, seed: int
     ) -> tuple[SlamMap, Located] | None:

@@ -14,7 +14,7 @@ from companion.messages import Bytes, Floats
 from companion.slam.compiled.compiling import Bools, Ints
 from companion.slam.compiled.spreading import spread
 
-__all__ = ["Bools", "FeatureExtractor", "Features", "Ints"]
+__all__ = ["Bools", "FeatureExtractor", "Features", "Ints", "features_of"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +37,16 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.pixels)
+
+
+def features_of(
+    camera: Camera, scale_factor: float, pixels: Floats, normalised: Array, octaves: Ints,
+    angles_deg: Floats, descriptors: Bytes,
+) -> Features:  # fmt: skip
+    """Features with what follows from octave and lens; arguments as the fields of `Features`."""
+    sigma = scale_factor ** octaves.astype(np.float64)
+    whitening = camera.pixel_from_normalised_jacobian(normalised) / sigma[:, None, None]
+    return Features(pixels, normalised, octaves, angles_deg, descriptors, sigma, whitening)
 
 
 class FeatureExtractor:
@@ -73,11 +83,9 @@ class FeatureExtractor:
         normalised = self._camera.normalise(pixels)
         seen = np.isfinite(normalised).all(1)
         pixels, octaves, angles = pixels[seen], octaves[seen], angles[seen]
-        normalised = normalised[seen]
-        sigma = self._config.scale_factor ** octaves.astype(np.float64)
-        whitening = self._camera.pixel_from_normalised_jacobian(normalised) / sigma[:, None, None]
-        return Features(
-            pixels, normalised, octaves, angles, descriptors[seen], sigma, whitening
+        return features_of(
+            self._camera, self._config.scale_factor, pixels, normalised[seen], octaves, angles,
+            descriptors[seen],
         )  # fmt: skip
 
     @property

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,6 +56,23 @@ class Keyframe:
         """Position of the camera in the map."""
         out: Array = -self.camera_from_map.rotation.T @ self.camera_from_map.translation
         return out
+
+
+class PointArrays(NamedTuple):
+    """N points of a map, but for who sees them; each field is as that of `SlamMap`."""
+
+    positions: Array
+    descriptors: Bytes
+    normals: Array
+    base_distance: Array
+    n_visible: Ints
+    n_found: Ints
+    born: Ints
+    first_seen: Ints
+    first_unproject: Array
+    patch_centre: Array
+    patch_level: Ints
+    patch_grey: Bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,6 +230,24 @@ class SlamMap:
         held = np.flatnonzero(other.patch_at[:n] >= 0)
         self._store(offset + held, other.patch_grey[other.patch_at[held]])
         return offset
+
+    def put_points(self, points: PointArrays) -> None:
+        """Take points that were kept (see `points_of`) into a map that has none yet."""
+        n = len(points.positions)
+        self._reserve(n)
+        self.n_points = n
+        every = slice(0, n)
+        for name, values in points._asdict().items():
+            if name != "patch_grey":
+                getattr(self, name)[every] = values
+        self.alive[every] = True
+        self.observers[every] = -1
+        self._store(np.arange(n), points.patch_grey)
+
+    def points_of(self, ids: Ints) -> PointArrays:
+        """Copies of what is known of points that live, but for who sees them."""
+        rows = [getattr(self, name)[ids] for name in PointArrays._fields[:-1]]
+        return PointArrays._make([*rows, self.patch_grey[self.patch_at[ids]]])
 
     def patches_of(self, points: Ints) -> Patches:
         """The patches of some points."""

@@ -98,6 +98,29 @@ class Tracker:
             features = self._extractor.extract(frame.grey)
         return self._place_frame(frame, features, prior) + self._worker.done()
 
+    def take_up(self, kept: SlamMap, next_keyframe_id: int, until_ns: int) -> None:
+        """Begin lost, in a map from before; to be called before the first frame.
+
+        Until a time no other map begins.
+        """
+        self.atlas.take_up(kept)
+        self._forget()
+        self._reference = kept.keyframes[max(kept.keyframes)]
+        self._next_keyframe_id = next_keyframe_id
+        self.state, self._lost_since_ns = TrackState.LOST, until_ns
+
+    def leave(self, first_keyframe_id: int) -> None:
+        """Let go of a map; where it is the one in use another begins."""
+        if self.atlas.leave(first_keyframe_id):
+            self._forget()
+            self._bootstrap = Bootstrap(self._config, self._camera)
+            self.state, self._lost_since_ns = TrackState.INITIALISING, None
+
+    @property
+    def next_keyframe_id(self) -> int:
+        """None so far had this number."""
+        return self._next_keyframe_id
+
     def set_effort(self, share: float) -> None:
         """Look for this share of the features from now on."""
         self._extractor.effort = share
@@ -222,6 +245,8 @@ class Tracker:
     def _given_up(self, t_ns: int, told: bool) -> bool:
         """Whether the map in use has been out of sight for so long that another may begin."""
         since = self._lost_since_ns
+        if since is not None and t_ns < since:
+            return False  # one from before is looked for
         if since is None or len(self.map.keyframes) <= MAX_YOUNG_KEYFRAMES:
             return True
         wait_s = self._config.restart_after_s * (TOLD_RESTART_SHARE if told else 1.0)

@@ -1,0 +1,173 @@
+"""A map that a process left behind is taken up by the next, where it is what the camera sees.
+
+The sample flight is flown for a while; then another localisation hangs over the same ground, whose
+telemetry has no more than attitude: nothing that tells a scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.camera import Camera
+from companion.checkpoint import MOST_BYTES, Checkpoint, decode, encode, opened
+from companion.config import Config
+from companion.geometry import quaternion_from_rotation, rotation_from_quaternion, yaw_rotation
+from companion.localisation import NOT_TAKEN_UP, TAKEN_UP, LocalisationStage
+from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
+from companion.resumption import TRIED_NS
+from drivers.open_flight import open_flight
+from tests.support.poses import TrueFlight
+from tests.support.to_and_fro import flown_again, walk
+
+SAMPLE = Path("sample/survey")
+CONFIG = Config()
+FLOWN_S, ABSENT_S, AFTER_S = 14.0, 8.0, 8.0
+OVER = 10
+"""The vehicle sways over what the last so many frames showed,"""
+ELSEWHERE = slice(300, 311)
+"""or over another part of the field, 30 m away."""
+Change = Callable[[Telemetry], Telemetry]
+
+
+@dataclass
+class Left:
+    """What a process left behind, and what it had to fly with."""
+
+    checkpoint: Checkpoint
+    data: bytes
+    camera: Camera
+    frames: list[Frame]
+    telemetry: list[Telemetry]
+    last: int
+    """Index of the last frame."""
+    last_pose: Odometry
+
+
+@pytest.fixture(scope="module")
+def left() -> Left:
+    flight = open_flight(SAMPLE, CONFIG.camera, CONFIG.telemetry)
+    telemetry = list(flight.telemetry().samples)
+    frames = [f for f in flight.frames(flight.start_ns, flight.stop_ns) if isinstance(f, Frame)]
+    stage = LocalisationStage(CONFIG, flight.camera, lambda _: nullcontext())
+    last = next(i for i, f in enumerate(frames) if f.t_ns > flight.start_ns + FLOWN_S * 1e9)
+    poses: list[Odometry] = []
+    for message in flown_again(frames, telemetry, range(last + 1)):
+        poses += [out for out in stage.step(message) if isinstance(out, Odometry)]
+    checkpoint = stage.checkpoint()
+    assert checkpoint is not None
+    data = b"".join(encode(checkpoint, {}))
+    _, arrays = opened(data)
+    read = decode(arrays, flight.camera, CONFIG.features.scale_factor)
+    return Left(read, data, flight.camera, frames, telemetry, last, poses[-1])
+
+
+def unchanged(sample: Telemetry) -> Telemetry:
+    return sample
+
+
+def turned(degrees: float) -> Change:
+    """An autopilot whose heading is another."""
+    turn = yaw_rotation(float(np.radians(degrees)))
+
+    def change(sample: Telemetry) -> Telemetry:
+        assert isinstance(sample, AttitudeSample)
+        rotation = turn @ rotation_from_quaternion(sample.ned_from_body)
+        return replace(sample, ned_from_body=quaternion_from_rotation(rotation))
+
+    return change
+
+
+def hovering(left: Left, places: slice, change: Change) -> Iterator[Message]:
+    """To and fro over some frames, attitude told and nothing else."""
+    first, end = places.start, places.stop - 1
+    n = round(AFTER_S / ((left.frames[1].t_ns - left.frames[0].t_ns) * 1e-9))
+    attitudes = [s for s in left.telemetry if isinstance(s, AttitudeSample)]
+    yield from (
+        message if isinstance(message, Frame) else change(message)
+        for message in flown_again(left.frames, attitudes, walk(first, end, n))
+    )
+
+
+@dataclass
+class Resumed:
+    """What the next process gave; times are seconds after its first frame."""
+
+    stage: LocalisationStage
+    poses: list[tuple[float, Odometry, int]]
+    """With the index of the frame that was shown."""
+    said: list[Warned]
+    first_ns: int
+
+
+def resumed(
+    left: Left, places: slice, change: Change = unchanged, kept: bool = True
+) -> Resumed:
+    stage = LocalisationStage(CONFIG, left.camera, lambda _: nullcontext())
+    out = Resumed(stage, [], [], 0)
+    shown = list(walk(places.start, places.stop - 1, 1000))
+    for message in hovering(left, places, change):
+        if isinstance(message, Frame) and not out.first_ns:
+            out.first_ns = message.t_ns
+            if kept:
+                stage.take_up(left.checkpoint, message.t_ns, round(ABSENT_S * 1e9))
+        for given in stage.step(message):
+            if isinstance(given, Odometry):
+                after_s = (given.t_ns - out.first_ns) * 1e-9
+                out.poses.append((after_s, given, shown[given.seq]))
+            elif isinstance(given, Warned):
+                out.said.append(given)
+    return out
+
+
+def over(left: Left) -> slice:
+    return slice(left.last - OVER, left.last + 1)
+
+
+def test_hovering_where_it_was_it_has_a_metric_pose_again_within_a_second(left: Left) -> None:
+    found = resumed(left, over(left))
+    metric = [(s, o, i) for s, o, i in found.poses if o.world_from_body is not None]
+    first_s = metric[0][0]
+    truth = TrueFlight(SAMPLE)
+    shown = np.array([left.frames[i].t_ns * 1e-9 for _, _, i in metric])
+    place = np.array([o.world_from_body.translation for _, o, _ in metric if o.world_from_body])
+    was_off = left.last_pose.world_from_body.translation - truth.place(  # type: ignore[union-attr]
+        np.array([left.last_pose.t_ns * 1e-9])
+    )
+    error_m = np.linalg.norm(place - truth.place(shown), axis=1)
+    print(f"first after {first_s:.2f} s; wrong by {error_m.max():.2f} m at most, before the"
+          f" restart by {np.linalg.norm(was_off):.2f} m")  # fmt: skip
+    assert first_s < 1.0
+    assert len(metric) > 0.9 * len([s for s, _, _ in found.poses if s >= first_s])
+    assert error_m.max() < np.linalg.norm(was_off) + 0.3
+    assert all(o.sigma_position_m < 1.0 for _, o, _ in metric)
+    assert [w.what for w in found.said if w.what in (TAKEN_UP, NOT_TAKEN_UP)] == [TAKEN_UP]
+
+
+def test_without_what_was_kept_hovering_tells_no_scale(left: Left) -> None:
+    found = resumed(left, over(left), kept=False)
+    assert all(o.world_from_body is None for _, o, _ in found.poses)
+
+
+@pytest.mark.parametrize(
+    ("places", "change"),
+    [("elsewhere", unchanged), ("here", turned(25.0))],
+    ids=["over other ground", "under another heading"],
+)
+def test_what_does_not_agree_is_never_taken_up(left: Left, places: str, change: Change) -> None:
+    found = resumed(left, ELSEWHERE if places == "elsewhere" else over(left), change)
+    assert all(o.world_from_body is None for _, o, _ in found.poses)
+    (said,) = (w for w in found.said if w.what in (TAKEN_UP, NOT_TAKEN_UP))
+    assert said.what == NOT_TAKEN_UP
+    assert said.t_ns - found.first_ns < TRIED_NS + 2e9  # another map has begun by then
+    print(said.detail)
+
+
+def test_what_is_kept_is_bounded(left: Left) -> None:
+    assert len(left.data) < 1.05 * MOST_BYTES
+    assert len(left.checkpoint.part.keyframes) >= 10
