@@ -122,6 +122,11 @@ def monotonic_s() -> float:
     return time.monotonic()
 
 
+def since_boot_ns() -> int:
+    """Time since the computer was switched on, sleep included: the same for all processes."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
 def wait_s(stop: threading.Event, seconds: float) -> None:
     """Wait for a while, or until `stop` is set."""
     if seconds > 0:

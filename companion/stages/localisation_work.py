@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
+from companion.checkpoint import CheckpointError
+from companion.clock import since_boot_ns
 from companion.localisation import LocalisationStage
-from companion.messages import Message
+from companion.messages import Frame, Message, Warned
 from companion.slam.compiled.compiling import not_kept
-from companion.stages.protocol import Finish, SetShare, Setup
+from companion.stages.map_keeper import Kept, MapKeeper
+from companion.stages.protocol import Finish, KeepMap, SetShare, Setup
 from companion.stages.work import Work
+
+KEEP_EVERY_NS = 1_000_000_000
+NOT_KEPT = "map not kept for a restart in flight"
 
 
 class _Localisation(Work):
@@ -24,16 +30,52 @@ class _Localisation(Work):
                 "start compiles them; NUMBA_CACHE_DIR names a folder for them",
                 file=sys.stderr,
             )
+        self._setup = setup
         self._stage = LocalisationStage(setup.config, setup.camera, self.times, beside=True)
+        self._keeper: MapKeeper | None = None
+        self._to_take_up: Kept | None = None
+        self._told_fault = ""
+        self._kept_ns = 0
 
     def step(self, message: Any) -> Iterable[Message]:
         if isinstance(message, SetShare):
             self._stage.set_effort(message.share)
             return []
-        return self._stage.step(message)
+        if isinstance(message, KeepMap):
+            self._begin_keeping(message)
+            return []
+        return self._frame(message) if isinstance(message, Frame) else self._stage.step(message)
 
     def finish(self, finish: Finish) -> Iterable[Message]:
+        if self._keeper is not None:
+            self._keeper.close(forget=not finish.keep_map)
         return self._stage.finish(adjust=not finish.hurry)
+
+    def _begin_keeping(self, message: KeepMap) -> None:
+        self._keeper = MapKeeper(message.path, self._setup)
+        try:
+            kept = self._keeper.take()
+        except CheckpointError as error:
+            print(f"companion: the map from before is of no use: {error}", file=sys.stderr)
+        else:
+            self._to_take_up = kept if message.take_up else None
+
+    def _frame(self, frame: Frame) -> Iterator[Message]:
+        if self._to_take_up is not None:
+            kept, tracked_ns = self._to_take_up
+            self._to_take_up = None
+            self._stage.take_up(kept, frame.t_ns, since_boot_ns() - tracked_ns)
+        yield from self._stage.step(frame)
+        keeper = self._keeper
+        if keeper is None or keeper.busy or frame.t_ns - self._kept_ns < KEEP_EVERY_NS:
+            return
+        if keeper.fault and keeper.fault != self._told_fault:
+            yield Warned(frame.t_ns, NOT_KEPT, keeper.fault)
+        self._told_fault = keeper.fault
+        checkpoint = self._stage.checkpoint()
+        if checkpoint is not None:
+            self._kept_ns = frame.t_ns
+            keeper.put(checkpoint)
 
 
 def work(setup: Setup) -> Work:

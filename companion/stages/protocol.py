@@ -27,11 +27,21 @@ class Setup:
 class Finish:
     """The last thing it is told: give the last results.
 
-    With `hurry` what takes long is left out. The recorder gets what its report states.
+    With `hurry` what takes long is left out. The recorder gets what its report states. With
+    `keep_map` the vehicle flies on, and another process may go on with the map.
     """
 
     hurry: bool
     facts: RunFacts | None = None
+    keep_map: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class KeepMap:
+    """Have localisation keep its map in a file; and take up what is in it, if so said."""
+
+    path: Path
+    take_up: bool
 
 
 @dataclass(frozen=True, slots=True)

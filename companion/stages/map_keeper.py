@@ -1,0 +1,137 @@
+"""The file in which the map of a flight is kept while it goes on, and read by who takes over.
+
+It lies where it outlives a process but not the computer's next start, if there is such a place:
+systemd's RuntimeDirectory is in memory, and writing a few megabytes each second wears nothing out.
+Nothing is synchronised to a disk, therefore.
+"""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import NamedTuple
+
+from companion.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    decode,
+    encode,
+    fingerprint,
+    opened,
+)
+from companion.clock import since_boot_ns
+from companion.output.atomic_file import write_atomically
+from companion.resumption import MOST_ABSENT_NS
+from companion.stages.protocol import Setup
+
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+MOST_READ_BYTES = 64_000_000
+"""Nothing that was written here is larger by far."""
+
+
+class Kept(NamedTuple):
+    """What was kept, and when its last frame was, by `since_boot_ns`."""
+
+    checkpoint: Checkpoint
+    tracked_ns: int
+
+
+class MapKeeper:
+    """Writes checkpoints in a thread of its own.
+
+    That has the process's priority: one that is lower could be made to wait with the interpreter
+    in its hands, and the pose with it.
+    """
+
+    def __init__(self, path: Path, setup: Setup) -> None:
+        self._path, self._setup = path, setup
+        self._same = {"fingerprint": fingerprint(setup.config, setup.camera), "boot": _boot()}
+        self._waiting: tuple[Checkpoint, int] | None = None
+        self._closed = False
+        self._changed = threading.Condition()
+        self.fault = ""
+        """Why nothing can be kept; "" while it can."""
+        self._thread = threading.Thread(target=self._work, name="map keeper", daemon=True)
+        self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        """Whether the last one is still being written."""
+        return self._waiting is not None
+
+    def put(self, checkpoint: Checkpoint) -> None:
+        """Have a checkpoint written, whose last frame has just been tracked; never waits."""
+        with self._changed:
+            self._waiting = checkpoint, since_boot_ns()
+            self._changed.notify()
+
+    def take(self) -> Kept | None:
+        """What another process has kept; None if nothing. CheckpointError says what is wrong.
+
+        It is there once only: should it bring this process down, too, the next begins without.
+        """
+        try:
+            with self._path.open("rb") as file:
+                data = file.read(MOST_READ_BYTES)
+            self._path.unlink()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise CheckpointError(f"{self._path}: {error.strerror or error}") from error
+        try:
+            return self._checked(data)
+        except CheckpointError as error:
+            raise CheckpointError(f"{self._path}: {error}") from error
+
+    def _checked(self, data: bytes) -> Kept:
+        said, arrays = opened(data)
+        if said["boot"] != self._same["boot"]:
+            raise CheckpointError("the computer was started anew since")
+        if said["fingerprint"] != self._same["fingerprint"]:
+            raise CheckpointError("camera, calibration or feedback.mode are others now")
+        age_ns = since_boot_ns() - said["tracked_ns"]
+        if not 0 <= age_ns <= MOST_ABSENT_NS:
+            raise CheckpointError(f"it is {age_ns * 1e-9:.0f} s old")
+        features = self._setup.config.features
+        checkpoint = decode(arrays, self._setup.camera, features.scale_factor)
+        return Kept(checkpoint, said["tracked_ns"])
+
+    def close(self, forget: bool) -> None:
+        """Write no more, and leave nothing for others to take up if so said."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+        if forget:
+            self._remove()
+
+    def _remove(self) -> None:
+        try:
+            self._path.unlink(missing_ok=True)
+        except OSError as error:
+            self.fault = f"{self._path}: {error.strerror or error}"
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._waiting is not None)
+                if self._closed or self._waiting is None:
+                    return
+                checkpoint, tracked_ns = self._waiting
+            try:
+                self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                remarks = self._same | {"tracked_ns": tracked_ns}
+                write_atomically(self._path, encode(checkpoint, remarks))
+                self.fault = ""
+            except OSError as error:
+                self.fault = f"{self._path}: {error.strerror or error}"
+            with self._changed:
+                self._waiting = None
+
+
+def _boot() -> str:
+    """What names this start of the computer; "" where the kernel does not tell."""
+    try:
+        return BOOT_ID.read_text().strip()
+    except OSError:
+        return ""
