@@ -212,7 +212,7 @@ class Daemon:
                 self._link.send(self._link.heartbeat())
             tasks[0].cancel()  # what is watched is being taken apart
             feed_closed = loop.run_in_executor(None, self._feed.stop)
-            await self._flights.close(END_S)
+            await self._flights.close(END_S, keep_map=self._armed)
             for task in (stopped, *tasks):
                 task.cancel()
             await asyncio.gather(stopped, *tasks, return_exceptions=True)
@@ -305,7 +305,7 @@ class Daemon:
     def _always(self) -> bool:
         return self._config.daemon.flight == "always" or self._link is None
 
-    def _begin_if_due(self) -> None:
+    def _begin_if_due(self, take_up: bool = True) -> None:
         if self._camera is None or self._flights.current is not None or self._stop.is_set():
             return
         if self._always or self._armed:
@@ -314,7 +314,7 @@ class Daemon:
             if self._reports is not None:
                 self._reports.restart(self._camera)
             self._watch.restart()
-            self._flights.begin(self._config, self._camera)
+            self._flights.begin(self._config, self._camera, take_up)
         else:
             self._flights.prepare(self._config, self._camera)
 
@@ -508,8 +508,8 @@ class Daemon:
             self._flights.prepare(self._config, self._camera)
 
     def begin_flight(self) -> None:
-        """Begin one, where one is due."""
-        self._begin_if_due()
+        """Begin one with a map of its own, where one is due."""
+        self._begin_if_due(take_up=False)
 
     def _give_up(self, why: str, status: int = FAULT) -> None:
         if self._status == 0:

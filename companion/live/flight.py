@@ -36,10 +36,11 @@ from companion.messages import (
 )
 from companion.output.flight_result import RunFacts
 from companion.stages.frame_ring import FrameRing
-from companion.stages.protocol import Finish, SetShare, Setup, Snapshot, TakeSnapshot
+from companion.stages.protocol import Finish, KeepMap, SetShare, Setup, Snapshot, TakeSnapshot
 from companion.stages.stage_process import StageProcess
 from companion.viewer import Watched
 from drivers.recording.content import HealthNote, LinkBytes
+from drivers.status_socket import own_socket_path
 
 NICE = {"localisation": 0, "tape": 5, "topics": 10, "recorder": 10, "depth": 20}
 """The pose comes first; the others take what is left over."""
@@ -57,6 +58,8 @@ RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
 """Between two starts of a stage that dies again and again."""
+KEPT_MAP = "map.checkpoint"
+"""Lies beside the socket, in a folder that only this daemon uses; see `MapKeeper`."""
 TELL_NS = 1_000_000_000
 NOT_FINISHED = "a stage did not give its last results in time"
 
@@ -94,6 +97,8 @@ class LiveFlight:
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._hurry_s: float | None = None
+        self.keep_map = False
+        """Whether the vehicle flies on without it, and what comes next may go on with its map."""
         self.n_frames = 0
         self._viewing: Viewing | None = None
         self._last_map: MapUpdate | None = None
@@ -128,9 +133,15 @@ class LiveFlight:
             if self.folder is not None or kind not in WITH_FLIGHT
         )
 
-    def begin(self, folder: Path) -> None:
-        """The flight begins, and leaves its results there."""
+    def begin(self, folder: Path, take_up: bool = True) -> None:
+        """The flight begins, and leaves its results there.
+
+        With `take_up` it goes on with the map of a process that died in the air, if there is one
+        and it is recognised.
+        """
         self.folder, self._began_s = folder, monotonic_s()
+        kept = own_socket_path(self._config.daemon.socket).with_name(KEPT_MAP)
+        self.stages["localisation"].offer(KeepMap(kept, take_up))
         for kind in WITH_FLIGHT:
             if kind in self.stages:
                 self._set_up(kind)
@@ -258,7 +269,8 @@ class LiveFlight:
 
     def _ask(self, kind: str, facts: RunFacts | None = None) -> None:
         if kind in self.stages and self.stages[kind].alive:
-            self.stages[kind].ask_to_finish(Finish(self._hurry_s is not None, facts))
+            hurry = self._hurry_s is not None
+            self.stages[kind].ask_to_finish(Finish(hurry, facts, self.keep_map))
 
     def _wait(self, kind: str) -> None:
         """Wait for the last results of a stage that was asked to finish."""

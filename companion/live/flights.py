@@ -55,13 +55,13 @@ class Flights:
         if self._spare is None:
             self._spare = LiveFlight(config, camera, self._clock, self._listener)
 
-    def begin(self, config: Config, camera: Camera) -> LiveFlight:
-        """A flight begins; the one before must have been ended."""
+    def begin(self, config: Config, camera: Camera, take_up: bool = True) -> LiveFlight:
+        """A flight begins; the one before must have been ended. See `LiveFlight.begin`."""
         self.prepare(config, camera)
         flight, self._spare = self._spare, None
         assert flight is not None and self.current is None
         folder = self._named(Path(config.daemon.flights))
-        flight.begin(folder)
+        flight.begin(folder, take_up)
         self.current = flight
         self._journal.say(f"flight {folder.name} begins; its results go to {folder}")
         return flight
@@ -101,8 +101,10 @@ class Flights:
         if self.current is not None:
             self.current.keep(message)
 
-    async def close(self, patience_s: float) -> None:
-        """End all flights in a hurry."""
+    async def close(self, patience_s: float, keep_map: bool) -> None:
+        """End all flights in a hurry; with `keep_map` the next daemon may go on with the map."""
+        if self.current is not None:
+            self.current.keep_map = keep_map
         self.end()
         for flight in list(self._ending):
             flight.hurry()

@@ -13,7 +13,9 @@ given. `daemon` is started at once, or by `start` where something is to be missi
 from __future__ import annotations
 
 import math
+import signal
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.geometry import Pose
 from tests.support.daemon import PROGRAM, Daemon
 from tests.support.fake_autopilot import FakeAutopilot
 from tests.support.fake_flight import MadeUpFlight
@@ -28,6 +31,8 @@ from tests.support.http_camera import HttpCamera, world_from_body
 from tests.support.poses import Array, Poses, poses_of
 from tests.support.strain import Strain
 
+PathOf = Callable[[int], Pose]
+"""`world_from_body` by CLOCK_MONOTONIC, ns."""
 TAKE_OFF_S = 60.0
 STOP_S = 3.0
 MOST_AWAY_M, MOST_TURNED_DEG = 1.0, 5.0
@@ -55,14 +60,17 @@ class Flying:
         camera_on: bool = True,
         start: bool = True,
         program: tuple[str, ...] = PROGRAM,
+        path: PathOf = world_from_body,
     ) -> None:
-        self.camera = HttpCamera(on=camera_on)
+        self._path = path
+        self.camera = HttpCamera(on=camera_on, world_from_body=path)
         self.strain = Strain()
         # a rangefinder would tell the scale sooner, but no place to compare with the truth
-        self.autopilot = FakeAutopilot("ardupilot", url, _flight(), lacks=("DISTANCE_SENSOR",))
+        self.autopilot = FakeAutopilot("ardupilot", url, _flight(path), lacks=("DISTANCE_SENSOR",))
         # the flight's clock is the monotonic one, and so is what the camera films
         self.autopilot.fly(at_monotonic_ns=0, arm=False)
         calibration = self.camera.write_calibration(folder / "camera.json")
+        self._folder, self._program = folder, program
         self.daemon = Daemon(
             folder, "camera.source=network", f"camera.url={self.camera.url}",
             f"camera.calibration={calibration}", f"link.url={self.autopilot.url}",
@@ -89,6 +97,15 @@ class Flying:
     def start(self) -> None:
         """Start the daemon, where that was left for later."""
         self._open.enter_context(self.daemon)
+
+    def start_again(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """End the daemon by a signal, and start another; when it was sent."""
+        sent_ns = time.monotonic_ns()
+        self.daemon.send(number)
+        self.daemon.ended(30)
+        self.daemon = Daemon(self._folder, *self.daemon.settings, program=self._program)
+        self.start()
+        return sent_ns
 
     def take_off(self) -> None:
         """Arm, and wait until the autopilot has poses to fly on."""
@@ -137,7 +154,7 @@ class Flying:
         epoch_ns = time.time_ns() - time.monotonic_ns()
         for late_s in np.arange(0.0, MOST_LATE_S, 0.02):
             stamps_ns = poses.stamp_us * 1000 - epoch_ns - round(late_s * 1e9)
-            true = [world_from_body(int(stamp_ns)) for stamp_ns in stamps_ns]
+            true = [self._path(int(stamp_ns)) for stamp_ns in stamps_ns]
             places = np.array([pose.translation for pose in true]).reshape(-1, 3)
             turns = np.array([pose.rotation for pose in true]).reshape(-1, 3, 3)
             cosine = (np.einsum("nij,nij->n", poses.rotations, turns) - 1) / 2
@@ -223,5 +240,5 @@ def stage(health: dict[str, Any], name: str) -> dict[str, Any] | None:
     return next((each for each in health["stages"] if each["name"] == name), None)
 
 
-def _flight() -> MadeUpFlight:
-    return MadeUpFlight(lambda t_s: world_from_body(round(t_s * 1e9)), duration_s=math.inf)
+def _flight(path: PathOf) -> MadeUpFlight:
+    return MadeUpFlight(lambda t_s: path(round(t_s * 1e9)), duration_s=math.inf)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,11 @@ class Poses:
         """When those came that came between two times."""
         came_ns = self.came_s * 1e9
         return self.came_s[(came_ns >= from_ns) & (came_ns < to_ns)]
+
+    def after(self, came_s: float) -> Poses:
+        """Those that came later."""
+        late = self.came_s > came_s
+        return Poses(*(getattr(self, each.name)[late] for each in fields(self)))
 
     def last_before_pause_s(self, from_ns: int, pause_s: float = 0.6) -> float:
         """How long after a time the last one came before there were none for a while."""

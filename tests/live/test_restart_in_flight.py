@@ -1,0 +1,120 @@
+"""What takes the pose away in the air, daemon or localisation, and is started again.
+
+The vehicle circles until its pose is sent, and hovers from then on: nothing would ever tell a new
+map its scale. What the killed one kept is taken up.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from companion.geometry import Pose
+from tests.support.flying import MOST_AWAY_M, MOST_TURNED_DEG, PROOF_S, Flying
+from tests.support.http_camera import world_from_body
+from tests.support.poses import Poses
+
+SWAY_M, SWAY_S = 0.1, 5.0
+"""As a hovering vehicle sways: too little for GPS or barometer to tell a scale by."""
+STARTED_S = 15.0
+"""A daemon comes up, its camera and its link are open, and its stages have begun, in this time;"""
+STAGE_S = 8.0
+"""a flight's stages alone in this."""
+RECOGNISED_S = 2.0
+KEPT_S = 2.5
+"""So long after the last pose was told everything there is to know is kept."""
+
+
+class Halting:
+    """A circle, on which the vehicle stays where it is told to hover."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+
+    def hover(self) -> None:
+        self._since_ns = time.monotonic_ns()
+
+    def __call__(self, monotonic_ns: int) -> Pose:
+        since_ns = self._since_ns
+        if since_ns is None or monotonic_ns < since_ns:
+            return world_from_body(monotonic_ns)
+        pose, after_s = world_from_body(since_ns), (monotonic_ns - since_ns) * 1e-9
+        turn = 2 * math.pi * after_s / SWAY_S
+        sway = np.array([math.sin(turn), math.sin(1.3 * turn), 0.0]) * SWAY_M
+        return Pose(pose.rotation, pose.translation + sway)
+
+
+@pytest.fixture(scope="module")
+def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
+    path = Halting()
+    with Flying(tmp_path_factory.mktemp("restart"), path=path) as begun:
+        begun.until_source("camera", "running", timeout_s=60)
+        begun.until_source("autopilot", "running", timeout_s=60)
+        begun.take_off()
+        time.sleep(KEPT_S)
+        path.hover()
+        time.sleep(KEPT_S)
+        yield begun
+
+
+def since(flying: Flying, from_ns: int) -> Poses:
+    """The poses that came after a time."""
+    poses = flying.poses
+    return poses.after(from_ns * 1e-9)
+
+
+def assert_taken_up(flying: Flying, lost_ns: int, started_s: float) -> None:
+    """Poses come again, after proof, where the vehicle is."""
+    flying.until_sending()
+    line = flying.daemon.line("map resumed after restart", 0, lost_ns)
+    flying.until_told("Companion: map resumed after restart", lost_ns)
+    poses = since(flying, lost_ns + round(0.5e9))
+    away_m, turned_deg = flying.errors(poses)
+    took_s = float(poses.came_s[0]) - lost_ns * 1e-9
+    recognised_s = (line.monotonic_ns - lost_ns) * 1e-9
+    print(
+        f"{took_s:.1f} s without a pose, recognised after {recognised_s:.1f} s;"
+        f" wrong by {away_m.max():.2f} m and {turned_deg.max():.1f} deg at most"
+    )
+    assert away_m.max() < MOST_AWAY_M
+    assert turned_deg.max() < MOST_TURNED_DEG
+    first_ns = round(float(poses.came_s[0]) * 1e9)
+    assert first_ns - line.monotonic_ns > 0.9e9 * PROOF_S
+    flying.assert_soon(lost_ns, first_ns, started_s + RECOGNISED_S + PROOF_S)
+
+
+def test_a_daemon_that_is_killed(flying: Flying) -> None:
+    killed_ns = flying.start_again(signal.SIGKILL)
+    assert_taken_up(flying, killed_ns, STARTED_S)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["dies", "hangs"])
+def test_a_localisation_that(flying: Flying, number: signal.Signals) -> None:
+    flying.until_sending()
+    time.sleep(KEPT_S)
+    resets = flying.poses.resets[-1]
+    lost_ns = flying.daemon.signal_stage("localisation", number)
+    named_ns = flying.daemon.line("localisation has died", 30, lost_ns).monotonic_ns
+    assert_taken_up(flying, named_ns, STAGE_S)
+    assert flying.poses.resets[-1] > resets
+
+
+def test_a_daemon_that_is_told_to_end_in_the_air(flying: Flying) -> None:
+    told_ns = flying.start_again()
+    assert_taken_up(flying, told_ns, STARTED_S)
+
+
+def test_nothing_is_kept_once_the_flight_is_over(flying: Flying) -> None:
+    kept = flying.daemon.socket.with_name("map.checkpoint")
+    assert 10_000 < kept.stat().st_size < 5_000_000
+    disarmed_ns = time.monotonic_ns()
+    flying.autopilot.disarm()
+    flying.daemon.line("flight over", 60, disarmed_ns)
+    assert not kept.exists()
+    flying.assert_stops()
+    assert not flying.daemon.said("Traceback")
