@@ -212,7 +212,7 @@ class Daemon:
                 self._link.send(self._link.heartbeat())
             tasks[0].cancel()  # what is watched is being taken apart
             feed_closed = loop.run_in_executor(None, self._feed.stop)
-            await self._flights.close(END_S, keep_map=self._armed)
+            await self._flights.close(END_S, keep_map=self.armed)
             for task in (stopped, *tasks):
                 task.cancel()
             await asyncio.gather(stopped, *tasks, return_exceptions=True)
@@ -448,7 +448,7 @@ class Daemon:
         flight = self._flights.current
         if flight is not None and old.feedback.mode == "off" != config.feedback.mode:
             self._flights.end()  # a map whose scale is the autopilot's own is none to fly on
-            self._begin_if_due()
+            self._begin_if_due(take_up=False)
             return
         if flight is not None:
             flight.set_dense(makes_depth(config))

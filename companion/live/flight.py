@@ -40,7 +40,6 @@ from companion.stages.protocol import Finish, KeepMap, SetShare, Setup, Snapshot
 from companion.stages.stage_process import StageProcess
 from companion.viewer import Watched
 from drivers.recording.content import HealthNote, LinkBytes
-from drivers.status_socket import own_socket_path
 
 NICE = {"localisation": 0, "tape": 5, "topics": 10, "recorder": 10, "depth": 20}
 """The pose comes first; the others take what is left over."""
@@ -58,8 +57,6 @@ RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
 """Between two starts of a stage that dies again and again."""
-KEPT_MAP = "map.checkpoint"
-"""Lies beside the socket, in a folder that only this daemon uses; see `MapKeeper`."""
 TELL_NS = 1_000_000_000
 NOT_FINISHED = "a stage did not give its last results in time"
 
@@ -133,15 +130,11 @@ class LiveFlight:
             if self.folder is not None or kind not in WITH_FLIGHT
         )
 
-    def begin(self, folder: Path, take_up: bool = True) -> None:
-        """The flight begins, and leaves its results there.
-
-        With `take_up` it goes on with the map of a process that died in the air, if there is one
-        and it is recognised.
-        """
+    def begin(self, folder: Path, keep: KeepMap | None = None) -> None:
+        """The flight begins, and leaves its results there; its map is kept as said in `keep`."""
         self.folder, self._began_s = folder, monotonic_s()
-        kept = own_socket_path(self._config.daemon.socket).with_name(KEPT_MAP)
-        self.stages["localisation"].offer(KeepMap(kept, take_up))
+        if keep is not None:
+            self.stages["localisation"].offer(keep)
         for kind in WITH_FLIGHT:
             if kind in self.stages:
                 self._set_up(kind)

@@ -16,8 +16,13 @@ from companion.live.journal import WARNING, Journal
 from companion.live.newest_file import NewestFile
 from companion.messages import Frame, Telemetry, Warned
 from companion.output.flight_result import RunFacts
+from companion.stages.protocol import KeepMap
 from drivers.recording.content import HealthNote, LinkBytes
 from drivers.recording.flights_folder import COUNTER, flight_name, next_number
+from drivers.status_socket import own_socket_path
+
+KEPT_MAP = "map.checkpoint"
+"""Lies beside the socket, in a folder that only this daemon uses; see `MapKeeper`."""
 
 
 class Flights:
@@ -56,12 +61,17 @@ class Flights:
             self._spare = LiveFlight(config, camera, self._clock, self._listener)
 
     def begin(self, config: Config, camera: Camera, take_up: bool = True) -> LiveFlight:
-        """A flight begins; the one before must have been ended. See `LiveFlight.begin`."""
+        """A flight begins; the one before must have been ended.
+
+        With `take_up` it goes on with the map of a process that died in the air, if there is one
+        and it is recognised.
+        """
         self.prepare(config, camera)
         flight, self._spare = self._spare, None
         assert flight is not None and self.current is None
         folder = self._named(Path(config.daemon.flights))
-        flight.begin(folder, take_up)
+        kept = own_socket_path(config.daemon.socket).with_name(KEPT_MAP)
+        flight.begin(folder, KeepMap(kept, take_up))
         self.current = flight
         self._journal.say(f"flight {folder.name} begins; its results go to {folder}")
         return flight

@@ -16,7 +16,7 @@ from companion.stages.protocol import Finish, KeepMap, SetShare, Setup
 from companion.stages.work import Work
 
 KEEP_EVERY_NS = 1_000_000_000
-NOT_KEPT = "map not kept for a restart in flight"
+NOT_KEPT = "the map cannot be kept for a restart in flight"
 
 
 class _Localisation(Work):

@@ -23,8 +23,8 @@ from companion.clock import since_boot_ns
 from companion.output.atomic_file import write_atomically
 from companion.resumption import MOST_ABSENT_NS
 from companion.stages.protocol import Setup
+from drivers.computer_boot import computer_boot
 
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 MOST_READ_BYTES = 64_000_000
 """Nothing that was written here is larger by far."""
 
@@ -45,7 +45,8 @@ class MapKeeper:
 
     def __init__(self, path: Path, setup: Setup) -> None:
         self._path, self._setup = path, setup
-        self._same = {"fingerprint": fingerprint(setup.config, setup.camera), "boot": _boot()}
+        same = fingerprint(setup.config, setup.camera)
+        self._same = {"fingerprint": same, "boot": computer_boot()}
         self._waiting: tuple[Checkpoint, int] | None = None
         self._closed = False
         self._changed = threading.Condition()
@@ -127,11 +128,3 @@ class MapKeeper:
                 self.fault = f"{self._path}: {error.strerror or error}"
             with self._changed:
                 self._waiting = None
-
-
-def _boot() -> str:
-    """What names this start of the computer; "" where the kernel does not tell."""
-    try:
-        return BOOT_ID.read_text().strip()
-    except OSError:
-        return ""

@@ -207,9 +207,7 @@ def test_what_is_old_or_of_another_start_is_refused(
             assert kept is not None and kept.tracked_ns == now_ns
             keeper.close(forget=False)
     keep(path, checkpoint)
-    other_boot = tmp_path / "boot_id"
-    other_boot.write_text("another\n")
-    monkeypatch.setattr(map_keeper, "BOOT_ID", other_boot)
+    monkeypatch.setattr(map_keeper, "computer_boot", lambda: "another")
     assert "started anew" in refusal(path)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from companion import feedback, pilot_messages
+from companion import feedback, localisation, pilot_messages
 from companion.live import armed_settings, flight, left_overs, link_watch, pose_sender, viewing
 from companion.live.flight_parameters import PARAMETERS
 from companion.messages import Warned
@@ -28,7 +28,7 @@ from companion.pilot_messages import (
     of_warning,
     position_lost,
 )
-from companion.stages import topics_work
+from companion.stages import localisation_work, topics_work
 from drivers import camera_feed, ground_requests, live_samples
 from drivers.recording import disk_writer
 
@@ -116,6 +116,7 @@ def test_every_warning_has_its_words() -> None:
     whats = {
         *phrases(camera_feed), *phrases(disk_writer), *phrases(live_samples),
         link_watch.DAMAGED, link_watch.REFUSED, link_watch.FLOODS, link_watch.SLOW,
+        localisation.TAKEN_UP, localisation.NOT_TAKEN_UP, localisation_work.NOT_KEPT,
         link_watch.NO_MAVLINK, flight.RESTARTED, flight.LOCALISATION_DIED, flight.NOT_FINISHED,
         viewing.SHOWN, viewing.NO_VIEWER, viewing.GONE, viewing.BEHIND, viewing.CLOSED,
         left_overs.CUT_SHORT, ground_requests.TOO_MANY, topics_work.MALFORMED, topics_work.TAKEN,
