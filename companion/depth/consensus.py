@@ -199,7 +199,8 @@ def _measured(depth_map: DepthMap, config: DepthConfig) -> Mask:
     """Pixels whose images fit, however sure their depth is; the rest was filled in from around."""
     fits = depth_map.inlier_ratio >= config.min_inlier_ratio
     unsure = (depth_map.state == PixelState.UPDATING.value) & fits
-    return (depth_map.state == PixelState.CONVERGED.value) | unsure
+    measured: Mask = (depth_map.state == PixelState.CONVERGED.value) | unsure
+    return measured
 
 
 def _seen(

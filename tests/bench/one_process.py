@@ -38,6 +38,7 @@ from companion.config import Config
 from companion.config_file import load_config
 from companion.health import LatencyMeter
 from companion.live.flight import Listener, LiveFlight
+from companion.live.flight_dates import FlightDates
 from companion.live.flights import Flights
 from companion.live.health_watch import HealthWatch
 from companion.live.journal import Journal
@@ -73,7 +74,8 @@ class Flown:
         self.clock, self.journal, self._seen = FlightClock(), Journal({}), seen
         self._answered = threading.Event()
         self._seq = -1
-        self.flights = Flights(self.clock, self.journal, self._listener, self._facts)
+        dates = FlightDates(self.clock, lambda: None, lambda: True)
+        self.flights = Flights(self.clock, self.journal, self._listener, self._facts, dates)
         self.feed = CameraFeed(
             camera_source(config.camera), self.clock, config.camera, lambda f: None, self._warned
         )

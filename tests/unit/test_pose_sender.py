@@ -20,6 +20,7 @@ from companion.live import kept_counter
 from companion.live.kept_counter import counter_path
 from companion.live.pose_sender import PoseSender
 from companion.messages import AttitudeSample, Odometry, Telemetry, TrackState, Warned
+from companion.output.atomic_file import write_atomically
 from drivers.autopilot_link import AutopilotLink
 from tests.support.memory_port import MemoryPort
 
@@ -286,14 +287,15 @@ def test_a_damaged_file_is_not_taken_for_none(tmp_path: Path, content: bytes) ->
 @flown
 async def test_a_disk_that_hangs_stalls_no_pose(tmp_path: Path) -> None:
     vehicle, hangs = Vehicle(tmp_path / "kept.json"), threading.Event()
-    write = kept_counter.write_atomically
+    write = write_atomically
 
     def hanging(path: Path, data: bytes, durable: bool = False) -> None:
         hangs.wait(60)
         write(path, data, durable)
 
     vehicle.joins = False
-    kept_counter.write_atomically = hanging  # type: ignore[assignment]
+    patch = pytest.MonkeyPatch()
+    patch.setattr(kept_counter, "write_atomically", hanging)
     try:
         await vehicle.begin()
         vehicle.run(2.4)
@@ -304,7 +306,7 @@ async def test_a_disk_that_hangs_stalls_no_pose(tmp_path: Path) -> None:
         assert stamps_ms.max() < 60
     finally:
         hangs.set()
-        kept_counter.write_atomically = write
+        patch.undo()
         for thread in threading.enumerate():
             if thread.name == "reset counter":
                 thread.join()
