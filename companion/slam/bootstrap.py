@@ -36,15 +36,24 @@ class Start:
 
 
 class Bootstrap:
-    """Tries each new frame against a reference frame until both start a map."""
+    """Tries each new frame against a reference frame until both start a map.
+
+    With a `reference` given, such as the last frame before the camera was lost, the map begins with
+    that one, for as long as it is in sight. `min_parallax_ratio` times the usual parallax is asked
+    for: the more there is, the surer is the motion.
+    """
 
     def __init__(
-        self, config: TrackingConfig, camera: Camera, reference: View | None = None
-    ) -> None:
-        self._config = config
+        self, config: TrackingConfig, camera: Camera, reference: View | None = None,
+        min_parallax_ratio: float = 1.0,
+    ) -> None:  # fmt: skip
         self._camera = camera
         self.pending: deque[View] = deque(maxlen=MAX_PENDING)
         self._reference = reference
+        self._given = reference
+        self._min_parallax_rad = min_parallax_ratio * max(
+            np.radians(config.min_init_parallax_deg), MIN_PARALLAX_PX / camera.focal_px
+        )
 
     def step(self, frame: Frame, features: Features, ned_from_camera: Array | None) -> Start | None:
         """Take a frame; a Start when a map can begin with it."""
@@ -55,9 +64,13 @@ class Bootstrap:
         )  # fmt: skip
         self.pending.append(view)
         reference = self._reference
+        if reference is not None and reference is not self._given:
+            reference = self._reference = self._with_attitude(reference)
         if reference is None:
             if len(features) >= 2 * MIN_POINTS:
                 self._reference = view
+            return None
+        if reference is view:
             return None
         ia, ib = match_descriptors(reference.features, features)
         if len(ia) < MIN_POINTS:
@@ -78,7 +91,7 @@ class Bootstrap:
         focal_px = self._camera.focal_px
         result = initialise(
             reference.features, features, ia, ib, focal_px, seq + 1, attitudes,
-            max(np.radians(self._config.min_init_parallax_deg), MIN_PARALLAX_PX / focal_px),
+            self._min_parallax_rad,
         )  # fmt: skip
         if result is None:
             return None
@@ -95,3 +108,17 @@ class Bootstrap:
         if third is not None and contradicts(third, reference, view, points_map, result.features_a):
             return None
         return Start(reference, view, points_map, result.features_a, result.features_b)
+
+    def _with_attitude(self, reference: View) -> View:
+        """The first view with an attitude, where the reference came before telemetry did.
+
+        Without attitudes two motions explain a plane, and nothing tells which way is down.
+        """
+        if reference.ned_from_camera is not None:
+            return reference
+        measured = (
+            v
+            for v in self.pending
+            if v.ned_from_camera is not None and len(v.features) >= 2 * MIN_POINTS
+        )
+        return next(measured, reference)

@@ -10,7 +10,7 @@ import pytest
 
 from companion.camera import Camera, Distortion
 from companion.config import Config
-from companion.geometry import Array, Pose, rotation_from_vector
+from companion.geometry import Array, Pose, angle_between, rotation_from_vector
 from companion.messages import Frame, KeyframeAdded, Track, TrackState
 from companion.slam.tracker import Prior, Tracker
 from tests.support.scene import DOWN_LOOKING, PlaneWorld, aligned_error
@@ -183,3 +183,21 @@ def test_a_map_that_was_outrun_is_carried_on_by_two_views(images: list[np.ndarra
     assert set(range(20, 40)) <= set(tracks)
     error, _ = aligned_error(*positions(tracker, tracks))
     assert error < 0.2
+
+
+def test_a_map_begins_level_where_the_attitude_comes_after_the_first_frames(
+    images: list[np.ndarray],
+) -> None:
+    tracker = Tracker(Config(), CAMERA, nothing)
+    off_deg = []
+    for k, image in enumerate(images):
+        ned = path(k).rotation if k >= 3 else None
+        frame = Frame(k, k * 100_000_000, image, np.repeat(image[..., None], 3, 2))
+        for message in tracker.step(frame, Prior(None, ned)):
+            if isinstance(message, Track) and message.map_from_camera is not None:
+                true = path(message.seq).rotation
+                off_deg.append(np.degrees(angle_between(message.map_from_camera.rotation, true)))
+        if len(off_deg) > 10:
+            break
+    assert tracker.map.level
+    assert max(off_deg) < 3.0
