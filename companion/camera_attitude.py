@@ -1,6 +1,7 @@
 """The camera's attitude as the autopilot tells it, if that is the camera's at all.
 
-Mount and clock are corrected in flight; an attitude that is not the camera's (a gimbal) is dropped.
+Mount and clock are corrected in flight; an attitude that is not the camera's (a gimbal) is left
+aside until it is.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.attitude_verdict import AttitudeVerdict
 from companion.geometry import Array, Pose, angle_between, rotation_from_vector
-from companion.messages import AttitudeSample, Warned
+from companion.map_tilt import RotationOf
+from companion.messages import AttitudeSample, Track, Warned
 from companion.motion import AttitudeHistory
 from companion.mount import RATE_STEP_NS, MountEstimate, MountEstimator
 
-MAX_DISAGREEMENT_RAD = np.radians(4.0)
-"""An attitude that misses this much of the camera's turning between frames is not the camera's."""
 MOUNT_EVERY_NS = 3_000_000_000
 MIN_MOUNT_RAD, MIN_LATE_S = np.radians(0.3), 0.006
 """Corrections of mount and clock that are not worth making."""
@@ -28,21 +29,29 @@ class Judged(NamedTuple):
     """What came of a look at the attitude.
 
     After a correction `now_from_before` (3, 3) turns what was told in the camera's axes by the
-    mount as it was, and `before_from_now_ned` (3, 3) is by what the frame's attitude was off.
+    mount as it was, and `before_from_now_ned` (3, 3) is by what the frame's attitude was off. With
+    `begin_anew` the map in use is tilted, and of no use at all if it is `young`; `n_anew` is how
+    many in a row were. Attitudes since `disowned_since_ns` were not the camera's.
     """
 
     warnings: list[Warned]
     now_from_before: Array | None = None
     before_from_now_ned: Array | None = None
+    begin_anew: bool = False
+    young: bool = True
+    n_anew: int = 0
+    disowned_since_ns: int | None = None
 
 
 class CameraAttitude:
     """Takes the autopilot's attitudes, and the camera's own turns to judge them by."""
 
     def __init__(self, body_from_camera: Pose | None) -> None:
-        self.used = body_from_camera is not None
-        """Whether it tells anything of the camera."""
+        self._mounted = body_from_camera is not None
         self._history = AttitudeHistory()
+        self._verdict = AttitudeVerdict(self._history)
+        self._disowned: list[tuple[int, int | None]] = []
+        """From when to when, or until now, the attitude was not the camera's."""
         self._mount = body_from_camera.rotation if body_from_camera is not None else np.eye(3)
         self._late_ns = 0
         """What the autopilot's stamps were found to be late by."""
@@ -52,20 +61,26 @@ class CameraAttitude:
         self._kept: dict[int, tuple[Array, Array] | None] = {}
         """`ned_from_body` and body rates of keyframes, kept when the history has moved on."""
 
+    @property
+    def used(self) -> bool:
+        """Whether it tells anything of the camera."""
+        return self._mounted and self._verdict.used
+
     def add(self, sample: AttitudeSample) -> None:
         """Take what the autopilot says."""
         self._history.add(sample)
+        self._verdict.add(sample)
 
     def at(self, t_ns: int) -> Array | None:
         """Rotation `ned_from_camera` (3, 3) of a frame; None where it is not known."""
-        if not self.used:
+        if not self.used or self._is_disowned(t_ns):
             return None
         attitude = self._history.at(t_ns + self._late_ns)
         return None if attitude is None else attitude @ self._mount
 
     def of_keyframe(self, keyframe_id: int, t_ns: int) -> Array | None:
         """The same of a keyframe, interpolated once samples from after it have come."""
-        if not self.used:
+        if not self.used or self._is_disowned(t_ns):
             return None
         if keyframe_id not in self._kept:
             if self._history.newest_t_ns < t_ns + RATE_STEP_NS:
@@ -98,40 +113,55 @@ class CameraAttitude:
             still = np.zeros(3)
             self._kept[keyframe_id] = None if told is None else (told @ self._mount.T, still)
 
-    def compare(self, t_ns: int, map_from_camera: Array) -> None:
-        """Take the rotation (3, 3) of a tracked frame."""
-        if self.used:
-            self._estimator.take(t_ns, map_from_camera, self._history)
+    def _is_disowned(self, t_ns: int) -> bool:
+        return any(a <= t_ns and (b is None or t_ns < b) for a, b in self._disowned)
+
+    def compare(self, track: Track, map_from_camera: Array) -> None:
+        """Take a tracked frame and its rotation (3, 3) in the map in use."""
+        if not self._mounted:
+            return
+        if track.backfilled:
+            relative = track.keyframe_from_camera
+            if track.keyframe_id is not None and relative is not None:
+                self._verdict.take_earlier(track.t_ns, track.keyframe_id, relative.rotation)
+            return
+        self._estimator.take(track.t_ns, map_from_camera, self._history)
+        if track.keyframe_id is not None and track.keyframe_from_camera is not None:
+            self._verdict.take(
+                track.t_ns, map_from_camera, track.keyframe_id,
+                track.keyframe_from_camera.rotation,
+            )  # fmt: skip
 
     def forget(self) -> None:
         """Another map is in use: its turns are not comparable with those of the last."""
         self._estimator.forget()
+        self._verdict.forget()
 
-    def judge(self, t_ns: int, disagreement_rad: float | None) -> Judged:
-        """See how far the attitude is the camera's: correct it, or stop using it.
+    def judge(self, t_ns: int, rotation_of: RotationOf, ned_from_map: Array | None) -> Judged:
+        """See how far the attitude is the camera's, and the map level: correct what is off.
 
-        `disagreement_rad` is what it misses of the camera's turning between frames.
+        `rotation_of` tells how keyframes lie in the map in use, `ned_from_map` (3, 3) how that is
+        placed in the world, None where it is not.
         """
-        if not self.used:
+        if not self._mounted:
             return Judged([])
-        if disagreement_rad is not None and disagreement_rad > MAX_DISAGREEMENT_RAD:
-            return self._drop(t_ns, disagreement_rad)
-        if t_ns < self._due_ns:
+        verdict = self._verdict.judge(t_ns, rotation_of, self._mount, ned_from_map)
+        if verdict is not None:
+            if verdict.disowned_since_ns is not None:
+                self._disowned.append((verdict.disowned_since_ns, None))
+            elif self._disowned and self._disowned[-1][1] is None and self.used:
+                self._disowned[-1] = (self._disowned[-1][0], t_ns)
+                if not verdict.mount:
+                    self._estimator.forget()  # it was given a gimbal's turns
+            return Judged(
+                [verdict.warning], begin_anew=verdict.begin_anew, young=verdict.young,
+                n_anew=self._verdict.n_anew, disowned_since_ns=verdict.disowned_since_ns,
+            )  # fmt: skip
+        if not self.used or t_ns < self._due_ns:
             return Judged([])
         self._due_ns = t_ns + MOUNT_EVERY_NS
         found = self._estimator.estimate()
-        if found is None:
-            return Judged([])
-        if found.useless:
-            return self._drop(t_ns, found.residual_rad)
-        return self._correct(t_ns, found) if found.certain else Judged([])
-
-    def _drop(self, t_ns: int, off_rad: float) -> Judged:
-        self.used = False
-        detail = f"turns differ by {np.degrees(off_rad):.1f} degrees; is there a gimbal?"
-        return Judged(
-            [Warned(t_ns, "the autopilot's attitude is not the camera's and is not used", detail)]
-        )
+        return self._correct(t_ns, found) if found is not None and found.certain else Judged([])
 
     def _correct(self, t_ns: int, found: MountEstimate) -> Judged:
         """Use the mount and the clock as they were found to be; say so where they are far off."""

@@ -141,6 +141,23 @@ def vector_from_rotation(rotation: Array) -> Array:
     return out
 
 
+def vectors_from_rotations(rotations: Array) -> Array:
+    """Rotation vectors (N, 3) of rotations (N, 3, 3) that are no half turns."""
+    off = 0.5 * np.stack(
+        [
+            rotations[:, 2, 1] - rotations[:, 1, 2],
+            rotations[:, 0, 2] - rotations[:, 2, 0],
+            rotations[:, 1, 0] - rotations[:, 0, 1],
+        ],
+        1,
+    )
+    sine = np.linalg.norm(off, axis=1)
+    cosine = 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0)
+    angle = np.arctan2(sine, cosine)
+    out: Array = off * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[:, None]
+    return out
+
+
 def rotation_from_quaternion(quaternion_wxyz: NDArray[Any]) -> Array:
     """Rotation (3, 3) of a quaternion w x y z; it is normalised first."""
     q = np.asarray(quaternion_wxyz, np.float64)

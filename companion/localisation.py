@@ -193,9 +193,9 @@ class LocalisationStage:
                 if message.seq == frame.seq or told is not None:
                     # untold turns would be carried on, and those of a start are rough
                     self._motion.correct(message.t_ns, message.map_from_camera, told)
+                self._attitude.compare(message, message.map_from_camera.rotation)
                 if message.seq == frame.seq:
                     self._last = message
-                    self._attitude.compare(frame.t_ns, message.map_from_camera.rotation)
                     yield self._odometry_of(message)
                 placed = self._places.main_from_newest.apply_to_pose(message.map_from_camera)
                 yield replace(message, map_from_camera=placed)
@@ -328,12 +328,39 @@ class LocalisationStage:
         )
 
     def _judge_attitude(self, t_ns: int) -> list[Warned]:
-        judged = self._attitude.judge(t_ns, self._motion.attitude_disagreement_rad)
+        segment = self._tracker.map
+        placed = self._places.of(segment)
+
+        def rotation_of(keyframe_id: int) -> Array | None:
+            pose = segment.pose_of(keyframe_id)
+            return None if pose is None else pose.rotation.T
+
+        with self._tracker.turn.tracking():
+            judged = self._attitude.judge(
+                t_ns, rotation_of, None if placed is None else placed.world_from_map.rotation
+            )
         if judged.now_from_before is not None:
             self._turn_attitudes(judged.now_from_before)
         if judged.before_from_now_ned is not None:
             self._motion.attitude_corrected(judged.before_from_now_ned)
+        if judged.disowned_since_ns is not None:
+            self._disown_attitudes(judged.disowned_since_ns)
+        if judged.begin_anew:
+            with self._tracker.turn.tracking():
+                self._tracker.begin_anew(judged.n_anew, keep=not judged.young)
+            self._motion.reset()
+            self._attitude.forget()
+            self._last = None
         return judged.warnings
+
+    def _disown_attitudes(self, since_ns: int) -> None:
+        """Keyframes since then were given attitudes that are not the camera's."""
+        self._motion.untie()
+        with self._tracker.turn.tracking():
+            for segment in self._tracker.segments:
+                for keyframe in segment.keyframes.values():
+                    if keyframe.t_ns >= since_ns:
+                        keyframe.ned_from_camera = None
 
     def _turn_attitudes(self, turn: Array) -> None:
         """What keyframes were told of their attitude was told by the mount as it was stated."""

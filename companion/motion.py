@@ -182,6 +182,10 @@ class MotionFilter:
         """The attitude was given as `old`; what it is now takes this turn before the old error."""
         self._map_from_ned = nearest_rotation(self._map_from_ned @ old_from_new)
 
+    def untie(self) -> None:
+        """The attitude so far was not the camera's: how the map lies to it is not known."""
+        self._tied = False
+
     def correct(self, t_ns: int, map_from_camera: Pose, ned_from_camera: Array | None) -> None:
         """Take the pose that the image gave."""
         seen = np.eye(3)

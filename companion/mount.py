@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.geometry import Array, rotation_from_vector
+from companion.geometry import Array, rotation_from_vector, vectors_from_rotations
 from companion.motion import AttitudeHistory
 
 SPACING_NS = 150_000_000
@@ -26,7 +26,6 @@ INFLATION = 3.0
 """Errors of pairs that lie near each other are alike: sigmas are so much larger."""
 MIN_PAIRS = 150
 MIN_TURNED_RAD, CERTAIN_RAD, CERTAIN_S = np.radians(1.5), np.radians(0.7), 0.012
-USELESS_SHARE, USELESS_RAD = 0.5, np.radians(1.0)
 ITERATIONS = 5
 
 
@@ -55,11 +54,6 @@ class MountEstimate:
             and float(self.sigma_turn_rad.max()) < float(CERTAIN_RAD)
             and self.sigma_offset_s < CERTAIN_S
         )
-
-    @property
-    def useless(self) -> bool:
-        """Whether the attitude is not the camera's at all: a gimbal holds it still."""
-        return self.residual_rad > max(float(USELESS_RAD), USELESS_SHARE * self.turned_rad)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +113,7 @@ class MountEstimator:
             expected = np.matmul(np.matmul(mount.T, flown), mount)
             back = expected.transpose(0, 2, 1)
             by_offset = np.matmul(back, rate_i[..., None])[..., 0] - rate_j
-            error = _vectors(np.matmul(back, seen)) + by_offset * offset_s
+            error = vectors_from_rotations(np.matmul(back, seen)) + by_offset * offset_s
             jacobian = np.concatenate([back - np.eye(3), by_offset[..., None]], 2)
             size = np.linalg.norm(error, axis=1) / sigma
             weight = np.minimum(1.0, 2.5 / np.maximum(size, 1e-9)) / sigma**2
@@ -132,27 +126,11 @@ class MountEstimator:
             chi2 = float((size**2 * np.minimum(1.0, 2.5 / np.maximum(size, 1e-9))).mean() / 3)
         sigmas = np.sqrt(np.diag(np.linalg.inv(information)) * max(chi2, 0.05)) * INFLATION
         turned = np.maximum(
-            np.linalg.norm(_vectors(seen), axis=1), np.linalg.norm(_vectors(flown), axis=1)
+            np.linalg.norm(vectors_from_rotations(seen), axis=1),
+            np.linalg.norm(vectors_from_rotations(flown), axis=1),
         )
         return MountEstimate(
             self._stated @ rotation_from_vector(turn), turn, offset_s, sigmas[:3],
             float(sigmas[3]), float(np.median(np.linalg.norm(error, axis=1))),
             float(np.median(turned)),
         )  # fmt: skip
-
-
-def _vectors(rotations: Array) -> Array:
-    """Rotation vectors (N, 3) of rotations (N, 3, 3) that are no half turns."""
-    off = 0.5 * np.stack(
-        [
-            rotations[:, 2, 1] - rotations[:, 1, 2],
-            rotations[:, 0, 2] - rotations[:, 2, 0],
-            rotations[:, 1, 0] - rotations[:, 0, 1],
-        ],
-        1,
-    )
-    sine = np.linalg.norm(off, axis=1)
-    cosine = 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0)
-    angle = np.arctan2(sine, cosine)
-    out: Array = off * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[:, None]
-    return out

@@ -98,6 +98,17 @@ class Atlas:
             self.begin(level=False)
         return in_use
 
+    def give_up(self, keep: bool) -> None:
+        """Use a fresh map in place of one that is wrong now, and all of it unless `keep`."""
+        if keep:
+            self.begin(level=False)
+            return
+        gone = self.segments.pop()
+        for key in gone.keyframes:
+            if key in self._places:
+                self._places.remove(key)
+        self.begin(level=False)
+
     def find(
         self, features: Features, level_from_camera: Array | None, seed: int
     ) -> tuple[SlamMap, Located] | None:

@@ -54,6 +54,9 @@ class PlaceIndex:
     def __len__(self) -> int:
         return len(self._keys) - len(self._free)
 
+    def __contains__(self, key: int) -> bool:
+        return key in self._keys
+
     def add(self, key: int, descriptors: Bytes) -> None:
         """Take a keyframe's descriptors (N, 32)."""
         block = next((b for b in self._blocks if b.n_keys < BLOCK), None)

@@ -33,6 +33,8 @@ TOLD_RESTART_SHARE = 0.4
 """With attitude two views are surer to fit together, and another map may begin so much sooner."""
 MIN_FIRM, MIN_FIRM_SHARE = 25, 0.2
 """Without attitude a guess is believed when so many points of the last frame are found by it."""
+PARALLAX_RATIO = 1.5
+"""So much more parallax is asked for each time that a map turned out wrong."""
 Told = Track | KeyframeAdded | Reunited
 
 
@@ -124,6 +126,19 @@ class Tracker:
     def set_effort(self, share: float) -> None:
         """Look for this share of the features from now on."""
         self._extractor.effort = share
+
+    def begin_anew(self, number: int, keep: bool) -> None:
+        """Give up the map in use, which is wrong, for the `number`th time in a row.
+
+        What was mapped stays behind as a map of its own with `keep`. To be called in the tracker's
+        turn.
+        """
+        self.atlas.give_up(keep)
+        self._forget()
+        self.state, self._lost_since_ns = TrackState.INITIALISING, None
+        self._bootstrap = Bootstrap(
+            self._config, self._camera, min_parallax_ratio=PARALLAX_RATIO**number
+        )
 
     def close(self) -> Done:
         """Finish the mapping that is under way; what it gave."""

@@ -1,4 +1,4 @@
-"""A camera that sits askew, a clock that is late and a gimbal, each found from turns alone."""
+"""A camera that sits askew and a clock that is late, each found from turns alone."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def attitude(t_s: float) -> Array:
 
 
 def estimated(
-    askew: Array, late_s: float, gimbal: bool = False, still: bool = False
+    askew: Array, late_s: float, still: bool = False
 ) -> MountEstimate | None:
     rng = np.random.default_rng(2)
     history = AttitudeHistory()
@@ -43,7 +43,7 @@ def estimated(
         stamp_ns = int((t_s + late_s) * 1e9) + 10**9
         history.add(AttitudeSample(stamp_ns, quaternion_from_rotation(noise @ body)))
         if k % 3 == 0:
-            camera = yaw_rotation(0.4) @ (np.eye(3) if gimbal else body) @ true_mount
+            camera = yaw_rotation(0.4) @ body @ true_mount
             camera = camera @ rotation_from_vector(rng.normal(scale=0.0005, size=3))
             estimator.take(int(t_s * 1e9) + 10**9, camera, history)
     return estimator.estimate()
@@ -55,7 +55,6 @@ def test_a_mount_three_degrees_off_and_a_late_clock_are_found(late_s: float) -> 
     found = estimated(askew, late_s)
     assert found is not None
     assert found.certain
-    assert not found.useless
     wanted = DOWN_LOOKING @ rotation_from_vector(askew)
     assert np.degrees(angle_between(found.body_from_camera, wanted)) < 0.5
     assert found.offset_s == pytest.approx(late_s, abs=0.008)
@@ -67,13 +66,6 @@ def test_where_nothing_turns_nothing_is_claimed() -> None:
     found = estimated(np.radians([3.0, 0, 0]), 0.05, still=True)
     assert found is not None
     assert not found.certain
-    assert not found.useless
-
-
-def test_a_gimbal_makes_the_attitude_useless() -> None:
-    found = estimated(np.zeros(3), 0.0, gimbal=True)
-    assert found is not None
-    assert found.useless
 
 
 def test_too_little_says_nothing() -> None:
