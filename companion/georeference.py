@@ -31,6 +31,8 @@ from companion.messages import (
 )
 from companion.sample_series import SampleSeries
 
+MIN_RANGES = 4
+"""Fewer ranges have no median to speak of."""
 MAX_HELD_NS = 400_000_000
 """A velocity may be as old as this."""
 SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.01, 0.05
@@ -91,6 +93,11 @@ class Georeferencer:
         """Forget what was said before a time, save at the times of keyframes (N,), sorted."""
         for each in (*self._positions.values(), *self._travel.values(), self._height, self._range):
             each.let_go(before_ns, keyframes_ns)
+
+    @property
+    def has_ranges(self) -> bool:
+        """Whether a rangefinder has told enough to compare with a map."""
+        return len(self._range) >= MIN_RANGES
 
     def _integrate(self, series: SampleSeries, t_ns: int, velocity: Array) -> None:
         # rows: velocity, and the way travelled so far by it; a GPS may not tell the vertical part
@@ -235,7 +242,7 @@ class Georeferencer:
 
     def _range_scale(self, places: list[Place]) -> Scale | None:
         """Scale from the rangefinder against the map's ground."""
-        if len(self._range) < 4:
+        if not self.has_ranges:
             return None
         distance, ok = self._range.at(np.array([p.t_ns for p in places]))
         ratios = np.array([
@@ -243,7 +250,7 @@ class Georeferencer:
             for p, d, good in zip(places, distance, ok, strict=True)
             if good and p.ground_units is not None
         ])  # fmt: skip
-        if len(ratios) < 4:
+        if len(ratios) < MIN_RANGES:
             return None
         scale = float(np.median(ratios))
         spread = 1.4826 * float(np.median(np.abs(ratios - scale))) / scale

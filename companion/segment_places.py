@@ -10,6 +10,7 @@ import numpy as np
 from companion.camera_attitude import CameraAttitude
 from companion.geometry import Array, Pose, Similarity
 from companion.georeference import Georeferencer, Place
+from companion.ground_below import GroundBelow
 from companion.map_fit import DISAGREE, MAX_STEP_S, SIGMA_VELOCITY_M_S, VELOCITY_TAU_S
 from companion.messages import Georeference, MapUpdate
 from companion.slam.map import Keyframe, SlamMap
@@ -18,7 +19,6 @@ from companion.slam.ways import Ways, usual_error
 
 MAX_REUNION_OFF_M = 6.0
 """What the autopilot's own positions may be wrong by between two times."""
-MIN_DOWN_COSINE = np.cos(np.radians(8.0))
 ALIKE = 3.0
 """Each window takes the same ways anew, and their errors are alike: sigmas are so much larger."""
 MAX_SIGMA_SCALE_TOLD = 0.05
@@ -80,9 +80,7 @@ class SegmentPlaces:
         self._revision += 1
         for segment in segments:
             if final or (segment is segments[-1] and _due(segment)):
-                found = self._georeferencer.solve(
-                    [self._place(segment, keyframe) for keyframe in _spread(segment, final)]
-                )
+                found = self._georeferencer.solve(self._placed(segment, _spread(segment, final)))
                 if found is not None:
                     self._known[segment.first_keyframe_id] = self._surer(segment, found)
         main = self._main_of(segments, final)
@@ -194,7 +192,7 @@ class SegmentPlaces:
             return None
         start_ned_m = from_ned_m + moved_m
         if own is None:
-            places = [self._place(segment, k) for k in segment.keyframes.values()]
+            places = self._placed(segment, list(segment.keyframes.values()))
             return self._georeferencer.begin(places, start_ned_m)
         to_world = own.world_from_map
         origin = start_ned_m - to_world.scale * to_world.rotation @ first.centre
@@ -219,23 +217,29 @@ class SegmentPlaces:
         off_m = float(np.linalg.norm(way_m - flown_m))
         return off_m < MAX_REUNION_OFF_M + 3.0 * placed.sigma_scale * float(np.linalg.norm(way_m))
 
-    def _place(self, segment: SlamMap, keyframe: Keyframe) -> Place:
-        return Place(
-            keyframe.t_ns,
-            keyframe.camera_from_map.inverse(),
-            self._attitude.of_keyframe(keyframe.keyframe_id, keyframe.t_ns),
-            self._ground_below(segment, keyframe),
-        )
+    def _placed(self, segment: SlamMap, keyframes: list[Keyframe]) -> list[Place]:
+        poses = [k.camera_from_map.inverse() for k in keyframes]
+        grounds = self._grounds_below(segment, poses)
+        return [
+            Place(k.t_ns, pose, self._attitude.of_keyframe(k.keyframe_id, k.t_ns), ground)
+            for k, pose, ground in zip(keyframes, poses, grounds, strict=True)
+        ]
 
-    def _ground_below(self, segment: SlamMap, keyframe: Keyframe) -> float | None:
-        """Distance from the camera down the body's axis to the map, in map units."""
-        if self._body_from_camera is None:
-            return None
-        _, ids = segment.seen_by(keyframe)
-        in_camera = keyframe.camera_from_map.apply(segment.positions[ids])
-        p = in_camera @ self._body_from_camera.rotation.T
-        below = p[p[:, 2] > MIN_DOWN_COSINE * np.linalg.norm(p, axis=1)]
-        return float(np.median(below[:, 2])) if len(below) >= 5 else None
+    def _grounds_below(self, segment: SlamMap, poses: list[Pose]) -> list[float | None]:
+        """Distances from cameras, `map_from_camera`, down the body's axis to the map, in its units.
+
+        None where they are not known: no rangefinder asks for them, or a gimbal turns the camera.
+        """
+        mount = self._body_from_camera
+        asked = self._georeferencer.has_ranges and self._attitude.used
+        if mount is None or not poses or not asked:
+            return [None] * len(poses)
+        beams = [pose.rotation @ mount.rotation[2] for pose in poses]
+        down = np.sum(beams, axis=0)
+        ground = GroundBelow(segment.living_positions(), down / np.linalg.norm(down))
+        return [
+            ground.distance(pose.translation, beam) for pose, beam in zip(poses, beams, strict=True)
+        ]
 
 
 def _poses(keyframes: list[Keyframe]) -> tuple[Array, Array]:
