@@ -15,12 +15,10 @@ from companion.depth import takeover
 from companion.depth.self_test import SelfTest
 from companion.depth.stage import MAX_HELD, DepthStage
 from companion.depth.takeover import NONE_LEFT, TOOK_OVER, Devices
-from companion.geometry import Pose, rotation_from_vector
+from companion.geometry import Pose
 from companion.messages import (
     DepthMap,
     Frame,
-    KeyframeAdded,
-    MapUpdate,
     Message,
     PointChunk,
     Track,
@@ -29,15 +27,10 @@ from companion.messages import (
 )
 from tests.support import compute
 from tests.support.failing_driver import WrongDevice
-from tests.support.scene import DOWN_LOOKING, PlaneWorld
+from tests.support.mapped_plane import at, told
 
 RADTAN = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
 FISHEYE = Camera(242, 181, 170.0, 170.0, 121.0, 90.0, Distortion.EQUIDISTANT, (0.01, 0, 0, 0))
-
-
-def at(k: int) -> Pose:
-    turn = rotation_from_vector(np.array([0.01 * np.sin(k), 0.15, 0.004 * k])) @ DOWN_LOOKING
-    return Pose(turn, np.array([0.05 * k, 0.2 * k - 3, -12.0]))
 
 
 def stage(camera: Camera, devices: Devices | None = None) -> DepthStage:
@@ -54,26 +47,12 @@ def fly(
 
     `before` is told each frame's number before the stage gets it.
     """
-    world = PlaneWorld(np.random.default_rng(21))
-    it, out = stage(camera, devices), []
-    poses: dict[int, Pose] = {}
-    for k in range(n):
-        before(k)
-        grey, depth = world.render(camera, at(k))
-        out += it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
-        if k % 4 == 0:
-            poses[k // 4] = at(k)
-        reference = poses[k // 4]
-        relative = reference.inverse() @ at(k)
-        out += it.step(Track(k, k, TrackState.TRACKING, at(k), k // 4, relative))
-        if k % 4 == 0:
-            v, u = np.nonzero(depth)
-            some = slice(None, None, 97)
-            n2 = camera.normalise(np.stack([u[some], v[some]], 1))
-            z = depth[v[some], u[some]]
-            points = np.c_[n2 * z[:, None], z]
-            out += it.step(KeyframeAdded(k // 4, k, k, at(k), points[np.isfinite(points).all(1)]))
-            out += it.step(MapUpdate(k, k, dict(poses), np.zeros((0, 3)), None, unit_of or {}))
+    it, out, last = stage(camera, devices), [], -1
+    for k, message in told(camera, n, unit_of):
+        if k != last:
+            before(k)
+        last = k
+        out += it.step(message)
     return out + it.flush()
 
 

@@ -1,0 +1,165 @@
+"""An OpenCL device that fails in flight: its stage's process, and the daemon around that."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.camera import Camera, Distortion
+from companion.config import Config
+from companion.depth.takeover import NONE_LEFT, TOOK_OVER
+from companion.messages import DepthMap, Frame, Warned
+from companion.stages.frame_ring import FrameRing
+from companion.stages.protocol import Setup
+from companion.stages.stage_process import StageProcess
+from drivers.recording.recording import Recording
+from drivers.recording.topics import EVENTS
+from tests.support.daemon import UNGOVERNED
+from tests.support.failing_driver import fail, two_devices
+from tests.support.flying import Flying
+from tests.support.mapped_plane import told
+
+CAMERA = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
+N, N_BEFORE = 34, 20
+LONG_S = 150.0
+"""A driver is given 30 s to come back, on a machine that may have much else to do."""
+
+
+class Stage:
+    """The depth stage's process, with nothing of a daemon around it."""
+
+    def __init__(self, ring: FrameRing, failed: Mapping[str, str]) -> None:
+        self._ring = ring
+        self._came = threading.Condition()
+        self.out: list[Any] = []
+        self.why: str | None = None
+        self.process = StageProcess("depth", 0, ring, self._take, self._ended, every_frame=True)
+        self.process.begin(Setup(Config(), CAMERA, None, failed))
+        self.until(lambda: self.process.progress is not None or self.why is not None)
+
+    def feed(self, first: int, beyond: int) -> None:
+        """Tell it of some of the frames."""
+        for k, message in told(CAMERA, beyond):
+            if k >= first:
+                is_frame = isinstance(message, Frame)
+                self.process.offer(self._ring.put(message) if is_frame else message)  # type: ignore[arg-type]
+
+    def of(self, kind: type) -> list[Any]:
+        with self._came:
+            return [message for message in self.out if isinstance(message, kind)]
+
+    def until(self, such: Callable[[], bool]) -> None:
+        """Wait for it; AssertionError where it does not come."""
+        until_s = time.monotonic() + LONG_S
+        while not such():
+            assert time.monotonic() < until_s, f"it gave {self.out}, and ended: {self.why}"
+            with self._came:
+                self._came.wait(0.1)
+
+    def _take(self, message: Any) -> None:
+        with self._came:
+            self.out.append(message)
+            self._came.notify_all()
+
+    def _ended(self, why: str) -> None:
+        with self._came:
+            self.why = why
+            self._came.notify_all()
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"), [("abort", "killed by SIGABRT"), ("hang", "a driver does not come back")]
+)
+def test_a_driver_that_ends_or_hangs_the_stage_is_named_and_passed_over(
+    fault: str, why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    first, second = two_devices(monkeypatch, tmp_path)
+    now = tmp_path / "now"
+    fail(monkeypatch, tmp_path, fault, first, when=now)
+    ring = FrameRing(CAMERA.width, CAMERA.height)
+    stages = [Stage(ring, {})]
+    try:
+        (stage,) = stages
+        assert stage.process.progress is not None, stage.why
+        assert stage.process.progress.device.startswith(first.named)
+        stage.feed(0, N_BEFORE)
+        stage.until(lambda: bool(stage.of(DepthMap)))
+        now.touch()
+        stage.feed(N_BEFORE, N)
+        stage.until(lambda: stage.why is not None)
+        assert stage.why == why
+        driver = stage.process.driver
+        assert driver is not None and (driver.identity, driver.named) == (
+            first.identity, first.named,
+        )  # fmt: skip
+        stages.append(Stage(ring, {driver.identity: f"{driver.named}: {why}"}))
+        stage = stages[-1]
+        assert stage.process.progress is not None, stage.why
+        assert stage.process.progress.device.startswith(second.named)
+        stage.feed(0, N)
+        stage.until(lambda: bool(stage.of(DepthMap) and stage.of(Warned)))
+        (warned,) = stage.of(Warned)
+        assert (warned.what, warned.detail) == (TOOK_OVER, f"{second.named}; {first.named}: {why}")
+    finally:
+        for each in stages:
+            each.process.kill()
+        ring.close()
+
+
+def test_a_stage_that_is_killed_from_outside_blames_no_device(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    first, _ = two_devices(monkeypatch, tmp_path)
+    now = tmp_path / "now"
+    fail(monkeypatch, tmp_path, "hang", first, when=now)
+    ring = FrameRing(CAMERA.width, CAMERA.height)
+    stage = Stage(ring, {})
+    try:
+        stage.process._child.kill()  # as the kernel does where memory is short
+        stage.until(lambda: stage.why is not None)
+        assert (stage.why, stage.process.driver) == ("killed by SIGKILL", None)
+    finally:
+        stage.process.kill()
+        ring.close()
+
+
+def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As journal, pilot, status and recording have it."""
+    first, second = two_devices(monkeypatch, tmp_path)
+    now = tmp_path / "now"
+    fail(monkeypatch, tmp_path, "abort", first, when=now)
+    with Flying(tmp_path, "depth.enabled=true", "depth.stride=4", program=UNGOVERNED) as flying:
+        flying.until_source("camera", "running")
+        flying.until_source("autopilot", "running")
+        flying.take_off()
+        flying.until_stage("depth", lambda it: it["detail"].startswith(first.named), LONG_S)
+        flying.until_stage("depth", lambda it: it["rate_hz"] > 0, LONG_S)
+        failed_ns = time.monotonic_ns()
+        now.touch()
+        flying.daemon.line("started again: depth: killed by SIGABRT", LONG_S, failed_ns)
+        flying.until_stage("depth", lambda it: it["detail"].startswith(second.named), LONG_S)
+        flying.daemon.line(TOOK_OVER, LONG_S, failed_ns)
+        flying.until_told(TOOK_OVER, failed_ns)
+        health = flying.until_stage("depth", lambda it: it["alive"] and it["rate_hz"] > 0, LONG_S)
+        assert health["n_restarted"] == 1
+        assert f"failed: {first.named}: killed by SIGABRT" in health["detail"]
+        flying.assert_went_on(failed_ns)
+        flying.assert_true_poses()
+        flying.assert_stops()
+        (folder,) = flying.daemon.flown()
+    recording = Recording(folder / "flight.mcap")
+    chunks = range(len(recording.found.chunks))
+    events = b"".join(
+        bytes(each.data) for n in chunks for each in recording.messages(n)
+        if each.channel.topic == EVENTS
+    )  # fmt: skip
+    recording.close()
+    assert f"{second.named}; {first.named}: killed by SIGABRT".encode() in events
+    assert events.count(TOOK_OVER.encode()) == 1 and NONE_LEFT.encode() not in events
