@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from companion.config import OpenclConfig
 from companion.depth.device_choice import MeasuredDevice, in_order, why_taken
@@ -69,10 +70,13 @@ def choose_devices(
     order = in_order(found)
     if not order and not failed:
         raise DeviceError(_none(found))
-    devices = Devices(
-        order, lambda taken: "asked for" if asked_for else why_taken(taken, found),
-        list(failed.values()), watch,
-    )  # fmt: skip
+
+    def why(taken: ListedDevice) -> str:
+        if asked_for:
+            return "asked for"
+        return why_taken(taken, found) if taken is order[0] else "the next best"
+
+    devices = Devices(order, why, list(failed.values()), watch)
     for failure in devices.failures[len(failed) :]:
         say(f"OpenCL: {failure}")
     return devices
@@ -90,8 +94,9 @@ def _known(
 ) -> dict[str, MeasuredDevice]:
     """What is kept; nothing where no device wanted works, as somebody may just have mended that."""
     kept = kept_verdict(verdict_path(), circumstances(listed))
-    works = any(each.identity in kept and kept[each.identity].frames_per_s for each in wanted)
-    return kept if works else {}
+    found = [kept[each.identity] for each in wanted if each.identity in kept]
+    hopeless = len(found) == len(wanted) and not in_order(found)
+    return {} if hopeless else kept
 
 
 def _measured(
@@ -99,23 +104,29 @@ def _measured(
     listed: Sequence[ListedDevice], say: Say, program: Sequence[str] = PROGRAM,
     told: bool = True,
 ) -> list[MeasuredDevice]:  # fmt: skip
-    """Those wanted, each as it is known or else measured now; what is new is kept."""
-    missing = [each for each in wanted if each.identity not in known]
-    for each in missing:
+    """Those wanted, each as it is known or else measured now.
+
+    What is new is kept at once: a service that is ended for taking long goes on there.
+    """
+    now, why_not = circumstances(listed), ""
+    for each in wanted:
+        if each.identity in known:
+            continue
         found = known[each.identity] = probed(each, program)
         if found.problem and told:
             say(f"OpenCL: {found.named}: {found.problem}")
-    if missing:
-        _keep(verdict_path(), listed, list(known.values()), say)
+        why_not = _kept(verdict_path(), now, list(known.values()))
+    if why_not:
+        say(f"OpenCL: what devices can do is not kept, and measured at each start: {why_not}")
     return [known[each.identity] for each in wanted]
 
 
-def _keep(
-    path: Path | None, listed: Sequence[ListedDevice], found: Sequence[MeasuredDevice], say: Say
-) -> None:
+def _kept(path: Path | None, now: Mapping[str, Any], found: Sequence[MeasuredDevice]) -> str:
+    """Keep it; "", or why that cannot be."""
+    if path is None:
+        return "neither $XDG_CACHE_HOME nor $HOME is set"
     try:
-        if path is None:
-            raise OSError("neither $XDG_CACHE_HOME nor $HOME is set")
-        keep_verdict(path, circumstances(listed), found)
+        keep_verdict(path, now, found)
     except OSError as error:
-        say(f"OpenCL: what devices can do is not kept, and measured at each start: {error}")
+        return str(error)
+    return ""

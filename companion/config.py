@@ -306,7 +306,8 @@ class OpenclConfig:
     """Where kernels run."""
 
     device: str = "auto"
-    """"auto", or a part of a device's or platform's name, or "platform:device" by number."""
+    """"auto" (the fastest that computes right), or a part of a device's or platform's name, or
+    "platform:device" by number."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,8 +35,9 @@ def listed_devices(
     """All devices there are; and those platforms whose driver fails when it is asked for them."""
     devices: list[ListedDevice] = []
     failed: list[MeasuredDevice] = []
-    first = 0
-    while first < MOST_PLATFORMS:
+    first, before = 0, -1
+    while before < first < MOST_PLATFORMS:
+        before = first
         said, ended, detail = _said(["list", str(first)], program, patience_s)
         asked = ListedDevice(f"{first}:?", "", "a driver, when platforms are listed")
         finished = False
@@ -49,8 +50,6 @@ def listed_devices(
         if finished:
             break
         failed.append(measured(asked, None, ended, detail))
-        if not said:
-            break
     return devices, failed
 
 

@@ -27,7 +27,10 @@ class _Depth(Work):
         super().__init__()
         self._setup = setup
         self._tell: Callable[[Any], None] = lambda _: None
-        self._patience_s = FIRST_PATIENCE_S
+        self._used = ""
+        """Identity of the device that was last at work."""
+        self._proven: set[str] = set()
+        """Devices that have made a depth map."""
         self._devices: Devices | None = None
         self._stage: DepthStage | None = None
 
@@ -50,7 +53,7 @@ class _Depth(Work):
             return []
         out = self._stage.step(message)
         if any(isinstance(each, DepthMap) for each in out):
-            self._patience_s = PATIENCE_S
+            self._proven.add(self._used)
         self.device = self._devices.described
         return out
 
@@ -64,8 +67,10 @@ class _Depth(Work):
 
         The kernel sends it, so that it does not matter what the driver holds meanwhile.
         """
+        self._used = device.identity
+        patience_s = PATIENCE_S if self._used in self._proven else FIRST_PATIENCE_S
         self._tell(DriverAtWork(device.identity, device.named))
-        signal.setitimer(signal.ITIMER_REAL, self._patience_s)
+        signal.setitimer(signal.ITIMER_REAL, patience_s)
         try:
             yield
         finally:

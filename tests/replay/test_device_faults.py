@@ -18,7 +18,7 @@ KERNELS = 900
 
 def told(run: Run) -> dict[str, str]:
     """What was warned of, with the detail."""
-    return {each["what"]: each["detail"] for each in run.report["warnings"]}
+    return {each["what"]: each["first_detail"] for each in run.report["warnings"]}
 
 
 def test_the_next_device_takes_over_and_each_run_is_the_same(

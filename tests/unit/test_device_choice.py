@@ -227,6 +227,17 @@ else:
 """
 
 
+TWO = """
+import json, os, sys
+if sys.argv[1] == "list":
+    each = {"number": "0:0", "name": "first", "platform": "P"}
+    print(json.dumps({"devices": [each, {**each, "number": "0:1", "name": "second"}]}))
+    print(json.dumps({"finished": True}))
+else:
+    os.abort()
+"""
+
+
 class Measuring:
     """Chooses the device of this computer, which is measured by a program that counts."""
 
@@ -343,6 +354,24 @@ def test_the_processor_is_its_model_and_not_its_clock(tmp_path: Path) -> None:
     assert processor(path) == one
     path.write_text("processor\t: 0\nmodel name\t: B\ncpu MHz\t: 800\n")
     assert processor(path) != one
+
+
+def test_what_was_measured_before_an_interruption_is_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A service is ended that takes too long to start, and would never get further."""
+    monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
+
+    def stop(remark: str) -> None:
+        if "second" in remark:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        choose_devices(OpenclConfig(), stop, program=(sys.executable, "-c", TWO))
+    path = verdict_path()
+    assert path is not None
+    document = json.loads(path.read_text())
+    assert [each["name"] for each in document["measured"]] == ["first"]
 
 
 def test_in_flight_what_has_failed_is_passed_over_and_none_may_be_left() -> None:
