@@ -14,6 +14,7 @@ from companion.camera import Camera, Distortion
 from companion.config import Config
 from companion.depth.takeover import NONE_LEFT, TOOK_OVER
 from companion.messages import DepthMap, Frame, Warned
+from companion.pilot_messages import MAP_OTHER_DEVICE
 from companion.stages.frame_ring import FrameRing
 from companion.stages.protocol import Setup
 from companion.stages.stage_process import StageProcess
@@ -146,7 +147,7 @@ def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
         flying.daemon.line("started again: depth: killed by SIGABRT", LONG_S, failed_ns)
         flying.until_stage("depth", lambda it: it["detail"].startswith(second.named), LONG_S)
         flying.daemon.line(TOOK_OVER, LONG_S, failed_ns)
-        flying.until_told(TOOK_OVER, failed_ns)
+        flying.until_told(MAP_OTHER_DEVICE.text, failed_ns)
         health = flying.until_stage("depth", lambda it: it["alive"] and it["rate_hz"] > 0, LONG_S)
         assert health["n_restarted"] == 1
         assert f"failed: {first.named}: killed by SIGABRT" in health["detail"]
