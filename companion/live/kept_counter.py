@@ -97,6 +97,7 @@ class CounterFile:
                 return
             data = json.dumps(dataclasses.asdict(kept), indent=1).encode()
             try:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(self.path, data, durable=True)
             except OSError as error:
                 with self._lock:
