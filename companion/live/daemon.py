@@ -400,7 +400,7 @@ class Daemon:
         else:
             config, cannot = reloaded(self._config, read)
             waiting: dict[str, Any] = {}
-            if self.armed:
+            if self.armed or self._arming.holds:
                 config, waiting = tightened(self._config, config)
             stays = {*cannot, *waiting}
             kept |= {name: value for name, value in self._by_ground.items() if name in stays}
@@ -408,10 +408,11 @@ class Daemon:
             if self._ground is not None:
                 self._ground.changed = kept
             self.take_over(config)
-            off_until = {k: v for k, v in self._arming.waiting.items() if k == "feedback.mode"}
-            self._arming.waiting = off_until | waiting
+            if "feedback.mode" in self._arming.waiting and read.feedback.mode != "off":
+                waiting["feedback.mode"] = read.feedback.mode
+            self._arming.waiting = waiting
             text = f"; these need a restart: {', '.join(cannot)}" if cannot else ""
-            if waiting:
+            if set(waiting) - {"feedback.mode"}:
                 text += f"; these are looser and wait for disarming: {', '.join(waiting)}"
                 self._tell_pilot(LIMITS_WAIT())
             self._journal.say(f"configuration read again{text}", WARNING if stays else INFO)
