@@ -22,6 +22,8 @@ FILE = ".armed.json"
 """In the folder of flights, the one place that the daemon is sure to be able to write to."""
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """Another each time that the computer starts (random(4))."""
+ANOTHER_BOOT = "unknown"
+"""Of the computer: what is held is let go as soon as the autopilot says that it is disarmed."""
 NOT_KEPT = "settings cannot be kept"
 MODE = "feedback.mode"
 
@@ -90,7 +92,7 @@ def read_settings(flights: Path, config: Config) -> tuple[ArmedSettings | None, 
     """What a daemon before has left, None if it ended disarmed; and what is wrong with it, if.
 
     Of a file that cannot be read it is known that something was switched off or made stricter just
-    as the computer lost its power: nothing is sent then until the motors are disarmed.
+    as the computer lost its power: nothing is sent then as long as the motors are armed.
     """
     path = flights / FILE
     try:
@@ -106,11 +108,11 @@ def read_settings(flights: Path, config: Config) -> tuple[ArmedSettings | None, 
             checked, by_ground, str(document["computer_boot"]),
             None if boot_s is None else float(boot_s), float(document["written_s"]),
         ), ""  # fmt: skip
-    except FileNotFoundError:
-        return None, ""
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return None, ""  # nor can there have been one of ours
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
         off = {MODE: "off"}
-        return ArmedSettings(off, off, computer_boot(), None, 0.0), f"{path}: {error}"
+        return ArmedSettings(off, off, ANOTHER_BOOT, None, 0.0), f"{path}: {error}"
 
 
 def _checked(config: Config, name: str, value: Any) -> Any:

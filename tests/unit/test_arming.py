@@ -171,9 +171,16 @@ def test_a_file_that_a_power_cut_has_damaged_sends_nothing(tmp_path: Path, data:
     before, why = read_settings(tmp_path, READ)
     assert before is not None and FILE in why
     file = NewestFile(tmp_path / FILE, lambda _: None)
-    found = Arming(file, before, lambda: None, lambda: True).resume(READ)
-    assert found.config == with_values(READ, OFF)
+    began = Arming(file, before, lambda: 5.0, lambda: True)
+    assert began.resume(READ).config == with_values(READ, OFF)
+    began.take(False, 10.0)  # on the ground it is over at once
+    assert began.step(10.0 + CERTAIN_S)
     file.close(0.0)
+
+
+def test_where_there_can_be_no_file_nothing_is_held(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert read_settings(tmp_path / "file" / "flights", READ) == (None, "")
 
 
 def test_what_is_written_is_read_back_and_a_full_disk_is_told(
