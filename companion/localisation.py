@@ -48,8 +48,8 @@ SIGMA_COASTING_RAD_S = np.radians(0.2)
 REMEMBERED_NS = 600_000_000_000
 """What telemetry told longer ago is only asked for at the times of keyframes."""
 LET_GO_EVERY_NS = 60_000_000_000
-TAKEN_UP = "the map from before is taken up"
-NOT_TAKEN_UP = "the map from before is not what is seen: another begins"
+TAKEN_UP = "map resumed after restart"
+NOT_TAKEN_UP = "old map not recognised: new map"
 
 
 class LocalisationStage:

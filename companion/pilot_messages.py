@@ -57,12 +57,12 @@ POSITION_ENABLED = PilotMessage(NOTICE, "vision position enabled: disarmed")
 LIMITS_WAIT = PilotMessage(NOTICE, "looser limits wait for disarming")
 SETTINGS_NOT_SAVED = PilotMessage(WARNING, "disk error: settings not saved")
 TRACKING_FAILED = PilotMessage(WARNING, "visual tracking failed: restarting")
-MAP_RESUMED = PilotMessage(INFO, "map resumed after restart")
-MAP_NOT_RESUMED = PilotMessage(WARNING, "old map not recognised: new map")
-MAP_NOT_SAVED = PilotMessage(NOTICE, "map not saved for a restart")
 ATTITUDE_MISMATCH = PilotMessage(WARNING, "attitude mismatch: no vision position")
 ATTITUDE_USED = PilotMessage(INFO, "attitude matches again")
 MAP_TILTED = PilotMessage(WARNING, "map tilted: restarting")
+MAP_RESUMED = PilotMessage(NOTICE, "map resumed after restart")
+MAP_NOT_RESUMED = PilotMessage(NOTICE, "old map not recognised: new map")
+MAP_NOT_SAVED = PilotMessage(NOTICE, "map not saved for a restart")
 MOUNT_CORRECTED = PilotMessage(NOTICE, "camera mount angle corrected")
 
 # -- camera and autopilot -----------------------------------------------------------------
@@ -167,14 +167,14 @@ PARTS: Mapping[str, str] = {
 
 OF_WARNING: Mapping[str, PilotMessage] = {
     "localisation has died: the flight ends, and another begins": TRACKING_FAILED,
-    "the map from before is taken up": MAP_RESUMED,
-    "the map from before is not what is seen: another begins": MAP_NOT_RESUMED,
-    "the map cannot be kept for a restart in flight": MAP_NOT_SAVED,
     "the autopilot's attitude is not the camera's and is not used": ATTITUDE_MISMATCH,
     "camera does not turn with the body: attitude not used, no vision position": ATTITUDE_MISMATCH,
     "camera mount disagrees with the autopilot's attitude: no vision position": ATTITUDE_MISMATCH,
     "camera turns with the body again: attitude used": ATTITUDE_USED,
     "map tilted against the autopilot's attitude: begun anew": MAP_TILTED,
+    "map resumed after restart": MAP_RESUMED,
+    "old map not recognised: new map": MAP_NOT_RESUMED,
+    "the map cannot be kept for a restart in flight": MAP_NOT_SAVED,
     "camera and autopilot were found to disagree, corrected": MOUNT_CORRECTED,
     "settings cannot be kept": SETTINGS_NOT_SAVED,
     "reset counter is not kept": SETTINGS_NOT_SAVED,

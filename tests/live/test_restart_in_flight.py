@@ -71,7 +71,7 @@ def since(flying: Flying, from_ns: int) -> Poses:
 def assert_taken_up(flying: Flying, lost_ns: int, started_s: float) -> None:
     """Poses come again, after proof, where the vehicle is."""
     flying.until_sending()
-    line = flying.daemon.line("the map from before is taken up", 0, lost_ns)
+    line = flying.daemon.line("map resumed after restart", 0, lost_ns)
     flying.until_told("Companion: map resumed after restart", lost_ns)
     poses = since(flying, lost_ns + round(0.5e9))
     away_m, turned_deg = flying.errors(poses)

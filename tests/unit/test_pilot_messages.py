@@ -121,6 +121,7 @@ def test_every_warning_has_its_words() -> None:
         viewing.SHOWN, viewing.NO_VIEWER, viewing.GONE, viewing.BEHIND, viewing.CLOSED,
         left_overs.CUT_SHORT, ground_requests.TOO_MANY, topics_work.MALFORMED, topics_work.TAKEN,
         topics_work.NOT_TAKEN, flight_result.GIVEN_UP, armed_settings.NOT_KEPT,
+        localisation.TAKEN_UP, localisation.NOT_TAKEN_UP, localisation_work.NOT_KEPT,
     }  # fmt: skip
     for module in ("drivers/autopilot_link.py", "companion/camera_attitude.py"):
         for node in ast.walk(ast.parse((ROOT / module).read_text("utf-8"))):
