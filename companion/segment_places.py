@@ -59,17 +59,22 @@ class SegmentPlaces:
         """What was found of a segment, or what was known of it before, if that is surer.
 
         What it was found by is not kept: it takes as long again until as much is known. A scale
-        that both cannot have is the newly measured one.
+        that both cannot have is the newly measured one. A place in the world is not given up for
+        a map that begins at its first camera: poses would be led from the one to the other; where
+        scales disagree it is as uncertain as they are apart.
         """
         if self._kept is None or self._kept[0] != segment.first_keyframe_id:
             return found
         kept = self._kept[1]
         apart = abs(float(np.log(found.world_from_map.scale / kept.world_from_map.scale)))
+        disagree = apart > DISAGREE * float(np.hypot(found.sigma_scale, kept.sigma_scale))
+        if kept.has_origin and not found.has_origin:
+            return replace(kept, sigma_scale=apart) if disagree else kept
         if (
             found.sigma_scale <= kept.sigma_scale
             or found.n_positions >= kept.n_positions
             or found.has_origin > kept.has_origin
-            or apart > DISAGREE * float(np.hypot(found.sigma_scale, kept.sigma_scale))
+            or disagree
         ):
             self._kept = None
             return found
