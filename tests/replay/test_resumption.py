@@ -6,6 +6,7 @@ telemetry has no more than attitude: nothing that tells a scale.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -21,6 +22,9 @@ from companion.geometry import quaternion_from_rotation, rotation_from_quaternio
 from companion.localisation import NOT_TAKEN_UP, TAKEN_UP, LocalisationStage
 from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
 from companion.resumption import TRIED_NS
+from companion.stages.localisation_work import work
+from companion.stages.map_keeper import MapKeeper
+from companion.stages.protocol import Finish, KeepMap, Setup
 from drivers.open_flight import open_flight
 from tests.support.poses import TrueFlight
 from tests.support.to_and_fro import flown_again, walk
@@ -166,6 +170,27 @@ def test_what_does_not_agree_is_never_taken_up(left: Left, places: str, change: 
     assert said.what == NOT_TAKEN_UP
     assert said.t_ns - found.first_ns < TRIED_NS + 2e9  # another map has begun by then
     print(said.detail)
+
+
+@pytest.mark.parametrize("take_up", [True, False], ids=["taken up", "not wanted"])
+def test_the_process_takes_up_what_another_kept_and_keeps_its_own(
+    left: Left, tmp_path: Path, take_up: bool
+) -> None:
+    path, setup = tmp_path / "map.checkpoint", Setup(CONFIG, left.camera)
+    keeper = MapKeeper(path, setup)
+    keeper.put(left.checkpoint)
+    while keeper.busy:
+        time.sleep(0.001)
+    keeper.close(forget=False)
+    process = work(setup)
+    assert not list(process.step(KeepMap(path, take_up)))
+    assert not path.exists()
+    given = [out for m in hovering(left, over(left), unchanged) for out in process.step(m)]
+    metric = [o for o in given if isinstance(o, Odometry) and o.world_from_body is not None]
+    said = [w.what for w in given if isinstance(w, Warned)]
+    assert (TAKEN_UP in said, bool(metric)) == (take_up, take_up)
+    list(process.finish(Finish(hurry=True, keep_map=take_up)))
+    assert path.exists() == take_up
 
 
 def test_what_is_kept_is_bounded(left: Left) -> None:
