@@ -13,16 +13,13 @@ from companion.config import Config
 from companion.live.flight import Listener, LiveFlight
 from companion.live.flight_dates import FlightDates
 from companion.live.journal import WARNING, Journal
+from companion.live.kept_map_place import kept_map_path
 from companion.live.newest_file import NewestFile
 from companion.messages import Frame, Telemetry, Warned
 from companion.output.flight_result import RunFacts
 from companion.stages.protocol import KeepMap
 from drivers.recording.content import HealthNote, LinkBytes
 from drivers.recording.flights_folder import COUNTER, flight_name, next_number
-from drivers.status_socket import own_socket_path
-
-KEPT_MAP = "map.checkpoint"
-"""Lies beside the socket, in a folder that only this daemon uses; see `MapKeeper`."""
 
 
 class Flights:
@@ -70,8 +67,7 @@ class Flights:
         flight, self._spare = self._spare, None
         assert flight is not None and self.current is None
         folder = self._named(Path(config.daemon.flights))
-        kept = own_socket_path(config.daemon.socket).with_name(KEPT_MAP)
-        flight.begin(folder, KeepMap(kept, take_up))
+        flight.begin(folder, KeepMap(kept_map_path(config.daemon.socket), take_up))
         self.current = flight
         self._journal.say(f"flight {folder.name} begins; its results go to {folder}")
         return flight

@@ -7,6 +7,9 @@ Nothing is synchronised to a disk, therefore.
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 import threading
 from pathlib import Path
 from typing import NamedTuple
@@ -72,6 +75,7 @@ class MapKeeper:
         It is there once only: should it bring this process down, too, the next begins without.
         """
         try:
+            self._be_ours()
             with self._path.open("rb") as file:
                 data = file.read(MOST_READ_BYTES)
             self._path.unlink()
@@ -106,6 +110,12 @@ class MapKeeper:
         if forget:
             self._remove()
 
+    def _be_ours(self) -> None:
+        """OSError where others may have put there what they like."""
+        folder = self._path.parent.stat()
+        if folder.st_uid not in (os.getuid(), 0) or folder.st_mode & stat.S_IWOTH:
+            raise PermissionError(errno.EPERM, "its folder is not ours alone")
+
     def _remove(self) -> None:
         try:
             self._path.unlink(missing_ok=True)
@@ -121,6 +131,7 @@ class MapKeeper:
                 checkpoint, tracked_ns = self._waiting
             try:
                 self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                self._be_ours()
                 remarks = self._same | {"tracked_ns": tracked_ns}
                 write_atomically(self._path, encode(checkpoint, remarks))
                 self.fault = ""

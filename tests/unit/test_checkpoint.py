@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +15,8 @@ from companion.checkpoint import MOST_BYTES, Checkpoint, CheckpointError, decode
 from companion.clock import since_boot_ns
 from companion.config import Config, FeedbackConfig
 from companion.geometry import Pose, Similarity
+from companion.live import kept_map_place
+from companion.live.kept_map_place import kept_map_path
 from companion.messages import Georeference, Track, TrackState
 from companion.odometry import OdometryState
 from companion.resumption import MIN_FRAMES, MOST_ABSENT_NS, TRIED_NS, Resumption, Verdict
@@ -217,6 +220,32 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, checkpoint: Che
     written(keeper, checkpoint)
     assert "file/map.checkpoint: Not a directory" in keeper.fault or "exists" in keeper.fault
     keeper.close(forget=True)
+
+
+def test_a_folder_that_others_can_write_to_is_not_trusted(
+    tmp_path: Path, checkpoint: Checkpoint
+) -> None:
+    folder = tmp_path / "open"
+    keep(folder / "map.checkpoint", checkpoint)
+    folder.chmod(0o777)
+    keeper = MapKeeper(folder / "map.checkpoint", SETUP)
+    with pytest.raises(CheckpointError, match="not ours alone"):
+        keeper.take()
+    written(keeper, checkpoint)
+    assert "not ours alone" in keeper.fault
+    keeper.close(forget=False)
+
+
+def test_it_is_kept_in_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Where no runtime folder is given the socket lies on what may be an SD card."""
+    monkeypatch.setattr(kept_map_place, "SHARED_MEMORY", tmp_path)
+    in_memory = tmp_path / f"companion-{os.getuid()}" / "map.checkpoint"
+    assert kept_map_path("auto", {}) == in_memory
+    run = {"RUNTIME_DIRECTORY": "/run/companion"}
+    assert kept_map_path("auto", run) == Path("/run/companion/map.checkpoint")
+    assert kept_map_path("/x/status.sock", {}) == Path("/x/map.checkpoint")
+    monkeypatch.setattr(kept_map_place, "SHARED_MEMORY", tmp_path / "none")
+    assert kept_map_path("auto", {}).parent.name == f"companion-{os.getuid()}"
 
 
 def test_a_flight_that_is_over_leaves_nothing(tmp_path: Path, checkpoint: Checkpoint) -> None:
