@@ -1,4 +1,8 @@
-"""The dense engine on a data set with truth, beside REMODE's filter on one core."""
+"""The dense engine on a data set with truth, beside REMODE's filter on one core.
+
+One reference is measured with its range of depths taken from the truth, as REMODE's filter has it;
+then all that `companion depth` makes of the data set by itself.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,7 @@ from companion.depth.engine import DepthEngine
 from companion.depth.undistortion import Undistortion
 from companion.depth.views import Intrinsics
 from companion.depth_accuracy import Accuracy, accuracy
+from companion.depth_command import Wanted, reconstruct
 from companion.errors import FlightError
 from companion.geometry import Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
@@ -67,8 +72,34 @@ class Timed:
 
 
 @dataclass(frozen=True, slots=True)
+class ReferenceAsUsed:
+    """One reference, its range of depths found by itself: before and after others were asked."""
+
+    reference: int
+    alone_converged: Accuracy
+    alone_all: Accuracy
+    converged: Accuracy
+    all_pixels: Accuracy
+
+
+@dataclass(frozen=True, slots=True)
+class AsUsed:
+    """What `companion depth` makes of the data set: ranges found by itself, all references.
+
+    `rows` are of those of the `n_references` that have truth; times are of all, for each, reading
+    of images and search for ranges included. `refused` says why there is nothing, else is empty.
+    """
+
+    n_references: int
+    wall_s: float
+    cpu_s: float
+    rows: tuple[ReferenceAsUsed, ...]
+    refused: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class DepthBench:
-    """All that was measured on one reference; `searched` of `frames` images were searched."""
+    """All that was measured; `searched` of `frames` images were searched for one reference."""
 
     dataset: str
     device: str
@@ -81,6 +112,7 @@ class DepthBench:
     after_frames: tuple[AfterFrames, ...]
     serial_after_frames: tuple[AfterFrames, ...]
     thresholds: tuple[AtThreshold, ...]
+    as_used: AsUsed
 
     @property
     def speed_up(self) -> float | None:
@@ -148,15 +180,55 @@ def bench_depth(
             runs.append(run)
     finally:
         progress.finish()
+    as_used = _as_used(images, config, frames, progress)
     bench = DepthBench(
         str(path), device.described, width, height, len(scene.others), searched, tuple(runs),
         {name: round(ms, 2) for name, ms in depth_map.kernel_ms.items()}, tuple(after),
-        tuple(serial_after), tuple(thresholds),
+        tuple(serial_after), tuple(thresholds), as_used,
     )  # fmt: skip
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         write_bench(out, bench)
     return bench
+
+
+def _as_used(
+    images: PosedImages, config: Config, frames: tuple[int | None, int | None], progress: Progress
+) -> AsUsed:
+    full = replace(config, depth=replace(config.depth, stride=1))
+    prepared = Undistortion(images.camera)
+    truths: dict[int, Floats] = {}
+    before: dict[int, tuple[Accuracy, Accuracy]] = {}
+
+    def look(depth_map: DepthMap) -> None:
+        truth = images.truth(images.numbers.index(depth_map.keyframe_id))
+        if truth is not None:
+            truths[depth_map.keyframe_id] = prepared.nearest(truth)
+            before[depth_map.keyframe_id] = _judged(depth_map, truths[depth_map.keyframe_id])
+
+    times = StageTimes()
+    cpu = cpu_s()
+    try:
+        with times("all"):
+            maps = reconstruct(images.path, None, full, Wanted(None, frames, None), progress, look)
+    except FlightError as error:
+        return AsUsed(0, 0.0, 0.0, (), str(error))
+    cpu = cpu_s() - cpu
+    rows = tuple(
+        ReferenceAsUsed(m.keyframe_id, *before[m.keyframe_id], *_judged(m, truths[m.keyframe_id]))
+        for m in maps
+        if m.keyframe_id in truths
+    )
+    return AsUsed(len(maps), times.total_ms("all") / 1e3 / len(maps), cpu / len(maps), rows)
+
+
+def _judged(depth_map: DepthMap, truth: Floats) -> tuple[Accuracy, Accuracy]:
+    """Of what has converged, and of all."""
+    converged = depth_map.state == PixelState.CONVERGED.value
+    return (
+        accuracy(depth_map.depth, truth, converged),
+        accuracy(depth_map.depth, truth, np.ones_like(converged)),
+    )
 
 
 def _scene(images: PosedImages, reference: int, frames: tuple[int | None, int | None]) -> _Scene:
@@ -207,11 +279,9 @@ def _run(
     with times("finish"):
         out = engine.finish(0, 0, rgb)
     cpu = cpu_s() - cpu
-    converged = out.state == PixelState.CONVERGED.value
     return Timed(
         "companion", times.total_ms("update") / 1e3, times.total_ms("finish") / 1e3, cpu,
-        accuracy(out.depth, scene.truth, converged),
-        accuracy(out.depth, scene.truth, np.ones_like(converged)),
+        *_judged(out, scene.truth),
     ), out  # fmt: skip
 
 

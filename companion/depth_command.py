@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -137,9 +138,13 @@ class Reconstruction:
 
 
 def reconstruct(
-    path: Path, out: Path, config: Config, wanted: Wanted, progress: Progress
-) -> list[DepthMap]:
-    """Write depth of the wanted references, their cloud and depth.json into the folder `out`."""
+    path: Path, out: Path | None, config: Config, wanted: Wanted, progress: Progress,
+    alone: Callable[[DepthMap], None] | None = None,
+) -> list[DepthMap]:  # fmt: skip
+    """Depth of the wanted references; with their cloud and depth.json into the folder `out`.
+
+    `alone` is given each map as it is before others are asked about it.
+    """
     images = open_posed_images(path)
     device = choose_device(config.opencl)
     work = Reconstruction(images, config, device)
@@ -152,9 +157,10 @@ def reconstruct(
             "far away things are: give --range NEAR:FAR"
         )
     middle_m = float(np.sqrt(range_m[0] * range_m[1]))
-    alone = wanted.reference is not None
-    references = [first] if alone else _references(images, positions, middle_m, config)
-    out.mkdir(parents=True, exist_ok=True)
+    single = wanted.reference is not None
+    references = [first] if single else _references(images, positions, middle_m, config)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
     fusion, consensus = Fusion(config.cloud), Consensus(config.depth)
     n_written = 0
     chunks: list[PointChunk] = []
@@ -168,28 +174,33 @@ def reconstruct(
         for n, reference in enumerate(references, 1):
             if wanted.range_m is None and n > 1:
                 range_m = work.found_range(reference, positions) or range_m
-            reach_m = np.inf if alone else LONGEST_BASELINE * math.sqrt(range_m[0] * range_m[1])
+            reach_m = np.inf if single else LONGEST_BASELINE * math.sqrt(range_m[0] * range_m[1])
             others = _others(images, positions, reference, reach_m)
             work.load([reference, *others])
             depth_map, updates, spent = work.depth_map(reference, others, *range_m)
-            done += [depth_map] if alone else consensus.add(depth_map, work.pose(reference))
+            if alone is not None:
+                alone(depth_map)
+            done += [depth_map] if single else consensus.add(depth_map, work.pose(reference))
             log.append(
                 ReferenceLog(
                     numbers[reference], range_m, work.engine.n_searched, tuple(updates), spent
                 )
             )
-            if not alone:
+            if not single:
                 chunks += fusion.add(depth_map, update)
-            for it in done[n_written:]:
-                write_depth(out, it)
+            if out is not None:
+                for it in done[n_written:]:
+                    write_depth(out, it)
             n_written = len(done)
             progress.update(n, f"frame {numbers[reference]}", sum(len(c.rgb) for c in chunks))
     finally:
         progress.finish()
     done += consensus.flush()
+    if out is None:
+        return done
     for it in done[n_written:]:
         write_depth(out, it)
-    chunks += [chunk_alone(done[0])] if alone else fusion.flush(update)
+    chunks += [chunk_alone(done[0])] if single else fusion.flush(update)
     write_cloud(out, chunks, places)
     write_log(
         out, device=device.described, layout=images.layout, maps=done, log=log,

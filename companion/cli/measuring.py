@@ -111,7 +111,8 @@ def add_parsers(commands: Any) -> None:
     dense = benches.add_parser(
         "depth", parents=[configuration(), json_option()], help="time and accuracy of dense depth",
         description="Reconstruct one reference of a data set with true depth, its range taken from "
-        "the truth, and do the same with REMODE's filter on one core.",
+        "the truth, and do the same with REMODE's filter on one core; then reconstruct all "
+        "references as `companion depth` does, and measure those that have true depth.",
     )  # fmt: skip
     dense.add_argument("dataset", type=Path, metavar="DATASET")
     dense.add_argument("--reference", type=int, default=0, metavar="N", help="frame (default: 0)")

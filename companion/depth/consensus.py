@@ -199,8 +199,7 @@ def _measured(depth_map: DepthMap, config: DepthConfig) -> Mask:
     """Pixels whose images fit, however sure their depth is; the rest was filled in from around."""
     fits = depth_map.inlier_ratio >= config.min_inlier_ratio
     unsure = (depth_map.state == PixelState.UPDATING.value) & fits
-    measured: Mask = (depth_map.state == PixelState.CONVERGED.value) | unsure
-    return measured
+    return np.asarray((depth_map.state == PixelState.CONVERGED.value) | unsure, np.bool_)
 
 
 def _seen(
@@ -271,7 +270,8 @@ def _mean(off: Array, sigma: Array, near: Mask) -> tuple[Array, Array]:
 def _beside_edge(depth: Floats) -> Mask:
     """Pixels with another surface beside them: a map that is half a pixel off has that one."""
     window = np.ones((3, 3), np.uint8)
-    far, near = (np.asarray(f(depth, window)) for f in (cv2.dilate, cv2.erode))
+    far = np.asarray(cv2.dilate(depth, window), np.float32)
+    near = np.asarray(cv2.erode(depth, window), np.float32)
     return np.asarray(far > (1.0 + MAX_STEP) * near, np.bool_)
 
 

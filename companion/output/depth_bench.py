@@ -76,6 +76,54 @@ class Threshold(Protocol):
         """Of what has converged."""
 
 
+class Reference(Protocol):
+    """One reference of all, its range of depths found by itself."""
+
+    @property
+    def reference(self) -> int:
+        """Its frame's number."""
+
+    @property
+    def alone_converged(self) -> Accuracy:
+        """Of what has converged, before other references were asked."""
+
+    @property
+    def alone_all(self) -> Accuracy:
+        """Of all pixels, before."""
+
+    @property
+    def converged(self) -> Accuracy:
+        """Of what has converged in the end."""
+
+    @property
+    def all_pixels(self) -> Accuracy:
+        """Of all pixels in the end."""
+
+
+class Used(Protocol):
+    """All references, as `companion depth` makes them."""
+
+    @property
+    def n_references(self) -> int:
+        """With truth or without."""
+
+    @property
+    def wall_s(self) -> float:
+        """For each."""
+
+    @property
+    def cpu_s(self) -> float:
+        """Of all cores, for each."""
+
+    @property
+    def rows(self) -> Sequence[Reference]:
+        """Of those with truth."""
+
+    @property
+    def refused(self) -> str:
+        """Why there is nothing, or nothing."""
+
+
 class Bench(Protocol):
     """All that was measured; any dataclass with these."""
 
@@ -119,6 +167,10 @@ class Bench(Protocol):
     def thresholds(self) -> Sequence[Threshold]:
         """Ours."""
 
+    @property
+    def as_used(self) -> Used:
+        """As a user runs it."""
+
 
 def tables(bench: Bench) -> str:
     """All of it for people; shares in percent, of the pixels whose truth is known."""
@@ -138,6 +190,7 @@ def tables(bench: Bench) -> str:
     ]  # fmt: skip
     if bench.speed_up is not None:
         parts.append(f"{bench.speed_up:.1f} times as fast")
+    parts.append(_as_used(bench.as_used))
     head = ["frames", "updated", "ms/frame", "converged", "within 1", "2", "5 %"]
     for title, stands in (
         ("companion", bench.after_frames), ("REMODE, one core", bench.serial_after_frames)
@@ -154,6 +207,30 @@ def tables(bench: Bench) -> str:
     spent = sorted(bench.kernel_ms.items(), key=lambda item: -item[1])
     parts.append(_aligned([["kernel", "ms"], *([name, f"{ms:.1f}"] for name, ms in spent)]))
     return "\n\n".join(parts)
+
+
+def _as_used(used: Used) -> str:
+    title = "as a user runs it: ranges of depth found by itself, all references"
+    if used.refused:
+        return f"{title}\nnot measured: {used.refused}"
+    title += f" ({used.n_references}), {used.wall_s:.2f} s and {used.cpu_s:.2f} CPU s for each"
+    if not used.rows:
+        return f"{title}\nnone of them has a true depth"
+    rows = [["reference", "", "converged", "within 1", "2", "5 %", "all: 1", "2", "5 %"]]
+    for name, alone, together in (
+        ("alone", "alone_converged", "alone_all"), ("as written", "converged", "all_pixels")
+    ):  # fmt: skip
+        pairs = [(getattr(r, alone), getattr(r, together)) for r in used.rows]
+        shares = [
+            (a.estimated, a.within_1, a.within_2, a.within_5, b.within_1, b.within_2, b.within_5)
+            for a, b in pairs
+        ]
+        for r, share in zip(used.rows, shares, strict=True):
+            rows.append([str(r.reference), name, *map(_percent, share)])
+        if len(shares) > 1:
+            means = [sum(column) / len(column) for column in zip(*shares, strict=True)]
+            rows.append(["mean", name, *map(_percent, means)])
+    return title + "\n" + _aligned(rows)
 
 
 def as_json(bench: Bench) -> str:

@@ -227,3 +227,23 @@ def test_bench(
     assert bench["runs"][0]["converged"]["within_2"] > 0.9
     assert [row["frames"] for row in bench["after_frames"]] == [1, 5, 8]
     assert (out / "depth_bench.png").stat().st_size > 1000
+    used = bench["as_used"]
+    assert used["n_references"] > 1 and used["wall_s"] > 0 and used["refused"] == ""
+    # each image of this set has a true depth; the references are those of `companion depth`
+    assert main(["depth", str(tmp_path / "set"), "--out", str(tmp_path / "maps")]) == 0
+    log = json.loads((tmp_path / "maps" / "depth.json").read_text())["references"]
+    assert [r["reference"] for r in used["rows"]] == [r["reference"] for r in log]
+    for row in used["rows"]:
+        assert row["all_pixels"]["within_5"] >= row["alone_all"]["within_5"] - 0.01
+        assert row["converged"]["estimated"] > 0.3
+    assert "as a user runs it" in printed and "as written" in printed
+
+
+def test_bench_says_why_it_cannot_measure_what_a_user_gets(
+    rendered: list[tuple[Bytes, Floats]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # two frames of hardly any texture: no point can be followed to tell how far away things are
+    faint = [(np.asarray(90 + grey // 200, np.uint8), depth) for grey, depth in rendered]
+    write_remode(tmp_path / "set", faint)
+    assert main(["bench", "depth", str(tmp_path / "set"), "--no-serial"]) == 0
+    assert "not measured: " in capsys.readouterr().out
