@@ -58,6 +58,8 @@ class StageHealth:
     n_restarted: int = 0
     detail: str = ""
     latency_p99_ms: float | None = None
+    waiting_mb: float = 0.0
+    """Of messages that it has yet to take."""
 
 
 @dataclass(frozen=True, slots=True)

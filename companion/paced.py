@@ -10,8 +10,12 @@ import threading
 from collections.abc import Iterable, Iterator
 
 from companion.clock import monotonic_s, wait_s
-from companion.latest import LatestWins
+from companion.mailbox import Fate, Mailbox
+from companion.message_size import size_bytes
 from companion.messages import Frame, Message
+
+ROOM_BYTES = 256 << 20
+"""Of telemetry that waits: more than that of an hour."""
 
 
 class PacedFeed:
@@ -20,7 +24,10 @@ class PacedFeed:
     def __init__(self, messages: Iterable[Message], speed: float = 1.0) -> None:
         self._messages = messages
         self._speed = speed
-        self._waiting: LatestWins[Message] = LatestWins(lambda message: isinstance(message, Frame))
+        self._waiting: Mailbox[Message] = Mailbox(
+            lambda m: Fate.LATEST_WINS if isinstance(m, Frame) else Fate.LOSSLESS,
+            size_bytes, ROOM_BYTES,
+        )  # fmt: skip
         self._stop = threading.Event()
         self._fault: BaseException | None = None
 

@@ -370,6 +370,7 @@ class Daemon:
                 self._service.extend_timeout(START_S)
             if not self._watch.pose_loop_alive:
                 self._watch.kill_stuck()
+            self._watch.end_stalled()
             if progress and not self._watch.progress:
                 self._journal.say(NO_PROGRESS, ERROR)
             progress = self._watch.progress

@@ -10,6 +10,7 @@ own state: depth and recorder begin again within the flight, localisation ends i
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,6 +48,12 @@ PATIENCE_S = {
     "localisation": 120.0, "depth": 60.0, "tape": 60.0, "recorder": 180.0, "topics": 15.0,
 }  # fmt: skip
 HURRIED_S = {"localisation": 0.7, "depth": 0.2, "tape": 0.3, "recorder": 1.6, "topics": 0.2}
+START_S = 300.0
+"""Who has not begun its work by then never will. On a computer with far too much to do the imports
+alone take a minute and more, and the first start of all compiles loops or kernels."""
+ANSWER_S = {"depth": 120.0, "tape": 60.0, "recorder": 60.0, "topics": 30.0}
+"""Who is at one step for longer hangs, and is ended and started again: depth may wait for a driver
+that compiles and has the least right to the processor, the others for a slow disk or network."""
 IN_FOLDER = ("tape", "recorder")
 """Stages that leave something in the flight's folder."""
 WITH_FLIGHT = (*IN_FOLDER, "topics")
@@ -54,6 +61,7 @@ WITH_FLIGHT = (*IN_FOLDER, "topics")
 PUBLISHED = (Odometry, Track, KeyframeAdded, MapUpdate, DepthMap, PointChunk)
 """What the topics are told, beside frames."""
 RESTARTED = "a stage has died and is started again"
+STALLED = "it hung for {:.0f} s and was ended"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
 """Between two starts of a stage that dies again and again."""
@@ -207,7 +215,6 @@ class LiveFlight:
             self._dense = dense
         if not dense:
             return
-        self.stages["depth"].heard_s = monotonic_s()  # it was not asked anything
         self._take_up("depth")
 
     def set_budget(self, kbit_s: float) -> None:
@@ -233,6 +240,19 @@ class LiveFlight:
     def kill_localisation(self) -> None:
         """End a localisation that hangs."""
         self.stages["localisation"].interrupt()
+
+    def end_stalled(self) -> None:
+        """End stages that hang, so that others take their place; localisation only as it starts.
+
+        Whether a localisation that has begun hangs is known by its poses, and sooner.
+        """
+        now_s = monotonic_s()
+        for kind, stage in list(self.stages.items()):
+            begun = stage.progress is not None
+            allowed_s = ANSWER_S.get(kind, math.inf) if begun else START_S
+            stalled_s = stage.stalled_s(now_s)
+            if stalled_s > allowed_s and not self._over.is_set():
+                stage.interrupt(STALLED.format(stalled_s))
 
     def hurry(self) -> None:
         """Whatever `finish` is at, it has little time left."""

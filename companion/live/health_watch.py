@@ -42,7 +42,7 @@ START_S = 120.0
 PATIENCE_NS = 20_000_000_000
 """Frames come, localisation was started again, and still no track: nothing here will help."""
 NO_SIGN_S = 10.0
-"""A stage from which nothing is heard for so long, while frames come, is not well."""
+"""A stage that has been at one step for so long is not well; when it is ended: see live.flight."""
 SETTLE_NS = 3_000_000_000
 """Beginning a map takes long, and tells nothing of what comes after."""
 STUCK = "localisation hangs and is ended"
@@ -81,7 +81,6 @@ class HealthWatch:
         self._settled_ns = 0
         self._n_dropped = 0
         self._last_frame_ns = 0
-        self._frames_since_s = 0.0
         self._odometry: Odometry | None = None
         self._odometry_ns = 0
         self._progress_ns = self._began_ns
@@ -116,8 +115,6 @@ class HealthWatch:
     def frame_came(self) -> None:
         """A frame; from the camera's thread."""
         now_ns = self._clock.now_ns()
-        if now_ns - self._last_frame_ns > GOVERN_NS:
-            self._frames_since_s = monotonic_s()
         self._last_frame_ns = now_ns
 
     def take_odometry(self, odometry: Odometry) -> None:
@@ -173,6 +170,12 @@ class HealthWatch:
             self._odometry_ns = now_ns
             self._journal.warn(Warned(now_ns, STUCK))
             flight.kill_localisation()
+
+    def end_stalled(self) -> None:
+        """End whatever other stage hangs."""
+        for flight in (self._flights.current, self._flights.spare):
+            if flight is not None:
+                flight.end_stalled()
 
     async def govern(self) -> None:
         """Read the load and leave out work where there is too much; ends by cancellation."""
@@ -261,15 +264,14 @@ class HealthWatch:
             return ()
         out = []
         now_s = monotonic_s()
-        frames_come = now_ns - self._last_frame_ns < GOVERN_NS
         for kind, stage in flight.stages.items():
             meter = {"localisation": self._pose, "depth": self._depth}.get(kind)
             measured = meter.health(now_ns) if meter is not None else StageHealth(kind)
             said = stage.progress
             detail = said.device if said is not None else "starting"
-            no_sign_s = now_s - max(stage.heard_s, self._frames_since_s)
+            no_sign_s = stage.stalled_s(now_s)
             is_off = kind == "depth" and not flight.dense
-            hangs = frames_come and said is not None and no_sign_s > NO_SIGN_S and not is_off
+            hangs = said is not None and no_sign_s > NO_SIGN_S and not is_off
             if is_off:
                 detail = "switched off"
             out.append(
@@ -278,6 +280,7 @@ class HealthWatch:
                     alive=stage.alive and not hangs,
                     n=said.n_done if said is not None else 0,
                     n_dropped=stage.n_dropped,
+                    waiting_mb=stage.waiting_bytes * 1e-6,
                     n_restarted=flight.n_restarted.get(kind, 0),
                     detail=f"no sign of it for {no_sign_s:.0f} s" if hangs else detail,
                 )

@@ -26,13 +26,15 @@ from collections.abc import Callable  # noqa: E402
 from multiprocessing.connection import Connection  # noqa: E402
 from typing import Any  # noqa: E402
 
-from companion.clock import monotonic_s  # noqa: E402
+from companion.clock import monotonic_s, wait_s  # noqa: E402
 from companion.errors import CompanionError, InputError  # noqa: E402
-from companion.latest import LatestWins  # noqa: E402
+from companion.mailbox import Mailbox  # noqa: E402
+from companion.message_size import size_bytes  # noqa: E402
 from companion.messages import Frame  # noqa: E402
 from companion.stages.frame_ring import FrameInRing, FrameRing  # noqa: E402
+from companion.stages.mail import FRAMES_SHARE, IN_BYTES, fate_of  # noqa: E402
 from companion.stages.protocol import Failed, Finish, Finished, Progress, Setup  # noqa: E402
-from companion.stages.work import WorkModule, module_of  # noqa: E402
+from companion.stages.work import Work, WorkModule, module_of  # noqa: E402
 
 REPORT_EVERY_S = 1.0
 LOWEST_NICE = 19
@@ -76,51 +78,78 @@ def _serve(
     work = module.work(setup)
     work.begin(send)
     send(Progress(device=work.device))
-    inbox: LatestWins[Any] = LatestWins(work.may_skip)
-    n_overwritten = 0
+    loop = _Loop(ring, work)
+    threading.Thread(target=loop.read, args=(pipe,), name="from the daemon", daemon=True).start()
+    threading.Thread(target=loop.report, args=(send,), name="reports", daemon=True).start()
+    loop.run(send)
+    send(Finished(work.times.summary(), work.device))
 
-    def read() -> None:
-        nonlocal n_overwritten
+
+class _Loop:
+    """Takes one message after the other, and tells how that goes, also of a step that hangs."""
+
+    def __init__(self, ring: FrameRing, work: Work) -> None:
+        self._ring, self._work = ring, work
+        self._inbox: Mailbox[Any] = Mailbox(
+            lambda message: fate_of(message, work.latest_only), size_bytes, IN_BYTES
+        )
+        self._n_done = 0
+        self._n_overwritten = 0
+        """Frames for which it was too late, or that there was no room for."""
+        self._busy_since_s: float | None = None
+
+    def read(self, pipe: Connection[Any, Any]) -> None:
+        """Put what comes into the inbox, frames copied, until the daemon is gone."""
+        ring, work = self._ring, self._work
         try:
             while True:
                 message = pipe.recv()
                 if isinstance(message, FrameInRing) and not work.latest_only:
-                    frame = ring.get(message) if work.has_room else None
+                    room = self._inbox.n_bytes + ring.frame_bytes <= FRAMES_SHARE * IN_BYTES
+                    frame = ring.get(message) if room or not len(self._inbox) else None
                     if frame is None:
-                        n_overwritten += 1
+                        self._n_overwritten += 1
                         continue
                     message = frame
-                    work.n_held += 1
-                inbox.put(message)
+                self._inbox.put(message)
         except (OSError, EOFError):
             if not work.outlives_daemon:
                 os._exit(0)  # the daemon is gone, and nobody waits for results
-            inbox.put(Finish(hurry=True))
+            self._inbox.put(Finish(hurry=True))
 
-    threading.Thread(target=read, name="from the daemon", daemon=True).start()
-    reported_s = monotonic_s()
-    n_done = 0
-    while (message := inbox.get()) is not None:
-        if isinstance(message, Finish):
-            for out in work.finish(message):
+    def report(self, send: Callable[[Any], None]) -> None:
+        """Tell every now and then how it goes, as long as the process lives."""
+        while True:
+            wait_s(threading.Event(), REPORT_EVERY_S)
+            inbox, work = self._inbox, self._work
+            n_dropped = inbox.n_dropped + inbox.n_overflown + self._n_overwritten
+            send(
+                Progress(
+                    self._n_done, n_dropped + work.n_turned_away, self._busy_since_s,
+                    inbox.n_bytes, work.times.summary(), work.device,
+                )
+            )  # fmt: skip
+
+    def run(self, send: Callable[[Any], None]) -> None:
+        """Work until told to finish."""
+        work = self._work
+        while True:
+            self._busy_since_s = None
+            message = self._inbox.get()
+            self._busy_since_s = monotonic_s()
+            if isinstance(message, Finish):
+                for out in work.finish(message):
+                    send(out)
+                return
+            if isinstance(message, FrameInRing):
+                frame = self._ring.get(message, colour=False)
+                if frame is None:
+                    self._n_overwritten += 1
+                    continue
+                message = frame
+            for out in work.step(message):
                 send(out)
-            break
-        if isinstance(message, FrameInRing):
-            frame = ring.get(message, colour=False)
-            if frame is None:
-                n_overwritten += 1
-                continue
-            message = frame
-        elif isinstance(message, Frame):
-            work.n_held -= 1
-        for out in work.step(message):
-            send(out)
-        n_done += isinstance(message, Frame)
-        if monotonic_s() - reported_s > REPORT_EVERY_S:
-            reported_s = monotonic_s()
-            n_dropped = inbox.n_dropped + n_overwritten + work.n_turned_away
-            send(Progress(n_done, n_dropped, work.times.summary(), work.device))
-    send(Finished(work.times.summary(), work.device))
+            self._n_done += isinstance(message, Frame)
 
 
 def _take_real_time() -> None:
@@ -137,9 +166,13 @@ def _take_real_time() -> None:
 
 
 def _sender(pipe: Connection[Any, Any]) -> Callable[[Any], None]:
+    lock = threading.Lock()
+
     def send(message: Any) -> None:
+        data = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
         try:
-            pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
+            with lock:
+                pipe.send_bytes(data)
         except OSError:
             pass  # the daemon is gone, which the reader sees
 

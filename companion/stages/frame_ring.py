@@ -52,7 +52,7 @@ class FrameRing:
     def __init__(self, width: int, height: int, fd: int | None = None) -> None:
         self._pixels = width * height
         self._shape = (height, width)
-        self._frame_bytes = frame_bytes = 4 * self._pixels
+        self.frame_bytes = frame_bytes = 4 * self._pixels
         self.n_slots = int(np.clip(ROOM_BYTES // frame_bytes, LEAST_SLOTS, MOST_SLOTS))
         self._begin = 8 * self.n_slots
         """of the first slot, behind all serials"""
@@ -99,7 +99,7 @@ class FrameRing:
     @contextmanager
     def _locked(self, at: int, kind: int) -> Iterator[bool]:
         """Hold a slot's lock; False where others have it in a way that this cannot be."""
-        begin, length = self._begin + at * self._frame_bytes, self._frame_bytes
+        begin, length = self._begin + at * self.frame_bytes, self.frame_bytes
         try:
             fcntl.lockf(self.fd, kind | fcntl.LOCK_NB, length, begin)
         except (BlockingIOError, PermissionError):  # EAGAIN or EACCES, fcntl(2)

@@ -72,10 +72,16 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What a stage's process says of itself, every second or so while it works."""
+    """What a stage's process says of itself, every second or so, whatever it is at.
+
+    `busy_since_s` is when the step began that it is in (CLOCK_MONOTONIC, the same for all processes
+    of a computer); None while it waits for work.
+    """
 
     n_done: int = 0
     n_dropped: int = 0
+    busy_since_s: float | None = None
+    waiting_bytes: int = 0
     times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     device: str = ""
 

@@ -17,8 +17,10 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from companion.clock import monotonic_s
-from companion.latest import LatestWins
-from companion.stages.frame_ring import FrameInRing, FrameRing
+from companion.mailbox import Mailbox
+from companion.message_size import size_bytes
+from companion.stages.frame_ring import FrameRing
+from companion.stages.mail import OUT_BYTES, fate_of
 from companion.stages.protocol import DriverAtWork, Failed, Finish, Finished, Progress, Setup
 
 CHILD = "companion.stages.child"
@@ -50,16 +52,18 @@ class StageProcess:
         """None until the stage is ready."""
         self.finished: Finished | None = None
         self.failed: Failed | None = None
-        self.heard_s = monotonic_s()
-        """When it last gave a sign of its work."""
+        self._interrupted: str | None = None
+        self._begun_s: float | None = None
+        self._busy_since_s: float | None = None
+        """As it last said."""
+        self._offered_s: float | None = None
+        """When it was first offered something since it last said that it waits."""
         self._deliver, self._ended = deliver, ended
         self.asked_to_end = False
         """Whether it was told to end, one way or the other."""
-        self.was_interrupted = False
         self._driver = DriverAtWork()
-        self._begun = False
-        self._outbox: LatestWins[Any] = LatestWins(
-            lambda message: not every_frame and isinstance(message, FrameInRing)
+        self._outbox: Mailbox[Any] = Mailbox(
+            lambda message: fate_of(message, not every_frame), size_bytes, OUT_BYTES
         )
         ours, theirs = socket.socketpair()
         self._child = subprocess.Popen(
@@ -90,15 +94,38 @@ class StageProcess:
         inside = self.progress.n_dropped if self.progress is not None else 0
         return self._outbox.n_dropped + self._outbox.n_overflown + inside
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Of messages that it has yet to take, here and in its process."""
+        inside = self.progress.waiting_bytes if self.progress is not None else 0
+        return self._outbox.n_bytes + inside
+
+    def stalled_s(self, now_s: float) -> float:
+        """For how long it has been at one step, or not taken what it was offered, or starting.
+
+        0 where it waits for work, or was told to end. A process that is stopped or hangs in a
+        driver says nothing more, and what it last said is true the longer the less.
+        """
+        if self.asked_to_end or self._begun_s is None or self._interrupted is not None:
+            return 0.0
+        since_s = self._begun_s if self.progress is None else self._busy_since_s or self._offered_s
+        return max(0.0, now_s - since_s) if since_s is not None else 0.0
+
     def begin(self, setup: Setup) -> None:
         """Say what to do; what is offered before is not for it."""
         self._outbox.put(setup)
-        self._begun = True
+        self._begun_s = monotonic_s()
 
     def offer(self, message: Any) -> None:
-        """Hand over a message or a FrameInRing; a frame that waits gives way to a newer one."""
-        if self._begun:
-            self._outbox.put(message)
+        """Hand over a message or a FrameInRing; a frame that waits gives way to a newer one.
+
+        Where more than OUT_BYTES wait, depth maps give way first; see companion.mailbox.
+        """
+        if self._begun_s is None:
+            return
+        self._outbox.put(message)
+        if self._offered_s is None:
+            self._offered_s = monotonic_s()
 
     def ask_to_finish(self, finish: Finish) -> None:
         """Have it give its last results and end."""
@@ -111,9 +138,14 @@ class StageProcess:
         self._reader.join(seconds)
         return not self._reader.is_alive()
 
-    def interrupt(self) -> None:
-        """End it as if it had died by itself: `ended` hears of it."""
-        self.was_interrupted = True
+    @property
+    def was_interrupted(self) -> bool:
+        """Whether it was ended by `interrupt`."""
+        return self._interrupted is not None
+
+    def interrupt(self, why: str = "") -> None:
+        """End it as if it had died by itself: `ended` hears of it, and why if that is given."""
+        self._interrupted = why
         self._child.kill()
 
     @property
@@ -149,8 +181,9 @@ class StageProcess:
             while True:
                 message = self._pipe.recv()
                 if isinstance(message, Progress):
+                    self._busy_since_s = message.busy_since_s
+                    self._offered_s = None
                     self.progress = message
-                    self.heard_s = monotonic_s()
                 elif isinstance(message, DriverAtWork):
                     self._driver = message
                 elif isinstance(message, Failed):
@@ -163,7 +196,8 @@ class StageProcess:
             pass
         self._outbox.close()
         status = self._child.wait()
-        why = self.failed.why if self.failed is not None else _in_words(status)
+        why = self.failed.why if self.failed is not None else self._interrupted
+        why = why or _in_words(status)
         self._ended("" if self.asked_to_end else why)
 
 

@@ -9,10 +9,7 @@ from typing import Any, Protocol
 
 from companion.clock import StageTimes
 from companion.messages import Message
-from companion.stages.frame_ring import FrameInRing
 from companion.stages.protocol import Finish, Setup, Snapshot
-
-MOST_HELD = 32
 
 
 class Work(ABC):
@@ -26,22 +23,11 @@ class Work(ABC):
 
     def __init__(self) -> None:
         self.times = StageTimes()
-        self.n_held = 0
-        """Frames that wait."""
 
     @property
     def n_turned_away(self) -> int:
         """Messages taken and then given up."""
         return 0
-
-    @property
-    def has_room(self) -> bool:
-        """Whether another frame may wait."""
-        return self.n_held < MOST_HELD
-
-    def may_skip(self, message: Any) -> bool:
-        """Whether a message gives way to a newer one of its kind."""
-        return self.latest_only and isinstance(message, FrameInRing)
 
     def begin(self, tell: Callable[[Any], None]) -> None:  # noqa: B027 - most have nothing to do
         """Before the first message; `tell` takes what the daemon is to know at once."""

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import fields
 
-import numpy as np
-
-from companion.messages import Frame, MapUpdate
+from companion.message_size import size_bytes
+from companion.messages import Frame
 from companion.stream.story import Watched
-
-SMALL_BYTES = 256
-POSE_BYTES = 400
 
 
 class Inbox:
@@ -73,11 +68,3 @@ class Inbox:
         self._held.append((message, size))
         self._bytes += size
         self._changed.notify_all()
-
-
-def size_bytes(message: Watched) -> int:
-    """About how much memory a message holds."""
-    values = [getattr(message, field.name) for field in fields(message)]
-    arrays = sum(value.nbytes for value in values if isinstance(value, np.ndarray))
-    poses = len(message.map_from_camera) if isinstance(message, MapUpdate) else 0
-    return SMALL_BYTES + arrays + POSE_BYTES * poses

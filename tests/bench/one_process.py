@@ -1,7 +1,7 @@
 """Two hours of one flight in one process for each stage: does a pose cost more, does memory grow?
 
     python -m tests.bench.one_process [--flight sample/survey] [--minutes 120] [--rate-hz 10]
-        [--shrink 2] [--out FOLDER] [--set SECTION.KEY=VALUE ...]
+        [--part-s 20] [--shrink 2] [--out FOLDER] [--set SECTION.KEY=VALUE ...]
 
 `soak` flies laps, each of which has processes of its own. Here a short flight goes to and fro as
 one long one, with time stamps that only grow, as fast as localisation answers: the next frame is
@@ -175,6 +175,8 @@ def messages_of(arguments: argparse.Namespace, config: Config) -> Iterator[Frame
     flight = open_flight(arguments.flight, config.camera, config.telemetry)
     frames: list[Frame] = []
     for f in flight.frames():
+        if frames and f.t_ns - frames[0].t_ns > arguments.part_s * 1e9:
+            break
         if isinstance(f, Frame) and (
             not frames or f.t_ns - frames[-1].t_ns > 0.9e9 / arguments.rate_hz
         ):
@@ -271,6 +273,7 @@ def main() -> int:
     parser.add_argument("--flight", type=Path, default=Path("sample/survey"))
     parser.add_argument("--minutes", type=float, default=120.0)
     parser.add_argument("--rate-hz", type=float, default=10.0)
+    parser.add_argument("--part-s", type=float, default=1e9, help="only so much of the flight")
     parser.add_argument("--shrink", type=int, default=1, help="so many times smaller pictures")
     parser.add_argument("--out", type=Path, default=Path("one_process"))
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")

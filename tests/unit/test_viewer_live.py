@@ -17,11 +17,12 @@ from companion.camera import Camera
 from companion.config import StreamConfig, ViewerConfig
 from companion.errors import InputError
 from companion.health import Health
+from companion.message_size import size_bytes
 from companion.messages import Frame, GeoOrigin
 from companion.stream.ground_link import GroundLink
 from companion.stream.items import Item, PictureItem, PointsItem, PoseItem, StatusItem
 from companion.viewer import LiveViewer
-from companion.viewer.inbox import Inbox, size_bytes
+from companion.viewer.inbox import Inbox
 from companion.viewer.screen import GRPC_PORT, WEB_PORT, listens
 from tests.support import flown
 

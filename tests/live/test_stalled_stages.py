@@ -1,0 +1,131 @@
+"""A stage that hangs holds no more than its room, is ended, and another takes its place."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from companion.clock import monotonic_s
+from companion.config import Config
+from companion.messages import DepthMap, Frame
+from companion.stages.frame_ring import FrameRing
+from companion.stages.mail import OUT_BYTES
+from companion.stages.protocol import Setup
+from companion.stages.stage_process import StageProcess
+from drivers.recording.recording import Recording
+from tests.support.daemon import Daemon
+from tests.support.topic_flight import CAMERA
+
+ANSWER_S = 4.0
+IMPATIENT = f"""
+import sys
+from companion.governor import Governor
+from companion.live import flight
+Governor.step = lambda self, t_ns, pressure: False
+for kind in ("recorder", "tape"):
+    flight.ANSWER_S[kind] = {ANSWER_S}
+from companion.__main__ import main
+sys.exit(main())
+"""
+SIZE = 480, 640
+
+
+def depth_map(number: int) -> DepthMap:
+    """Five megabytes, each its own."""
+    floats = [np.full(SIZE, number, np.float32) for _ in range(3)]
+    return DepthMap(
+        number, number, (500.0, 500.0, 320.0, 240.0), floats[0], floats[1],
+        np.zeros(SIZE, np.uint8), floats[2], np.zeros((*SIZE, 3), np.uint8), 9, {},
+    )  # fmt: skip
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Iterator[StageProcess]:
+    ring = FrameRing(CAMERA.width, CAMERA.height)
+    ended: list[str] = []
+    stage = StageProcess("recorder", 0, ring, lambda message: None, ended.append)
+    stage.begin(Setup(Config(), CAMERA, tmp_path))
+    try:
+        until(lambda: stage.progress is not None)
+        yield stage
+    finally:
+        stage.kill()
+        ring.close()
+
+
+def until(such: object, timeout_s: float = 60.0) -> None:
+    until_s = time.monotonic() + timeout_s
+    while not such():  # type: ignore[operator]
+        assert time.monotonic() < until_s
+        threading.Event().wait(0.02)
+
+
+def test_depth_maps_for_a_stage_that_is_stopped(recorder: StageProcess) -> None:
+    psutil.Process(recorder.pid).suspend()
+    before = psutil.Process().memory_info().rss
+    for number in range(100):
+        recorder.offer(depth_map(number))
+    assert recorder.waiting_bytes <= OUT_BYTES
+    assert psutil.Process().memory_info().rss - before < 2 * OUT_BYTES
+    assert recorder.n_dropped >= 100 - OUT_BYTES // 5_000_000 - 2
+    until(lambda: recorder.stalled_s(monotonic_s()) > 1.5)
+
+
+def test_a_stage_that_has_nothing_to_do_does_not_hang(recorder: StageProcess) -> None:
+    """It says so by itself, and what it is offered it takes."""
+    until(lambda: recorder.progress is not None and recorder.stalled_s(monotonic_s()) == 0.0)
+    first = recorder.progress
+    until(lambda: recorder.progress is not first)
+    assert recorder.stalled_s(monotonic_s()) == 0.0
+    recorder.offer(Frame(1, 1, np.zeros((96, 128), np.uint8), np.zeros((96, 128, 3), np.uint8)))
+    until(lambda: recorder.progress is not None and recorder.progress.n_done == 1)
+    until(lambda: recorder.stalled_s(monotonic_s()) == 0.0)
+
+
+def stage_of(health: dict[str, Any], kind: str) -> dict[str, Any]:
+    return next((each for each in health["stages"] if each["name"] == kind), {})
+
+
+def is_up(health: dict[str, Any], kind: str, n_restarted: int) -> bool:
+    found = stage_of(health, kind)
+    return bool(
+        found and found["alive"] and found["detail"] != "starting"
+        and found["n_restarted"] == n_restarted
+    )  # fmt: skip
+
+
+def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path) -> None:
+    settings = "camera.source=pattern", "depth.enabled=false", "link.url="
+    kinds = "recorder", "tape"
+    with Daemon(tmp_path, *settings, program=("-c", IMPATIENT)) as daemon:
+        for kind in kinds:
+            daemon.until(lambda health, kind=kind: is_up(health, kind, 0), 250)  # type: ignore[misc]
+        for kind in kinds:
+            stopped_ns = daemon.signal_stage(kind, signal.SIGSTOP)
+            n_poses = stage_of(daemon.status(), "localisation")["n"]
+            ended = daemon.line(f"started again: {kind}: it hung for", 120, stopped_ns)
+            assert ended.monotonic_ns - stopped_ns > (ANSWER_S - 2.0) * 1e9
+            health = daemon.until(lambda h, kind=kind: is_up(h, kind, 1), 250)  # type: ignore[misc]
+            assert stage_of(health, "localisation")["n"] > n_poses, "poses went on"
+            daemon.until(
+                lambda h, kind=kind: stage_of(h, kind)["n"] > 5, 250  # type: ignore[misc]
+            )  # fmt: skip
+        daemon.stop(60.0)
+        assert not daemon.said("Traceback")
+        (folder,) = daemon.flown()
+    first, second = folder, folder / "part-2"
+    assert (first / "flight.rrd").stat().st_size > 0
+    assert json.loads((second / "report.json").read_text())["frames"] > 5
+    with closing(Recording(second / "flight.mcap")) as recording:
+        assert recording.pictures
+        assert not recording.warnings
