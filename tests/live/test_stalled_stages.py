@@ -26,7 +26,7 @@ from drivers.recording.recording import Recording
 from tests.support.daemon import Daemon
 from tests.support.topic_flight import CAMERA
 
-ANSWER_S = 4.0
+ANSWER_S, UP_S = 4.0, 120.0
 IMPATIENT = f"""
 import sys
 from companion.governor import Governor
@@ -104,28 +104,27 @@ def is_up(health: dict[str, Any], kind: str, n_restarted: int) -> bool:
     )  # fmt: skip
 
 
-def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path) -> None:
-    settings = "camera.source=pattern", "depth.enabled=false", "link.url="
-    kinds = "recorder", "tape"
+@pytest.mark.parametrize("kind", ["recorder", "tape"])
+def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path, kind: str) -> None:
+    settings = "camera.source=pattern", "camera.rate_hz=10", "depth.enabled=false", "link.url="
     with Daemon(tmp_path, *settings, program=("-c", IMPATIENT)) as daemon:
-        for kind in kinds:
-            daemon.until(lambda health, kind=kind: is_up(health, kind, 0), 250)  # type: ignore[misc]
-        for kind in kinds:
-            stopped_ns = daemon.signal_stage(kind, signal.SIGSTOP)
-            n_poses = stage_of(daemon.status(), "localisation")["n"]
-            ended = daemon.line(f"started again: {kind}: it hung for", 120, stopped_ns)
-            assert ended.monotonic_ns - stopped_ns > (ANSWER_S - 2.0) * 1e9
-            health = daemon.until(lambda h, kind=kind: is_up(h, kind, 1), 250)  # type: ignore[misc]
-            assert stage_of(health, "localisation")["n"] > n_poses, "poses went on"
-            daemon.until(
-                lambda h, kind=kind: stage_of(h, kind)["n"] > 5, 250  # type: ignore[misc]
-            )  # fmt: skip
+        daemon.until(lambda health: is_up(health, kind, 0), UP_S)
+        daemon.until(lambda health: is_up(health, "localisation", 0), UP_S)
+        stopped_ns = daemon.signal_stage(kind, signal.SIGSTOP)
+        n_poses = stage_of(daemon.status(), "localisation")["n"]
+        ended = daemon.line(f"started again: {kind}: it hung for", UP_S, stopped_ns)
+        assert ended.monotonic_ns - stopped_ns > (ANSWER_S - 2.0) * 1e9
+        daemon.until(lambda health: is_up(health, kind, 1), UP_S)
+        health = daemon.until(lambda health: stage_of(health, kind)["n"] > 5, UP_S)
+        assert stage_of(health, "localisation")["n"] > n_poses, "poses went on"
         daemon.stop(60.0)
         assert not daemon.said("Traceback")
         (folder,) = daemon.flown()
     first, second = folder, folder / "part-2"
-    assert (first / "flight.rrd").stat().st_size > 0
-    assert json.loads((second / "report.json").read_text())["frames"] > 5
-    with closing(Recording(second / "flight.mcap")) as recording:
-        assert recording.pictures
-        assert not recording.warnings
+    if kind == "recorder":
+        assert (first / "flight.rrd").stat().st_size > 0
+        assert json.loads((second / "report.json").read_text())["frames"] > 5
+        return
+    for part in (first, second):  # the first is mended, which it was not closed for
+        with closing(Recording(part / "flight.mcap")) as recording:
+            assert recording.pictures

@@ -58,7 +58,7 @@ def test_each_key_goes_one_way(name: str) -> None:
         assert not may_change(name, TIGHTER[name], now)
 
 
-@pytest.mark.parametrize("name", {*LOOSER, *FIXED})
+@pytest.mark.parametrize("name", sorted({*LOOSER, *FIXED}))
 def test_what_is_read_again_waits_where_it_is_looser(name: str) -> None:
     wanted = with_values(FLYING, {name: (LOOSER | FIXED)[name], "depth.stride": 4})
     going_on, waiting = tightened(FLYING, wanted)
@@ -67,7 +67,7 @@ def test_what_is_read_again_waits_where_it_is_looser(name: str) -> None:
     assert with_values(going_on, waiting) == wanted
 
 
-@pytest.mark.parametrize("name", {*TIGHTER, *FREE})
+@pytest.mark.parametrize("name", sorted({*TIGHTER, *FREE}))
 def test_what_is_read_again_counts_where_it_is_tighter(name: str) -> None:
     wanted = with_values(FLYING, {name: (TIGHTER | FREE)[name]})
     assert tightened(FLYING, wanted) == (wanted, {})
