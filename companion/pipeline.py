@@ -21,6 +21,7 @@ from typing import Protocol
 
 from companion.errors import CompanionError
 from companion.localisation import LocalisationStage
+from companion.message_size import size_bytes
 from companion.messages import (
     Frame,
     KeyframeAdded,
@@ -30,7 +31,8 @@ from companion.messages import (
     Warned,
 )
 
-DEPTH_QUEUE = 64
+DEPTH_QUEUE, DEPTH_QUEUE_BYTES = 64, 128 << 20
+"""Messages that wait for depth, and bytes of them: of large pictures there is room for fewer."""
 DEPTH_FAILED = "the dense map ends here: the depth stage has failed"
 
 
@@ -63,6 +65,8 @@ class StageThread:
         self._lossless = lossless
         self._inbox: queue.Queue[Message | None] = queue.Queue(DEPTH_QUEUE)
         self._outbox: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        self._n_bytes = 0
+        self._taken = threading.Condition()
         self.fault: BaseException | None = None
         """What the stage raised; None while it works."""
         self.n_dropped = 0
@@ -71,12 +75,19 @@ class StageThread:
 
     def put(self, message: Message) -> None:
         """Hand over a message; waits for room in lockstep, else drops frames and keyframes."""
-        if self._lossless or not isinstance(message, Frame):
-            self._inbox.put(message)
-        elif self._inbox.qsize() < DEPTH_QUEUE // 2:
-            self._inbox.put(message)
-        else:
-            self.n_dropped += 1
+        size = size_bytes(message)
+        with self._taken:
+            fits = not self._n_bytes or self._n_bytes + size <= DEPTH_QUEUE_BYTES
+            if not self._lossless and isinstance(message, Frame):
+                if not fits or self._inbox.qsize() >= DEPTH_QUEUE // 2:
+                    self.n_dropped += 1
+                    return
+            elif not fits:
+                self._taken.wait_for(
+                    lambda: not self._n_bytes or self._n_bytes + size <= DEPTH_QUEUE_BYTES
+                )
+            self._n_bytes += size
+        self._inbox.put(message)
 
     def collect(self) -> Iterator[Message]:
         """Results so far."""
@@ -95,7 +106,7 @@ class StageThread:
     def _work(self) -> None:
         is_open = True
         try:
-            while (message := self._inbox.get()) is not None:
+            while (message := self._take()) is not None:
                 for out in self._stage.step(message):
                     self._outbox.put(out)
             is_open = False
@@ -103,8 +114,16 @@ class StageThread:
                 self._outbox.put(out)
         except BaseException as fault:  # handed to the caller's thread, which tells of it
             self.fault = fault
-        while is_open and self._inbox.get() is not None:
+        while is_open and self._take() is not None:
             pass  # whoever puts must not wait for ever
+
+    def _take(self) -> Message | None:
+        message = self._inbox.get()
+        if message is not None:
+            with self._taken:
+                self._n_bytes -= size_bytes(message)
+                self._taken.notify()
+        return message
 
 
 class Pipeline:
