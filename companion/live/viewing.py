@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from companion.camera import Camera
+from companion.clock import monotonic_s
 from companion.config import Config
 from companion.errors import InputError
 from companion.health import StageHealth
@@ -21,6 +22,8 @@ AGAIN_S = 3.0
 """Between two attempts to show it."""
 PATIENCE_S, HURRIED_S = 3.0, 0.2
 """What a viewer may take to show the last of a flight."""
+STALLED_S = 30.0
+"""An exporter that takes nothing for so long is ended, and another takes its place."""
 MANY = 50
 """So many messages given up between two looks are an exporter that hangs."""
 NOWHERE = "none"
@@ -113,6 +116,9 @@ class Viewing:
                 self._close_viewer(HURRIED_S)
                 self._viewer = self._open()
                 wait_s = AGAIN_S
+            elif self._viewer.stalled_s(monotonic_s()) > STALLED_S:
+                self._viewer.interrupt()
+                wait_s = 0.0
             elif self._where != NOWHERE and not self._viewer.is_shown:
                 wait_s = self._show()
             self._look()

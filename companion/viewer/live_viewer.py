@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from companion.camera import Camera
+from companion.clock import monotonic_s
 from companion.config import StreamConfig, ViewerConfig
 from companion.errors import InputError
 from companion.messages import Frame, GeoOrigin
@@ -62,6 +63,7 @@ class LiveViewer:
         self._frame_ns = -(2**63)
         self._port = 0
         self._has_port = threading.Event()
+        self._sending_since_s: float | None = None
         listen = stream.listen if stream is not None else ""
         self._bind = stream.web_bind if stream is not None else StreamConfig().web_bind
         flight = FlightItem(name or os.urandom(8).hex(), name, camera.pinhole(), origin)
@@ -127,6 +129,15 @@ class LiveViewer:
         """Whether the exporter is there."""
         return self._exporter.poll() is None
 
+    def stalled_s(self, now_s: float) -> float:
+        """For how long the exporter has not taken a message; 0 where none waits for it."""
+        since_s = self._sending_since_s
+        return now_s - since_s if since_s is not None else 0.0
+
+    def interrupt(self) -> None:
+        """End an exporter that hangs, as if it had died by itself."""
+        _end(self._exporter)
+
     @property
     def is_shown(self) -> bool:
         """Whether the process is there that shows it here."""
@@ -165,10 +176,12 @@ class LiveViewer:
         try:
             self._send(setup)
             while (message := self._inbox.get()) is not None:
+                self._sending_since_s = monotonic_s()
                 budget, self._budget = self._budget, None
                 if budget is not None:
                     self._send(budget)
                 self._send(reduced(message, self._width))
+                self._sending_since_s = None
         except OSError:  # the exporter is gone; the flight goes on, and what follows is counted
             self.n_dropped += 1
             self._inbox.close()
