@@ -152,7 +152,6 @@ def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
         assert health["n_restarted"] == 1
         assert f"failed: {first.named}: killed by SIGABRT" in health["detail"]
         flying.until_stage("localisation", lambda it: it["rate_hz"] > 0 and not it["n_restarted"])
-        flying.assert_true_poses()
         flying.assert_stops()
         (folder,) = flying.daemon.flown()
     recording = Recording(folder / "flight.mcap")
