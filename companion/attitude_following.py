@@ -35,6 +35,9 @@ SIGMAS = 2.5
 ALONE_RAD, ALONE_SHARE = np.radians(0.7), 0.4
 """RMS turn that the body does not explain, at least and as a share of the body's, that says that
 the camera turns by itself; jitter of 30 ms leaves up to 0.3 of turns over 0.2 s."""
+KEPT_SHARE = 0.85
+"""The greatest turns of the body are left out: where an autopilot sets its heading anew, it turns
+by tens of degrees in itself alone, which is in one pair of eight at most."""
 FILTERED = 3.0
 """Turns that overlap count for so much less."""
 
@@ -44,8 +47,9 @@ class Following:
     """How camera turns follow body turns: about the body's axes (3,) forward, right, down.
 
     `gain` is nan about axes about which the body did not turn; `sigma_gain` is its standard
-    deviation. `body_rad` are RMS turns of the body, `alone_rad` the RMS of what is left of the
-    camera's turns without the body's, both over `LAGS_NS`. `offset_s` is what fits best.
+    deviation. `body_rad` are RMS turns of the body, `alone_rad` the median of what is left of the
+    camera's turns without the body's, both over `LAGS_NS`. The autopilot's stamps are late by
+    `offset_s` as far as turns tell.
     `turned_mount` (3, 3) is the turn of the camera on the body that would make both agree, None
     where no such turn does.
     """
@@ -171,9 +175,11 @@ def _turns(a: Array, b: Array) -> Array:
 
 def _regressed(seen: Array, flown: Array, span_s: float, offset_s: float) -> Following:
     n_free = max(len(LAGS_NS) * span_s / (1e-9 * LAGS_NS[-1]) / FILTERED, 1.0)
-    body = np.sqrt((flown * flown).mean(0))
-    gain = (seen * flown).sum(0) / np.maximum((flown * flown).sum(0), 1e-12)
-    rest = np.sqrt(((seen - gain * flown) ** 2).mean(0))
+    kept = np.abs(flown) <= np.quantile(np.abs(flown), KEPT_SHARE, axis=0)
+    n = kept.sum(0)
+    body = np.sqrt((flown * flown * kept).sum(0) / n)
+    gain = (seen * flown * kept).sum(0) / np.maximum((flown * flown * kept).sum(0), 1e-12)
+    rest = np.sqrt((((seen - gain * flown) ** 2) * kept).sum(0) / n)
     sigma = rest / np.maximum(body, 1e-9) / np.sqrt(n_free)
     still = body < LEAST_TURN_RAD
     gain, sigma = np.where(still, np.nan, gain), np.where(still, np.nan, sigma)

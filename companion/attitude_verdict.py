@@ -104,6 +104,10 @@ class AttitudeVerdict:
         self._tilt.forget()
         self._straight, self._tilted_since_ns = False, None
 
+    def due(self, t_ns: int) -> bool:
+        """Whether it is time to judge."""
+        return t_ns >= self._turns_due_ns or (self.used and t_ns >= self._check_due_ns)
+
     def judge(
         self, t_ns: int, rotation_of: RotationOf, body_from_camera: Array,
         ned_from_map: Array | None,

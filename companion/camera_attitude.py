@@ -137,6 +137,11 @@ class CameraAttitude:
         self._estimator.forget()
         self._verdict.forget()
 
+    def due(self, t_ns: int) -> bool:
+        """Whether it is time to judge."""
+        mount_due = self.used and t_ns >= self._due_ns
+        return self._mounted and (mount_due or self._verdict.due(t_ns))
+
     def judge(self, t_ns: int, rotation_of: RotationOf, ned_from_map: Array | None) -> Judged:
         """See how far the attitude is the camera's, and the map level: correct what is off.
 

@@ -328,6 +328,8 @@ class LocalisationStage:
         )
 
     def _judge_attitude(self, t_ns: int) -> list[Warned]:
+        if not self._attitude.due(t_ns):
+            return []
         segment = self._tracker.map
         placed = self._places.of(segment)
 

@@ -120,6 +120,23 @@ def test_a_camera_that_is_swept_over_a_still_body_does_not_follow() -> None:
     assert found.turns_alone
 
 
+def test_a_heading_that_is_set_anew_is_no_gimbal() -> None:
+    """An autopilot turns by 25 degrees in itself when its compass is found to be wrong."""
+
+    def body_as(t_s: float) -> Array:
+        jump = rotation_from_vector(np.array([0.0, 0.0, np.radians(25.0) * (t_s > 4.5)]))
+        return jump @ rotation_from_quaternion(
+            quaternion_from_euler(*(euler(t_s) * [1.0, 1.0, 0.0]))
+        )
+
+    def camera_on(t_s: float) -> Array:
+        return rotation_from_quaternion(quaternion_from_euler(*(euler(t_s) * [1.0, 1.0, 0.0])))
+
+    found = result(camera_on=camera_on, body_as=body_as)
+    assert not found.held
+    assert found.follows
+
+
 def test_where_nothing_turns_nothing_is_claimed() -> None:
     found = result(camera_on=fixed, body_as=fixed)
     assert not found.held
