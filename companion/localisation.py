@@ -123,20 +123,23 @@ class LocalisationStage:
     def checkpoint(self) -> Checkpoint | None:
         """What another process needs to go on from the last frame; None unless it was tracked.
 
-        It does not change with the map. A map from before that is in question gives none.
+        It does not change with the map. A map from before that is in question gives none, nor does
+        one with a scale while attitude is missing, by which whoever takes it up checks it.
         """
         last, segment = self._last, self._tracker.map
         if self._resumption is not None or last is None or last.map_from_camera is None:
             return None
         if last.t_ns != self._t_ns or self.state is not TrackState.TRACKING:
             return None
+        told, georeference = self._attitude.at(last.t_ns), self._places.of(segment)
+        mounted = self._camera.body_from_camera is not None
+        if georeference is not None and mounted and told is None:
+            return None
         with self._times("checkpoint"), self._tracker.turn.tracking():
             place = last.map_from_camera.translation
             (nearest,) = segment.nearest(place, 1, set())
             part = part_around(segment, segment.keyframes[nearest], MOST_BYTES)
-        told = self._attitude.at(last.t_ns)
         mount, late_ns = self._attitude.correction
-        georeference = self._places.of(segment)
         return Checkpoint(
             last.t_ns, part, self._tracker.next_keyframe_id,
             None if told is None else told @ last.map_from_camera.rotation.T, georeference,
@@ -211,7 +214,7 @@ class LocalisationStage:
         if update is not None:
             yield update
         if self._resumption is not None:
-            yield from self._judge_map(self._resumption, frame.t_ns, other_map)
+            yield from self._judge_map(self._resumption, frame.t_ns)
         yield from self._judge_attitude(frame.t_ns)
         self._let_go(frame.t_ns)
 
@@ -226,23 +229,22 @@ class LocalisationStage:
         when_ns: Array = np.array(sorted(living.values()))
         self._georeferencer.let_go(t_ns - REMEMBERED_NS, when_ns)
 
-    def _judge_map(
-        self, resumption: Resumption, t_ns: int, other_map: bool
-    ) -> Iterator[MapUpdate | Warned]:
+    def _judge_map(self, resumption: Resumption, t_ns: int) -> Iterator[MapUpdate | Warned]:
         """See whether the map from before is what is seen, and take it up or leave it."""
         last = self._last if self._last is not None and self._last.t_ns == t_ns else None
+        kept, segment = resumption.kept, self._tracker.map
+        in_use = segment.first_keyframe_id == kept.part.first_keyframe_id
         verdict = Verdict.REFUSED
-        if not other_map:
+        if in_use:
             attitude = self._attitude.at(t_ns)
             verdict = resumption.judge(t_ns, last, attitude, self.camera_from_body)
         if verdict is Verdict.TRYING:
             return
         self._resumption = None
-        kept, segment = resumption.kept, self._tracker.map
         if verdict is Verdict.REFUSED:
             with self._tracker.turn.tracking():
                 self._tracker.leave(kept.part.first_keyframe_id)
-            if not other_map:
+            if in_use:
                 self._forget_frames()
             yield Warned(t_ns, NOT_TAKEN_UP, resumption.why_not)
             return

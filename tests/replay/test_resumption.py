@@ -18,7 +18,11 @@ import pytest
 from companion.camera import Camera
 from companion.checkpoint import MOST_BYTES, Checkpoint, decode, encode, opened
 from companion.config import Config
-from companion.geometry import quaternion_from_rotation, rotation_from_quaternion, yaw_rotation
+from companion.geometry import (
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_from_vector,
+)
 from companion.localisation import NOT_TAKEN_UP, TAKEN_UP, LocalisationStage
 from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
 from companion.resumption import TRIED_NS
@@ -75,9 +79,9 @@ def unchanged(sample: Telemetry) -> Telemetry:
     return sample
 
 
-def turned(degrees: float) -> Change:
-    """An autopilot whose heading is another."""
-    turn = yaw_rotation(float(np.radians(degrees)))
+def turned(*degrees: float) -> Change:
+    """An autopilot whose attitude is another: turned about north, east and down."""
+    turn = rotation_from_vector(np.radians(degrees))
 
     def change(sample: Telemetry) -> Telemetry:
         assert isinstance(sample, AttitudeSample)
@@ -160,8 +164,10 @@ def test_without_what_was_kept_hovering_tells_no_scale(left: Left) -> None:
 
 @pytest.mark.parametrize(
     ("places", "change"),
-    [("elsewhere", unchanged), ("here", turned(25.0))],
-    ids=["over other ground", "under another heading"],
+    [
+        ("elsewhere", unchanged), ("here", turned(0.0, 0.0, 25.0)), ("here", turned(20.0, 0.0, 0.0))
+    ],
+    ids=["over other ground", "under another heading", "under another vertical"],
 )
 def test_what_does_not_agree_is_never_taken_up(left: Left, places: str, change: Change) -> None:
     found = resumed(left, ELSEWHERE if places == "elsewhere" else over(left), change)
