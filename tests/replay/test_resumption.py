@@ -178,6 +178,25 @@ def test_what_does_not_agree_is_never_taken_up(left: Left, places: str, change: 
     print(said.detail)
 
 
+def test_a_map_in_question_that_is_given_up_lends_the_next_no_scale(left: Left) -> None:
+    """As where it is found to be tilted."""
+    stage = LocalisationStage(CONFIG, left.camera, lambda _: nullcontext())
+    said: list[str] = []
+    n_frames = 0
+    for message in hovering(left, over(left), unchanged):
+        if isinstance(message, Frame):
+            if not n_frames:
+                stage.take_up(left.checkpoint, message.t_ns, round(ABSENT_S * 1e9))
+            n_frames += 1
+            if n_frames == 3:
+                stage._tracker.begin_anew(0, keep=True)
+        for out in stage.step(message):
+            assert not (isinstance(out, Odometry) and out.world_from_body is not None)
+            said += [out.what] if isinstance(out, Warned) else []
+    assert NOT_TAKEN_UP in said and TAKEN_UP not in said
+    assert stage.n_segments == 1
+
+
 @pytest.mark.parametrize("take_up", [True, False], ids=["taken up", "not wanted"])
 def test_the_process_takes_up_what_another_kept_and_keeps_its_own(
     left: Left, tmp_path: Path, take_up: bool
