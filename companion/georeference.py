@@ -158,7 +158,8 @@ class Georeferencer:
         return None
 
     def solve(self, places: list[Place]) -> Georeference | None:
-        """Where the map lies; None until it is known well enough."""
+        """Where the map lies; None until it is known well enough. Places may come in any order."""
+        places = sorted(places, key=lambda place: place.t_ns)  # a joined map has its own after ours
         if len(places) > MAX_PLACES:
             chosen = np.unique(np.linspace(0, len(places) - 1, MAX_PLACES).astype(int))
             places = [places[int(i)] for i in chosen]

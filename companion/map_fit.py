@@ -121,7 +121,7 @@ def _add_ways(
     """From one place to the next, where velocity tells how far that was; robust (Huber)."""
     dt = np.diff(t_s)
     known = np.isfinite(way[1:, :2] - way[:-1, :2]).all(1)
-    use = known & (dt < MAX_STEP_S) & keep[1:] & keep[:-1]
+    use = known & (dt > 0) & (dt < MAX_STEP_S) & keep[1:] & keep[:-1]
     if not use.any():
         return
     j = (jacobian[1:] - jacobian[:-1])[use]

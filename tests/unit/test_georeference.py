@@ -90,6 +90,17 @@ def test_a_wrong_position_for_a_few_seconds_does_not_bend_the_map() -> None:
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=0.02)
 
 
+def test_keyframes_of_a_joined_map_may_come_before_those_that_are_older() -> None:
+    kept, ned = places()
+    velocity_noise = np.zeros((1, 3))
+    georeferencer = reference(ned, np.zeros_like(ned), velocity_noise)
+    in_order = georeferencer.solve(kept)
+    joined = georeferencer.solve([*kept[50:], *kept[:50], kept[49]])
+    assert in_order is not None and joined is not None
+    assert joined.world_from_map.scale == pytest.approx(in_order.world_from_map.scale, rel=1e-3)
+    assert np.isfinite(joined.sigma_scale)
+
+
 def test_hovering_gives_no_scale() -> None:
     kept, ned = places(20)
     still = np.repeat(ned[:1], len(ned), 0)
