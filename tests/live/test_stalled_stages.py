@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import threading
 import time
@@ -122,8 +121,8 @@ def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path, kind: st
         (folder,) = daemon.flown()
     first, second = folder, folder / "part-2"
     if kind == "recorder":
-        assert (first / "flight.rrd").stat().st_size > 0
-        assert json.loads((second / "report.json").read_text())["frames"] > 5
+        for part in (first, second):
+            assert (part / "flight.rrd").stat().st_size > 10_000
         return
     for part in (first, second):  # the first is mended, which it was not closed for
         with closing(Recording(part / "flight.mcap")) as recording:
