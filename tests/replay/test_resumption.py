@@ -179,14 +179,15 @@ def test_what_does_not_agree_is_never_taken_up(left: Left, places: str, change: 
 
 
 def test_a_map_in_question_that_is_given_up_lends_the_next_no_scale(left: Left) -> None:
-    """As where it is found to be tilted."""
+    """As where it is found to be tilted. No attitude is asked for, which could tell them apart."""
+    kept = replace(left.checkpoint, ned_from_map=None)
     stage = LocalisationStage(CONFIG, left.camera, lambda _: nullcontext())
     said: list[str] = []
     n_frames = 0
     for message in hovering(left, over(left), unchanged):
         if isinstance(message, Frame):
             if not n_frames:
-                stage.take_up(left.checkpoint, message.t_ns, round(ABSENT_S * 1e9))
+                stage.take_up(kept, message.t_ns, round(ABSENT_S * 1e9))
             n_frames += 1
             if n_frames == 3:
                 stage._tracker.begin_anew(0, keep=True)
