@@ -112,20 +112,12 @@ class MotionFilter:
         self._map_from_ned = np.eye(3)
         self._tied = False
         """Whether `map_from_ned` is known: how the map's axes lie to the autopilot's."""
-        self._disagreement_rad: deque[float] = deque(maxlen=60)
         self.unit = 1.0
 
     def reset(self) -> None:
         """Forget everything but what is known of the autopilot's attitude."""
         self._t_ns, self._filter, self._tied = None, None, False
         self._poses.clear()
-
-    @property
-    def attitude_disagreement_rad(self) -> float | None:
-        """Median turn between frames that the attitude did not see; None until known."""
-        if len(self._disagreement_rad) < 20:
-            return None
-        return float(np.median(self._disagreement_rad))
 
     @property
     def tied(self) -> bool:
@@ -222,7 +214,6 @@ class MotionFilter:
                     f.P[6:], f.P[:, 6:] = 0.0, 0.0
                     f.P[6:, 6:] = VARIANCE_TIED_RAD2 * np.eye(3)
                 turn = vector_from_rotation(seen @ self._map_from_ned.T)
-                self._disagreement_rad.append(float(np.linalg.norm(turn)))
                 z = np.r_[z, turn]
             f.update(z.reshape(-1, 1), R=r, H=h)
             turned = rotation_from_vector(f.x[6:9, 0])

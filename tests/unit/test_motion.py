@@ -9,7 +9,6 @@ from companion.geometry import (
     Pose,
     angle_between,
     quaternion_from_euler,
-    rotation_from_quaternion,
     rotation_from_vector,
     vector_from_rotation,
     yaw_rotation,
@@ -74,19 +73,6 @@ def test_a_steady_motion_is_predicted(attitude: bool) -> None:
     assert predicted is not None
     np.testing.assert_allclose(predicted.translation, path(20).translation, atol=2e-3)
     assert angle_between(predicted.rotation, path(20).rotation) < np.radians(0.3)
-
-
-def test_an_attitude_that_is_not_the_cameras_is_seen_to_be_none() -> None:
-    steady, gimballed = MotionFilter(), MotionFilter()
-    for k in range(40):
-        steady.correct(k * STEP_NS, path(k), path(k).rotation)
-        swinging = rotation_from_quaternion(quaternion_from_euler(0.3 * np.sin(k), 0.2, 0.1 * k))
-        gimballed.correct(k * STEP_NS, path(k), swinging)
-    assert steady.attitude_disagreement_rad is not None
-    assert gimballed.attitude_disagreement_rad is not None
-    assert steady.attitude_disagreement_rad < np.radians(0.5)
-    assert gimballed.attitude_disagreement_rad > np.radians(4)
-    assert MotionFilter().predict(0, None) is None
 
 
 def tied(motion: MotionFilter, map_from_ned: np.ndarray) -> None:
