@@ -23,6 +23,8 @@ def begin_map(atlas: Atlas, start: Start, first: Keyframe, second: Keyframe) -> 
     ids = slam_map.add_points(
         start.points_map, second, start.features_second, image_levels(second.grey)
     )
+    for keyframe in (first, second):
+        keyframe.refined_for[:] = -1  # a view that was tracked in another map names points of that
     slam_map.first_keyframe_id = first.keyframe_id
     slam_map.keyframes[first.keyframe_id] = first
     slam_map.poses_changed()

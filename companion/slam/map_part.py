@@ -56,7 +56,8 @@ def part_around(slam_map: SlamMap, keyframe: Keyframe, most_bytes: int) -> MapPa
     index[ids] = np.arange(len(ids))
     copies = (
         replace(
-            k, point_ids=index[k.point_ids], refined_for=index[k.refined_for],
+            k, point_ids=index[k.point_ids],
+            refined_for=np.where(k.refined_for == k.point_ids, index[k.point_ids], -1),
             normalised=k.normalised.copy(), whitening=k.whitening.copy(), grey=None,
         )
         for _, k in sorted(chosen.items())

@@ -74,6 +74,19 @@ def refusal(path: Path, setup: Setup = SETUP) -> str:
     return str(refused.value)
 
 
+def test_what_a_feature_was_refined_for_in_another_map_is_not_kept() -> None:
+    path = [flown(p) for p in np.linspace((-6, 0), (6, 0), 8)]
+    made = mapped(Ground(np.random.default_rng(4)), path, Similarity.identity())
+    first, second = list(made.keyframes.values())[:2]
+    first.refined_for[:] = made.n_points + 2000
+    second.refined_for[:] = second.point_ids
+    part = part_around(made, second, MOST_BYTES)
+    kept = {k.keyframe_id: k for k in part.keyframes}
+    assert (kept[first.keyframe_id].refined_for == -1).all()
+    of_second = kept[second.keyframe_id]
+    assert (of_second.refined_for == of_second.point_ids).all() and of_second.refined_for.max() > 0
+
+
 def test_what_was_kept_comes_back_once(tmp_path: Path, checkpoint: Checkpoint) -> None:
     path = tmp_path / "run" / "map.checkpoint"
     keep(path, checkpoint)
