@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -72,7 +73,14 @@ class _Localisation(Work):
         if keeper.fault and keeper.fault != self._told_fault:
             yield Warned(frame.t_ns, NOT_KEPT, keeper.fault)
         self._told_fault = keeper.fault
-        checkpoint = self._stage.checkpoint()
+        try:
+            checkpoint = self._stage.checkpoint()
+        except Exception as error:  # a bug in what is kept for later must not end the pose of now
+            self._keeper = None
+            keeper.close(forget=True)
+            traceback.print_exc()
+            yield Warned(frame.t_ns, NOT_KEPT, f"{type(error).__name__}: {error}")
+            return
         if checkpoint is not None:
             self._kept_ns = frame.t_ns
             keeper.put(checkpoint)

@@ -17,14 +17,15 @@ from companion.config import Config, FeedbackConfig
 from companion.geometry import Pose, Similarity
 from companion.live import kept_map_place
 from companion.live.kept_map_place import kept_map_path
-from companion.messages import Georeference, Track, TrackState
+from companion.localisation import LocalisationStage
+from companion.messages import Frame, Georeference, Odometry, Track, TrackState, Warned
 from companion.odometry import OdometryState
 from companion.resumption import MIN_FRAMES, MOST_ABSENT_NS, TRIED_NS, Resumption, Verdict
 from companion.slam.map import SlamMap
 from companion.slam.map_part import map_of, part_around
-from companion.stages import map_keeper
+from companion.stages import localisation_work, map_keeper
 from companion.stages.map_keeper import MapKeeper
-from companion.stages.protocol import Setup
+from companion.stages.protocol import Finish, KeepMap, Setup
 from tests.support.made_map import CAMERA, N_LEVELS, SCALE_FACTOR, Ground, flown, mapped
 
 SETUP = Setup(Config(), CAMERA)
@@ -85,6 +86,31 @@ def test_what_a_feature_was_refined_for_in_another_map_is_not_kept() -> None:
     assert (kept[first.keyframe_id].refined_for == -1).all()
     of_second = kept[second.keyframe_id]
     assert (of_second.refined_for == of_second.point_ids).all() and of_second.refined_for.max() > 0
+
+
+def test_a_fault_in_what_is_kept_for_later_does_not_end_the_pose_of_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(stage: LocalisationStage) -> None:
+        raise IndexError("index 2080 is out of bounds")
+
+    monkeypatch.setattr(LocalisationStage, "checkpoint", fails)
+    path = tmp_path / "map.checkpoint"
+    localisation = localisation_work.work(SETUP)
+    list(localisation.step(KeepMap(path, take_up=False)))
+    grey = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    told = [
+        message
+        for k in range(1, 4)
+        for message in localisation.step(Frame(k, k * SECOND_NS, grey, np.dstack([grey] * 3)))
+    ]
+    assert len([m for m in told if isinstance(m, Odometry)]) == 3
+    (warned,) = (m for m in told if isinstance(m, Warned))
+    assert (warned.what, warned.detail) == (
+        localisation_work.NOT_KEPT, "IndexError: index 2080 is out of bounds"
+    )  # fmt: skip
+    list(localisation.finish(Finish(hurry=True)))
+    assert not path.exists()
 
 
 def test_what_was_kept_comes_back_once(tmp_path: Path, checkpoint: Checkpoint) -> None:
