@@ -35,9 +35,8 @@ MIN_RANGES = 4
 """Fewer ranges have no median to speak of."""
 MAX_HELD_NS = 400_000_000
 """A velocity may be as old as this."""
-SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.02, 0.05
-"""No rangefinder and no barometer tells the scale better than this. By ranges alone it was 0.1,
-0.5, 0.5 and 4 % off on rendered flights with cameras 45, 80, 90 and 30 degrees down: 2 %, RMS."""
+SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.01, 0.05
+"""No rangefinder and no barometer tells the scale better than this."""
 MAX_SIGMA_TURN_RAD = np.radians(8.0)
 MAX_PLACES = 400
 MAX_SIGMA_BEGUN = 0.5
