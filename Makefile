@@ -12,11 +12,10 @@ OUT ?= out/demo
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
 
-# First what only computes, on all cores; then, with nothing beside them, tests that measure times:
-# those that failed are tried once more, as another program may have had the processor.
+# First what only computes, on all cores; then, with nothing beside them, tests that measure times.
 test: lint opencl
 	$(BIN)/pytest -m "not alone" -n logical --maxprocesses 4 --dist loadfile
-	$(BIN)/pytest -m alone || $(BIN)/pytest -m alone --last-failed --last-failed-no-failures none
+	$(BIN)/pytest -m alone
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check
