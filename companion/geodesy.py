@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry import Array
-from companion.messages import GeoOrigin
 
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1 / 298.257223563
 ECCENTRICITY_2 = FLATTENING * (2 - FLATTENING)
+
+
+@dataclass(frozen=True, slots=True)
+class GeoOrigin:
+    """Where local NED has its zero (WGS84; altitude above mean sea level)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
 
 
 def ned_from_geodetic(

@@ -98,15 +98,6 @@ class ArmedSample:
 Telemetry = AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
 
 
-@dataclass(frozen=True, slots=True)
-class GeoOrigin:
-    """Where local NED has its zero (WGS84; altitude above mean sea level)."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-
-
 class TrackState(Enum):
     """What the tracker knows."""
 

@@ -17,8 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.clock import FlightClock
 from companion.config import LinkConfig
+from companion.geodesy import GeoOrigin
 from companion.health import RateMeter, SourceHealth, SourceMeter
-from companion.messages import ArmedSample, GeoOrigin, Telemetry, Warned
+from companion.messages import ArmedSample, Telemetry, Warned
 from companion.pilot_messages import PilotText
 from companion.timesync import ClockFilter
 from drivers.commands import NO_ANSWER, TRIES, Commands

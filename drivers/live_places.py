@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from companion.geodesy import ned_from_geodetic, origin_of
+from companion.geodesy import GeoOrigin, ned_from_geodetic, origin_of
 from companion.geometry import Array
-from companion.messages import GeoOrigin, PositionSample, PositionSource
+from companion.messages import PositionSample, PositionSource
 from drivers.telemetry_log import PAIR_NS, GeodeticFix
 
 WAIT_NS = 2_000_000_000

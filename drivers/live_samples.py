@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.messages import GeoOrigin, PositionSample, PositionSource, Telemetry, Warned
+from companion.geodesy import GeoOrigin
+from companion.messages import PositionSample, PositionSource, Telemetry, Warned
 from companion.timesync import ClockFilter
 from drivers.live_places import LivePlaces
 from drivers.mavlink_samples import ATTITUDE_IDS, IMU_IDS, SAMPLE_OF, boot_ns

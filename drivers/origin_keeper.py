@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import FeedbackConfig
-from companion.messages import GeoOrigin
+from companion.geodesy import GeoOrigin
 from drivers.autopilot_link import AutopilotLink
 
 LOOK_EVERY_S = 0.5

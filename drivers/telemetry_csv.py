@@ -22,11 +22,11 @@ from pathlib import Path
 import numpy as np
 
 from companion.errors import FlightError
+from companion.geodesy import GeoOrigin
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
     ClockReport,
-    GeoOrigin,
     HeightSample,
     ImuSample,
     PositionSample,

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from companion.clocksync import clock_from_utc
+from companion.geodesy import GeoOrigin
 from companion.geometry import Array, quaternion_from_euler
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
-    GeoOrigin,
     HeightSample,
     ImuSample,
     PositionSample,

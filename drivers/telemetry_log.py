@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.geodesy import ned_from_geodetic, origin_of
+from companion.geodesy import GeoOrigin, ned_from_geodetic, origin_of
 from companion.geometry import Array
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
     ClockReport,
-    GeoOrigin,
     ImuSample,
     PositionSample,
     PositionSource,

@@ -14,7 +14,8 @@ from pathlib import Path
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.clocksync import BootSegments, estimate_clock
-from companion.messages import ArmedSample, GeoOrigin, Warned
+from companion.geodesy import GeoOrigin
+from companion.messages import ArmedSample, Warned
 from drivers.mavlink_samples import (
     ATTITUDE_IDS,
     HEIGHT_IDS,

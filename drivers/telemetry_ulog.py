@@ -15,11 +15,11 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from companion.clocksync import clock_from_utc
+from companion.geodesy import GeoOrigin
 from companion.geometry import Array
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
-    GeoOrigin,
     HeightSample,
     ImuSample,
     PositionSample,

@@ -31,7 +31,7 @@ def _devices(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
 def _calibrate(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.calibrate import calibrate, print_board
-    from drivers.camera_source import camera_source
+    from drivers.camera_registry import camera_source
 
     if arguments.print_board is not None:
         paper = print_board(arguments.board, arguments.print_board)

@@ -61,11 +61,11 @@ from companion.pilot_messages import (
 from companion.stages.protocol import Snapshot
 from drivers.autopilot_date import AutopilotDate
 from drivers.autopilot_link import AutopilotLink
-from drivers.calibration import live_camera
 from drivers.camera_feed import CameraFeed
-from drivers.camera_source import camera_source
+from drivers.camera_registry import camera_source
 from drivers.clock_is_set import clock_is_set
 from drivers.link_port import link_port
+from drivers.live_calibration import live_camera
 from drivers.metrics import Metrics
 from drivers.origin_keeper import OriginKeeper
 from drivers.service_manager import ServiceManager

@@ -20,12 +20,12 @@ from typing import Any
 from companion.camera import Camera
 from companion.clock import FlightClock, monotonic_s
 from companion.config import Config
+from companion.geodesy import GeoOrigin
 from companion.health import Health
 from companion.live.viewing import Viewing
 from companion.messages import (
     DepthMap,
     Frame,
-    GeoOrigin,
     KeyframeAdded,
     MapUpdate,
     Message,

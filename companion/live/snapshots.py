@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from companion.geodesy import GeoOrigin
 from companion.live.flight import LiveFlight
 from companion.live.flights import Flights
-from companion.messages import GeoOrigin
 from companion.pilot_messages import CLOUD_NOT_SAVED, CLOUD_SAVED, PilotText
 from companion.stages.protocol import Snapshot
 from drivers.command_server import ACCEPTED, FAILED, Job

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from companion.messages import GeoOrigin
+from companion.geodesy import GeoOrigin
 from companion.output.cloud import Cloud
 from companion.output.trajectory import frame_lines
 

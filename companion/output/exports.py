@@ -11,7 +11,7 @@ from typing import NamedTuple
 from companion import __version__
 from companion.config import ExportConfig
 from companion.errors import InputError
-from companion.messages import GeoOrigin
+from companion.geodesy import GeoOrigin
 from companion.output.accuracy import Axes, accuracy_statement, remarks_on_heights
 from companion.output.atomic_file import write_atomically
 from companion.output.cloud_las import cloud_las

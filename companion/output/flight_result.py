@@ -13,12 +13,12 @@ import numpy as np
 
 from companion.camera import Camera
 from companion.clock import StageTimes
+from companion.geodesy import GeoOrigin
 from companion.geometry import Array, Pose, Similarity
 from companion.messages import (
     ClockReport,
     DepthMap,
     Frame,
-    GeoOrigin,
     Georeference,
     MapUpdate,
     Message,

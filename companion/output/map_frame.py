@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import InputError
-from companion.geodesy import geodetic_from_ned
+from companion.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry import Array, nearest_rotation
-from companion.messages import GeoOrigin
 from companion.utm import UtmZone, utm_from_geodetic, utm_zone
 
 WGS84 = (

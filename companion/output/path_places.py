@@ -8,9 +8,8 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from companion.geodesy import geodetic_from_ned
+from companion.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry import Array
-from companion.messages import GeoOrigin
 from companion.output.flight_result import WorldPose
 
 

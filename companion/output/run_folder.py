@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from companion.errors import InputError
+from companion.geodesy import GeoOrigin
 from companion.geometry import Pose, rotation_from_quaternion
-from companion.messages import GeoOrigin
 from companion.output.cloud import Cloud
 from companion.output.cloud_ply import KINDS, VERTEX
 from companion.output.flight_result import WorldPose

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from companion.geodesy import GeoOrigin
 from companion.geometry import quaternion_from_rotation
-from companion.messages import GeoOrigin
 from companion.output.flight_result import WorldPose
 
 

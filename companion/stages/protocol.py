@@ -8,7 +8,7 @@ from pathlib import Path
 
 from companion.camera import Camera
 from companion.config import Config
-from companion.messages import GeoOrigin
+from companion.geodesy import GeoOrigin
 from companion.output.flight_result import RunFacts
 
 

@@ -27,8 +27,9 @@ import numpy as np
 
 from companion.camera import Camera
 from companion.errors import StreamError
+from companion.geodesy import GeoOrigin
 from companion.geometry import Pose, Similarity, quaternion_from_rotation, rotation_from_quaternion
-from companion.messages import Floats, GeoOrigin
+from companion.messages import Floats
 from companion.stream.items import (
     COARSE,
     FINE,

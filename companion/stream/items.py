@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from companion.camera import Camera
+from companion.geodesy import GeoOrigin
 from companion.geometry import Pose, Similarity
-from companion.messages import Bytes, Floats, GeoOrigin
+from companion.messages import Bytes, Floats
 
 WHOLE, COARSE, FINE = "", "coarse", "fine"
 """Levels of a keyframe's points; coarse and fine together are all of them."""

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from companion.camera import Camera
+from companion.geodesy import GeoOrigin
 from companion.geometry import Array, Pose, Similarity
 from companion.health import Health
 from companion.messages import (
     DepthMap,
     Floats,
     Frame,
-    GeoOrigin,
     KeyframeAdded,
     MapUpdate,
     Message,

@@ -8,7 +8,7 @@ from types import TracebackType
 
 from companion.camera import Camera
 from companion.config import ViewerConfig
-from companion.messages import GeoOrigin
+from companion.geodesy import GeoOrigin
 from companion.stream.items import FlightItem, ImageItem, Item
 from companion.stream.pictures import picture_of
 from companion.stream.story import Story, Watched

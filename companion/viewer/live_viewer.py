@@ -20,7 +20,8 @@ from companion.camera import Camera
 from companion.clock import monotonic_s
 from companion.config import StreamConfig, ViewerConfig
 from companion.errors import InputError
-from companion.messages import Frame, GeoOrigin
+from companion.geodesy import GeoOrigin
+from companion.messages import Frame
 from companion.stream.export_process import ExportSetup, SetBudget
 from companion.stream.items import FlightItem
 from companion.stream.story import Watched

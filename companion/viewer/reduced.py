@@ -7,11 +7,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from companion.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import (
     DepthMap,
     Frame,
-    GeoOrigin,
     KeyframeAdded,
     MapUpdate,
     Odometry,

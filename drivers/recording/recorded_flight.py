@@ -11,7 +11,8 @@ from typing import Any
 from companion.camera import Camera
 from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
-from companion.messages import Bytes, ClockReport, Frame, GeoOrigin, Warned
+from companion.geodesy import GeoOrigin
+from companion.messages import Bytes, ClockReport, Frame, Warned
 from drivers.calibration import assumed_camera
 from drivers.flight import Flight
 from drivers.recording.camera_document import camera_of

@@ -45,7 +45,7 @@ from companion.live.journal import Journal
 from companion.messages import Frame, MapUpdate, Odometry, PointChunk, Telemetry, Track, Warned
 from companion.output.flight_result import RunFacts
 from drivers.camera_feed import CameraFeed
-from drivers.camera_source import camera_source
+from drivers.camera_registry import camera_source
 from drivers.open_flight import open_flight
 from tests.support.to_and_fro import flown_again, walk
 

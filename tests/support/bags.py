@@ -16,14 +16,14 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from companion.geodesy import geodetic_from_ned
+from companion.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry import (
     Array,
     Pose,
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
-from companion.messages import AttitudeSample, GeoOrigin, PositionSample, PositionSource
+from companion.messages import AttitudeSample, PositionSample, PositionSource
 from tests.support.sequences import Piece
 
 ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])

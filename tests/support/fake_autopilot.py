@@ -60,8 +60,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.geodesy import origin_of
-from companion.messages import GeoOrigin
+from companion.geodesy import GeoOrigin, origin_of
 from tests.support.fake_flight import Flight, RecordedFlight, circle, hover
 from tests.support.fake_parameters import Parameters
 from tests.support.fake_wire import wire

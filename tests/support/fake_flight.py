@@ -12,9 +12,8 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.clocksync import BootSegments
-from companion.geodesy import origin_of
+from companion.geodesy import GeoOrigin, origin_of
 from companion.geometry import Array, Pose, quaternion_from_rotation, vector_from_rotation
-from companion.messages import GeoOrigin
 from drivers.mavlink_samples import boot_ns
 from drivers.telemetry_tlog import read_tlog
 from drivers.tlog_records import TlogRecords

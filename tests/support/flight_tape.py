@@ -20,11 +20,11 @@ from companion.clock import StageTimes
 from companion.compute_devices import choose_devices
 from companion.config import Config
 from companion.depth.stage import DepthStage
+from companion.geodesy import GeoOrigin
 from companion.localisation import LocalisationStage
 from companion.messages import (
     DepthMap,
     Frame,
-    GeoOrigin,
     KeyframeAdded,
     MapUpdate,
     Message,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from companion.camera import Camera
+from companion.geodesy import GeoOrigin
 from companion.geometry import Array, Pose, Similarity, quaternion_from_euler
 from companion.geometry import rotation_from_quaternion as rotation
 from companion.messages import (
     ClockReport,
     DepthMap,
     Frame,
-    GeoOrigin,
     Georeference,
     MapUpdate,
     Message,

@@ -16,10 +16,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.clock import FlightClock
 from companion.config import LinkConfig, RouterConfig
+from companion.geodesy import GeoOrigin
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
-    GeoOrigin,
     HeightSample,
     PositionSample,
     PositionSource,

@@ -13,11 +13,11 @@ import pytest
 
 from companion.config import CameraConfig
 from companion.errors import FlightError
+from companion.geodesy import GeoOrigin
 from companion.geometry import angle_between, rotation_from_quaternion
 from companion.messages import (
     AttitudeSample,
     Frame,
-    GeoOrigin,
     ImuSample,
     PositionSample,
     PositionSource,

@@ -10,7 +10,8 @@ import pytest
 from companion.camera import Distortion
 from companion.config import CameraConfig, MountConfig
 from companion.errors import ConfigError, FlightError
-from drivers.calibration import assumed_camera, body_from_camera, live_camera, read_calibration
+from drivers.calibration import assumed_camera, read_calibration
+from drivers.live_calibration import body_from_camera, live_camera
 
 GOOD: dict[str, Any] = {
     "width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 31.0, "cy": 24.0,

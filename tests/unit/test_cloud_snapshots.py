@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.geodesy import GeoOrigin
 from companion.geometry import Pose
-from companion.messages import GeoOrigin, MapUpdate, PointChunk
+from companion.messages import MapUpdate, PointChunk
 from companion.output.flight_result import FlightResult
 from companion.stages.cloud_snapshots import BUSY, NO_POINTS, CloudSnapshots
 from companion.stages.protocol import Snapshot, TakeSnapshot

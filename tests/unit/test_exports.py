@@ -20,8 +20,8 @@ from pyproj import CRS, Transformer
 from companion.cli import main
 from companion.config import ExportConfig
 from companion.errors import InputError
+from companion.geodesy import GeoOrigin
 from companion.geometry import Pose, quaternion_from_euler, rotation_from_quaternion
-from companion.messages import GeoOrigin
 from companion.output.cloud import Cloud
 from companion.output.cloud_ply import VERTEX, cloud_ply
 from companion.output.exports import PRODUCTS, export_run

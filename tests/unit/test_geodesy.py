@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.geodesy import geodetic_from_ned, ned_from_geodetic, origin_of
-from companion.messages import GeoOrigin
+from companion.geodesy import GeoOrigin, geodetic_from_ned, ned_from_geodetic, origin_of
 
 HOME = GeoOrigin(-35.363262, 149.165237, 584.09)
 

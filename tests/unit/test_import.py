@@ -12,13 +12,13 @@ from companion.camera import Camera
 from companion.cli import main
 from companion.config import CameraConfig, Config
 from companion.errors import FlightError, InputError
+from companion.geodesy import GeoOrigin
 from companion.import_command import import_flight
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
     ClockReport,
     Frame,
-    GeoOrigin,
     HeightSample,
     ImuSample,
     PositionSample,

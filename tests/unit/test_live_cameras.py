@@ -19,14 +19,9 @@ from companion.geometry import angle_between
 from companion.messages import Bytes
 from drivers import gstreamer_camera
 from drivers.arrival_clock import ArrivalClock
-from drivers.calibration import live_camera
-from drivers.camera_source import (
-    CameraSource,
-    DriverFault,
-    EndOfPictures,
-    Picture,
-    camera_source,
-)
+from drivers.camera_registry import camera_source
+from drivers.camera_source import CameraSource, DriverFault, EndOfPictures, Picture
+from drivers.live_calibration import live_camera
 from drivers.pattern_camera import PatternScene, pattern_optics, world_from_body, world_from_camera
 from drivers.pixel_formats import to_grey_and_rgb
 

@@ -8,7 +8,8 @@ from mcap.reader import make_reader
 
 from companion.config import CameraConfig, RecorderConfig, TelemetryConfig
 from companion.errors import ConfigError, FlightError
-from companion.messages import ClockReport, Frame, GeoOrigin, Warned
+from companion.geodesy import GeoOrigin
+from companion.messages import ClockReport, Frame, Warned
 from drivers.open_flight import open_flight
 from drivers.recording import pictures
 from drivers.recording.mcap_file import McapFile

@@ -6,18 +6,10 @@ import numpy as np
 import pytest
 
 from companion.camera import Camera
+from companion.geodesy import GeoOrigin
 from companion.geometry import Array, Pose, Similarity
 from companion.health import ComputerLoad, FeedbackHealth, Health, SourceHealth
-from companion.messages import (
-    Floats,
-    GeoOrigin,
-    MapUpdate,
-    Message,
-    PointChunk,
-    Track,
-    TrackState,
-    Warned,
-)
+from companion.messages import Floats, MapUpdate, Message, PointChunk, Track, TrackState, Warned
 from companion.output.flight_result import FlightResult
 from companion.stream.encoding import decode
 from companion.stream.items import (

@@ -16,9 +16,10 @@ import pytest
 from companion.camera import Camera
 from companion.config import StreamConfig, ViewerConfig
 from companion.errors import InputError
+from companion.geodesy import GeoOrigin
 from companion.health import Health
 from companion.message_size import size_bytes
-from companion.messages import Frame, GeoOrigin
+from companion.messages import Frame
 from companion.stream.ground_link import GroundLink
 from companion.stream.items import Item, PictureItem, PointsItem, PoseItem, StatusItem
 from companion.viewer import LiveViewer
