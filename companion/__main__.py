@@ -12,7 +12,7 @@ for variable in (
 ):  # fmt: skip
     os.environ.setdefault(variable, "1")
 
-from companion.cli import main  # noqa: E402
+from companion.app.cli import main  # noqa: E402
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -355,7 +355,7 @@ class CloudConfig:
 
 @dataclass(frozen=True, slots=True)
 class StreamConfig:
-    """What viewers on the ground are given; see companion.stream."""
+    """What viewers on the ground are given; see companion.streaming."""
 
     listen: str = "127.0.0.1:9870"
     """HOST:PORT at which viewers connect; "" for none. 0.0.0.0 is every network."""

@@ -143,7 +143,7 @@ class Health:
     """Name of the flight that goes on; "" between flights."""
     load: ComputerLoad = field(default_factory=ComputerLoad)
     degradation: int = 0
-    """0 is everything; see companion.governor."""
+    """0 is everything; see companion.runtime.governor."""
     degraded: str = ""
     """What is left out and why, in words."""
     loop_delay_p99_ms: float | None = None

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.geometry import Array, Pose, Similarity
+from companion.geometry.transforms import Array, Pose, Similarity
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]

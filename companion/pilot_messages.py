@@ -157,7 +157,7 @@ REASONS: Mapping[str, str] = {
     "disk is slow": "disk slow",
     "autopilot rebooted": "autopilot reboot",
 }
-"""Why no pose is sent, as `companion.feedback` and `companion.live.pose_sender` have it."""
+"""Why no pose is sent, as `estimation.pose_gate` and `daemon.pose.pose_sender` have it."""
 OTHER_REASON = "see its log"
 SWITCHED_OFF = ("off", "switched off")
 """Reasons that are the pilot's own, or the ground's."""
@@ -239,7 +239,7 @@ def of_warning(what: str, detail: str = "", good: bool = False) -> PilotText | N
 
 
 def position_lost(why_not: str) -> PilotText:
-    """No poses are sent any more, for a reason of `companion.feedback`."""
+    """No poses are sent any more, for a reason of `companion.estimation.pose_gate`."""
     if why_not in SWITCHED_OFF:
         return POSITION_OFF()
     return POSITION_LOST(reason=REASONS.get(why_not, OTHER_REASON))

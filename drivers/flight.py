@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.camera import Camera
-from companion.geometry import Pose
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose
 from companion.messages import Frame, Warned
-from drivers.ahead import Ahead
-from drivers.frame_source import FrameSource
-from drivers.telemetry_log import Pictures, TelemetryLog
+from drivers.images.frame_source import FrameSource
+from drivers.images.prefetch import Ahead
+from drivers.telemetry.telemetry_log import Pictures, TelemetryLog
 
 FRAMES_AHEAD = 4
 ENDS_EARLY = "the video ends early"

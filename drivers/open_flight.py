@@ -8,22 +8,22 @@ from typing import NamedTuple
 
 from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
-from drivers.bag_flight import is_bag, is_ros2_folder, open_bag
-from drivers.euroc import is_euroc, open_euroc
+from drivers.datasets.bag_flight import is_bag, is_ros2_folder, open_bag
+from drivers.datasets.euroc import is_euroc, open_euroc
+from drivers.datasets.flight_folder import has_pictures, is_flight_folder, open_flight_folder
+from drivers.datasets.geotagged_stills import is_geotagged, open_geotagged
+from drivers.datasets.kitti import is_kitti, open_kitti
+from drivers.datasets.posed_flight import is_posed_folder, open_posed_flight
+from drivers.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
+from drivers.datasets.video_flight import is_video, open_video
 from drivers.flight import Flight
-from drivers.flight_folder import has_pictures, is_flight_folder, open_flight_folder
-from drivers.geotagged_stills import is_geotagged, open_geotagged
-from drivers.kitti import is_kitti, open_kitti
-from drivers.posed_flight import is_posed_folder, open_posed_flight
 from drivers.recording.recorded_flight import (
     is_recorded_folder,
     is_recording,
     open_recorded_folder,
     open_recording,
 )
-from drivers.telemetry_folder import READERS as LOGS
-from drivers.tum_rgbd import is_tum_rgbd, open_tum_rgbd
-from drivers.video_flight import is_video, open_video
+from drivers.telemetry.telemetry_folder import READERS as LOGS
 
 
 class Format(NamedTuple):

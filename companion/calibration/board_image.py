@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.views import View
-from companion.camera import Camera, Distortion
-from companion.geometry import Array
+from companion.calibration.board_views import View
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Array
 
 N_BOW = 3
 """Of the board's depth a x^2 + b x y + c y^2."""

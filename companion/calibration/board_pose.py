@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from companion.calibration.board_image import LensModel, camera_of, imaged, unexplained
-from companion.calibration.views import View
-from companion.geometry import Array
+from companion.calibration.board_views import View
+from companion.geometry.transforms import Array
 
 MIRRORED = 25.0
 """The second of the two poses that a flat board allows is not tried when it is so much worse."""

@@ -28,9 +28,9 @@ from companion.calibration.board_image import (
     unexplained,
 )
 from companion.calibration.board_pose import board_pose
-from companion.calibration.views import View
-from companion.camera import Camera, Distortion
-from companion.geometry import Array
+from companion.calibration.board_views import View
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Array
 
 FIRST_FOV_DEG = {
     Distortion.RADTAN: (35, 60, 85, 110),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from companion.config_file import load_config
 from companion.errors import InputError
-from companion.service.places import PACKAGED_UNITS, SYSTEM, Places, user_places
+from companion.service.install_paths import PACKAGED_UNITS, SYSTEM, Places, user_places
 
 
 def flights_meant(

@@ -22,7 +22,7 @@ from companion.service.environment import (
     present_environment,
     why_unfit,
 )
-from companion.service.places import (
+from companion.service.install_paths import (
     ACCOUNT,
     GROUPS,
     OWN_ENVIRONMENT,
@@ -35,8 +35,8 @@ from companion.service.places import (
 )
 from companion.service.shipped import clone, shipped, unit_for
 from companion.service.steps import Step, carry_out, command, file_written, removed
-from drivers.login_console import login_console_on, login_consoles
-from drivers.mavlink_url import link_endpoint
+from drivers.mavlink.wire.link_url import link_endpoint
+from drivers.system.login_console import login_console_on, login_consoles
 
 Told = Callable[[str], None]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from companion.errors import InstallError
-from companion.service.places import OWN_ENVIRONMENT, SYSTEM
+from companion.service.install_paths import OWN_ENVIRONMENT, SYSTEM
 
 PACKAGED = Path(__file__).with_name("files")
 CLONE = Path(__file__).parents[2]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Generator
 from pathlib import Path
 
-from companion.clock import monotonic_s
-from companion.output.atomic_file import write_atomically
-from companion.output.cloud import Cloud
-from companion.output.cloud_ply import ply_parts
-from companion.output.flight_result import FlightResult
-from companion.stages.protocol import Snapshot, TakeSnapshot
+from companion.products.atomic_file import write_atomically
+from companion.products.cloud import Cloud
+from companion.products.cloud_ply import ply_parts
+from companion.products.flight_result import FlightResult
+from companion.runtime.stage_protocol import Snapshot, TakeSnapshot
+from companion.timing.clock import monotonic_s
 
 WORK_S = 0.01
 """For so long it holds up a message that the recorder has to take."""

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from companion.compute_devices import choose_devices, say_on_stderr
-from companion.depth.opencl import ListedDevice
-from companion.depth.stage import DepthStage
-from companion.depth.takeover import Devices
+from companion.compute.compute_devices import choose_devices, say_on_stderr
+from companion.dense.depth_stage import DepthStage
+from companion.dense.device_takeover import Devices
+from companion.dense.opencl import ListedDevice
 from companion.messages import DepthMap, Message
-from companion.stages.protocol import DriverAtWork, Finish, SetShare, Setup
-from companion.stages.work import Work
+from companion.runtime.stage_protocol import DriverAtWork, Finish, SetShare, Setup
+from companion.runtime.stage_work import Work
 
 FIRST_PATIENCE_S = 120.0
 """Drivers may compile kernels when they first run: on a small processor that takes most of a

@@ -7,14 +7,14 @@ import traceback
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from companion.checkpoint import CheckpointError
-from companion.clock import since_boot_ns
-from companion.localisation import LocalisationStage
+from companion.estimation.checkpoint import CheckpointError
+from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, Message, Warned
+from companion.runtime.stage_protocol import Finish, KeepMap, SetShare, Setup
+from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import not_kept
 from companion.stages.map_keeper import Kept, MapKeeper
-from companion.stages.protocol import Finish, KeepMap, SetShare, Setup
-from companion.stages.work import Work
+from companion.timing.clock import since_boot_ns
 
 KEEP_EVERY_NS = 1_000_000_000
 NOT_KEPT = "the map cannot be kept for a restart in flight"

@@ -14,7 +14,7 @@ import threading
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.checkpoint import (
+from companion.estimation.checkpoint import (
     Checkpoint,
     CheckpointError,
     decode,
@@ -22,11 +22,11 @@ from companion.checkpoint import (
     fingerprint,
     opened,
 )
-from companion.clock import since_boot_ns
-from companion.output.atomic_file import write_atomically
-from companion.resumption import MOST_ABSENT_NS
-from companion.stages.protocol import Setup
-from drivers.computer_boot import computer_boot
+from companion.estimation.resumption import MOST_ABSENT_NS
+from companion.products.atomic_file import write_atomically
+from companion.runtime.stage_protocol import Setup
+from companion.timing.clock import since_boot_ns
+from drivers.system.computer_boot import computer_boot
 
 MOST_READ_BYTES = 64_000_000
 """Nothing that was written here is larger by far."""

@@ -8,12 +8,12 @@ from typing import Any
 
 from companion.errors import StageError
 from companion.messages import Message
-from companion.output.flight_result import FlightResult
-from companion.output.write import write_results
+from companion.products.flight_result import FlightResult
+from companion.products.report.write_results import write_results
+from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from companion.runtime.stage_work import Work
 from companion.stages.cloud_snapshots import CloudSnapshots
-from companion.stages.protocol import Finish, Setup, Snapshot, TakeSnapshot
-from companion.stages.work import Work
-from companion.viewer import FileViewer
+from companion.streaming.viewer import FileViewer
 
 
 class _Recorder(Work):

@@ -7,9 +7,9 @@ from typing import Any
 
 from companion.errors import StageError
 from companion.messages import Message
-from companion.output.surroundings import versions
-from companion.stages.protocol import Finish, Setup
-from companion.stages.work import Work
+from companion.products.surroundings import versions
+from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_work import Work
 from drivers.recording.recorder import Recorder
 
 

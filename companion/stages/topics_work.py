@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
-from companion.clock import monotonic_s, wait_s
 from companion.errors import StageError, StreamError
 from companion.messages import (
     DepthMap,
@@ -24,21 +23,22 @@ from companion.messages import (
     Track,
     Warned,
 )
-from companion.stages.protocol import Finish, Setup
-from companion.stages.work import Work
+from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_work import Work
+from companion.timing.clock import monotonic_s, wait_s
 from companion.topics.backlog import Backlog
-from companion.topics.bundle import Bundle
 from companion.topics.camera_fields import camera_fields
-from companion.topics.encoding import (
+from companion.topics.envelope import Envelope, unpack
+from companion.topics.gatherer import Gatherer
+from companion.topics.keyframe_bundle import Bundle
+from companion.topics.message_codec import (
     cloud_envelope,
     depth_envelope,
     keyframe_envelope,
     map_envelope,
     pose_envelope,
 )
-from companion.topics.envelope import Envelope, unpack
-from companion.topics.gatherer import Gatherer
-from drivers.zenoh_bus import LAST, URGENT, USUAL, ZenohBus
+from drivers.system.zenoh_bus import LAST, URGENT, USUAL, ZenohBus
 
 TOPICS = {"pose": URGENT, "keyframe": USUAL, "map": USUAL, "depth": LAST, "cloud": LAST}
 BYTES_S_PER_KBIT_S = 125.0

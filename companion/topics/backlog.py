@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.messages import MapUpdate
-from companion.topics.bundle import Bundle, MapChange
 from companion.topics.envelope import Envelope
+from companion.topics.keyframe_bundle import Bundle, MapChange
 
 SAVED_S = 2.0
 """Of a budget that was not used, so much is kept."""

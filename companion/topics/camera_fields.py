@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from companion.camera import Camera, Distortion
 from companion.errors import StreamError
+from companion.geometry.camera import Camera, Distortion
 from companion.topics.envelope import Envelope
-from companion.topics.places import POSE_NUMBERS, pose_of, pose_row
+from companion.topics.pose_rows import POSE_NUMBERS, pose_of, pose_row
 
 LEAST_SIDE, MOST_SIDE = 16, 8192
 MOST_PIXELS = 20_000_000

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from companion.messages import Frame, KeyframeAdded, MapUpdate, Track
-from companion.topics.bundle import Bundle, MapChange, MapChanges, Picture
-from companion.topics.jpeg import jpeg_of, without_colour
+from companion.topics.image_jpeg import jpeg_of, without_colour
+from companion.topics.keyframe_bundle import Bundle, MapChange, MapChanges, Picture
 
 MOST_WAITING, MOST_WAITING_BYTES = 240, 24 << 20
 MOST_PICTURES = 48

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
-from companion.camera import Camera, Distortion
-from companion.geometry import Pose
-from drivers.recording.content import serialised, set_time
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Pose
+from drivers.recording.recorded_content import serialised, set_time
 
 _FOXGLOVE = {
     Distortion.NONE: "",

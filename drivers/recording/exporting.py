@@ -22,13 +22,13 @@ from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 
 from companion.config import TelemetryConfig
 from companion.errors import FlightError
-from drivers.mavlink_stream import MavlinkStream
+from drivers.mavlink.wire.packet_stream import MavlinkStream
 from drivers.recording.flights_folder import TLOG
-from drivers.recording.pictures import still
+from drivers.recording.picture_codec import still
 from drivers.recording.recorded_flight import telemetry_of
 from drivers.recording.recording import PicturePlace, Recording
-from drivers.recording.topics import IMAGE, RECEIVED, SENT, VIDEO, MavlinkBytes
-from drivers.telemetry_csv import NAME, telemetry_csv
+from drivers.recording.recording_topics import IMAGE, RECEIVED, SENT, VIDEO, MavlinkBytes
+from drivers.telemetry.telemetry_csv import NAME, telemetry_csv
 
 MICROSECONDS = Fraction(1, 1_000_000)
 NAMES = {"jpeg": "jpg", "png": "png"}

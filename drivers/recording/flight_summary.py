@@ -10,8 +10,8 @@ from typing import Literal
 from drivers.recording.growing_file import is_growing
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.mcap_scan import scan, summary
+from drivers.recording.recording_topics import PICTURES
 from drivers.recording.repair import was_cut
-from drivers.recording.topics import PICTURES
 
 State = Literal["whole", "repaired", "cut short", "damaged", "being recorded"]
 

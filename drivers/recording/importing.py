@@ -9,15 +9,15 @@ from pathlib import Path
 from companion.config import RecorderConfig
 from companion.errors import FlightError
 from companion.messages import Frame, Warned
-from companion.pipeline import in_order_of_time
+from companion.runtime.pipeline import in_order_of_time
 from drivers.flight import Flight
 from drivers.recording.camera_document import calibration_bytes, camera_document
-from drivers.recording.content import event_bytes, json_bytes, sample_bytes, sample_topic
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.pictures import picture_encoder
+from drivers.recording.picture_codec import picture_encoder
+from drivers.recording.recorded_content import event_bytes, json_bytes, sample_bytes, sample_topic
 from drivers.recording.recorder import CAMERA_JSON, NOTES
-from drivers.recording.topics import CALIBRATION, EVENTS, HEALTH, PROFILE, open_channels
+from drivers.recording.recording_topics import CALIBRATION, EVENTS, HEALTH, PROFILE, open_channels
 
 CHUNK_BYTES = 4_000_000
 RATE_HZ = 30.0

@@ -8,21 +8,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from companion.camera import Camera
 from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
-from companion.geodesy import GeoOrigin
+from companion.geometry.camera import Camera
+from companion.geometry.geodesy import GeoOrigin
 from companion.messages import Bytes, ClockReport, Frame, Warned
-from drivers.calibration import assumed_camera
 from drivers.flight import Flight
+from drivers.images.calibration_file import assumed_camera
 from drivers.recording.camera_document import camera_of
 from drivers.recording.flights_folder import RECORDING
 from drivers.recording.mcap_file import McapFile
-from drivers.recording.pictures import VideoDecoder, grey_of, still
+from drivers.recording.picture_codec import VideoDecoder, grey_of, still
 from drivers.recording.recorder import CAMERA_JSON
 from drivers.recording.recording import PicturePlace, Recording
-from drivers.recording.topics import PROFILE, VIDEO
-from drivers.telemetry_log import TelemetryLog, rates_hz
+from drivers.recording.recording_topics import PROFILE, VIDEO
+from drivers.telemetry.telemetry_log import TelemetryLog, rates_hz
 
 NO_TELEMETRY = "no telemetry"
 LOST = "a picture could not be decoded"

@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
-from companion.camera import Camera
 from companion.config import Config
 from companion.config_file import to_toml, without_passwords
 from companion.errors import StageError
-from companion.geometry import Similarity
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Similarity
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
@@ -27,9 +27,14 @@ from companion.messages import (
     RangeSample,
     Warned,
 )
-from drivers.mavlink_stream import MavlinkStream, Packet
+from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
 from drivers.recording.camera_document import calibration_bytes, camera_document
-from drivers.recording.content import (
+from drivers.recording.disk_writer import DiskWriter, Entry
+from drivers.recording.flights_folder import RECORDING, TLOG
+from drivers.recording.growing_file import GrowingFile
+from drivers.recording.mcap_writer import McapWriter
+from drivers.recording.picture_codec import Recorded, picture_encoder
+from drivers.recording.recorded_content import (
     HealthNote,
     LinkBytes,
     cloud_bytes,
@@ -41,12 +46,7 @@ from drivers.recording.content import (
     sample_bytes,
     sample_topic,
 )
-from drivers.recording.disk_writer import DiskWriter, Entry
-from drivers.recording.flights_folder import RECORDING, TLOG
-from drivers.recording.growing_file import GrowingFile
-from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.pictures import Recorded, picture_encoder
-from drivers.recording.topics import (
+from drivers.recording.recording_topics import (
     CALIBRATION,
     CLOUD,
     EVENTS,

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 from companion.errors import FlightError
 from companion.messages import Bytes, Telemetry, Warned
-from drivers.recording.content import is_sample_topic, sample_of
 from drivers.recording.mcap_file import DAMAGED, ChunkPlace, McapMessage
-from drivers.recording.pictures import stands_alone, still
+from drivers.recording.picture_codec import stands_alone, still
+from drivers.recording.recorded_content import is_sample_topic, sample_of
+from drivers.recording.recording_topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
 from drivers.recording.repair import n_cut_bytes, opened, was_cut
-from drivers.recording.topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
 
 CUT, DAMAGE = "the recording was cut short", "the recording is damaged"
 

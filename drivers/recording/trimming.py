@@ -10,7 +10,7 @@ from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_file import McapMessage
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.recording import Recording
-from drivers.recording.topics import GREY, LASTING, PICTURES, PROFILE, open_channels
+from drivers.recording.recording_topics import GREY, LASTING, PICTURES, PROFILE, open_channels
 
 LEAD_NS = 10_000_000_000
 """Of what is no picture so much from before the first is kept, as a replay uses it."""

@@ -18,10 +18,10 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.support.bags import write_bag
-from tests.support.damage import KINDS, damage_source, in_limits, read_all
-from tests.support.photos import write_photo
-from tests.support.sequences import (
+from tests.support.cameras.photos import write_photo
+from tests.support.flights.bags import write_bag
+from tests.support.flights.damage import KINDS, damage_source, in_limits, read_all
+from tests.support.flights.sequences import (
     piece,
     write_euroc,
     write_flight_folder,

@@ -32,8 +32,8 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.clock import FlightClock
 from companion.config import LinkConfig, RouterConfig
+from companion.timing.clock import FlightClock
 
 WAYS = ("pymavlink", "mavsdk", "json")
 TICK_S = 0.005  # 200 Hz
@@ -106,11 +106,11 @@ async def by_port(way: str, port: int, measured: Measured) -> None:
         measured.take(message.get_type(), sent_in(message), t_ns - clock.epoch_ns)
 
     if way == "mavsdk":
-        from drivers.mavsdk_port import MavsdkPort
+        from drivers.mavlink.wire.mavsdk_port import MavsdkPort
 
         await MavsdkPort(config, RouterConfig(), clock).run(take)
     else:
-        from drivers.pymavlink_port import PymavlinkPort
+        from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 
         await PymavlinkPort(config, RouterConfig(), clock).run(take)
 

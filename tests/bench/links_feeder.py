@@ -14,8 +14,8 @@ import psutil
 
 from companion.config import StreamConfig, ViewerConfig
 from companion.messages import PointChunk
-from companion.viewer import LiveViewer
-from tests.support.flight_tape import Tape
+from companion.streaming.viewer import LiveViewer
+from tests.support.flights.flight_tape import Tape
 
 
 def main() -> None:

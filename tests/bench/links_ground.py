@@ -15,10 +15,10 @@ from pathlib import Path
 import psutil
 import rerun as rr
 
-from companion.stream.ground_link import GroundLink, host_and_port
-from companion.stream.items import PictureItem, PointsItem, PoseItem, StatusItem
-from companion.viewer.colours import Colours
-from companion.viewer.drawing import Drawing
+from companion.streaming.ground_link import GroundLink, host_and_port
+from companion.streaming.items import PictureItem, PointsItem, PoseItem, StatusItem
+from companion.streaming.viewer.colours import Colours
+from companion.streaming.viewer.drawing import Drawing
 
 
 def main() -> None:

@@ -27,9 +27,9 @@ import numpy as np
 
 from companion.config import Config
 from tests.bench import viewers_and_pose
-from tests.support.flight_tape import make_tape
-from tests.support.link_trial import Trial, fly
-from tests.support.two_namespaces import TwoNamespaces, why_not
+from tests.support.flights.flight_tape import make_tape
+from tests.support.processes.link_trial import Trial, fly
+from tests.support.processes.two_namespaces import TwoNamespaces, why_not
 
 SETTLE_S = 5.0
 MARGIN_S = 1.0

@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from companion.geometry import Pose, Similarity
+from companion.geometry.transforms import Pose, Similarity
 from companion.messages import Floats, Georeference, MapUpdate, PointChunk
-from companion.output.atomic_file import write_atomically
-from companion.output.cloud_ply import ply_parts
-from companion.output.flight_result import FlightResult
+from companion.products.atomic_file import write_atomically
+from companion.products.cloud_ply import ply_parts
+from companion.products.flight_result import FlightResult
 
 DOWN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 HEIGHT_M = 20.0

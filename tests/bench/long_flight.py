@@ -16,12 +16,12 @@ import numpy as np
 import psutil
 from matplotlib.figure import Figure
 
-from companion.clock import StageTimes, cpu_s
 from companion.config import CameraConfig, Config, TelemetryConfig
-from companion.localisation import LocalisationStage
+from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, MapUpdate
+from companion.timing.clock import StageTimes, cpu_s
 from drivers.open_flight import open_flight
-from tests.support.to_and_fro import flown_again, walk
+from tests.support.flights.to_and_fro import flown_again, walk
 
 ROW_S = 30.0
 PARTS = ("features", "tracking", "initialising")

@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from companion.camera import Camera
 from companion.config import StreamConfig, ViewerConfig
-from companion.geometry import Pose
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose
 from companion.messages import SPANS_REACH, KeyframeAdded, MapUpdate, Track, TrackState
-from companion.viewer import LiveViewer
-from companion.viewer.web_gate import free_ports
-from tests.support import flown
+from companion.streaming.viewer import LiveViewer
+from companion.streaming.viewer.web_gate import free_ports
+from tests.support.flights import flown
 
 POINTS = 2800
 EACH_S, MOST_WAITING = 0.012, 40

@@ -32,22 +32,22 @@ import numpy as np
 import psutil
 from matplotlib.figure import Figure
 
-from companion.camera import Camera
-from companion.clock import FlightClock
 from companion.config import Config
 from companion.config_file import load_config
+from companion.daemon.flights.flight_dates import FlightDates
+from companion.daemon.flights.flights import Flights
+from companion.daemon.flights.live_flight import Listener, LiveFlight
+from companion.daemon.health_watch import HealthWatch
+from companion.geometry.camera import Camera
 from companion.health import LatencyMeter
-from companion.live.flight import Listener, LiveFlight
-from companion.live.flight_dates import FlightDates
-from companion.live.flights import Flights
-from companion.live.health_watch import HealthWatch
-from companion.live.journal import Journal
 from companion.messages import Frame, MapUpdate, Odometry, PointChunk, Telemetry, Track, Warned
-from companion.output.flight_result import RunFacts
-from drivers.camera_feed import CameraFeed
-from drivers.camera_registry import camera_source
+from companion.products.flight_result import RunFacts
+from companion.timing.clock import FlightClock
+from drivers.camera.camera_feed import CameraFeed
+from drivers.camera.camera_registry import camera_source
 from drivers.open_flight import open_flight
-from tests.support.to_and_fro import flown_again, walk
+from drivers.system.journal import Journal
+from tests.support.flights.to_and_fro import flown_again, walk
 
 ROW_NS, SECOND_NS = 60_000_000_000, 1_000_000_000
 ANSWER_S, START_S = 60.0, 180.0

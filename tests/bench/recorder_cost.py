@@ -19,14 +19,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from companion.camera import Camera
 from companion.config import CameraConfig, Config, RecorderConfig
-from companion.geometry import quaternion_from_euler
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import quaternion_from_euler
 from companion.messages import AttitudeSample, Bytes, Frame
 from drivers.open_flight import open_flight
-from drivers.recording.content import LinkBytes
+from drivers.recording.recorded_content import LinkBytes
 from drivers.recording.recorder import Recorder
-from tests.support.recorded import link_bytes
+from tests.support.flights.recorded import link_bytes
 
 SIZE, RATE_HZ, LINK_HZ, ATTITUDE_HZ = (640, 480), 30.0, 120, 50
 N_PICTURES = 60

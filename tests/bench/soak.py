@@ -34,11 +34,11 @@ from companion.config import CameraConfig
 from companion.errors import CompanionError
 from drivers.open_flight import open_flight
 from drivers.recording.recording import Recording
-from tests.support.daemon import Daemon
-from tests.support.fake_autopilot import FakeAutopilot
-from tests.support.fake_flight import RecordedFlight
-from tests.support.fake_wire import free_port
-from tests.support.poses import poses_of
+from tests.support.autopilot.fake_autopilot import FakeAutopilot
+from tests.support.autopilot.fake_flight import RecordedFlight
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.autopilot.received_poses import poses_of
+from tests.support.processes.daemon_process import Daemon
 
 LEAD_S, ARM_S, LAST_S = 6.0, 1.0, 1.0
 WARM_S = 900.0

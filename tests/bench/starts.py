@@ -20,20 +20,20 @@ from typing import Any
 
 import numpy as np
 
-from companion.camera import Camera
-from companion.camera_attitude import CameraAttitude
+from companion.app.bench.injected_faults import OFFSET_AXIS, OFFSET_RAD
 from companion.config import Config
-from companion.faults import OFFSET_AXIS, OFFSET_RAD
-from companion.geometry import (
+from companion.estimation.camera_attitude import CameraAttitude
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import (
     Array,
     angle_between,
     rotation_from_quaternion,
     rotation_from_vector,
 )
 from companion.messages import AttitudeSample, Frame
-from companion.pipeline import in_order_of_time
-from companion.slam.bootstrap import Bootstrap
-from companion.slam.features import FeatureExtractor, Features
+from companion.runtime.pipeline import in_order_of_time
+from companion.slam.features.orb_features import FeatureExtractor, Features
+from companion.slam.initialisation.bootstrap import Bootstrap
 from drivers.open_flight import open_flight
 
 MAX_FRAMES = 60

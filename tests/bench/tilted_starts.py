@@ -2,9 +2,9 @@
 
     python -m tests.bench.tilted_starts FLIGHT… [--tilts 10,20,40] [--seconds 20] [--maps 1]
 
-For every kind of `tests.support.tilted_start` and every tilt one line: when tracking began, when
-poses first had a scale, what was told, and until when a pose was tilted by more than feedback
-believes. Flights are replayed in lockstep up to so many seconds.
+For every kind of `tests.support.flights.tilted_start` and every tilt one line: when tracking
+began, when poses first had a scale, what was told, and until when a pose was tilted by more than
+the pose gate allows. Flights are replayed in lockstep up to so many seconds.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import Config
-from companion.feedback import MAX_TILT_APART_RAD
-from companion.localisation import LocalisationStage
+from companion.estimation.localisation import LocalisationStage
+from companion.estimation.motion_filter import AttitudeHistory
+from companion.estimation.pose_gate import MAX_TILT_APART_RAD
 from companion.messages import AttitudeSample, Frame, Odometry, TrackState, Warned
-from companion.motion import AttitudeHistory
-from companion.pipeline import in_order_of_time
+from companion.runtime.pipeline import in_order_of_time
 from drivers.open_flight import open_flight
-from tests.support.tilted_start import KINDS, tilted_starts
+from tests.support.flights.tilted_start import KINDS, tilted_starts
 
 
 def fly(path: Path, kind: str, tilt_deg: float, seconds: float, maps: int) -> str:

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.support.daemon import UNGOVERNED, Daemon
+from tests.support.processes.daemon_process import UNGOVERNED, Daemon
 
 PHASES = ("none", "two", "two that hang")
 RATE_HZ = 15.0

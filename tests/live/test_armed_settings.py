@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.support.daemon import Daemon
-from tests.support.fake_wire import free_port
-from tests.support.flying import Flying
-from tests.support.ground import GroundStation
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.autopilot.ground_station import GroundStation
+from tests.support.processes.daemon_process import Daemon
+from tests.support.processes.flying import Flying
 
 AGAIN_S = 90.0
 """A map, its scale and proof, by a daemon that begins in the air of a busy machine."""

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.support.flying import Flying, source
+from tests.support.processes.flying import Flying, source
 
 LASTS_S = 2.0
 """Of what goes on for a while."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from tests.support.flying import Flying
+from tests.support.processes.flying import Flying
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.command import refused
-from tests.support.daemon import Daemon
-from tests.support.fake_autopilot import FakeAutopilot
-from tests.support.fake_wire import free_port
-from tests.support.flying import STOP_S, Flying, source
-from tests.support.strain import Strain
+from tests.support.autopilot.fake_autopilot import FakeAutopilot
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.processes.daemon_process import Daemon
+from tests.support.processes.flying import STOP_S, Flying, source
+from tests.support.processes.program import refused
+from tests.support.processes.strain import Strain
 
 PATTERN = ("camera.source=pattern", "camera.width=160", "camera.height=120", "camera.rate_hz=5")
 NO_DEPTH = "depth.enabled=false"

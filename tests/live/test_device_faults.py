@@ -10,20 +10,20 @@ from typing import Any
 
 import pytest
 
-from companion.camera import Camera, Distortion
 from companion.config import Config
-from companion.depth.takeover import NONE_LEFT, TOOK_OVER
+from companion.dense.device_takeover import NONE_LEFT, TOOK_OVER
+from companion.geometry.camera import Camera, Distortion
 from companion.messages import DepthMap, Frame, Warned
 from companion.pilot_messages import MAP_OTHER_DEVICE
-from companion.stages.frame_ring import FrameRing
-from companion.stages.protocol import Setup
-from companion.stages.stage_process import StageProcess
+from companion.runtime.frame_ring import FrameRing
+from companion.runtime.stage_process import StageProcess
+from companion.runtime.stage_protocol import Setup
 from drivers.recording.recording import Recording
-from drivers.recording.topics import EVENTS
-from tests.support.daemon import UNGOVERNED
-from tests.support.failing_driver import fail, two_devices
-from tests.support.flying import Flying
-from tests.support.mapped_plane import told
+from drivers.recording.recording_topics import EVENTS
+from tests.support.flights.mapped_plane import told
+from tests.support.processes.daemon_process import UNGOVERNED
+from tests.support.processes.flying import Flying
+from tests.support.reference.failing_driver import fail, two_devices
 
 CAMERA = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
 N, N_BEFORE = 34, 20

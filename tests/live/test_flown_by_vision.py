@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from companion.geometry import Array
-from tests.support.daemon import Daemon
-from tests.support.fake_wire import free_port
-from tests.support.flying_vehicle import FlownByVision, Moment
-from tests.support.http_camera import HttpCamera
+from companion.geometry.transforms import Array
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.autopilot.flying_vehicle import FlownByVision, Moment
+from tests.support.cameras.http_camera import HttpCamera
+from tests.support.processes.daemon_process import Daemon
 
 HEIGHT_M, SIDE_M = 7.0, 4.0
 HEIGHT_OF = {"ardupilot": "GLOBAL_POSITION_INT", "px4": "LOCAL_POSITION_NED"}

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.live.flight_parameters import PARAMETERS
-from companion.live.ground_control import BUDGET, MAPPING, NEW_MAP, SNAPSHOT
-from tests.support.daemon import UNGOVERNED
-from tests.support.fake_wire import free_port
-from tests.support.flying import Flying
-from tests.support.ground import OURS, GroundStation
-from tests.support.scoring import read_ply
+from companion.daemon.control.flight_parameters import PARAMETERS
+from companion.daemon.control.ground_control import BUDGET, MAPPING, NEW_MAP, SNAPSHOT
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.autopilot.ground_station import OURS, GroundStation
+from tests.support.processes.daemon_process import UNGOVERNED
+from tests.support.processes.flying import Flying
+from tests.support.reference.scoring import read_ply
 
 ACCEPTED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
 FAILED, IN_PROGRESS = mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_IN_PROGRESS

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.support.daemon import Daemon
-from tests.support.flying import Flying
-from tests.support.poses import poses_of
+from tests.support.autopilot.received_poses import poses_of
+from tests.support.processes.daemon_process import Daemon
+from tests.support.processes.flying import Flying
 
 
 def test_the_next_process_counts_on(tmp_path: Path) -> None:

@@ -14,14 +14,14 @@ import pytest
 
 from companion.config import StreamConfig, ViewerConfig
 from companion.messages import Bytes
-from companion.viewer import LiveViewer
-from companion.viewer.drawing import COLOUR_AUTOPILOT, COLOUR_PATH
-from companion.viewer.layout import BACKGROUND
-from companion.viewer.screen import GRPC_PORT, listens
-from companion.viewer.web_gate import LOOPBACK, free_ports
-from tests.support import flown
-from tests.support.virtual_display import VirtualDisplay, why_not
-from tests.unit.test_viewer_recording import CAMERA
+from companion.streaming.viewer import LiveViewer
+from companion.streaming.viewer.drawing import COLOUR_AUTOPILOT, COLOUR_PATH
+from companion.streaming.viewer.layout import BACKGROUND
+from companion.streaming.viewer.screen import GRPC_PORT, listens
+from companion.streaming.viewer.web_gate import LOOPBACK, free_ports
+from tests.support.flights import flown
+from tests.support.processes.virtual_display import VirtualDisplay, why_not
+from tests.unit.streaming.test_viewer_recording import CAMERA
 
 PATIENCE_S = 150.0
 """A first picture by processor only, on a machine that has other work."""

@@ -13,21 +13,21 @@ import pytest
 
 from companion.config import CameraConfig
 from companion.messages import Frame, PositionSample
+from drivers.camera.pattern_camera import world_from_body
 from drivers.open_flight import open_flight
-from drivers.pattern_camera import world_from_body
 from drivers.recording.disk_writer import FAILED
 from drivers.recording.flights_folder import recordings_in
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.mcap_scan import summary
 from drivers.recording.recorded_flight import RecordedFlight
 from drivers.recording.recording import CUT
-from drivers.tlog_records import TlogRecords
-from tests.support.command import replay
-from tests.support.daemon import Daemon
-from tests.support.fake_autopilot import FakeAutopilot
-from tests.support.fake_flight import MadeUpFlight
-from tests.support.fake_wire import free_port
-from tests.support.strain import Strain
+from drivers.telemetry.tlog_records import TlogRecords
+from tests.support.autopilot.fake_autopilot import FakeAutopilot
+from tests.support.autopilot.fake_flight import MadeUpFlight
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.processes.daemon_process import Daemon
+from tests.support.processes.program import replay
+from tests.support.processes.strain import Strain
 
 SETTINGS = (
     "camera.source=pattern", "camera.rate_hz=15", "camera.width=320", "camera.height=240",

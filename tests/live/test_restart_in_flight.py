@@ -14,10 +14,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from companion.geometry import Pose
-from tests.support.flying import MOST_AWAY_M, MOST_TURNED_DEG, PROOF_S, Flying
-from tests.support.http_camera import world_from_body
-from tests.support.poses import Poses
+from companion.geometry.transforms import Pose
+from tests.support.autopilot.received_poses import Poses
+from tests.support.cameras.http_camera import world_from_body
+from tests.support.processes.flying import MOST_AWAY_M, MOST_TURNED_DEG, PROOF_S, Flying
 
 SWAY_M, SWAY_S = 0.1, 5.0
 """As a hovering vehicle sways: too little for GPS or barometer to tell a scale by."""

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.support.fake_wire import free_port
-from tests.support.flying import Flying
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.processes.flying import Flying
 
 LASTS_S = 2.0
 PORT = free_port(socket.SOCK_STREAM)

@@ -14,9 +14,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from companion.live.daemon import NO_PROGRESS
-from companion.live.health_watch import PATIENCE_NS
-from tests.support.daemon import Daemon
+from companion.daemon.daemon import NO_PROGRESS
+from companion.daemon.health_watch import PATIENCE_NS
+from tests.support.processes.daemon_process import Daemon
 
 PATTERN = ("camera.source=pattern", "daemon.flight=always", "recorder.enabled=false")
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from companion.camera import Camera
 from companion.config import Config
-from companion.geometry import Pose
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose
 from companion.messages import MapUpdate, PointChunk
-from companion.stages.frame_ring import FrameRing
-from companion.stages.protocol import Finish, Setup, Snapshot, TakeSnapshot
-from companion.stages.stage_process import StageProcess
-from tests.support.scoring import read_ply
+from companion.runtime.frame_ring import FrameRing
+from companion.runtime.stage_process import StageProcess
+from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from tests.support.reference.scoring import read_ply
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 N_CHUNKS, N_POINTS = 200, 2000

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import psutil
 import pytest
 
-from tests.support.flying import Flying
+from tests.support.processes.flying import Flying
 
-STAGE = "companion.stages.child"
+STAGE = "companion.runtime.stage_child"
 NO_SIGN_S = 10.0
 
 

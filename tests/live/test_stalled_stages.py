@@ -14,25 +14,25 @@ import numpy as np
 import psutil
 import pytest
 
-from companion.clock import monotonic_s
 from companion.config import Config
 from companion.messages import DepthMap, Frame
-from companion.stages.frame_ring import FrameRing
-from companion.stages.mail import OUT_BYTES
-from companion.stages.protocol import Setup
-from companion.stages.stage_process import StageProcess
+from companion.runtime.frame_ring import FrameRing
+from companion.runtime.mail_policy import OUT_BYTES
+from companion.runtime.stage_process import StageProcess
+from companion.runtime.stage_protocol import Setup
+from companion.timing.clock import monotonic_s
 from drivers.recording.recording import Recording
-from tests.support.daemon import Daemon
-from tests.support.topic_flight import CAMERA
+from tests.support.flights.topic_flight import CAMERA
+from tests.support.processes.daemon_process import Daemon
 
 ANSWER_S, UP_S = 4.0, 120.0
 IMPATIENT = f"""
 import sys
-from companion.governor import Governor
-from companion.live import flight
+from companion.runtime.governor import Governor
+from companion.daemon.flights import live_flight
 Governor.step = lambda self, t_ns, pressure: False
 for kind in ("recorder", "tape"):
-    flight.ANSWER_S[kind] = {ANSWER_S}
+    live_flight.ANSWER_S[kind] = {ANSWER_S}
 from companion.__main__ import main
 sys.exit(main())
 """
@@ -122,8 +122,8 @@ def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path, kind: st
     first, second = folder, folder / "part-2"
     if kind == "recorder":
         for part in (first, second):
-            assert (part / "flight.rrd").stat().st_size > 10_000
+            assert (part / "live_flight.rrd").stat().st_size > 10_000
         return
     for part in (first, second):  # the first is mended, which it was not closed for
-        with closing(Recording(part / "flight.mcap")) as recording:
+        with closing(Recording(part / "live_flight.mcap")) as recording:
             assert recording.pictures

@@ -8,11 +8,11 @@ import subprocess
 import numpy as np
 import pytest
 
-from tests.support import flown
-from tests.support.flight_tape import Keeper
-from tests.support.link_trial import Trial, fly
-from tests.support.two_namespaces import TwoNamespaces, why_not
-from tests.unit.test_viewer_recording import CAMERA
+from tests.support.flights import flown
+from tests.support.flights.flight_tape import Keeper
+from tests.support.processes.link_trial import Trial, fly
+from tests.support.processes.two_namespaces import TwoNamespaces, why_not
+from tests.unit.streaming.test_viewer_recording import CAMERA
 
 KBIT_S, DELAY_MS, LOSS, BUDGET_KBIT_S = 1000, 50, 0.02, 800
 SECONDS, CUT_S, BACK_S = 22.0, 8.0, 12.0

@@ -16,13 +16,13 @@ from typing import IO
 
 import pytest
 
+from companion.daemon.nodes.kept_chunks import NAME
 from companion.errors import SourceError
-from companion.live.kept_chunks import NAME
-from companion.stages.protocol import Finish
-from drivers.status_socket import ask_status
-from tests.support import topic_flight
-from tests.support.bus import Ground, free_endpoint, ground_config, topics_of
-from tests.support.two_namespaces import TwoNamespaces, why_not
+from companion.runtime.stage_protocol import Finish
+from drivers.system.status_socket import ask_status
+from tests.support.flights import topic_flight
+from tests.support.processes.two_namespaces import TwoNamespaces, why_not
+from tests.support.processes.zenoh_nodes import Ground, free_endpoint, ground_config, topics_of
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
 SLOWER = 3

@@ -18,13 +18,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig
 from drivers.open_flight import open_flight
-from tests.support.command import Run, refused
-from tests.support.daemon import Daemon
-from tests.support.fake_autopilot import FakeAutopilot, Received
-from tests.support.fake_flight import RecordedFlight
-from tests.support.fake_wire import free_port
-from tests.support.poses import Poses, TrueFlight, poses_of
-from tests.support.scoring import Trajectory, read_ply, read_tum, score
+from tests.support.autopilot.fake_autopilot import FakeAutopilot, Received
+from tests.support.autopilot.fake_flight import RecordedFlight
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.autopilot.received_poses import Poses, TrueFlight, poses_of
+from tests.support.processes.daemon_process import Daemon
+from tests.support.processes.program import Run, refused
+from tests.support.reference.scoring import Trajectory, read_ply, read_tum, score
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 TRUTH = read_tum(SAMPLE / "truth" / "world_from_camera.tum")

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from tests.support.command import refused, replay
-from tests.support.faults import make_flight
+from tests.support.flights.sample_faults import make_flight
+from tests.support.processes.program import refused, replay
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 

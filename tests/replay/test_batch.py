@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.recorded import record
+from tests.support.flights.recorded import record
 
 pytest.importorskip("distributed")
 FIRST, SECOND = "2026-01-01T00-00-00Z", "2026-01-02T00-00-00Z"

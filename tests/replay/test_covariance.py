@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from companion.bench_slam import bench_slam
+from companion.app.bench.bench_slam import bench_slam
+from companion.app.progress import NoProgress
 from companion.config import Config
-from companion.progress import NoProgress
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 

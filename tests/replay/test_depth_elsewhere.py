@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from companion.clock import StageTimes
 from companion.config import Config, DistributedConfig
-from companion.depth.stage import DepthStage
-from companion.localisation import LocalisationStage
+from companion.dense.depth_stage import DepthStage
+from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, KeyframeAdded, MapUpdate, Message, Track
-from companion.output.flight_result import FlightResult
-from companion.pipeline import in_order_of_time
-from companion.topics.bundle import MapMirror, bundle_of, frame_of
+from companion.products.flight_result import FlightResult
+from companion.runtime.pipeline import in_order_of_time
+from companion.timing.clock import StageTimes
 from companion.topics.envelope import unpack
 from companion.topics.gatherer import Gatherer
+from companion.topics.keyframe_bundle import MapMirror, bundle_of, frame_of
 from drivers.open_flight import open_flight
-from tests.support import compute
+from tests.support.reference import at_hand
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
 STOP_S = 8.0
@@ -54,7 +54,7 @@ def made() -> Made:
     config = Config()
     flight = open_flight(FLIGHT, config.camera, config.telemetry)
     stop_ns = flight.start_ns + int(STOP_S * 1e9)
-    devices = compute.devices()
+    devices = at_hand.devices()
     here, there = (
         _Stage(DepthStage(config.depth, config.cloud, flight.camera, devices, StageTimes()))
         for _ in range(2)

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from companion.pipeline import DEPTH_FAILED
-from tests.support.command import Run
-from tests.support.scoring import read_ply, read_tum
+from companion.runtime.pipeline import DEPTH_FAILED
+from tests.support.processes.program import Run
+from tests.support.reference.scoring import read_ply, read_tum
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 FAILS = """
 import sys
-from companion.cli import main
-from companion.depth.stage import DepthStage
+from companion.app.cli import main
+from companion.dense.depth_stage import DepthStage
 from companion.messages import DepthMap
 flawed, n_left = getattr(DepthStage, sys.argv[1]), int(sys.argv[2])
 def fails(self, *message):

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from companion.depth.takeover import NONE_LEFT, TOOK_OVER
-from tests.support.command import Run, replay
-from tests.support.failing_driver import fail, two_devices
+from companion.dense.device_takeover import NONE_LEFT, TOOK_OVER
+from tests.support.processes.program import Run, replay
+from tests.support.reference.failing_driver import fail, two_devices
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
 STOP_S = "6"

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.command import Run, replay
-from tests.support.faults import TIMESYNC, Image, Record, make_flight
-from tests.support.scoring import Score, Trajectory, read_tum, score
+from tests.support.flights.sample_faults import TIMESYNC, Image, Record, make_flight
+from tests.support.processes.program import Run, replay
+from tests.support.reference.scoring import Score, Trajectory, read_tum, score
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 TRUTH = read_tum(SAMPLE / "truth" / "world_from_camera.tum")

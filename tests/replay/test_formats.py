@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.cli import main
-from tests.support.bags import write_bag
-from tests.support.command import Run, replay
-from tests.support.sequences import (
+from companion.app.cli import main
+from tests.support.flights.bags import write_bag
+from tests.support.flights.sequences import (
     Piece,
     piece,
     write_euroc,
@@ -19,6 +18,7 @@ from tests.support.sequences import (
     write_posed_video,
     write_tum_rgbd,
 )
+from tests.support.processes.program import Run, replay
 
 FAST = ["--set", "depth.enabled=false"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.camera import Camera, Distortion
-from companion.geometry import Pose, rotation_from_vector
-from tests.support.rendered_flight import CAMERA_DOWN, Terrain, fly
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Pose, rotation_from_vector
+from tests.support.flights.rendered_flight import CAMERA_DOWN, Terrain, fly
 
 HEIGHT_M = 12.0
 FISHEYE = (-0.02, 0.006, -0.003, 0.0006)

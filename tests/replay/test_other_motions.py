@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.camera import Camera
-from companion.geometry import Pose, rotation_from_vector, yaw_rotation
-from tests.support.rendered_flight import CAMERA_DOWN, Terrain, fly
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose, rotation_from_vector, yaw_rotation
+from tests.support.flights.rendered_flight import CAMERA_DOWN, Terrain, fly
 
 CAMERA = Camera(320, 240, 260.0, 258.0, 161.0, 118.0, body_from_camera=CAMERA_DOWN)
 BOTH = pytest.mark.parametrize("plane", [False, True], ids=["over roofs", "over flat ground"])

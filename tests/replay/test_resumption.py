@@ -15,23 +15,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.camera import Camera
-from companion.checkpoint import MOST_BYTES, Checkpoint, decode, encode, opened
 from companion.config import Config
-from companion.geometry import (
+from companion.estimation.checkpoint import MOST_BYTES, Checkpoint, decode, encode, opened
+from companion.estimation.localisation import NOT_TAKEN_UP, TAKEN_UP, LocalisationStage
+from companion.estimation.resumption import TRIED_NS
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import (
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
 )
-from companion.localisation import NOT_TAKEN_UP, TAKEN_UP, LocalisationStage
 from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
-from companion.resumption import TRIED_NS
+from companion.runtime.stage_protocol import Finish, KeepMap, Setup
 from companion.stages.localisation_work import work
 from companion.stages.map_keeper import MapKeeper
-from companion.stages.protocol import Finish, KeepMap, Setup
 from drivers.open_flight import open_flight
-from tests.support.poses import TrueFlight
-from tests.support.to_and_fro import flown_again, walk
+from tests.support.autopilot.received_poses import TrueFlight
+from tests.support.flights.to_and_fro import flown_again, walk
 
 SAMPLE = Path("sample/survey")
 CONFIG = Config()

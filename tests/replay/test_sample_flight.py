@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.cli import main
-from tests.support.command import Run, replay
-from tests.support.scoring import Score, depth_errors, read_ply, read_tum, score
+from companion.app.cli import main
+from tests.support.processes.program import Run, replay
+from tests.support.reference.scoring import Score, depth_errors, read_ply, read_tum, score
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 SHORT = ["--start", "10", "--stop", "20"]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.scoring import read_ply, read_tum
+from tests.support.reference.scoring import read_ply, read_tum
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 

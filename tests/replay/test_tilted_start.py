@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.attitude_verdict import BEGUN_ANEW
 from companion.config import Config
-from companion.geometry import (
+from companion.estimation.attitude_verdict import BEGUN_ANEW
+from companion.estimation.localisation import LocalisationStage
+from companion.estimation.motion_filter import AttitudeHistory
+from companion.geometry.transforms import (
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
 )
-from companion.localisation import LocalisationStage
 from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
-from companion.motion import AttitudeHistory
-from companion.pipeline import in_order_of_time
+from companion.runtime.pipeline import in_order_of_time
 from drivers.flight import Flight
 from drivers.open_flight import open_flight
-from tests.support.tilted_start import KINDS, tilted_starts
+from tests.support.flights.tilted_start import KINDS, tilted_starts
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 SECONDS = 6.0

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.command import refused, replay
+from tests.support.processes.program import refused, replay
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 FAST = ["--stop", "14", "--set", "depth.enabled=false"]

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.booted_service import BootedService, told, until
-from tests.support.container import Container, lacking
+from tests.support.processes.booted_service import BootedService, told, until
+from tests.support.processes.container import Container, lacking
 
 REPOSITORY = Path(__file__).parents[2]
 PACKAGES = sorted((REPOSITORY / "dist").glob("companion_*.deb"))
@@ -39,8 +39,8 @@ least_free_mb = 100
 AUTOPILOT = """
 [Service]
 WorkingDirectory=/mnt
-ExecStart=/opt/companion/bin/python -m tests.support.fake_autopilot --flight sample/survey \
-  --url udpout:127.0.0.1:14550
+ExecStart=/opt/companion/bin/python -m tests.support.autopilot.fake_autopilot \
+  --flight sample/survey --url udpout:127.0.0.1:14550
 Restart=always
 StandardOutput=null
 [Install]
@@ -165,7 +165,7 @@ def test_a_wedged_pose_loop_is_ended_by_the_watchdog(
     began_s = time.monotonic()
     while "Watchdog timeout" not in container.run("journalctl", "--unit=companion", "--no-pager"):
         assert time.monotonic() < began_s + 120
-        container.run("pkill", "-STOP", "-f", "companion.stages.child localisation", check=False)
+        container.run("pkill", "-STOP", "-f", "stage_child localisation", check=False)
         time.sleep(0.2)
     told(f"watchdog after {time.monotonic() - began_s:.0f} s")
     until(lambda: int(service.shown("NRestarts")) > n_before, 60, "another start")

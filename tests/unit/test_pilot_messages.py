@@ -8,11 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from companion import feedback, localisation, pilot_messages
-from companion.live import armed_settings, flight, left_overs, link_watch, pose_sender, viewing
-from companion.live.flight_parameters import PARAMETERS
+from companion import pilot_messages
+from companion.daemon import link_watch
+from companion.daemon.control import armed_settings
+from companion.daemon.control.flight_parameters import PARAMETERS
+from companion.daemon.flights import live_flight, recording_recovery, viewing
+from companion.daemon.pose import pose_sender
+from companion.estimation import localisation, pose_gate
 from companion.messages import Warned
-from companion.output import flight_result
 from companion.pilot_messages import (
     INFO,
     JOURNAL_ONLY,
@@ -28,9 +31,12 @@ from companion.pilot_messages import (
     of_warning,
     position_lost,
 )
+from companion.products import flight_result
 from companion.stages import localisation_work, topics_work
-from drivers import camera_feed, ground_requests, live_samples
+from drivers.camera import camera_feed
+from drivers.mavlink import ground_requests
 from drivers.recording import disk_writer
+from drivers.telemetry import live_samples
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "pilot_messages.md"
@@ -105,7 +111,7 @@ def phrases(module: object) -> set[str]:
 
 def test_every_reason_has_its_words() -> None:
     known = {*REASONS, *pilot_messages.SWITCHED_OFF}
-    assert phrases(feedback) <= known
+    assert phrases(pose_gate) <= known
     assert {pose_sender.UNHEARD, pose_sender.SWITCHED_OFF} <= known
     assert position_lost("quality too low").text == "Companion: vision position lost: low quality"
     assert position_lost("switched off").text == "Companion: vision position off: ground command"
@@ -117,13 +123,15 @@ def test_every_warning_has_its_words() -> None:
         *phrases(camera_feed), *phrases(disk_writer), *phrases(live_samples),
         link_watch.DAMAGED, link_watch.REFUSED, link_watch.FLOODS, link_watch.SLOW,
         localisation.TAKEN_UP, localisation.NOT_TAKEN_UP, localisation_work.NOT_KEPT,
-        link_watch.NO_MAVLINK, flight.RESTARTED, flight.LOCALISATION_DIED, flight.NOT_FINISHED,
+        link_watch.NO_MAVLINK, live_flight.RESTARTED, live_flight.LOCALISATION_DIED,
+        live_flight.NOT_FINISHED,
         viewing.SHOWN, viewing.NO_VIEWER, viewing.GONE, viewing.BEHIND, viewing.CLOSED,
-        left_overs.CUT_SHORT, ground_requests.TOO_MANY, topics_work.MALFORMED, topics_work.TAKEN,
+        recording_recovery.CUT_SHORT, ground_requests.TOO_MANY,
+        topics_work.MALFORMED, topics_work.TAKEN,
         topics_work.NOT_TAKEN, flight_result.GIVEN_UP, armed_settings.NOT_KEPT,
         localisation.TAKEN_UP, localisation.NOT_TAKEN_UP, localisation_work.NOT_KEPT,
     }  # fmt: skip
-    for module in ("drivers/autopilot_link.py", "companion/camera_attitude.py"):
+    for module in ("drivers/mavlink/autopilot_link.py", "companion/estimation/camera_attitude.py"):
         for node in ast.walk(ast.parse((ROOT / module).read_text("utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == Warned.__name__:
                 whats |= {arg.value for arg in node.args[1:2] if isinstance(arg, ast.Constant)}  # type: ignore[misc]
@@ -134,9 +142,9 @@ def test_what_a_warning_becomes() -> None:
     died = of_warning("localisation has died: the flight ends, and another begins", "SIGKILL")
     assert died is not None
     assert (died.severity, died.text) == (WARNING, "Companion: visual tracking failed: restarting")
-    restarted = of_warning(flight.RESTARTED, "depth: killed by SIGKILL")
+    restarted = of_warning(live_flight.RESTARTED, "depth: killed by SIGKILL")
     assert restarted is not None and restarted.text == "Companion: dense map restarted"
-    unknown = of_warning(flight.RESTARTED, "another: killed")
+    unknown = of_warning(live_flight.RESTARTED, "another: killed")
     assert unknown is not None and unknown.text == "Companion: a process restarted"
     assert of_warning("ValueError: something at /home/me") == OTHER()
     assert of_warning("good news", good=True) is None

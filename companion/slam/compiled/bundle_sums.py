@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.geometry import Array
+from companion.geometry.transforms import Array
 from companion.slam.compiled.compiling import Ints, compiled, integer, integers, matrices, pairs
-from companion.slam.compiled.pose import HUBER
+from companion.slam.compiled.pose_sums import HUBER
 
 _BEHIND_COST = HUBER * 100.0
 

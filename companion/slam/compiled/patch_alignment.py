@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.geometry import Array
+from companion.geometry.transforms import Array
 from companion.messages import Bytes
 from companion.slam.compiled.compiling import (
     Bools,
@@ -149,7 +149,7 @@ def align(
     grey: Bytes, centre: Array, stored_level: Ints, image_from_patch: Array, image: Bytes,
     half_image: Bytes, quarter_image: Bytes, pixels: Array, max_move_px: Array,
 ) -> tuple[Array, Bools]:  # fmt: skip
-    """As `companion.slam.patches.align`."""
+    """As `companion.slam.features.patches.align`."""
     found, sure = pixels.copy(), np.zeros(len(pixels), np.bool_)
     back, place, work = np.empty((2, 2)), np.empty(2), np.empty((4, _SIDE, _SIDE))
     for i in range(len(pixels)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.geometry import Array
+from companion.geometry.transforms import Array
 from companion.slam.compiled.compiling import (
     Bools,
     Ints,
@@ -20,7 +20,7 @@ from companion.slam.compiled.compiling import (
 )
 
 NO_LENS, RADTAN, EQUIDISTANT = 0, 1, 2
-"""The distortion models of companion.camera."""
+"""The distortion models of companion.geometry.camera."""
 N_COEFFICIENTS = 5
 MIN_VIEW_COSINE = 0.5
 """A point is looked for only within 60 degrees of where it was seen from before."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.geometry import Array
+from companion.geometry.transforms import Array
 from companion.messages import Floats
 from companion.slam.compiled.compiling import (
     Bools,

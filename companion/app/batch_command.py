@@ -1,0 +1,196 @@
+"""companion batch: many flights replayed on many cores or machines, and one page about all.
+
+Each flight is a task of Dask, which runs it in a process of its own. What is done already, with the
+same files and settings, is not done again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from companion import __version__
+from companion.app.progress import NoProgress, Progress
+from companion.app.replay_command import replay
+from companion.app.thumbnail import thumbnail
+from companion.config import Config
+from companion.config_file import shown
+from companion.errors import CompanionError, InputError
+from companion.products.atomic_file import write_atomically
+from companion.products.report.batch_page import batch_page
+
+DONE, INDEX, THUMBNAIL = "batch.json", "index.html", "thumbnail.jpg"
+MOST_FILES = 1000
+"""Of a flight's folder that are looked at for changes; a flight of images has its list besides."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class BatchResult:
+    """What became of one flight; `error` is "" where it is done, `report` then its numbers."""
+
+    name: str
+    flight: Path
+    error: str
+    report: dict[str, Any]
+    done_before: bool = False
+
+
+def batch(
+    flights: Sequence[Path], out: Path, config: Config, *, scheduler: str | None,
+    n_workers: int | None, progress: Progress,
+) -> list[BatchResult]:  # fmt: skip
+    """Replay all flights into folders of `out`, and write index.html there.
+
+    `scheduler` is the address of a Dask cluster that sees the same files, else processes of this
+    machine do it. InputError where Dask is not there.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, BatchResult] = {}
+    todo: dict[str, tuple[Path, str]] = {}
+    for name, flight in _named(flights).items():
+        mark = _mark(flight, config)
+        report = _done(out / name, mark)
+        if report is not None:
+            results[name] = BatchResult(name, flight, "", report, done_before=True)
+        else:
+            todo[name] = flight, mark
+    names = [*_named(flights)]
+
+    def write_index() -> list[BatchResult]:
+        known = [results[name] for name in names if name in results]
+        pictures = {each.name: _bytes(out / each.name / THUMBNAIL) for each in known}
+        write_atomically(out / INDEX, batch_page(known, pictures))
+        return known
+
+    progress.start(len(names))
+    progress.update(len(results), "done", 0)
+    write_index()
+    if todo:
+        with _cluster(scheduler, n_workers or len(todo)) as run:
+            for result in run(out, todo, config):
+                results[result.name] = result
+                progress.update(len(results), "done", 0)
+                write_index()
+    progress.finish()
+    return write_index()
+
+
+def replay_one(name: str, flight: Path, out: Path, config: Config, mark: str) -> BatchResult:
+    """One task; where it runs is Dask's affair. What is wrong with a flight ends that one only."""
+    folder = out / name
+    try:
+        replay(
+            flight, folder, config, start_s=None, stop_s=None, viewer="none", paced=False,
+            progress=NoProgress(),
+        )  # fmt: skip
+        write_atomically(folder / THUMBNAIL, thumbnail(flight, config.camera))
+    except (CompanionError, OSError) as error:
+        return BatchResult(name, flight, str(error), {})
+    except Exception as error:  # a bug that one flight brings out must not cost the others
+        return BatchResult(name, flight, f"{type(error).__name__}: {error}", {})
+    write_atomically(folder / DONE, json.dumps({"mark": mark}).encode())
+    return BatchResult(name, flight, "", _report(folder) or {})
+
+
+@contextmanager
+def _cluster(scheduler: str | None, n_wanted: int) -> Iterator[Any]:
+    try:
+        import distributed
+    except ImportError as error:
+        raise InputError("companion batch needs Dask: pip install 'companion[batch]'") from error
+    dask: Any = distributed  # whose calls carry no types
+
+    def run(out: Path, todo: dict[str, tuple[Path, str]], config: Config) -> Iterator[BatchResult]:
+        futures = {
+            client.submit(replay_one, name, flight.absolute(), out.absolute(), config, mark,
+                          pure=False): (name, flight)
+            for name, (flight, mark) in todo.items()
+        }  # fmt: skip
+        for future in dask.as_completed(futures):
+            name, flight = futures[future]
+            error = future.exception()
+            if error is not None:  # its process has died
+                yield BatchResult(name, flight, f"{type(error).__name__}: {error}", {})
+            else:
+                yield dataclasses.replace(future.result(), flight=flight)
+
+    if scheduler is not None:
+        try:
+            client = dask.Client(scheduler, timeout="10s")
+        except (OSError, ValueError, TimeoutError) as error:
+            raise InputError(f"{scheduler}: there is no Dask scheduler: {error}") from error
+        with client:
+            yield run
+        return
+    n_workers = min(n_wanted, _n_cores())
+    with (
+        dask.LocalCluster(
+            n_workers=n_workers, threads_per_worker=1, processes=True, memory_limit=0,
+            dashboard_address=None, silence_logs=logging.ERROR,
+        ) as cluster,
+        dask.Client(cluster) as client,
+    ):  # fmt: skip
+        yield run
+
+
+def _n_cores() -> int:
+    return max(1, len(os.sched_getaffinity(0)))
+
+
+def _named(flights: Sequence[Path]) -> dict[str, Path]:
+    """A name for each flight, that of its folder or file; a number where two have the same."""
+    out: dict[str, Path] = {}
+    for flight in flights:
+        own = flight.absolute()
+        base = own.parent.name if own.stem == "flight" and own.is_file() else own.stem
+        name, number = base or "flight", 2
+        while name in out:
+            name, number = f"{base}-{number}", number + 1
+        out[name] = flight
+    return out
+
+
+def _mark(flight: Path, config: Config) -> str:
+    """Changes when the files, the settings or the program do."""
+    inside = sorted(flight.iterdir())[:MOST_FILES] if flight.is_dir() else [flight]
+    files = []
+    for path in inside:
+        try:
+            status = path.stat()
+        except OSError:
+            continue
+        if path.is_file():
+            files.append([path.name, status.st_size, status.st_mtime_ns])
+    text = json.dumps([str(flight.absolute()), files, shown(config), __version__])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _done(folder: Path, mark: str) -> dict[str, Any] | None:
+    """The report of a flight that was done with the same mark; None if there is none."""
+    try:
+        said = json.loads((folder / DONE).read_bytes())
+    except (OSError, ValueError):
+        return None
+    return _report(folder) if isinstance(said, dict) and said.get("mark") == mark else None
+
+
+def _report(folder: Path) -> dict[str, Any] | None:
+    try:
+        report = json.loads((folder / "report.json").read_bytes())
+    except (OSError, ValueError):
+        return None
+    return report if isinstance(report, dict) else None
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""

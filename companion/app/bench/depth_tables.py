@@ -1,0 +1,295 @@
+"""The results of `companion bench depth`: tables, JSON, and a picture of the curves."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Protocol
+
+from matplotlib.figure import Figure
+
+from companion.app.bench.depth_accuracy import Accuracy
+from companion.products.atomic_file import write_atomically
+
+
+class Run(Protocol):
+    """One timed run."""
+
+    @property
+    def name(self) -> str:
+        """Whose."""
+
+    @property
+    def wall_s(self) -> float:
+        """All of it."""
+
+    @property
+    def cpu_s(self) -> float:
+        """Of all cores."""
+
+    @property
+    def converged(self) -> Accuracy:
+        """Of what has converged."""
+
+    @property
+    def all_pixels(self) -> Accuracy:
+        """Of the regularised result."""
+
+
+class Stand(Protocol):
+    """How it stands after some frames."""
+
+    @property
+    def frames(self) -> int:
+        """So many."""
+
+    @property
+    def still_updated(self) -> float:
+        """Share of the pixels."""
+
+    @property
+    def ms_per_frame(self) -> float:
+        """Wall time."""
+
+    @property
+    def converged(self) -> Accuracy:
+        """Of what has converged."""
+
+    @property
+    def all_pixels(self) -> Accuracy:
+        """Of all."""
+
+
+class Threshold(Protocol):
+    """The result at one threshold."""
+
+    @property
+    def min_zncc(self) -> float:
+        """Least correlation."""
+
+    @property
+    def converged(self) -> Accuracy:
+        """Of what has converged."""
+
+
+class Reference(Protocol):
+    """One reference of all, its range of depths found by itself."""
+
+    @property
+    def reference(self) -> int:
+        """Its frame's number."""
+
+    @property
+    def alone_converged(self) -> Accuracy:
+        """Of what has converged, before other references were asked."""
+
+    @property
+    def alone_all(self) -> Accuracy:
+        """Of all pixels, before."""
+
+    @property
+    def converged(self) -> Accuracy:
+        """Of what has converged in the end."""
+
+    @property
+    def all_pixels(self) -> Accuracy:
+        """Of all pixels in the end."""
+
+
+class Used(Protocol):
+    """All references, as `companion depth` makes them."""
+
+    @property
+    def n_references(self) -> int:
+        """With truth or without."""
+
+    @property
+    def wall_s(self) -> float:
+        """For each."""
+
+    @property
+    def cpu_s(self) -> float:
+        """Of all cores, for each."""
+
+    @property
+    def rows(self) -> Sequence[Reference]:
+        """Of those with truth."""
+
+    @property
+    def refused(self) -> str:
+        """Why there is nothing, or nothing."""
+
+
+class Bench(Protocol):
+    """All that was measured; any dataclass with these."""
+
+    @property
+    def dataset(self) -> str:
+        """Where it lies."""
+
+    @property
+    def device(self) -> str:
+        """Where the kernels ran."""
+
+    @property
+    def frames(self) -> int:
+        """Images but for the reference."""
+
+    @property
+    def searched(self) -> int:
+        """Of them worth keeping."""
+
+    @property
+    def runs(self) -> Sequence[Run]:
+        """Ours, then the serial reference."""
+
+    @property
+    def speed_up(self) -> float | None:
+        """Of wall time."""
+
+    @property
+    def kernel_ms(self) -> dict[str, float]:
+        """Of each kernel on the device."""
+
+    @property
+    def after_frames(self) -> Sequence[Stand]:
+        """Ours."""
+
+    @property
+    def serial_after_frames(self) -> Sequence[Stand]:
+        """The serial reference's."""
+
+    @property
+    def thresholds(self) -> Sequence[Threshold]:
+        """Ours."""
+
+    @property
+    def as_used(self) -> Used:
+        """As a user runs it."""
+
+
+def tables(bench: Bench) -> str:
+    """All of it for people; shares in percent, of the pixels whose truth is known."""
+    parts = [
+        f"{bench.dataset}: {bench.frames} images taken, {bench.searched} of them searched\n"
+        f"{bench.device}",
+        _aligned(
+            [
+                ["", "wall s", "CPU s", "converged", "within 1", "2", "5 %", "all: 1", "2", "5 %"],
+                *(
+                    [r.name, f"{r.wall_s:.2f}", f"{r.cpu_s:.2f}", *_shares(r.converged),
+                     *_shares(r.all_pixels)[1:]]
+                    for r in bench.runs
+                ),
+            ]
+        ),
+    ]  # fmt: skip
+    if bench.speed_up is not None:
+        parts.append(f"{bench.speed_up:.1f} times as fast")
+    parts.append(_as_used(bench.as_used))
+    head = ["frames", "updated", "ms/frame", "converged", "within 1", "2", "5 %"]
+    for title, stands in (
+        ("companion", bench.after_frames), ("REMODE, one core", bench.serial_after_frames)
+    ):  # fmt: skip
+        if stands:
+            rows = [
+                [str(s.frames), _percent(s.still_updated), f"{s.ms_per_frame:.1f}",
+                 *_shares(s.converged)]
+                for s in stands
+            ]  # fmt: skip
+            parts.append(title + "\n" + _aligned([head, *rows]))
+    rows = [[f"{t.min_zncc:g}", *_shares(t.converged)] for t in bench.thresholds]
+    parts.append(_aligned([["min_zncc", "converged", "within 1", "2", "5 %"], *rows]))
+    spent = sorted(bench.kernel_ms.items(), key=lambda item: -item[1])
+    parts.append(_aligned([["kernel", "ms"], *([name, f"{ms:.1f}"] for name, ms in spent)]))
+    return "\n\n".join(parts)
+
+
+def _as_used(used: Used) -> str:
+    title = "as a user runs it: ranges of depth found by itself, all references"
+    if used.refused:
+        return f"{title}\nnot measured: {used.refused}"
+    title += f" ({used.n_references}), {used.wall_s:.2f} s and {used.cpu_s:.2f} CPU s for each"
+    if not used.rows:
+        return f"{title}\nnone of them has a true depth"
+    rows = [["reference", "", "converged", "within 1", "2", "5 %", "all: 1", "2", "5 %"]]
+    for name, alone, together in (
+        ("alone", "alone_converged", "alone_all"), ("as written", "converged", "all_pixels")
+    ):  # fmt: skip
+        pairs = [(getattr(r, alone), getattr(r, together)) for r in used.rows]
+        shares = [
+            (a.estimated, a.within_1, a.within_2, a.within_5, b.within_1, b.within_2, b.within_5)
+            for a, b in pairs
+        ]
+        for r, share in zip(used.rows, shares, strict=True):
+            rows.append([str(r.reference), name, *map(_percent, share)])
+        if len(shares) > 1:
+            means = [sum(column) / len(column) for column in zip(*shares, strict=True)]
+            rows.append(["mean", name, *map(_percent, means)])
+    return title + "\n" + _aligned(rows)
+
+
+def as_json(bench: Bench) -> str:
+    """All of it; null for what is not known."""
+    content = asdict(bench)  # type: ignore[call-overload]
+    return json.dumps({**_finite(content), "speed_up": bench.speed_up}, indent=1, allow_nan=False)
+
+
+def write_bench(out: Path, bench: Bench) -> None:
+    """Write depth_bench.json and depth_bench.png into folder `out`."""
+    write_atomically(out / "depth_bench.json", as_json(bench).encode())
+    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    for name, stands in (
+        ("companion", bench.after_frames), ("REMODE, one core", bench.serial_after_frames)
+    ):  # fmt: skip
+        if stands:
+            n = [s.frames for s in stands]
+            left.plot(n, [100 * s.converged.estimated for s in stands], "o-", ms=3, label=name)
+            middle.plot(n, [100 * s.all_pixels.within_1 for s in stands], "o-", ms=3, label=name)
+            right.plot(n, [s.ms_per_frame for s in stands], "o-", ms=3, label=name)
+    for axes, label in (
+        (left, "converged, %"), (middle, "all pixels within 1 %, %"), (right, "ms per frame")
+    ):  # fmt: skip
+        axes.set_xscale("log")
+        axes.set_xlabel("frames")
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+    right.set_yscale("log")
+    left.legend(frameon=False)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    write_atomically(out / "depth_bench.png", picture.getvalue())
+
+
+def _shares(a: Accuracy) -> list[str]:
+    return [_percent(v) for v in (a.estimated, a.within_1, a.within_2, a.within_5)]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}" if math.isfinite(share) else "-"
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,301 @@
+"""`companion calibrate`: from a board held before a camera to the camera's calibration file.
+
+A calibration that may not be flown with is refused with the reason, and nothing is written.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from companion.app.progress import Progress
+from companion.calibration.board_views import (
+    Coverage,
+    LitArea,
+    View,
+    choose,
+    coverage,
+    novelty,
+)
+from companion.calibration.calibration_verdict import advice, faults, few
+from companion.calibration.chart import Chart, parse_chart
+from companion.calibration.lens_calibration import MODELS, Calibration, determine
+from companion.errors import InputError
+from companion.messages import Bytes
+from companion.products.atomic_file import write_atomically
+from companion.products.board_print import board_page
+from companion.products.calibration_picture import calibration_png
+from companion.products.calibration_toml import calibration_toml
+from drivers.camera.camera_source import CameraSource, EndOfPictures
+from drivers.images.frame_source import FrameSource, Video, find_frames
+
+MAX_SEARCHED = 400
+"""Pictures of a recording in which the board is looked for, the sharpest of each stretch."""
+MAX_VIEWS = 40
+"""Views that a lens is fitted to; more of them make it slower and hardly better."""
+MAX_LIVE_VIEWS = 80
+LIVE_NOVELTY, LIVE_GAIN = 0.05, 0.005
+"""Views of a live camera are kept when they are so unlike those before, or cover so much more."""
+LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
+"""A lens is fitted to the views of a live camera from so many on, and again after so many more."""
+READ_S = 0.25
+"""A live camera is waited for so long before Ctrl-C is looked for."""
+MIN_FOUND = 0.05
+"""Of the pictures must show the board, else it is asked whether they show another."""
+N_UNFOUND_KEPT = 12
+"""Pictures without the board that are kept, to tell what else is on them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationReport:
+    """What a calibration came to, and where it was written."""
+
+    name: str
+    calibration: Calibration
+    n_pictures: int
+    """In which the board was looked for."""
+    n_found: int
+    n_blurred: int
+    toml: Path
+    picture: Path
+
+    def __str__(self) -> str:
+        """Some lines for the terminal."""
+        made = self.calibration
+        fx, fy, cx, cy = (
+            f"{key} {value:.2f} ± {sigma:.2f}"
+            for key, value, sigma in zip(
+                ("fx", "fy", "cx", "cy"), made.lens.parameters, made.sigmas, strict=False
+            )
+        )
+        left_out = f", {len(made.rejected)} left out" if made.rejected else ""
+        return (
+            f"{self.name}: {made.camera.distortion.value}, "
+            f"{made.camera.width} x {made.camera.height}\n"
+            f"  {fx}, {fy}, {cx}, {cy} px\n"
+            f"  error {made.rms_px:.3f} px, in views held out {made.holdout_px:.3f} px\n"
+            f"  {len(made.views)} views{left_out}; the board was found in {self.n_found} of "
+            f"{self.n_pictures} pictures, {self.n_blurred} of them blurred; "
+            f"{made.coverage.share:.0%} of the picture covered\n"
+            f"  the board is flat to {made.sag_m * 1000:.1f} mm\n"
+            f"calibration: {self.toml}\n"
+            f"picture: {self.picture}"
+        )
+
+
+def calibrate(
+    source: Path | CameraSource, board: str, name: str, out: Path, model: str, progress: Progress
+) -> CalibrationReport:
+    """Calibrate from a video, a folder of images, or a live camera, into `out`.
+
+    InputError when the board is not there, or the result may not be used; then no file is touched.
+    A KeyboardInterrupt out of `progress` ends a live camera's views; what there is must do.
+    """
+    chart = parse_chart(board)
+    if model not in ("auto", *MODELS):
+        raise InputError(f"--model {model}: wanted auto, {' or '.join(MODELS)}")
+    if not name or name != Path(name).name or name.startswith("."):
+        raise InputError(f"--name {name}: wanted a name for a file, without folders")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; --out wants a folder")
+    gathered = _Gathered(chart)
+    if isinstance(source, Path):
+        called = source.name
+        _search(_frames(source), gathered, progress)
+    else:
+        called = source.name
+        _watch(source, gathered, model, progress)
+    calibration = _judged(gathered, called, model)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        toml, picture = out / f"{name}.toml", out / f"{name}.png"
+        drawn = calibration_png(calibration, name, board)
+        write_atomically(toml, calibration_toml(calibration, name, board, called))
+        write_atomically(picture, drawn)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
+    return CalibrationReport(
+        name, calibration, gathered.n_searched, gathered.n_found, gathered.n_blurred, toml, picture
+    )
+
+
+def print_board(board: str, path: Path) -> str:
+    """Write the board as a page to print, .pdf or .png; returns the paper that it is for."""
+    form = path.suffix.lower().lstrip(".")
+    if form not in ("pdf", "png"):
+        raise InputError(f"--print-board {path}: wanted a name that ends in .pdf or .png")
+    page, paper = board_page(parse_chart(board), form)
+    try:
+        write_atomically(path, page)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return paper
+
+
+@dataclass(slots=True)
+class _Gathered:
+    """What was found so far."""
+
+    chart: Chart
+    views: list[View] = field(default_factory=list)
+    lit: LitArea = field(default_factory=LitArea)
+    size: tuple[int, int] = (0, 0)
+    n_searched: int = 0
+    n_found: int = 0
+    n_blurred: int = 0
+    n_small: int = 0
+    unfound: list[Bytes] = field(default_factory=list)
+
+    def look(self, number: int, grey: Bytes, *, only_new: bool) -> str:
+        """Look for the board in a picture; "" when it gave a view, else why it gave none."""
+        height, width = grey.shape
+        if self.n_searched and self.size != (width, height):
+            raise InputError(
+                f"picture {number} is {width} x {height}, those before were {self.size[0]} x "
+                f"{self.size[1]}: a calibration is for one size"
+            )
+        self.size = width, height
+        self.n_searched += 1
+        self.lit.see(grey)
+        sighting = self.chart.find(grey)
+        if sighting is None:
+            self._keep_unfound(grey)
+            return "the board is not to be seen"
+        self.n_found += 1
+        view = View(number, sighting, width, height)
+        if view.blurred:
+            self.n_blurred += 1
+            return "hold the board still"
+        if view.small:
+            self.n_small += 1
+            return "bring the board nearer"
+        if only_new and not self._is_new(view):
+            return "move the board"
+        self.views.append(view)
+        return ""
+
+    def covered(self) -> Coverage:
+        """Where the board was."""
+        return coverage(self.views, self.lit.mask(*self.size))
+
+    def _is_new(self, view: View) -> bool:
+        if novelty(view, self.views) >= LIVE_NOVELTY:
+            return True
+        lit = self.lit.mask(*self.size)
+        before, after = coverage(self.views, lit), coverage([*self.views, view], lit)
+        return after.share >= before.share + LIVE_GAIN
+
+    def _keep_unfound(self, grey: Bytes) -> None:
+        if len(self.unfound) < N_UNFOUND_KEPT:
+            self.unfound.append(grey)
+        elif self.n_searched % 10 == 0:  # some of them from later on too
+            self.unfound[(self.n_searched // 10) % N_UNFOUND_KEPT] = grey
+
+
+def _frames(source: Path) -> FrameSource:
+    if not source.exists():
+        raise InputError(f"{source}: there is no such file or folder")
+    return find_frames(source) if source.is_dir() else Video(source)
+
+
+def _search(frames: FrameSource, gathered: _Gathered, progress: Progress) -> None:
+    """Views of a recording."""
+    progress.start(frames.n_frames)
+    try:
+        stretch = math.ceil(frames.n_frames / MAX_SEARCHED)
+        for number, grey, done in _sharpest(frames, stretch):
+            gathered.look(number, grey, only_new=False)
+            progress.update(done, "looking for the board", len(gathered.views))
+    finally:
+        progress.finish()
+    if not gathered.n_searched:
+        raise InputError(f"{frames.path}: none of its {frames.n_frames} pictures can be decoded")
+
+
+def _sharpest(frames: FrameSource, stretch: int) -> Iterator[tuple[int, Bytes, int]]:
+    """Number and grey picture of the sharpest of each stretch, and how many were decoded so far."""
+    best: tuple[float, int, Bytes] | None = None
+    for number, rgb in frames.pictures(0, frames.n_frames - 1):
+        if rgb is not None:
+            grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+            sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).std()) if stretch > 1 else 0.0
+            if best is None or sharpness > best[0]:
+                best = sharpness, number, grey
+        if best is not None and ((number + 1) % stretch == 0 or number + 1 == frames.n_frames):
+            yield best[1], best[2], number + 1
+            best = None
+
+
+def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Progress) -> None:
+    """Views of a live camera, until they are enough or its user stops."""
+    progress.start(0)
+    try:
+        source.open()
+        made: Calibration | None = None
+        n_fitted = number = 0
+        while len(gathered.views) < MAX_LIVE_VIEWS:
+            picture = source.read(READ_S)
+            if picture is None:
+                progress.update(number, "no picture comes", len(gathered.views))
+                continue
+            amiss = gathered.look(number, picture.grey, only_new=True)
+            number += 1
+            covered = gathered.covered()
+            wanted = advice(gathered.views, covered, made)
+            n_new = len(gathered.views) - n_fitted
+            if n_new >= (LIVE_FIT_EVERY if wanted else 1) and len(gathered.views) >= LEAST_FITTED:
+                n_fitted = len(gathered.views)
+                made = determine(choose(gathered.views, MAX_VIEWS), covered.lit, model)
+                wanted = advice(gathered.views, covered, made)
+            if not wanted:
+                break
+            # what to do is said where the board is seen well, else why it is not
+            seen_well = amiss in ("", "move the board")
+            progress.update(number, wanted if seen_well else amiss, len(gathered.views))
+    except (KeyboardInterrupt, EndOfPictures):
+        pass  # what there is must do; if it does not, the reason is told
+    finally:
+        source.close()
+        progress.finish()
+    if not gathered.n_searched:
+        raise InputError(f"{source.name}: no picture came")
+
+
+def _judged(gathered: _Gathered, called: str, model: str) -> Calibration:
+    """The calibration, when it may be used."""
+    refused = f"{called}: not calibrated: "
+    n, found = gathered.n_searched, gathered.n_found
+    if found < MIN_FOUND * n:  # perhaps by chance, on a board that is another one
+        instead = gathered.chart.explain(gathered.unfound)
+        raise InputError(
+            f"{refused}--board {gathered.chart.name} was found in {found or 'none'} of {n} "
+            "pictures"
+            + (f"; {instead}" if instead else ": is it in view, lit, and the board that was given?")
+        )
+    views = choose(gathered.views, MAX_VIEWS)
+    if gathered.n_blurred > found / 2 and few(len(views)):
+        raise InputError(
+            f"{refused}the board is blurred in {gathered.n_blurred} of the {found} pictures that "
+            "show it: hold it still, give it more light, or focus the lens"
+        )
+    if gathered.n_small > found / 2 and few(len(views)):
+        raise InputError(
+            f"{refused}the board is too small in {gathered.n_small} of the {found} pictures that "
+            "show it: bring it nearer"
+        )
+    lit = gathered.lit.mask(*gathered.size)
+    calibration = determine(views, lit, model)
+    if calibration is None:
+        reasons = few(len(views)) or [
+            f"no lens explains the {len(views)} views: is the board flat, and the one given?"
+        ]
+    else:
+        reasons = faults(calibration)
+    if reasons or calibration is None:
+        raise InputError(refused + "; ".join(reasons))
+    return calibration

@@ -1,0 +1,54 @@
+"""The command line: what was asked, handed on; what came of it, as an exit status.
+
+0 done; 1 a fault; 2 bad input or usage; 130 and 143 stopped by Ctrl-C and SIGTERM. An error that
+the program raises on purpose is one line; anything else is a bug and shows its traceback, that of
+a stage which was survived before the line that says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+from collections.abc import Sequence
+
+from companion import __version__
+from companion.app.cli import flying, hardware, measuring, recordings, replaying, service_commands
+from companion.app.cli.options import Command
+from companion.app.stopping import StopSignals
+from companion.errors import CompanionError, InputError, StageError
+
+# In a command libraries are loaded late: they take a second, and --help needs none of them.
+FAMILIES = (flying, replaying, recordings, hardware, measuring, service_commands)
+COMMANDS: dict[str, Command] = {
+    name: command for family in FAMILIES for name, command in family.COMMANDS.items()
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    arguments = _parser().parse_args(argv)
+    with StopSignals() as signals:
+        try:
+            return COMMANDS[arguments.command](arguments, signals)
+        except KeyboardInterrupt:
+            print("companion: stopped", file=sys.stderr)
+            return signals.exit_status
+        except CompanionError as error:
+            cause = error.__cause__ if isinstance(error, StageError) else None
+            if cause is not None and not isinstance(cause, CompanionError | OSError):
+                traceback.print_exception(cause, file=sys.stderr)
+            print(f"companion: error: {error}", file=sys.stderr)
+            return 2 if isinstance(error, InputError) else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="companion",
+        description="Visual SLAM and dense metric mapping for drones.",
+    )
+    parser.add_argument("--version", action="version", version=f"companion {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for family in FAMILIES:
+        family.add_parsers(commands)
+    return parser

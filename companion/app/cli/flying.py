@@ -1,0 +1,118 @@
+"""The commands for a flight that is under way: the daemon, and who looks at it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+from typing import Any
+
+from companion.app.cli.options import Command, configuration, json_option, names, viewer
+from companion.app.stopping import StopSignals
+from companion.config import Config
+from companion.config_file import load_config, to_toml
+
+
+def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.daemon.nodes.node_config import with_stages
+
+    def load() -> Config:
+        config = load_config(arguments.config, arguments.set)
+        return with_stages(config, arguments.stages, arguments.join)
+
+    if "tracking" not in load().distributed.stages:
+        from companion.daemon.nodes.depth_node import run_depth_node
+
+        signals.defer()
+        return run_depth_node(load(), lambda: signals.received is not None)
+    from companion.daemon.daemon import run
+
+    return run(load)
+
+
+def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.app.status_command import show_status
+    from drivers.system.status_socket import found_socket_path
+
+    setting = load_config(arguments.config, arguments.set).daemon.socket
+    show_status(
+        found_socket_path(setting), sys.stdout, as_json=arguments.json, watch=arguments.watch,
+        stop=threading.Event(),
+    )  # fmt: skip
+    return 0
+
+
+def _view(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.app.view_command import view
+
+    def told(text: str) -> None:
+        print(f"companion: {text}", file=sys.stderr, flush=True)
+
+    where = "web" if arguments.web else arguments.viewer
+    return view(arguments.host, where, arguments.bind, arguments.colours, told)
+
+
+def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    print(to_toml(load_config(arguments.config, arguments.set)), end="")
+    return 0
+
+
+COMMANDS: dict[str, Command] = {
+    "run": _run,
+    "status": _status,
+    "view": _view,
+    "check-config": _check_config,
+}
+
+
+def add_parsers(commands: Any) -> None:
+    """Add them to the subparsers of the program."""
+    run = commands.add_parser(
+        "run", parents=[configuration()],
+        help="fly: camera, autopilot, map and pose, until stopped",
+        description="The daemon on the drone. SIGTERM ends it, SIGHUP has it read its "
+        "configuration again. With --stages depth,cloud it is a node on another machine, which "
+        "makes the map of a drone that runs --stages tracking.",
+    )  # fmt: skip
+    run.add_argument(
+        "--stages", type=names, metavar="LIST",
+        help="what runs here, joined with other nodes over Zenoh: tracking, or depth,cloud, or all",
+    )  # fmt: skip
+    run.add_argument(
+        "--join", action="append", default=[], metavar="ENDPOINT",
+        help="a node to join, as tcp/HOST:7447; can be given again",
+    )  # fmt: skip
+
+    status = commands.add_parser(
+        "status", parents=[configuration(), json_option()], help="ask the running daemon how it is"
+    )
+    status.add_argument("--watch", action="store_true", help="again every second, until Ctrl-C")
+
+    view = commands.add_parser(
+        "view", help="watch a flight on the ground, over whatever link there is",
+        description="Connect to a companion that flies (its stream.listen) and show the map, the "
+        "camera and how all is, until Ctrl-C; the link may come and go.",
+    )  # fmt: skip
+    view.add_argument(
+        "host", nargs="?", default="127.0.0.1", metavar="HOST[:PORT]",
+        help="the drone's address (default: %(default)s, port 9870)",
+    )  # fmt: skip
+    view.add_argument("--web", action="store_true", help="on a page for a browser, not in a window")
+    view.add_argument(
+        "--viewer", type=viewer, default="native", metavar="WHERE",
+        help="native, web, or the rerun+http://… of a running viewer (default: %(default)s)",
+    )  # fmt: skip
+    view.add_argument(
+        "--bind", default="127.0.0.1", metavar="ADDRESS",
+        help="where the page is served; 0.0.0.0 for other machines too (default: %(default)s)",
+    )  # fmt: skip
+    view.add_argument(
+        "--colours", choices=("picture", "height", "confidence"), default="picture",
+        help="what the colours of the cloud tell (default: %(default)s)",
+    )  # fmt: skip
+
+    commands.add_parser(
+        "check-config", parents=[configuration()],
+        help="print the configuration that would be used",
+        description="Check a configuration and print the whole of it as TOML.",
+    )  # fmt: skip

@@ -1,0 +1,106 @@
+"""Options that several commands share, and what a value given on the command line may be."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.app.stopping import StopSignals
+
+Command = Callable[[argparse.Namespace, StopSignals], int]
+"""What does it: the arguments in, the exit status out."""
+
+
+def configuration() -> argparse.ArgumentParser:
+    """--config and --set, for `parents`."""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument(
+        "--config", type=Path, metavar="FILE", help="TOML file; see config/companion.toml"
+    )
+    options.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE",
+        help="set one key, over the file; can be given again",
+    )  # fmt: skip
+    return options
+
+
+def json_option() -> argparse.ArgumentParser:
+    """--json, for `parents`."""
+    options = argparse.ArgumentParser(add_help=False)
+    options.add_argument("--json", action="store_true", help="as JSON, for programs")
+    return options
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Some names, separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def shift(text: str) -> float:
+    """Seconds to add to a clock."""
+    seconds = float(text)
+    if not abs(seconds) <= 1e10:
+        raise ValueError
+    return seconds
+
+
+def seconds(text: str) -> float:
+    """Seconds since the first frame."""
+    value = float(text)
+    if not (math.isfinite(value) and value >= 0):
+        raise argparse.ArgumentTypeError(f"wanted seconds since the first frame, given is {text}")
+    return value
+
+
+def number(text: str) -> int:
+    """How many, from none on."""
+    value = int(text) if text.isascii() and text.isdigit() else -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"wanted a number from 0 on, given is {text}")
+    return value
+
+
+def amount(text: str) -> float:
+    """How much, from nothing on."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"wanted a number from 0 on, given is {text}")
+    return value
+
+
+def frames(text: str) -> tuple[int | None, int | None]:
+    """From the first up to, not including, the second; None where it is open."""
+    first, colon, beyond = text.partition(":")
+    try:
+        out = (int(first) if first else None, int(beyond) if beyond else None)
+    except ValueError:
+        colon = ""
+    if not colon or (None not in out and out[1] <= out[0]):  # type: ignore[operator]
+        raise argparse.ArgumentTypeError(f"wanted FIRST:BEYOND, given is {text}")
+    return out
+
+
+def depths(text: str) -> tuple[float, float]:
+    """The nearer and the farther, metres."""
+    near, _, far = text.partition(":")
+    try:
+        out = float(near), float(far)
+    except ValueError:
+        out = 0.0, 0.0
+    if not (0 < out[0] < out[1] < math.inf):
+        raise argparse.ArgumentTypeError(f"wanted NEAR:FAR in metres, given is {text}")
+    return out
+
+
+def viewer(text: str) -> str:
+    """Where to show."""
+    if text in ("none", "web", "native") or text.startswith(("rerun+http://", "rerun+https://")):
+        return text
+    raise argparse.ArgumentTypeError(
+        f"wanted none, web, native or rerun+http://HOST:PORT/proxy, given is {text}"
+    )

@@ -1,0 +1,193 @@
+"""The part of the command line that has to do with recordings and runs that are there already."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from companion.app.cli.options import Command, amount, configuration, json_option, number, seconds
+from companion.app.progress import Progress, progress_on
+from companion.app.stopping import StopSignals
+from companion.config_file import load_config
+from companion.errors import InputError
+
+
+def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    """List, show, trim, export, verify, repair or prune."""
+    from companion.app import flights_command as flights
+    from companion.service.flights_meant import flights_meant, installed_services
+
+    folder = arguments.flights
+    if folder is None:
+        folder = flights_meant(arguments.config, arguments.set, installed_services())
+    what = arguments.what
+    megabytes = signals.between_frames(progress_on(sys.stderr, "", "MB"))
+    if what == "list":
+        print(flights.list_flights(folder, arguments.json))
+    elif what == "show":
+        path = flights.found_recording(arguments.flight, folder)
+        print(flights.show_flight(path, arguments.json))
+    elif what == "trim":
+        if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
+            raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
+        path = flights.found_recording(arguments.flight, folder)
+        print(flights.trim_flight(path, arguments.start, arguments.stop, arguments.out, megabytes))
+    elif what == "export":
+        path = flights.found_recording(arguments.flight, folder)
+        progress = signals.between_frames(progress_on(sys.stderr, ""))
+        print(flights.export_flight(path, arguments.out, progress))
+    elif what == "verify":
+        text, well = flights.verify_flights(
+            flights.recordings_meant(arguments.flights_named, folder), megabytes
+        )
+        print(text)
+        return 0 if well else 1
+    elif what == "repair":
+        if not arguments.flights_named:
+            flights.correct_names(folder)
+        paths = flights.recordings_meant(arguments.flights_named, folder)
+        return _repair(paths, arguments.gently, megabytes)
+    else:
+        print(
+            flights.prune_flights(
+                folder, keep_newest=arguments.keep_newest, older_than_days=arguments.older_than,
+                free_mb=arguments.free, dry_run=arguments.dry_run,
+            )
+        )  # fmt: skip
+    signals.take()
+    return 0
+
+
+def _repair(paths: Sequence[Path], gently: bool, progress: Progress) -> int:
+    from companion.app.flights_repair import repair_flights
+
+    repaired = []
+    for line, well in repair_flights(paths, progress, gently):
+        print(line, flush=True)
+        repaired.append(well)
+    if not gently:
+        n = f"{len(repaired)} of {len(paths)}"
+        print(f"{n} recordings cut short, {sum(repaired)} repaired")
+    return 0 if all(repaired) else 1
+
+
+def _compare(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    """Compare two runs; 1 where a limit is not kept."""
+    from companion.app.compare_command import beyond, compare, in_words
+
+    found = compare(arguments.run_a, arguments.run_b, arguments.out)
+    print(in_words(found))
+    if arguments.out is not None:
+        print(f"report: {arguments.out / 'compare.html'}")
+    too_far = beyond(found, arguments.max_apart, arguments.max_cloud)
+    for line in too_far:
+        print(f"companion: {line}", file=sys.stderr)
+    return 1 if too_far else 0
+
+
+def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    """Replay many; 1 where one has failed."""
+    from companion.app.batch_command import INDEX, batch
+
+    results = batch(
+        arguments.flights, arguments.out, load_config(arguments.config, arguments.set),
+        scheduler=arguments.scheduler, n_workers=arguments.workers,
+        progress=signals.between_frames(progress_on(sys.stderr, "", "flights")),
+    )  # fmt: skip
+    failed = [result for result in results if result.error]
+    for result in failed:
+        print(f"companion: {result.name}: {result.error}", file=sys.stderr)
+    before = sum(result.done_before for result in results)
+    print(f"{len(results)} flights, {before} done before, {len(failed)} failed")
+    print(f"index: {arguments.out / INDEX}")
+    signals.take()
+    return 1 if failed else 0
+
+
+COMMANDS: dict[str, Command] = {"flights": _flights, "compare": _compare, "batch": _batch}
+
+
+def add_parsers(commands: Any) -> None:
+    """Add them to the subparsers of the program."""
+    _add_flights(commands)
+    compare = commands.add_parser(
+        "compare", help="what differs between two runs of a flight",
+        description="Compare the --out folders of two replays of one flight: poses, cloud, times. "
+        "Exit status 1 where a limit is given and not kept.",
+    )  # fmt: skip
+    compare.add_argument("run_a", type=Path, metavar="RUN_A")
+    compare.add_argument("run_b", type=Path, metavar="RUN_B")
+    compare.add_argument("--out", type=Path, metavar="DIR", help="write a report with plots there")
+    compare.add_argument(
+        "--max-apart", type=float, metavar="M", help="poses at most so far apart, RMS"
+    )
+    compare.add_argument(
+        "--max-cloud", type=float, metavar="M", help="95 %% of points at most so far from the other"
+    )
+
+    batch = commands.add_parser(
+        "batch", parents=[configuration()], help="replay an archive of flights on many cores",
+        description="Replay each flight into a folder of DIR, and write DIR/index.html with a row "
+        "for each. What is done already is not done again. Exit status 1 where a flight failed.",
+    )  # fmt: skip
+    batch.add_argument("flights", type=Path, nargs="+", metavar="FLIGHT")
+    batch.add_argument("--out", type=Path, required=True, metavar="DIR")
+    batch.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    batch.add_argument(
+        "--scheduler", metavar="ADDRESS",
+        help="a Dask cluster that sees the same files, as tcp://192.168.1.5:8786",
+    )  # fmt: skip
+
+
+def _add_flights(commands: Any) -> None:
+    place = argparse.ArgumentParser(add_help=False, parents=[configuration()])
+    place.add_argument(
+        "--flights", type=Path, metavar="DIR",
+        help="folder of all flights (default: daemon.flights of the configuration given, else that "
+        "of the installed service, else ./flights)",
+    )  # fmt: skip
+    flights = commands.add_parser("flights", help="recordings of live flights")
+    does = flights.add_subparsers(dest="what", required=True, metavar="WHAT")
+
+    does.add_parser("list", parents=[place, json_option()], help="which there are")
+    show = does.add_parser("show", parents=[place, json_option()], help="what is in one")
+    trim = does.add_parser("trim", parents=[place], help="a part of one, as a recording")
+    trim.add_argument("--start", type=seconds, metavar="S", help="from this second on")
+    trim.add_argument("--stop", type=seconds, metavar="S", help="up to this second")
+    trim.add_argument("--out", type=Path, required=True, metavar="FILE")
+    export = does.add_parser(
+        "export", parents=[place], help="one as a flight folder, for other programs",
+        description="Write pictures as they were recorded, frames.csv, camera.json, config.toml "
+        "and flight.tlog, or telemetry.csv where no bytes of a link were recorded.",
+    )  # fmt: skip
+    export.add_argument("--out", type=Path, required=True, metavar="DIR")
+    for parser in (show, trim, export):
+        parser.add_argument("flight", metavar="FLIGHT", help="name, folder or file")
+    verify = does.add_parser(
+        "verify", parents=[place], help="check all checksums",
+        description="Exit status 1 where a recording is damaged or cut short. Changes nothing.",
+    )  # fmt: skip
+    repair = does.add_parser(
+        "repair", parents=[place], help="end those that were cut short, where they lie",
+        description="What opens a recording does the same; the daemon does it after its start, for "
+        "all. Exit status 1 where one cannot be repaired.",
+    )  # fmt: skip
+    repair.add_argument(
+        "--gently", action="store_true", help="slowly, and without a last line; as the daemon does"
+    )
+    for parser in (verify, repair):
+        parser.add_argument(
+            "flights_named", metavar="FLIGHT", nargs="*", help="name, folder or file (default: all)"
+        )
+    prune = does.add_parser(
+        "prune", parents=[place], help="delete the oldest",
+        description="Delete finished flights with all their results, the oldest first. One with a "
+        'file named "keep" in its folder stays. Of several conditions all must hold.',
+    )  # fmt: skip
+    prune.add_argument("--keep-newest", type=number, metavar="N", help="all but the newest N")
+    prune.add_argument("--older-than", type=amount, metavar="DAYS")
+    prune.add_argument("--free", type=amount, metavar="MB", help="until so much room is free")
+    prune.add_argument("--dry-run", action="store_true", help="only say which")

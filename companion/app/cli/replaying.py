@@ -1,0 +1,154 @@
+"""The commands that take a logged flight: replay, import, export."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+from companion.app.cli.options import Command, configuration, names, seconds, shift, viewer
+from companion.app.progress import progress_on
+from companion.app.stopping import StopSignals
+from companion.config import Config, ExportConfig
+from companion.config_file import load_config
+from companion.errors import InputError
+
+
+def _with_telemetry(arguments: argparse.Namespace) -> Config:
+    """The configuration, with what the options say of the log."""
+    config = load_config(arguments.config, arguments.set)
+    telemetry = config.telemetry
+    if arguments.log is not None:
+        telemetry = dataclasses.replace(telemetry, log=str(arguments.log))
+    if arguments.offset is not None:
+        # a log without absolute time counts from the first picture then
+        telemetry = dataclasses.replace(
+            telemetry, offset_s=arguments.offset, align="never", starts_with_video=True
+        )
+    return dataclasses.replace(config, telemetry=telemetry)
+
+
+def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    config = _with_telemetry(arguments)
+    if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
+        raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
+    if arguments.out.exists() and not arguments.out.is_dir():
+        raise InputError(f"{arguments.out}: is a file; --out wants a folder")
+    if config.export.formats:
+        from companion.products.export.exports import check_formats
+
+        check_formats(config.export)
+    from companion.app.replay_command import replay
+
+    replay(
+        arguments.flight,
+        arguments.out,
+        config,
+        start_s=arguments.start,
+        stop_s=arguments.stop,
+        viewer=arguments.viewer,
+        paced=arguments.paced,
+        progress=signals.between_frames(progress_on(sys.stderr)),
+        told=print,
+    )
+    if config.export.formats:
+        _export_into(arguments.out, arguments.out, config.export)
+    print(f"report: {arguments.out / 'report.html'}")
+    signals.take()
+    return 0
+
+
+def _import(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.app.import_command import import_flight
+
+    n = import_flight(
+        arguments.source, arguments.out, _with_telemetry(arguments),
+        signals.between_frames(progress_on(sys.stderr, "images")), print,
+    )  # fmt: skip
+    print(f"flight: {arguments.out}, {n} frames")
+    signals.take()
+    return 0
+
+
+def _export(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    settings = load_config(arguments.config, arguments.set).export
+    if arguments.formats is not None:
+        settings = dataclasses.replace(settings, formats=names(arguments.formats.lower()))
+    if not settings.formats:
+        raise InputError("nothing to export: --as las,gpx,… says what")
+    _export_into(arguments.run, arguments.out or arguments.run, settings)
+    return 0
+
+
+def _export_into(run: Path, out: Path, settings: ExportConfig) -> None:
+    from companion.products.export.exports import export_run
+    from companion.products.run_folder import read_run
+
+    for path in export_run(read_run(run), out, settings):
+        print(f"export: {path}")
+
+
+COMMANDS: dict[str, Command] = {"replay": _replay, "import": _import, "export": _export}
+
+
+def add_parsers(commands: Any) -> None:
+    """Add them to the subparsers of the program."""
+    timing = argparse.ArgumentParser(add_help=False)
+    timing.add_argument(
+        "--log", type=Path, metavar="LOG", help="telemetry log, where it does not lie beside FLIGHT"
+    )
+    timing.add_argument(
+        "--offset", type=shift, metavar="S",
+        help="seconds added to the log's times, instead of finding them by rotation",
+    )  # fmt: skip
+
+    replay = commands.add_parser(
+        "replay", parents=[configuration(), timing], help="turn a logged flight into a metric map",
+        description="Track the camera of a logged flight, reconstruct what it saw, report on it.",
+    )  # fmt: skip
+    replay.add_argument(
+        "flight", type=Path, metavar="FLIGHT",
+        help="a folder with video or images, a video, or a data set (EuRoC, KITTI, TUM RGB-D)",
+    )  # fmt: skip
+    replay.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the results"
+    )
+    replay.add_argument(
+        "--start", type=seconds, metavar="S", help="leave out what comes before this second"
+    )
+    replay.add_argument(
+        "--stop", type=seconds, metavar="S", help="leave out what comes from this second on"
+    )
+    replay.add_argument(
+        "--viewer", type=viewer, default="none", metavar="WHERE",
+        help="show it live: none, web, native, or the rerun+http://… of a running viewer",
+    )  # fmt: skip
+    replay.add_argument(
+        "--paced", action="store_true",
+        help="in the flight's own time, dropping what a live run would drop",
+    )  # fmt: skip
+
+    imported = commands.add_parser(
+        "import", parents=[configuration(), timing],
+        help="write any flight as a flight folder or a recording",
+        description="Read a flight of any format and write it, all on one clock: as a folder with "
+        "pictures, times, calibration and telemetry, or as FILE.mcap, a recording.",
+    )  # fmt: skip
+    imported.add_argument("source", type=Path, metavar="SOURCE", help="as FLIGHT of replay")
+    imported.add_argument(
+        "--out", type=Path, required=True, metavar="OUT", help="a new folder, or FILE.mcap"
+    )
+
+    export = commands.add_parser(
+        "export", parents=[configuration()], help="write a replay's results in other formats",
+        description="Clouds, rasters and paths for other programs, from the folder of a finished "
+        "replay, with a statement of accuracy beside each.",
+    )  # fmt: skip
+    export.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
+    export.add_argument(
+        "--as", dest="formats", metavar="FORMATS",
+        help="any of ply,pcd,las,laz,dsm,ortho,tum,kitti,euroc,gpx,kml,geojson; see [export]",
+    )  # fmt: skip
+    export.add_argument("--out", type=Path, metavar="DIR", help="folder for them (default: RUN)")

@@ -1,0 +1,287 @@
+"""`companion doctor`: which of the autopilot's parameters keep it from using our pose.
+
+It reads over the configured link, or through the router of a daemon that holds that link. With
+`write` it sets them, after asking, reads each back, and looks again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, TextIO
+
+from companion.advice.line_rate import advise_on_line, names_of_lines
+from companion.advice.pose_parameters import advise, names_to_read
+from companion.advice.wanted import FIRMWARES, Finding
+from companion.config import Config, LinkConfig
+from companion.errors import ConfigError, InputError, SourceError
+from drivers.mavlink.asking_link import asking_link
+from drivers.mavlink.parameters import Parameters
+from drivers.mavlink.vehicle import Vehicle
+from drivers.mavlink.wire.link_url import LOOPBACK, client_endpoint, link_endpoint
+from drivers.system.login_console import login_console_on
+from drivers.system.status_socket import ask_status, found_socket_path
+
+PATIENCE_S, SEARCH_PATIENCE_S = 10.0, 25.0
+"""The second where the baud rate is to be found out."""
+ROUNDS = 3
+"""A parameter that is set may bring others to light."""
+ANY_ADDRESS = ("0.0.0.0", "::")
+GOOD, IN_THE_WAY = 0, 1
+
+Ask = Callable[[str], bool]
+
+
+@dataclass(slots=True)
+class Examination:
+    """What was found, and what was done about it."""
+
+    vehicle: Vehicle
+    where: str
+    mode: str
+    findings: list[Finding]
+    n_examined: int
+    written: list[dict[str, Any]] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    """What the autopilot did not take, in words."""
+
+    @property
+    def in_the_way(self) -> list[Finding]:
+        """Without what is only to be known."""
+        return [finding for finding in self.findings if finding.in_the_way]
+
+    @property
+    def reboot_for(self) -> list[str]:
+        """What was set and is used after a reboot only."""
+        return [each["name"] for each in self.written if each["reboot"]]
+
+
+def doctor(
+    config: Config,
+    *,
+    write: bool = False,
+    yes: bool = False,
+    as_json: bool = False,
+    out: TextIO | None = None,
+    ask: Ask | None = None,
+) -> int:
+    """Examine, print, and set if told to; 0 if nothing stands in the way, else 1.
+
+    InputError for a configuration or usage that cannot be, SourceError if there is no autopilot to
+    examine.
+    """
+    out = sys.stdout if out is None else out
+    ask = _ask_at_terminal if ask is None else ask
+    if as_json and write and not yes:
+        raise InputError("doctor: --json with --write asks nobody; add --yes")
+    if not config.link.url:
+        raise ConfigError(
+            "link.url: is empty; it says where the autopilot is, as in "
+            "--set link.url=serial:/dev/ttyACM0:auto"
+        )
+    where = link_endpoint(config.link.url)
+    console = login_console_on(where.device) if where.kind == "serial" else None
+    if console is not None:  # which, first of all, keeps the autopilot from being understood
+        raise SourceError(console.what)
+    daemon = _running_daemon(config)
+    link = replace(config.link, url=_url_to_ask_at(config, daemon))
+    decide: Ask = (lambda question: True) if yes else ask
+    show = None if as_json else lambda examination: _print_findings(examination, config, out)
+    found = asyncio.run(
+        _examine(config, link, _latency_ms(daemon), decide if write else None, show)
+    )
+    if as_json:
+        print(json.dumps(_document(found), ensure_ascii=False), file=out)
+    else:
+        _print_outcome(found, write, out)
+    return IN_THE_WAY if found.in_the_way else GOOD
+
+
+async def _examine(
+    config: Config,
+    link_config: LinkConfig,
+    latency_ms: float | None,
+    decide: Ask | None,
+    show: Callable[[Examination], None] | None,
+) -> Examination:
+    feedback = config.feedback
+    mode = "odometry" if feedback.mode == "off" else feedback.mode
+    patience_s = SEARCH_PATIENCE_S if link_config.url.endswith(":auto") else PATIENCE_S
+    async with asking_link(link_config, patience_s) as (link, vehicle, baud):
+        firmware = vehicle.firmware
+        if firmware not in FIRMWARES:
+            raise SourceError(
+                f"{link_config.url}: {vehicle} is neither ArduPilot nor PX4; nothing is known of "
+                "its parameters"
+            )
+        parameters = Parameters(link)
+
+        async def look() -> tuple[list[Finding], int]:
+            ports = names_of_lines(firmware) if baud > 0 else ()
+            read = await parameters.read([*names_to_read(firmware), *ports])
+            values = {name: each.value for name, each in read.items()}
+            findings = advise(firmware, values, feedback, mode, latency_ms)
+            if baud:
+                findings += advise_on_line(firmware, values, config.link, feedback, mode, baud)
+            return findings, len(values)
+
+        findings, n_examined = await look()
+        found = Examination(vehicle, link_config.url, mode, findings, n_examined)
+        if show is not None:
+            show(found)
+        if decide is None or not _to_set(found):
+            return found
+        if link.vehicle is not None and link.vehicle.armed:
+            raise SourceError(f"{vehicle} is armed; nothing is set in flight")
+        if not await asyncio.to_thread(decide, _question(found)):
+            return found
+        for _ in range(ROUNDS):
+            for finding in _to_set(found):
+                await _set(parameters, finding, found)
+            found.findings, found.n_examined = await look()
+            if not _to_set(found) or found.refused:
+                break
+        return found
+
+
+async def _set(parameters: Parameters, finding: Finding, found: Examination) -> None:
+    assert finding.set_to is not None
+    try:
+        now = await parameters.write(finding.name, finding.set_to)
+    except SourceError as error:
+        found.refused.append(str(error))
+        return
+    found.written.append(
+        {
+            "name": finding.name, "from": finding.value, "to": now.value,
+            "reboot": finding.reboot,
+        }
+    )  # fmt: skip
+
+
+def _to_set(found: Examination) -> list[Finding]:
+    return [finding for finding in found.in_the_way if finding.set_to is not None]
+
+
+def _question(found: Examination) -> str:
+    n = len(_to_set(found))
+    return f"Set {_n(n, 'parameter')} of {found.vehicle}? [y/N] "
+
+
+def _ask_at_terminal(question: str) -> bool:
+    try:
+        return input(question).strip().lower() in ("y", "yes")
+    except EOFError:
+        print()
+        return False
+
+
+# -- where to ask --------------------------------------------------------------------------------
+
+
+def _running_daemon(config: Config) -> Mapping[str, Any] | None:
+    """What the daemon that runs on this machine says of itself; None if there is none."""
+    try:
+        return ask_status(found_socket_path(config.daemon.socket))
+    except SourceError:
+        return None
+
+
+def _url_to_ask_at(config: Config, daemon: Mapping[str, Any] | None) -> str:
+    """The link itself, unless a daemon holds it: then a place of its router."""
+    url = config.link.url
+    if daemon is None or link_endpoint(url).kind not in ("serial", "udpin"):
+        return url
+    for client in map(client_endpoint, config.router.clients):
+        if client.kind == "udpout":
+            continue
+        host = LOOPBACK if client.host in ANY_ADDRESS else client.host
+        host = f"[{host}]" if ":" in host else host
+        return f"{'tcp' if client.kind == 'tcpin' else 'udpout'}:{host}:{client.port}"
+    raise SourceError(
+        f"{url}: the daemon holds it; stop it, or give it a place for others, as in "
+        'router.clients = ["tcpin::5760"]'
+    )
+
+
+def _latency_ms(daemon: Mapping[str, Any] | None) -> float | None:
+    """From exposure to sending, as the daemon measures it in flight."""
+    feedback = (daemon or {}).get("feedback")
+    latency = feedback.get("latency_p50_ms") if isinstance(feedback, Mapping) else None
+    return float(latency) if isinstance(latency, (int, float)) else None
+
+
+# -- what is shown -------------------------------------------------------------------------------
+
+
+def _document(found: Examination) -> dict[str, Any]:
+    return {
+        "vehicle": dataclasses.asdict(found.vehicle),
+        "link": found.where,
+        "mode": found.mode,
+        "n_examined": found.n_examined,
+        "in_the_way": [_plain(finding) for finding in found.in_the_way],
+        "notes": [_plain(finding) for finding in found.findings if not finding.in_the_way],
+        "written": found.written,
+        "refused": found.refused,
+        "reboot_needed": bool(found.reboot_for),
+    }
+
+
+def _plain(finding: Finding) -> dict[str, Any]:
+    document = dataclasses.asdict(finding)
+    del document["in_the_way"]
+    return document
+
+
+def _print_findings(found: Examination, config: Config, out: TextIO) -> None:
+    print(f"{found.vehicle}, by {found.where}", file=out)
+    if config.feedback.mode == "off":
+        print("feedback.mode is off; examined for odometry", file=out)
+    if found.in_the_way:
+        width = max(len(finding.name) for finding in found.in_the_way)
+        print(f"\nThese stand in the way of {found.mode}:", file=out)
+        for finding in found.in_the_way:
+            value = "missing" if finding.value is None else f"is {_number(finding.value)}"
+            wanted = f", wanted {finding.wanted}" if finding.wanted else ""
+            print(f"  {finding.name:{width}}  {value}{wanted}", file=out)
+            print(f"  {'':{width}}  {finding.why}", file=out)
+    for finding in found.findings:
+        if not finding.in_the_way and finding.value is not None:
+            print(
+                f"\nNot judged: {finding.name} is {_number(finding.value)}, wanted "
+                f"{finding.wanted}; {finding.why}",
+                file=out,
+            )
+    out.flush()
+
+
+def _print_outcome(found: Examination, write: bool, out: TextIO) -> None:
+    print(file=out)
+    for each in found.written:
+        print(f"{each['name']}: {_number(each['from'])} -> {_number(each['to'])}, read back",
+              file=out)  # fmt: skip
+    for refusal in found.refused:
+        print(f"not set: {refusal}", file=out)
+    if found.reboot_for:
+        print(f"Reboot the autopilot, for {', '.join(found.reboot_for)}", file=out)
+    if not found.in_the_way:
+        print(f"Nothing stands in the way of {found.mode} ({found.n_examined} examined)", file=out)
+        return
+    n = len(found.in_the_way)
+    left = f"{_n(n, 'parameter')} {'stands' if n == 1 else 'stand'} in the way"
+    if _to_set(found) and not write:
+        left += "; `companion doctor --write` sets what can be set"
+    print(left, file=out)
+
+
+def _number(value: float) -> str:
+    return f"{value:.7g}"
+
+
+def _n(n: int, noun: str) -> str:
+    return f"{n} {noun}" + ("" if n == 1 else "s")

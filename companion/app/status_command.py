@@ -1,0 +1,171 @@
+"""`companion status`: what the running daemon says of itself, as a table or as JSON."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+from companion.timing.clock import wait_s
+from drivers.system.status_socket import ask_status
+
+WATCH_EVERY_S = 1.0
+CLEAR = "\x1b[H\x1b[2J"
+NOTHING = "-"
+
+
+def show_status(
+    path: Path, out: TextIO, *, as_json: bool, watch: bool, stop: threading.Event
+) -> None:
+    """Ask once, or again and again until `stop`. SourceError where no daemon answers.
+
+    While watching, too, a daemon that goes away ends it.
+    """
+    while True:
+        document = ask_status(path)
+        if as_json:
+            print(json.dumps(document), file=out, flush=True)
+        else:
+            head = CLEAR if watch and out.isatty() else ""
+            print(head + status_table(document), file=out, flush=True)
+        if not watch or stop.is_set():
+            return
+        wait_s(stop, WATCH_EVERY_S)
+        if stop.is_set():
+            return
+
+
+def status_table(document: Mapping[str, Any]) -> str:
+    """The document as tables; a daemon of another version may lack any part of it."""
+    return "\n".join(
+        [
+            *_pairs(document),
+            "",
+            *_table(
+                ("source", "state", "rate", "received", "dropped", "reopened", "last", ""),
+                [_source(each) for each in document.get("sources") or ()],
+            ),
+            "",
+            *_table(
+                ("stage", "state", "rate", "p50", "p95", "done", "dropped", "restarted", ""),
+                [_stage(each) for each in document.get("stages") or ()],
+            ),
+            *_processes((document.get("load") or {}).get("processes") or ()),
+            *_warnings(document.get("n_warnings") or {}),
+        ]
+    )
+
+
+def _pairs(document: Mapping[str, Any]) -> list[str]:
+    load = document.get("load") or {}
+    quality = document.get("quality", -1)
+    pose = [str(document.get("tracker", NOTHING))]
+    pose += [f"quality {quality}"] if quality is not None and quality > 0 else []
+    pose += [f"{_number(document.get('pose_latency_p95_ms'), ' ms')} after exposure (p95)"]
+    computer = [
+        f"processor {_share(load.get('cpu_share'))}",
+        f"memory {_share(load.get('memory_share'))}",
+        f"{_number(load.get('temperature_c'), ' C')}",
+        f"disk {_number(_scaled(load.get('disk_free_mib'), 1 / 1024), ' GiB', 1)} free",
+    ]
+    rows = [
+        ("pose", ", ".join(pose)),
+        ("scale", document.get("scale") or "not known"),
+        ("feedback", _feedback(document.get("feedback") or {})),
+        ("flight", document.get("flight") or "none"),
+        ("reduced", document.get("degraded") or "nothing"),
+        ("set", _settings(document.get("set_by_ground") or {})),
+        ("computer", ", ".join(computer)),
+        ("event loop", f"{_number(document.get('loop_delay_p99_ms'), ' ms', 1)} late (p99)"),
+        ("running for", _number(document.get("uptime_s"), " s")),
+    ]
+    return [f"{name:12}{value}" for name, value in rows]
+
+
+def _settings(settings: Mapping[str, Any]) -> str:
+    """What the ground has set."""
+    parts = [f"{key} = {value}" for key, value in sorted(settings.items())]
+    return ", ".join(parts) + " (by the ground)" if parts else "nothing by the ground"
+
+
+def _feedback(feedback: Mapping[str, Any]) -> str:
+    if feedback.get("mode", "off") == "off":
+        return "off"
+    if not feedback.get("sending"):
+        detail = feedback.get("detail")
+        why = f"held back: {feedback.get('why_not') or 'not yet'}"
+        return why + (f" ({detail})" if detail else "")
+    return (
+        f"{feedback['mode']}, {_number(feedback.get('rate_hz'), '/s')},"
+        f" {_number(feedback.get('latency_p50_ms'), ' ms')} after exposure"
+        f" ({_number(feedback.get('latency_p95_ms'), ' ms')} p95),"
+        f" {feedback.get('n_resets', 0)} resets"
+    )
+
+
+def _source(source: Mapping[str, Any]) -> tuple[str, ...]:
+    return (
+        str(source.get("name", NOTHING)),
+        str(source.get("state", NOTHING)),
+        _number(source.get("rate_hz"), "/s", 1),
+        _number(source.get("n")),
+        _number(source.get("n_dropped")),
+        _number(source.get("n_reopened")),
+        _number(source.get("age_s"), " s ago", 1),
+        str(source.get("detail", "")),
+    )
+
+
+def _stage(stage: Mapping[str, Any]) -> tuple[str, ...]:
+    return (
+        str(stage.get("name", NOTHING)),
+        "runs" if stage.get("alive") else "down",
+        _number(stage.get("rate_hz"), "/s", 1),
+        _number(stage.get("latency_p50_ms"), " ms"),
+        _number(stage.get("latency_p95_ms"), " ms"),
+        _number(stage.get("n")),
+        _number(stage.get("n_dropped")),
+        _number(stage.get("n_restarted")),
+        str(stage.get("detail", "")),
+    )
+
+
+def _processes(processes: Sequence[Mapping[str, Any]]) -> list[str]:
+    rows = [
+        (
+            str(each.get("name", NOTHING)),
+            _number(each.get("pid")),
+            _number(each.get("cpu_cores"), "", 2),
+            _number(each.get("memory_mib"), " MiB"),
+        )
+        for each in processes
+    ]
+    return ["", *_table(("process", "pid", "cores", "memory"), rows)] if rows else []
+
+
+def _warnings(n_warnings: Mapping[str, Any]) -> list[str]:
+    rows = [(str(what), _number(n)) for what, n in sorted(n_warnings.items())]
+    return ["", *_table(("warned of", "times"), rows)] if rows else []
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
+    lines = [head, *(rows or [(NOTHING,) + ("",) * (len(head) - 1)])]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    ]
+
+
+def _number(value: Any, unit: str = "", digits: int = 0) -> str:
+    return NOTHING if value is None else f"{value:.{digits}f}{unit}"
+
+
+def _share(value: Any) -> str:
+    return _number(_scaled(value, 100), " %")
+
+
+def _scaled(value: Any, factor: float) -> Any:
+    return None if value is None else value * factor

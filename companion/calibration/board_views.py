@@ -1,0 +1,203 @@
+"""Views of the board: what one is worth, which are taken, how much of the picture they cover."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.chart import Sighting
+from companion.geometry.transforms import Array
+from companion.messages import Bytes
+
+MIN_NOVELTY = 0.03
+"""Views whose corners lie closer to each other, in shares of the picture's diagonal, are one."""
+MIN_AREA = 0.01
+"""Of the picture, taken by the board."""
+MAX_EDGE_PX, MAX_EDGE_SHARE = 3.5, 0.003
+"""Wider edges, in pixels and in the picture's diagonal, are blurred by motion or out of focus."""
+GRID_ACROSS = 64
+"""Cells of the coverage map in a row."""
+CORNER_BOX = 0.22
+"""Side of the box in each corner of the picture in which the board must have been, as a share."""
+MIN_BOX_COVERED = 0.15
+MIN_COVERAGE = 0.60
+DARK = 16
+"""A place that is never brighter than this in any picture is not lit by the lens."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """The board in one picture."""
+
+    number: int
+    """Of the picture in its source."""
+    sighting: Sighting
+    width: int
+    height: int
+
+    @property
+    def n_corners(self) -> int:
+        """How many corners were found."""
+        return len(self.sighting.ids)
+
+    @property
+    def diagonal_px(self) -> float:
+        """The picture's."""
+        return float(np.hypot(self.width, self.height))
+
+    @property
+    def area(self) -> float:
+        """Share of the picture between the outermost corners."""
+        return float(cv2.contourArea(_hull(self))) / (self.width * self.height)
+
+    @property
+    def blurred(self) -> bool:
+        """Whether its edges are too wide to say where they are."""
+        limit_px = max(MAX_EDGE_PX, MAX_EDGE_SHARE * self.diagonal_px)
+        return self.sighting.edge_px > limit_px
+
+    @property
+    def small(self) -> bool:
+        """Whether the board is too far away."""
+        return self.area < MIN_AREA
+
+
+def novelty(view: View, others: Sequence[View]) -> float:
+    """How far the corners lie from where any other view has them; 1 where nothing is like it.
+
+    In shares of the picture's diagonal, root mean square. Moving, turning and tilting the board
+    all count.
+    """
+    return min((_distance(view, other) for other in others), default=1.0)
+
+
+def choose(views: Sequence[View], n: int) -> list[View]:
+    """At most `n` views, unlike each other, that cover the most; in order of their numbers."""
+    if not views:
+        return []
+    masks = [_mask(view) for view in views]
+    covered = np.zeros_like(masks[0])
+    nearest = np.ones(len(views))
+    edges = np.array([view.sighting.edge_px for view in views])
+    bluntness = np.nan_to_num(edges / max(float(np.nanmin(edges)), 1e-6) - 1, nan=1.0)
+    taken: list[int] = []
+    while len(taken) < n:
+        gain = np.array([float((mask & ~covered).mean()) for mask in masks])
+        score = np.minimum(nearest, 0.3) + gain - 0.02 * bluntness
+        score[nearest < MIN_NOVELTY] = -np.inf
+        best = int(np.argmax(score))
+        if not np.isfinite(score[best]):
+            break
+        taken.append(best)
+        covered |= masks[best]
+        away = [_distance(view, views[best]) for view in views]
+        nearest = np.minimum(nearest, away)
+    return [views[i] for i in sorted(taken)]
+
+
+class LitArea:
+    """Where the lens lets light through: a fisheye's picture may be a circle on black."""
+
+    def __init__(self) -> None:
+        self._brightest: Bytes | None = None
+
+    def see(self, grey: Bytes) -> None:
+        """Take a picture into account."""
+        height, width = grey.shape
+        small = np.asarray(
+            cv2.resize(grey, grid_size(width, height), interpolation=cv2.INTER_AREA), np.uint8
+        )
+        before = self._brightest
+        self._brightest = small if before is None else np.maximum(before, small)
+
+    def mask(self, width: int, height: int) -> Mask:
+        """Cells of the coverage map that can show a board."""
+        across, down = grid_size(width, height)
+        if self._brightest is None:
+            return np.ones((down, across), np.bool_)
+        return self._brightest > DARK
+
+
+def grid_size(width: int, height: int) -> tuple[int, int]:
+    """Columns and rows of the coverage map of such a picture."""
+    return GRID_ACROSS, max(4, round(GRID_ACROSS * height / width))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coverage:
+    """Where the board was, of where it could have been."""
+
+    seen: Mask
+    lit: Mask
+
+    @property
+    def share(self) -> float:
+        """Of the lit area."""
+        return float((self.seen & self.lit).sum() / max(self.lit.sum(), 1))
+
+    def bare_corners(self) -> list[str]:
+        """Corners of the picture in which the board never was."""
+        down, across = self.seen.shape
+        rows, columns = round(CORNER_BOX * down), round(CORNER_BOX * across)
+        out = []
+        for row, upper in ((slice(0, rows), "upper"), (slice(down - rows, down), "lower")):
+            for column, left in (
+                (slice(0, columns), "left"),
+                (slice(across - columns, across), "right"),
+            ):
+                lit = self.lit[row, column]
+                if lit.mean() > 0.5 and self.seen[row, column][lit].mean() < MIN_BOX_COVERED:
+                    out.append(f"{upper} {left}")
+        return out
+
+    def barest_edge(self) -> str:
+        """The side of the picture with the least of it covered."""
+        down, across = self.seen.shape
+        sides: dict[str, tuple[slice, slice]] = {
+            "left": (slice(None), slice(0, across // 4)),
+            "right": (slice(None), slice(across - across // 4, across)),
+            "upper": (slice(0, down // 4), slice(None)),
+            "lower": (slice(down - down // 4, down), slice(None)),
+        }
+        shares = {
+            name: float(self.seen[at][self.lit[at]].mean()) if self.lit[at].any() else 1.0
+            for name, at in sides.items()
+        }
+        return min(shares, key=lambda name: shares[name])
+
+
+def coverage(views: Sequence[View], lit: Mask) -> Coverage:
+    """What the views cover between their outermost corners."""
+    seen = np.zeros_like(lit)
+    for view in views:
+        seen |= _mask(view)
+    return Coverage(seen, lit)
+
+
+def _distance(one: View, other: View) -> float:
+    _, mine, theirs = np.intersect1d(
+        one.sighting.ids, other.sighting.ids, assume_unique=True, return_indices=True
+    )
+    if len(mine) < 4:
+        return 1.0
+    away: Array = one.sighting.image_px[mine] - other.sighting.image_px[theirs]
+    return min(1.0, float(np.sqrt((away**2).sum(1).mean())) / one.diagonal_px)
+
+
+def _hull(view: View) -> NDArray[np.float32]:
+    return np.asarray(cv2.convexHull(view.sighting.image_px.astype(np.float32)), np.float32)
+
+
+def _mask(view: View) -> Mask:
+    across, down = grid_size(view.width, view.height)
+    scale = np.array([across / view.width, down / view.height])
+    cells = (_hull(view).reshape(-1, 2) + 0.5) * scale - 0.5
+    mask = np.zeros((down, across), np.uint8)
+    cv2.fillConvexPoly(mask, cells.round().astype(np.int32), 1)
+    return mask.astype(np.bool_)

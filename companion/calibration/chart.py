@@ -1,0 +1,387 @@
+"""The board that a camera is calibrated with: what it is, where a picture has it, what is printed.
+
+Board coordinates are metres, x to the right and y down from the board's upper left corner, z = 0.
+Image points have pixel centres at integers. Only inner corners of the squares are used: they are
+found where they are to some hundredths of a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.errors import InputError
+from companion.geometry.transforms import Array
+from companion.messages import Bytes
+
+CHART_FORMS = (
+    "charuco:COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY, as charuco:7x5:0.04:0.03:DICT_5X5_100 "
+    "(squares counted), or chessboard:COLUMNSxROWS:SQUARE_M, as chessboard:9x6:0.025 "
+    "(inner corners counted)"
+)
+MIN_CORNERS = 8
+"""Fewer say too little of where the board is."""
+SEARCH_WIDTH_PX = 1600
+"""Larger pictures are searched for a chessboard at this width, then refined at their own."""
+N_FIRST = 50
+"""So many markers of each dictionary are looked for, when it is asked which one a board is of."""
+MAX_TRIED = 4
+"""In so many pictures other boards are looked for, when the one asked for was not found."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """A board found in a picture: its inner corners there, and where these are on the board."""
+
+    ids: NDArray[np.int64]
+    """Number of each corner, row by row."""
+    image_px: Array
+    """(N, 2)"""
+    board_m: Array
+    """(N, 3)"""
+    edge_px: float
+    """Width of the edges between black and white, in the direction in which they are widest."""
+
+
+class Chart(Protocol):
+    """A flat board."""
+
+    name: str
+    """As given, which `parse_chart` reads."""
+    columns: int
+    """Inner corners in a row."""
+    rows: int
+    square_m: float
+
+    def find(self, grey: Bytes) -> Sighting | None:
+        """The board in a picture, or None."""
+
+    def explain(self, greys: Sequence[Bytes]) -> str | None:
+        """What is to be seen in pictures in which the board was not found: another one, perhaps."""
+
+    def black_m(self) -> Array:
+        """What is black on it: rectangles (N, 4) x, y, width, height in metres."""
+
+
+def parse_chart(text: str) -> Chart:
+    """The board that a text describes; InputError where it does not."""
+    kind, *parts = text.strip().split(":")
+    size = re.fullmatch(r"(\d+)x(\d+)", parts[0]) if parts else None
+    if kind not in ("charuco", "chessboard") or size is None:
+        raise InputError(f"--board {text}: wanted {CHART_FORMS}")
+    columns, rows = int(size[1]), int(size[2])
+    if not (3 <= columns <= 50 and 3 <= rows <= 50):
+        raise InputError(f"--board {text}: wanted 3 to 50 columns and rows")
+    if kind == "chessboard":
+        if len(parts) != 2:
+            raise InputError(f"--board {text}: wanted {CHART_FORMS}")
+        return ChessboardChart(text.strip(), columns, rows, _length(text, parts[1]))
+    legacy = parts[4:] == ["legacy"]
+    if len(parts) != (5 if legacy else 4):
+        raise InputError(f"--board {text}: wanted {CHART_FORMS}")
+    square_m, marker_m = _length(text, parts[1]), _length(text, parts[2])
+    if not 0.3 * square_m <= marker_m <= 0.95 * square_m:
+        raise InputError(f"--board {text}: the marker must be 0.3 to 0.95 of the square")
+    name = parts[3].upper()
+    if name not in _dictionaries():
+        raise InputError(
+            f"--board {text}: unknown dictionary; known are " + ", ".join(_dictionaries())
+        )
+    if columns * rows // 2 > len(_dictionary(name).bytesList):
+        raise InputError(
+            f"--board {text}: it has {columns * rows // 2} markers, {name} only "
+            f"{len(_dictionary(name).bytesList)}"
+        )
+    return CharucoChart(text.strip(), columns, rows, square_m, marker_m, name, legacy)
+
+
+class CharucoChart:
+    """A chessboard with markers in its white squares, so that a part of it in view is enough."""
+
+    def __init__(
+        self, name: str, n_across: int, n_down: int, square_m: float, marker_m: float,
+        dictionary: str, legacy: bool,
+    ) -> None:  # fmt: skip
+        self.name = name
+        self.columns, self.rows = n_across - 1, n_down - 1
+        self.square_m, self.marker_m = square_m, marker_m
+        self._dictionary, self._legacy = dictionary, legacy
+        # OpenCV takes lengths as float32; in squares they are exact enough for any use
+        self._board = cv2.aruco.CharucoBoard(
+            (n_across, n_down), 1.0, marker_m / square_m, _dictionary(dictionary)
+        )
+        self._board.setLegacyPattern(legacy)
+        careful = cv2.aruco.CharucoParameters()
+        careful.tryRefineMarkers = True
+        self._detector = cv2.aruco.CharucoDetector(self._board, careful)
+
+    def find(self, grey: Bytes) -> Sighting | None:
+        """The board in a picture, or None; a part of it will do."""
+        corners, ids, _, _ = self._detector.detectBoard(grey)
+        if ids is None or len(ids) < MIN_CORNERS:
+            return None
+        numbers = np.asarray(ids, np.int64).reshape(-1)
+        order = np.argsort(numbers)
+        image_px = np.asarray(corners, np.float64).reshape(-1, 2)[order]
+        return _sighting(self, grey, numbers[order], image_px)
+
+    def explain(self, greys: Sequence[Bytes]) -> str | None:
+        """What is to be seen instead of the board, as far as it can be told."""
+        tried = _spread(greys, MAX_TRIED)
+        seen = _markers_seen(tried, self._dictionary)
+        if not seen:
+            return _other_dictionary(tried) or _chessboard_seen(tried, self)
+        for other in self._variants():
+            if any(other.find(grey) is not None for grey in tried):
+                return f"what is to be seen is --board {other.name}"
+        n_markers = len(self._board.getIds())
+        if max(seen) >= n_markers:
+            return (
+                f"markers up to number {max(seen)} of {self._dictionary} are to be seen, this "
+                f"board has {n_markers} (0 to {n_markers - 1}): it has other columns and rows"
+            )
+        return (
+            f"markers of {self._dictionary} are to be seen, but too few of them ({len(seen)} of "
+            f"{n_markers}), blurred, or not where this board has them"
+        )
+
+    def black_m(self) -> Array:
+        """What is black on it."""
+        out = []
+        corners = np.asarray(self._board.getObjPoints(), np.float64)[..., :2]  # (markers, 4, 2)
+        numbers = np.ravel(np.asarray(self._board.getIds()))
+        white = {tuple(at): i for i, at in enumerate(corners.mean(1).astype(int).tolist())}
+        for row in range(self.rows + 1):
+            for column in range(self.columns + 1):
+                i = white.get((column, row))
+                if i is None:
+                    out.append([column, row, 1.0, 1.0])
+                else:
+                    out += _marker(
+                        _dictionary(self._dictionary), int(numbers[i]), corners[i, 0], corners[i, 2]
+                    )
+        return np.array(out, np.float64) * self.square_m
+
+    def _variants(self) -> list[CharucoChart]:
+        """What is often mixed up."""
+        across, down = self.columns + 1, self.rows + 1
+        out = []
+        for columns, rows, legacy in (
+            (down, across, self._legacy),
+            (across, down, not self._legacy),
+            (down, across, not self._legacy),
+        ):
+            name = (
+                f"charuco:{columns}x{rows}:{self.square_m:g}:{self.marker_m:g}:{self._dictionary}"
+                + (":legacy" if legacy else "")
+            )
+            out.append(
+                CharucoChart(
+                    name, columns, rows, self.square_m, self.marker_m, self._dictionary, legacy
+                )
+            )
+        return out
+
+
+class ChessboardChart:
+    """A plain chessboard, which must be in view as a whole."""
+
+    def __init__(self, name: str, columns: int, rows: int, square_m: float) -> None:
+        self.name = name
+        self.columns, self.rows, self.square_m = columns, rows, square_m
+
+    def find(self, grey: Bytes) -> Sighting | None:
+        """The board in a picture, or None; all of it must be there."""
+        scale = max(1.0, grey.shape[1] / SEARCH_WIDTH_PX)
+        small = grey
+        if scale > 1:
+            small = np.asarray(
+                cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA),
+                np.uint8,
+            )
+        found, corners = cv2.findChessboardCornersSB(
+            small, (self.columns, self.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
+        )
+        if not found:
+            return None
+        image_px = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
+        image_px = _refined(grey, image_px, self.columns)
+        return _sighting(self, grey, np.arange(self.columns * self.rows), image_px)
+
+    def explain(self, greys: Sequence[Bytes]) -> str | None:
+        """What is to be seen instead of the board, as far as it can be told."""
+        tried = _spread(greys, MAX_TRIED)
+        return _other_dictionary(tried) or _chessboard_seen(tried, None)
+
+    def black_m(self) -> Array:
+        """What is black on it."""
+        squares = [
+            [column, row, 1.0, 1.0]
+            for row in range(self.rows + 1)
+            for column in range(self.columns + 1)
+            if (row + column) % 2 == 0
+        ]
+        return np.array(squares, np.float64) * self.square_m
+
+
+def _length(text: str, word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not 1e-4 <= value <= 10:
+        raise InputError(f"--board {text}: {word!r} is no length in metres; wanted {CHART_FORMS}")
+    return value
+
+
+def _dictionaries() -> list[str]:
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_") and name == name.upper()]
+    # the smaller of two that share their first markers comes first
+    return sorted(
+        names, key=lambda name: (name.rpartition("_")[0], len(_dictionary(name).bytesList))
+    )
+
+
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def _marker(
+    dictionary: cv2.aruco.Dictionary, number: int, first: Array, last: Array
+) -> list[list[float]]:
+    """Black rectangles of a marker, in the units of its corners; each row's runs in one piece."""
+    n = dictionary.markerSize + 2
+    black = dictionary.generateImageMarker(number, n) == 0
+    step = (last - first) / n
+    out = []
+    for row in range(n):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], black[row], [False]]).astype(int)))
+        for begin, end in edges.reshape(-1, 2):
+            out.append([
+                first[0] + begin * step[0], first[1] + row * step[1],
+                (end - begin) * step[0], step[1],
+            ])  # fmt: skip
+    return out
+
+
+def _sighting(
+    chart: Chart, grey: Bytes, ids: NDArray[np.int64], image_px: Array
+) -> Sighting | None:
+    """None where the corners lie in one row, which says nothing."""
+    column, row = ids % chart.columns, ids // chart.columns
+    if len(np.unique(column)) < 2 or len(np.unique(row)) < 2:
+        return None
+    board_m = np.stack([column + 1.0, row + 1.0, 0.0 * row], 1) * chart.square_m
+    return Sighting(ids, image_px, board_m, _edge_px(grey, ids, image_px, chart.columns))
+
+
+def _refined(grey: Bytes, image_px: Array, columns: int) -> Array:
+    """Corners where the edges cross, from a window that holds nothing but these edges."""
+    grid = image_px.reshape(-1, columns, 2)
+    gap_px = min(
+        float(np.linalg.norm(np.diff(grid, axis=0), axis=-1).min()),
+        float(np.linalg.norm(np.diff(grid, axis=1), axis=-1).min()),
+    )
+    half = int(np.clip(0.3 * gap_px, 2, 12))
+    corners = image_px.astype(np.float32).reshape(-1, 1, 2)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.001)
+    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
+    return np.asarray(refined, np.float64).reshape(-1, 2)
+
+
+def _edge_px(grey: Bytes, ids: NDArray[np.int64], image_px: Array, columns: int) -> float:
+    """Contrast over the steepest slope, across the edges between neighbouring corners.
+
+    Motion widens the edges that it crosses only, so both directions are looked at, and the worse
+    one counts. nan where no two neighbours were found.
+    """
+    place = {int(number): at for at, number in enumerate(ids)}
+    widths = []
+    for step in (1, columns):
+        pairs = [
+            (place[number], place[number + step])
+            for number in place
+            if number + step in place and (step > 1 or (number + 1) % columns)
+        ]
+        if pairs:
+            widths.append(_edge_width(grey, image_px[np.array(pairs)]))
+    return max(widths) if widths else math.nan
+
+
+def _edge_width(grey: Bytes, ends_px: Array) -> float:
+    """Median over edges whose ends are given, (N, 2, 2)."""
+    along = ends_px[:, 1] - ends_px[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], 1) / length[:, None]
+    reach_px = float(np.clip(0.25 * np.median(length), 2.0, 15.0))
+    offsets = np.arange(-reach_px, reach_px + 1e-6, 0.5)
+    at = np.array([0.4, 0.5, 0.6])
+    middles = ends_px[:, 0, None] + at[:, None] * along[:, None]  # (N, 3, 2)
+    samples = middles[:, :, None] + offsets[:, None] * across[:, None, None]
+    flat = samples.reshape(-1, len(offsets), 2).astype(np.float32)
+    bright = np.asarray(
+        cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR,
+                  borderMode=cv2.BORDER_REPLICATE),
+        np.float64,
+    ).reshape(len(ends_px), 3, -1).mean(1)  # fmt: skip
+    slope = np.abs(bright[:, 2:] - bright[:, :-2]).max(1)  # samples are half a pixel apart
+    contrast = np.percentile(bright.max(1), 75) - np.percentile(bright.min(1), 25)
+    return float(np.median(contrast / np.maximum(slope, 1e-3)))
+
+
+def _spread(greys: Sequence[Bytes], n: int) -> list[Bytes]:
+    at = np.unique(np.linspace(0, len(greys) - 1, min(n, len(greys))).round().astype(int))
+    return [greys[i] for i in at]
+
+
+def _markers_seen(greys: Sequence[Bytes], dictionary: str) -> set[int]:
+    """Numbers of the markers in any picture that shows at least two."""
+    return _seen(greys, _dictionary(dictionary))
+
+
+def _seen(greys: Sequence[Bytes], dictionary: cv2.aruco.Dictionary) -> set[int]:
+    detector = cv2.aruco.ArucoDetector(dictionary)
+    seen: set[int] = set()
+    for grey in greys:
+        _, ids, _ = detector.detectMarkers(grey)
+        if ids is not None and len(ids) >= 2:
+            seen |= {int(number) for number in np.ravel(ids)}
+    return seen
+
+
+def _other_dictionary(greys: Sequence[Bytes]) -> str | None:
+    """A dictionary of which some picture shows enough not to be chance."""
+    families: dict[str, tuple[str, cv2.aruco.Dictionary]] = {}
+    for name in _dictionaries():
+        stem, _, count = name.rpartition("_")
+        full = _dictionary(name)
+        # the smallest of those that share their first markers, which are what boards are made of
+        first = cv2.aruco.Dictionary(
+            full.bytesList[:N_FIRST], full.markerSize, full.maxCorrectionBits
+        )
+        families.setdefault(stem if count.isdigit() else name, (name, first))
+    for grey in greys:
+        counts = {name: len(_seen([grey], first)) for name, first in families.values()}
+        best = max(counts, key=lambda name: counts[name])
+        if counts[best] >= 4:
+            return f"markers of {best} are to be seen, {counts[best]} of them in one picture"
+    return None
+
+
+def _chessboard_seen(greys: Sequence[Bytes], own: CharucoChart | None) -> str | None:
+    for grey in greys:
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
+        if not found or meta is None:
+            continue
+        rows, columns = sorted(np.asarray(meta).shape[:2])
+        if own is None or rows > min(own.rows, own.columns) or columns > max(own.rows, own.columns):
+            return f"a chessboard of {columns}x{rows} inner corners is to be seen"
+        return "squares are to be seen, but no markers: bring the board nearer, and focus the lens"
+    return None

@@ -1,0 +1,132 @@
+"""The OpenCL devices of this computer: which is taken, and which take over if it fails.
+
+Every user of the dense engine chooses here. Devices are tested in processes of their own, see
+device_probe, and what that has shown is kept, see device_verdict.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from companion.compute.device_probe import PROGRAM, listed_devices, probed
+from companion.compute.device_verdict import circumstances, keep_verdict, kept_verdict, verdict_path
+from companion.config import OpenclConfig
+from companion.dense.device_choice import MeasuredDevice, in_order, why_taken
+from companion.dense.device_takeover import Devices, Watch, unwatched
+from companion.dense.opencl import WANT, ComputeDevice, ListedDevice, device_asked_for
+from companion.errors import DeviceError
+
+Say = Callable[[str], None]
+"""Hears, in a line, what the user should know of a choice."""
+NO_FAILURES: Mapping[str, str] = {}
+
+
+def say_on_stderr(remark: str) -> None:
+    """One line."""
+    print(f"companion: {remark}", file=sys.stderr, flush=True)
+
+
+def measured_anew() -> list[MeasuredDevice]:
+    """All devices there are, tested and measured now, and platforms that fail; it is kept."""
+    listed, failed = listed_devices()
+    return [*_measured(listed, {}, listed, say_on_stderr, told=False), *failed]
+
+
+def known_devices(say: Say = say_on_stderr) -> list[MeasuredDevice]:
+    """All devices there are, as they are known, or else tested and measured now."""
+    listed, failed = listed_devices()
+    return [*_measured(listed, _known(listed, listed), listed, say), *failed]
+
+
+def choose_device(config: OpenclConfig, say: Say = say_on_stderr) -> ComputeDevice:
+    """The first of `choose_devices`."""
+    device = choose_devices(config, say).current
+    assert device is not None
+    return device
+
+
+def choose_devices(
+    config: OpenclConfig, say: Say = say_on_stderr, failed: Mapping[str, str] = NO_FAILURES,
+    watch: Watch = unwatched, program: Sequence[str] = PROGRAM,
+) -> Devices:  # fmt: skip
+    """The device that the configuration names, or those that compute right, in order.
+
+    DeviceError where there is none, with what is wrong with each. `failed` says in words, by
+    identity, what has failed in this flight: it is passed over, and then none may be left.
+    `program` lists and measures.
+    """
+    listed, unlisted = listed_devices(program)
+    if not listed:
+        raise DeviceError(_none(unlisted))
+    asked_for = config.device != "auto"
+    wanted = [device_asked_for(config.device, listed)] if asked_for else list(listed)
+    wanted = [each for each in wanted if each.identity not in failed]
+    # in flight what was refused stays refused
+    known = _known(wanted if asked_for and not failed else listed, listed)
+    found = [*_measured(wanted, known, listed, say, program), *([] if asked_for else unlisted)]
+    order = in_order(found)
+    if not order and not failed:
+        raise DeviceError(_none(found))
+
+    def why(taken: ListedDevice) -> str:
+        if asked_for:
+            return "asked for"
+        return why_taken(taken, found) if taken is order[0] else "the next best"
+
+    devices = Devices(order, why, list(failed.values()), watch)
+    for failure in devices.failures[len(failed) :]:
+        say(f"OpenCL: {failure}")
+    return devices
+
+
+def _none(found: Sequence[MeasuredDevice]) -> str:
+    if not found:
+        return f"no OpenCL device on this machine: {WANT}"
+    refused = "; ".join(f"{each.named}: {each.problem}" for each in found)
+    return f"no OpenCL device that works: {refused}: {WANT}"
+
+
+def _known(
+    wanted: Sequence[ListedDevice], listed: Sequence[ListedDevice]
+) -> dict[str, MeasuredDevice]:
+    """What is kept; nothing where no device wanted works, as somebody may just have mended that."""
+    kept = kept_verdict(verdict_path(), circumstances(listed))
+    found = [kept[each.identity] for each in wanted if each.identity in kept]
+    hopeless = len(found) == len(wanted) and not in_order(found)
+    return {} if hopeless else kept
+
+
+def _measured(
+    wanted: Sequence[ListedDevice], known: dict[str, MeasuredDevice],
+    listed: Sequence[ListedDevice], say: Say, program: Sequence[str] = PROGRAM,
+    told: bool = True,
+) -> list[MeasuredDevice]:  # fmt: skip
+    """Those wanted, each as it is known or else measured now.
+
+    What is new is kept at once: a service that is ended for taking long goes on there.
+    """
+    now, why_not = circumstances(listed), ""
+    for each in wanted:
+        if each.identity in known:
+            continue
+        found = known[each.identity] = probed(each, program)
+        if found.problem and told:
+            say(f"OpenCL: {found.named}: {found.problem}")
+        why_not = _kept(verdict_path(), now, list(known.values()))
+    if why_not:
+        say(f"OpenCL: what devices can do is not kept, and measured at each start: {why_not}")
+    return [known[each.identity] for each in wanted]
+
+
+def _kept(path: Path | None, now: Mapping[str, Any], found: Sequence[MeasuredDevice]) -> str:
+    """Keep it; "", or why that cannot be."""
+    if path is None:
+        return "neither $XDG_CACHE_HOME nor $HOME is set"
+    try:
+        keep_verdict(path, now, found)
+    except OSError as error:
+        return str(error)
+    return ""

@@ -1,0 +1,136 @@
+"""OpenCL devices are listed and tested in processes of their own: a driver may end its process.
+
+As a program: `list FIRST` names platforms from a number on and their devices, `measure NUMBER`
+tests one device; what it says is JSON, a line for each.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from companion.dense.device_choice import MeasuredDevice, measured, measured_device
+from companion.dense.opencl import ListedDevice, devices_of, platform_names
+from companion.timing.clock import monotonic_s
+
+PROGRAM = (sys.executable, "-m", "companion.compute.device_probe")
+PATIENCE_S = 120.0
+"""The first build of the kernels on a small processor takes most of a minute."""
+LIST_PATIENCE_S = 30.0
+MOST_PLATFORMS = 32
+MOST_OF_A_LINE = 160
+PR_SET_PDEATHSIG = 1
+"""prctl(2)"""
+
+
+def listed_devices(
+    program: Sequence[str] = PROGRAM, patience_s: float = LIST_PATIENCE_S
+) -> tuple[list[ListedDevice], list[MeasuredDevice]]:
+    """All devices there are; and those platforms whose driver fails when it is asked for them."""
+    devices: list[ListedDevice] = []
+    failed: list[MeasuredDevice] = []
+    first, before = 0, -1
+    while before < first < MOST_PLATFORMS:
+        before = first
+        said, ended, detail = _said(["list", str(first)], program, patience_s)
+        asked = ListedDevice(f"{first}:?", "", "a driver, when platforms are listed")
+        finished = False
+        for line in said:
+            if "asked" in line:
+                asked = ListedDevice(f"{line['asked']}:?", "", str(line["name"]))
+                first = int(line["asked"]) + 1
+            devices += [ListedDevice(**each) for each in line.get("devices", [])]
+            finished = finished or "finished" in line
+        if finished:
+            break
+        failed.append(measured(asked, None, ended, detail))
+    return devices, failed
+
+
+def probed(
+    listed: ListedDevice, program: Sequence[str] = PROGRAM, patience_s: float | None = None
+) -> MeasuredDevice:
+    """A device as `program` finds it, or what became of that."""
+    said, ended, detail = _said(["measure", listed.number], program, patience_s or PATIENCE_S)
+    for line in reversed(said):
+        try:
+            found = MeasuredDevice(**line)
+        except TypeError:
+            continue  # nothing of ours
+        if found.identity == listed.identity:
+            return found
+    return measured(listed, None, ended, detail)
+
+
+def _said(
+    arguments: Sequence[str], program: Sequence[str], patience_s: float
+) -> tuple[list[dict[str, Any]], str, str]:
+    """What the program said as JSON; how it ended, in words; and what it said of that."""
+    try:
+        # Ctrl-C is for us, who end it
+        ended = subprocess.run(
+            [*program, *arguments], stdin=subprocess.DEVNULL, capture_output=True,
+            timeout=patience_s, start_new_session=True,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired as error:
+        return _lines(error.stdout), f"hangs for {patience_s:.0f} s", _text(error.stderr)
+    said = _text(ended.stderr)
+    problem = f"its driver ends the program ({_how(ended.returncode)})"
+    last = [line[:MOST_OF_A_LINE] for line in said.splitlines()[-1:]]
+    return _lines(ended.stdout), ": ".join([problem, *last]), said
+
+
+def _lines(stdout: bytes | None) -> list[dict[str, Any]]:
+    """Drivers may write between them what they like."""
+    out = []
+    for line in (stdout or b"").splitlines():
+        try:
+            value = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(value, dict):
+            out.append(value)
+    return out
+
+
+def _text(stderr: bytes | None) -> str:
+    return (stderr or b"").decode(errors="replace").strip()
+
+
+def _how(status: int) -> str:
+    if status >= 0:
+        return f"status {status}"
+    try:
+        return signal.Signals(-status).name
+    except ValueError:
+        return f"signal {-status}"
+
+
+def main() -> int:
+    """List or measure; the exit status."""
+    # a driver that hangs must not outlive whoever asked
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
+    what, which = sys.argv[1:]
+    if what == "list":
+        for number, name in list(enumerate(platform_names()))[int(which) :]:
+            _say({"asked": number, "name": name})
+            _say({"devices": [dataclasses.asdict(each) for each in devices_of(number)]})
+        _say({"finished": True})
+        return 0
+    (listed,) = [each for each in devices_of(int(which.partition(":")[0])) if each.number == which]
+    _say(dataclasses.asdict(measured_device(listed, monotonic_s)))
+    return 0
+
+
+def _say(what: dict[str, Any]) -> None:
+    print(json.dumps(what), flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""What counts while the motors are armed, in a file: a daemon that ends in the air begins with it.
+
+The file is there from arming to disarming. Without it a crash would undo what the pilot has
+switched off or made stricter, and would bring limits into force that were loosened in the
+configuration meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.config import Config
+from companion.config_file import with_value
+from companion.daemon.control.tightening import WHILE_ARMED, tightened, value_of_key, with_values
+from companion.errors import ConfigError
+
+FILE = ".armed.json"
+"""In the folder of flights, the one place that the daemon is sure to be able to write to."""
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+"""Another each time that the computer starts (random(4))."""
+ANOTHER_BOOT = "unknown"
+"""Of the computer: what is held is let go as soon as the autopilot says that it is disarmed."""
+NOT_KEPT = "settings cannot be kept"
+MODE = "feedback.mode"
+
+
+@dataclass(frozen=True, slots=True)
+class ArmedSettings:
+    """As the file has it; times are CLOCK_MONOTONIC of the start of the computer that it names."""
+
+    values: Mapping[str, Any]
+    """Of each key of `WHILE_ARMED`."""
+    by_ground: Mapping[str, Any]
+    """Those that the ground has set, and to what."""
+    computer_boot: str
+    autopilot_boot_s: float | None
+    """When the autopilot was started; None while that is not known."""
+    written_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Resumed:
+    """The configuration of a daemon that begins in the air, and what of it waits for disarming."""
+
+    config: Config
+    waiting: dict[str, Any]
+    by_ground: dict[str, Any]
+
+
+def settings_of(
+    config: Config, by_ground: Mapping[str, Any], autopilot_boot_s: float | None, now_s: float
+) -> ArmedSettings:
+    """What is to be kept of the configuration that counts while armed."""
+    return ArmedSettings(
+        {name: value_of_key(config, name) for name in WHILE_ARMED},
+        {name: value for name, value in by_ground.items() if name in WHILE_ARMED},
+        computer_boot(), autopilot_boot_s, now_s,
+    )  # fmt: skip
+
+
+def resumed(read: Config, before: ArmedSettings) -> Resumed:
+    """A configuration just read, as it may count in the air.
+
+    What the ground had set goes over it, and it may only be tighter than what counted before.
+    """
+    by_ground = dict(before.by_ground)
+    running, wanted = with_values(read, before.values), with_values(read, by_ground)
+    config, waiting = tightened(running, wanted)
+    if by_ground.get(MODE) == "off" and read.feedback.mode != "off":
+        waiting[MODE] = read.feedback.mode
+    return Resumed(config, waiting, by_ground)
+
+
+def encoded(settings: ArmedSettings) -> bytes:
+    """As the file has it."""
+    return json.dumps(asdict(settings)).encode()
+
+
+def computer_boot() -> str:
+    """Which start of the computer this is; "" where it does not say."""
+    try:
+        return BOOT_ID.read_text("ascii").strip()
+    except OSError:
+        return ""
+
+
+def read_settings(flights: Path, config: Config) -> tuple[ArmedSettings | None, str]:
+    """What a daemon before has left, None if it ended disarmed; and what is wrong with it, if.
+
+    Of a file that cannot be read it is known that something was switched off or made stricter just
+    as the computer lost its power: nothing is sent then as long as the motors are armed.
+    """
+    path = flights / FILE
+    try:
+        document = json.loads(path.read_bytes())
+        checked = {
+            name: _checked(config, name, value)
+            for name, value in document["values"].items()
+            if name in WHILE_ARMED
+        }
+        by_ground = {name: checked[name] for name in document["by_ground"] if name in checked}
+        boot_s = document["autopilot_boot_s"]
+        return ArmedSettings(
+            checked, by_ground, str(document["computer_boot"]),
+            None if boot_s is None else float(boot_s), float(document["written_s"]),
+        ), ""  # fmt: skip
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return None, ""  # nor can there have been one of ours
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
+        off = {MODE: "off"}
+        return ArmedSettings(off, off, ANOTHER_BOOT, None, 0.0), f"{path}: {error}"
+
+
+def _checked(config: Config, name: str, value: Any) -> Any:
+    section, key = name.split(".")
+    return value_of_key(with_value(config, section, key, value, FILE), name)

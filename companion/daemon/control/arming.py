@@ -1,0 +1,116 @@
+"""Whether the motors are armed, as far as is known, and what has to wait until they are not.
+
+A link that falls silent disarms nobody, nor does an autopilot that is started anew in the air,
+which says that it is disarmed: what is held until disarming is held on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from companion.config import Config
+from companion.daemon.control.armed_settings import (
+    ArmedSettings,
+    Resumed,
+    computer_boot,
+    encoded,
+    resumed,
+    settings_of,
+)
+from companion.products.newest_file import NewestFile
+
+CERTAIN_S = 2.5
+"""An autopilot that says it is disarmed is believed after so long with the same clock: of another
+clock a ClockFilter is sure a second after stamps of it come."""
+SAME_BOOT_S, SAME_BOOT_SHARE = 5.0, 0.02
+"""A clock that is so far from where it was expected was started anew: what links delay, and what
+clocks may drift (companion.timing.link_clock.PRIOR_DRIFT)."""
+
+
+class Arming:
+    """Used in the event loop. `boot_s` says when the autopilot was started (CLOCK_MONOTONIC).
+
+    `before` is what a daemon has left that ended while armed. `heard` says whether the autopilot
+    is heard.
+    """
+
+    def __init__(
+        self, file: NewestFile, before: ArmedSettings | None,
+        boot_s: Callable[[], float | None], heard: Callable[[], bool],
+    ) -> None:  # fmt: skip
+        self._file, self._held, self._boot_s, self._heard = file, before, boot_s, heard
+        self._said: bool | None = None
+        self._disarmed_s: float | None = None
+        self.waiting: dict[str, Any] = {}
+        """By key: what the configuration says that counts after disarming only."""
+
+    @property
+    def armed(self) -> bool:
+        """Whether they are; where nothing has been heard yet, whether they last were."""
+        return self._held is not None if self._said is None else self._said
+
+    @property
+    def holds(self) -> bool:
+        """Whether something is held until disarming."""
+        return self._held is not None
+
+    def resume(self, read: Config) -> Resumed:
+        """The configuration to begin with."""
+        if self._held is None:
+            return Resumed(read, {}, {})
+        found = resumed(read, self._held)
+        self.waiting = dict(found.waiting)
+        return found
+
+    def take(self, armed: bool, now_s: float) -> bool:
+        """The autopilot says whether they are; True if what was held is to be let go before that.
+
+        Which is only so where they were disarmed and are armed anew before that was certain.
+        """
+        again = armed and self._disarmed_s is not None and self._is_same_boot(now_s)
+        if armed:
+            self._disarmed_s = None
+        elif self._said is not False:
+            self._disarmed_s = now_s
+        self._said = armed
+        return again
+
+    def step(self, now_s: float) -> bool:
+        """True once it is certain that the motors were disarmed: what was held may be let go."""
+        held = self._held
+        if held is None:
+            return False
+        if self._said and held.autopilot_boot_s is None and self._boot_s() is not None:
+            self._put(replace(held, autopilot_boot_s=self._boot_s(), written_s=now_s))
+        if self._disarmed_s is None or now_s - self._disarmed_s < CERTAIN_S or not self._heard():
+            return False
+        # with another start of the computer all was without power, which nobody survives in the air
+        return held.computer_boot != computer_boot() or self._is_same_boot(now_s)
+
+    def hold(self, config: Config, by_ground: Mapping[str, Any], now_s: float) -> None:
+        """Take what counts now and shall if the daemon ends; while armed, or as long as held."""
+        settings = settings_of(config, by_ground, self._boot_s(), now_s)
+        if not self._said and self._held is not None:  # it stays that of when they were armed
+            settings = replace(self._held, values=settings.values, by_ground=settings.by_ground)
+        self._put(settings)
+
+    def let_go(self) -> dict[str, Any]:
+        """Disarmed: nothing is held any more; what has waited for that."""
+        waiting, self.waiting = self.waiting, {}
+        self._held = self._disarmed_s = None
+        self._file.put(None)
+        return waiting
+
+    def _put(self, settings: ArmedSettings) -> None:
+        self._held = settings
+        self._file.put(encoded(settings))
+
+    def _is_same_boot(self, now_s: float) -> bool:
+        """Whether the autopilot's clock runs on that ran while it was armed."""
+        held, boot_s = self._held, self._boot_s()
+        if held is None or held.autopilot_boot_s is None or boot_s is None:
+            return False
+        allowed_s = SAME_BOOT_S + SAME_BOOT_SHARE * abs(now_s - held.written_s)
+        return abs(boot_s - held.autopilot_boot_s) < allowed_s

@@ -1,0 +1,262 @@
+"""What a ground station may have the companion do, and when not; docs/control.md tells it to users.
+
+Everything here runs in the event loop. How MAVLink asks and is answered the drivers know.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from companion.config import Config
+from companion.daemon.control import kept_settings
+from companion.daemon.control.armed_settings import NOT_KEPT
+from companion.daemon.control.flight_parameters import (
+    PARAMETERS,
+    FlightParameter,
+    number_of,
+    value_of,
+)
+from companion.daemon.control.tightening import may_change, value_of_key
+from companion.daemon.flights.flights import Flights
+from companion.daemon.flights.live_flight import depth_elsewhere
+from companion.daemon.flights.new_map import NewMap
+from companion.daemon.flights.snapshots import Snapshots
+from companion.errors import ConfigError
+from companion.messages import Warned
+from companion.pilot_messages import (
+    CLOUD_NO_MAP,
+    NEW_MAP_ARMED,
+    NEW_MAP_NO_MAP,
+    PARAMETER_NEXT_MAP,
+    PARAMETER_SET,
+    REFUSED_ARMED,
+    REFUSED_ELSEWHERE,
+    REFUSED_OFTEN,
+    REFUSED_VALUE,
+    PilotMessage,
+    PilotText,
+)
+from companion.pilot_messages import NEW_MAP as NEW_MAP_TEXT
+from companion.products.newest_file import NewestFile
+from companion.runtime.stage_protocol import Snapshot
+from companion.timing.clock import FlightClock
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.command_server import ACCEPTED, BUSY, DENIED, Command, CommandServer, Done, Job
+from drivers.mavlink.ground_requests import GroundRequests
+from drivers.mavlink.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, ParameterServer
+from drivers.mavlink.wire.send_queue import RateLimit
+from drivers.system.journal import INFO, WARNING, Journal
+
+MAPPING, NEW_MAP, SNAPSHOT, BUDGET = 31010, 31011, 31012, 31013
+"""MAV_CMD_USER_1 to MAV_CMD_USER_4."""
+STEP_S = 0.05
+TEXTS_HZ, TEXTS_AT_ONCE = 0.3, 5.0
+"""What comes of requests must not keep back what a pilot has to know."""
+CHANGES_HZ, CHANGES_AT_ONCE = 2.0, 40.0
+"""As many as there are parameters may be set in a row; afterwards so many a second."""
+NO_FLIGHT = "there is no flight"
+POSES_SENT = "the autopilot may fly on these poses; param1 = 1 does it all the same"
+NOT_ARMED = "while armed it can be switched off only", REFUSED_ARMED
+ELSEWHERE = "another machine makes the dense map", REFUSED_ELSEWHERE
+TOO_OFTEN = "it is set too often", REFUSED_OFTEN
+NOT_LOOSER = "while armed it can be made stricter only", REFUSED_ARMED
+"""Why a parameter is refused: for the journal, and for the pilot."""
+
+
+class Controlled(Protocol):
+    """The daemon, as far as the ground has a say."""
+
+    @property
+    def config(self) -> Config:
+        """What counts now."""
+
+    @property
+    def armed(self) -> bool:
+        """Whether the motors are; as they last were where nothing is heard."""
+
+    def take_over(self, config: Config) -> None:
+        """Go on with another configuration."""
+
+    def prepare(self) -> None:
+        """Have a flight at hand beside the one that goes on."""
+
+    def begin_flight(self) -> None:
+        """Begin one, where one is due."""
+
+
+class GroundControl:
+    """Commands and parameters of our component; `changed` is by key what the ground has set."""
+
+    def __init__(
+        self,
+        daemon: Controlled,
+        link: AutopilotLink,
+        clock: FlightClock,
+        journal: Journal,
+        flights: Flights,
+        questions: Mapping[int, Command],
+        changed: dict[str, Any],
+        warn: Callable[[Warned], None],
+    ) -> None:
+        self._daemon, self._link, self._journal = daemon, link, journal
+        self._clock, self._changes = clock, RateLimit(CHANGES_HZ, CHANGES_AT_ONCE)
+        self._texts = RateLimit(TEXTS_HZ, TEXTS_AT_ONCE)
+        self._flights, self.changed, self._warn = flights, changed, warn
+        self._kept: NewestFile | None = None
+        self._new_map = NewMap(flights, daemon.prepare, daemon.begin_flight)
+        self._snapshots = Snapshots(flights, self._tell)
+        commands = {
+            MAPPING: Command(self._switch_mapping),
+            NEW_MAP: Command(self._begin_new_map),
+            SNAPSHOT: Command(self._take_snapshot),
+            BUDGET: Command(self._set_budget),
+            **questions,
+        }
+        self._requests = GroundRequests(
+            link.port, clock, CommandServer(commands), ParameterServer(self), warn
+        )
+        link.on_request = self._requests.take
+
+    async def run(self) -> None:
+        """Answer, and carry out what takes long; until cancelled."""
+        answering = asyncio.ensure_future(self._requests.run())
+        try:
+            while not answering.done():
+                await asyncio.sleep(STEP_S)
+                self._new_map.step()
+                self._snapshots.step()
+            answering.result()
+        finally:
+            answering.cancel()
+
+    def snapshot_told(self, snapshot: Snapshot) -> None:
+        """The recorder says how far a snapshot is."""
+        self._snapshots.take(snapshot)
+
+    # -- parameters, as drivers.mavlink.parameter_server wants them ------------------------------
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of all parameters, in the order of their numbers."""
+        return tuple(PARAMETERS)
+
+    def value(self, name: str) -> float:
+        """As it counts now."""
+        return number_of(self._daemon.config, PARAMETERS[name])
+
+    def set(self, name: str, value: float) -> int:
+        """Set one, if it may be now; SET or a MAV_PARAM_ERROR."""
+        parameter, config = PARAMETERS[name], self._daemon.config
+        try:
+            wanted = value_of(config, parameter, value)
+            changed = kept_settings.checked(config, parameter, wanted)
+        except ConfigError as error:
+            self._tell(REFUSED_VALUE(name=name), f"not set: {error}", False)
+            return OUT_OF_RANGE
+        if changed == config:
+            return SET
+        why_not = self._forbidden(parameter, wanted)
+        if why_not:
+            self._tell(why_not[1](name=name), f"not set: {name}: {why_not[0]}", False)
+            return NOT_NOW
+        when = "" if parameter.at_once else ", from the next map on"
+        told = PARAMETER_SET if parameter.at_once else PARAMETER_NEXT_MAP
+        self._tell(
+            told(name=name, value=_shown(wanted, brief=True)),
+            f"{parameter.full_key} = {_shown(wanted)}{when}", True,
+        )  # fmt: skip
+        self._take_over(parameter, wanted, changed)
+        return SET
+
+    def _forbidden(
+        self, parameter: FlightParameter, wanted: Any
+    ) -> tuple[str, PilotMessage] | None:
+        """Why it must not be so now; None if it may."""
+        self._changes.refill(self._clock.now_ns())
+        if self._changes.left < 1.0:
+            return TOO_OFTEN
+        if parameter.full_key == "depth.enabled" and depth_elsewhere(self._daemon.config):
+            return ELSEWHERE
+        now = value_of_key(self._daemon.config, parameter.full_key)
+        if not self._daemon.armed or may_change(parameter.full_key, now, wanted):
+            return None
+        return NOT_ARMED if parameter.full_key == "feedback.mode" else NOT_LOOSER
+
+    def _take_over(self, parameter: FlightParameter, value: Any, config: Config) -> None:
+        self._changes.take(1.0)
+        self.changed[parameter.full_key] = value
+        self._daemon.take_over(config)
+        if config.control.keep:
+            self._kept_in(Path(config.control.keep)).put(kept_settings.encoded(self.changed))
+
+    def _kept_in(self, path: Path) -> NewestFile:
+        if self._kept is None or self._kept.path != path:
+            self.close()
+            self._kept = NewestFile(
+                path, lambda why: self._warn(Warned(self._clock.now_ns(), NOT_KEPT, why))
+            )
+        return self._kept
+
+    def close(self, seconds: float = 0.0) -> None:
+        """Keep what is still to be kept; waits for the disk at most so long."""
+        if self._kept is not None:
+            self._kept.close(seconds)
+
+    # -- commands --------------------------------------------------------------------------------
+
+    def _switch_mapping(self, parameters: Sequence[float]) -> Done:
+        return self._by_parameter("MAP_DENSE", parameters[0])
+
+    def _set_budget(self, parameters: Sequence[float]) -> Done:
+        return self._by_parameter("STR_KBIT_S", parameters[0])
+
+    def _by_parameter(self, name: str, value: float) -> Done:
+        return Done(ACCEPTED if self.set(name, value) == SET else DENIED)
+
+    def _begin_new_map(self, parameters: Sequence[float]) -> Done | Job:
+        all_the_same = parameters[0]
+        if all_the_same not in (0.0, 1.0) and not math.isnan(all_the_same):
+            return Done(DENIED)
+        if self._flights.current is None:
+            return self._refused(NEW_MAP_NO_MAP(), f"no new map: {NO_FLIGHT}", BUSY)
+        is_fed = self._daemon.config.feedback.mode != "off"
+        if self._daemon.armed and is_fed and all_the_same != 1.0:
+            return self._refused(NEW_MAP_ARMED(), f"no new map: {POSES_SENT}", DENIED)
+        self._tell(NEW_MAP_TEXT(), "a new map begins", True)
+        job = Job()
+        self._new_map.start(job)
+        return job
+
+    def _take_snapshot(self, _parameters: Sequence[float]) -> Done | Job:
+        flight = self._flights.current
+        if flight is None:
+            return self._refused(CLOUD_NO_MAP(), f"no cloud was written: {NO_FLIGHT}", BUSY)
+        job = Job()
+        self._snapshots.start(flight, self._link.origin, job)
+        return job
+
+    def _refused(self, told: PilotText, what: str, result: int) -> Done:
+        self._tell(told, what, False)
+        return Done(result)
+
+    def _tell(self, told: PilotText, text: str, good: bool) -> None:
+        """Answer the pilot, unless that comes too often, and say it at length in the journal."""
+        self._texts.refill(self._clock.now_ns())
+        in_time = self._texts.left >= 1.0
+        if in_time:
+            self._texts.take(1.0)
+            self._link.say(told)
+        if in_time or good:
+            self._journal.say(f"ground: {text}", INFO if good else WARNING)
+
+
+def _shown(value: Any, brief: bool = False) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.4g}" if brief else f"{value:g}"
+    return str(value)

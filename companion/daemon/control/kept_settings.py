@@ -1,0 +1,53 @@
+"""What the ground has set: how it differs from the configuration, and the file that keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from companion.config import Config
+from companion.config_file import changed_by, dump, toml_value, with_value
+from companion.daemon.control.flight_parameters import PARAMETERS, FlightParameter
+from companion.errors import ConfigError
+
+HEAD = "# What the ground has set over MAVLink; control.keep names this file.\n"
+KEYS = [(parameter.section, parameter.key) for parameter in PARAMETERS.values()]
+
+
+def kept_over(load: Callable[[], Config]) -> tuple[Config, dict[str, Any]]:
+    """The configuration with what a file keeps, and that by key.
+
+    ConfigError where it cannot be read, or names what no ground station can set.
+    """
+    config = load()
+    if not config.control.keep or not Path(config.control.keep).exists():
+        return config, {}
+    kept = changed_by(config, Path(config.control.keep))
+    settable, changed = {f"{section}.{key}" for section, key in KEYS}, differences(config, kept)
+    for name in changed:
+        if name not in settable:
+            raise ConfigError(f"{config.control.keep}: {name} is nothing that the ground sets")
+    return kept, changed
+
+
+def differences(config: Config, other: Config) -> dict[str, Any]:
+    """What the other has for each key in which they differ."""
+    before, after = dump(config), dump(other)
+    return {
+        f"{section}.{key}": value
+        for section, values in after.items()
+        for key, value in values.items()
+        if value != before[section][key]
+    }
+
+
+def encoded(changed: Mapping[str, Any]) -> bytes:
+    """The file that keeps this."""
+    lines = [f"{name} = {toml_value(value)}" for name, value in sorted(changed.items())]
+    return (HEAD + "\n".join(lines) + "\n").encode()
+
+
+def checked(config: Config, parameter: FlightParameter, value: Any) -> Config:
+    """The configuration with a value from the ground, checked as one of a file."""
+    return with_value(config, parameter.section, parameter.key, value, parameter.name)

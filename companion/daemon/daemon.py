@@ -1,0 +1,543 @@
+"""The long-running program: camera, autopilot and stages joined, from power on to power off.
+
+The event loop does I/O only. The camera has a thread, every heavy stage a process; what they give
+comes in by `call_soon_threadsafe`. Nothing that comes loose in flight ends it: it is named, waited
+for, and taken up again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Callable, Coroutine, Mapping
+from pathlib import Path
+from typing import Any
+
+from companion.config import Config
+from companion.daemon.component_state import POWEROFF, component_state
+from companion.daemon.control.armed_settings import FILE, NOT_KEPT, read_settings
+from companion.daemon.control.arming import Arming
+from companion.daemon.control.ground_control import GroundControl
+from companion.daemon.control.kept_settings import kept_over
+from companion.daemon.control.tightening import tightened, value_of_key, with_values
+from companion.daemon.flights.flight_dates import FlightDates
+from companion.daemon.flights.flight_facts import facts_of
+from companion.daemon.flights.flights import Flights
+from companion.daemon.flights.live_flight import Listener, LiveFlight, makes_depth
+from companion.daemon.flights.recording_recovery import LeftOvers
+from companion.daemon.health_watch import HealthWatch
+from companion.daemon.link_watch import LinkWatch
+from companion.daemon.loop_delay import measure_loop_delay
+from companion.daemon.missing_devices import Missing
+from companion.daemon.pose.kept_counter import counter_path
+from companion.daemon.pose.pose_sender import PoseSender
+from companion.daemon.reload import reloaded
+from companion.daemon.tape_notes import TapeNotes
+from companion.daemon.vehicle_reports import VehicleReports
+from companion.errors import CompanionError
+from companion.geometry.camera import Camera
+from companion.health import LatencyMeter
+from companion.messages import (
+    ArmedSample,
+    AttitudeSample,
+    Frame,
+    MapUpdate,
+    Odometry,
+    PointChunk,
+    Telemetry,
+    Track,
+    Warned,
+)
+from companion.pilot_messages import (
+    LIMITS_WAIT,
+    POSITION_ENABLED,
+    POSITION_STAYS_OFF,
+    PilotText,
+    of_warning,
+)
+from companion.products.newest_file import NewestFile
+from companion.runtime.stage_protocol import Snapshot
+from companion.timing.clock import FlightClock, monotonic_s
+from drivers.camera.camera_feed import CameraFeed
+from drivers.camera.camera_registry import camera_source
+from drivers.camera.live_calibration import live_camera
+from drivers.mavlink.autopilot_date import AutopilotDate
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.origin_keeper import OriginKeeper
+from drivers.mavlink.wire.link_port import link_port
+from drivers.system.clock_is_set import clock_is_set
+from drivers.system.journal import ERROR, INFO, WARNING, Journal
+from drivers.system.metrics import Metrics
+from drivers.system.service_manager import ServiceManager
+from drivers.system.status_socket import StatusSocket, own_socket_path
+
+NOT_THERE = ("missing", "driver fault")
+"""States of sources that are tried again."""
+WATCH_S = 0.2
+START_S = 180.0
+"""Stages have so long to come up once nothing is missing any more; the first time they compile."""
+FAULT, BAD_INPUT = 1, 2
+"""Exit statuses."""
+NO_PROGRESS = "frames come and no pose, whatever is tried: left to the service manager's watchdog"
+SPARE_AGAIN_S = 1.0
+WRITE_S = 0.2
+"""What counts while armed may take so long to be written down at the end."""
+END_S = 2.6
+"""A stop takes little longer, whatever hangs."""
+
+
+class Daemon:
+    """Everything that runs; `run` gives the exit status. To be made within the event loop."""
+
+    def __init__(self, load: Callable[[], Config]) -> None:
+        self._load = load
+        read, kept = kept_over(load)
+        self._clock = clock = FlightClock()
+        self._journal = Journal()
+        self._loop = asyncio.get_running_loop()
+        flights = Path(read.daemon.flights)
+        before, unreadable = read_settings(flights, read) if read.link.url else (None, "")
+        self._armed_file = NewestFile(
+            flights / FILE, lambda why: self._on_warned(Warned(clock.now_ns(), NOT_KEPT, why))
+        )
+        self._arming = Arming(self._armed_file, before, self._autopilot_boot_s, self._is_heard)
+        resumed = self._arming.resume(read)
+        self._config = config = resumed.config
+        kept |= resumed.by_ground
+        self._stays_off = resumed.by_ground.get("feedback.mode") == "off"
+        """Whether the pilot is still to be told so, once there is one to hear it."""
+        if before is not None:
+            self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
+        self._stop = asyncio.Event()
+        self._status = 0
+        self._camera: Camera | None = None
+        self._armed = False
+        self._service = ServiceManager()
+        self._is_ready = False
+        self._loop_delay = LatencyMeter()
+        self._feed = CameraFeed(
+            camera_source(config.camera), clock, config.camera, self._on_frame, self._on_warned
+        )
+        self._link: AutopilotLink | None = None
+        self._link_watch: LinkWatch | None = None
+        if config.link.url:
+            port = link_port(config.link, config.router, clock)
+            self._link_watch = LinkWatch(port, self._on_warned)
+            self._link = AutopilotLink(
+                config.link, port, clock, self._on_telemetry, self._on_warned
+            )
+        self._sender: PoseSender | None = None
+        if self._link is not None:
+            self._sender = PoseSender(
+                config.feedback, self._link, clock, counter_path(config.daemon.flights),
+                self._on_warned,
+            )  # fmt: skip
+        date = AutopilotDate(self._link) if self._link is not None else None
+        self._dates = FlightDates(
+            clock, lambda: date.ahead_ns if date is not None else None, clock_is_set
+        )
+        self._flights = Flights(
+            clock, self._journal, self._listener,
+            lambda flight: facts_of(flight, self._config, self._link), self._dates,
+        )  # fmt: skip
+        self._watch = HealthWatch(
+            config, clock, self._journal, self._feed, self._link, self._sender, self._flights,
+            self._loop_delay,
+        )  # fmt: skip
+        self._notes = TapeNotes(clock, self._flights, self._watch, self._link)
+        self._reports: VehicleReports | None = None
+        if self._link is not None:
+            self._reports = VehicleReports(
+                self._link, clock, self._watch, config.feedback.obstacle_distance
+            )
+        self._left_overs = LeftOvers(
+            Path(config.daemon.flights), clock, self._on_warned, lambda: self._armed
+        )
+        self._missing = Missing(config.daemon.missing_device_s)
+        self._spare_later: asyncio.TimerHandle | None = None
+        self._by_ground = self._watch.set_by_ground = kept
+        self._ground: GroundControl | None = None
+        if self._link is not None and self._reports is not None and config.control.enabled:
+            self._ground = GroundControl(
+                self, self._link, clock, self._journal, self._flights,
+                self._reports.questions(lambda: self._config.feedback), kept, self._on_warned,
+            )  # fmt: skip
+
+    async def run(self) -> int:
+        """Run until told to stop or unable to go on; the exit status."""
+        loop, config = self._loop, self._config
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, self._stop.set)
+        loop.add_signal_handler(signal.SIGHUP, self._reload)
+        socket = StatusSocket(
+            own_socket_path(config.daemon.socket), self._watch.document, self._problem
+        )
+        metrics = Metrics(config.daemon.prometheus_port, self._watch.health, self._problem)
+        await socket.start()
+        if config.daemon.prometheus_port:
+            await metrics.start()
+        self._feed.start()
+        work: list[Coroutine[Any, Any, None]] = [
+            self._run_watch(),
+            self._watch.govern(),
+            measure_loop_delay(self._clock, self._loop_delay),
+            self._notes.run(),
+            self._left_overs.run(),
+        ]
+        if self._link is not None:
+            work.append(self._link.run())
+        if self._link is not None and self._sender is not None:
+            work.append(self._sender.run())
+            if config.feedback.set_origin:
+                keeper = OriginKeeper(
+                    config.feedback, self._link, self._journal.say,
+                    lambda: self._config.feedback.mode != "off",
+                )  # fmt: skip
+                work.append(keeper.run())
+        if self._reports is not None:
+            work.append(self._reports.run())
+        if self._ground is not None:
+            work.append(self._ground.run())
+        tasks = [loop.create_task(each) for each in work]
+        stopped: asyncio.Task[Any] = loop.create_task(self._stop.wait())
+        try:
+            await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
+            for task in tasks:
+                if task.done() and not task.cancelled() and task.exception() is not None:
+                    raise task.exception() or AssertionError
+        finally:
+            self._service.stopping()
+            if self._link is not None:
+                self._link.system_status = POWEROFF
+                self._link.send(self._link.heartbeat())
+            tasks[0].cancel()  # what is watched is being taken apart
+            feed_closed = loop.run_in_executor(None, self._feed.stop)
+            await self._flights.close(END_S, keep_map=self.armed)
+            for task in (stopped, *tasks):
+                task.cancel()
+            await asyncio.gather(stopped, *tasks, return_exceptions=True)
+            await metrics.stop()
+            await socket.stop()
+            await asyncio.wait([feed_closed], timeout=0.2)
+            await loop.run_in_executor(None, self._armed_file.close, WRITE_S)
+            if self._ground is not None:
+                await loop.run_in_executor(None, self._ground.close, WRITE_S)
+            self._service.close()
+        self._journal.say("stopped")
+        return self._status
+
+    # -- what comes in --------------------------------------------------------------------------
+
+    def _on_frame(self, frame: Frame) -> None:
+        """A frame, in the camera's thread."""
+        self._watch.frame_came()
+        if self._camera is None:
+            self._soon(self._camera_known)
+            return
+        self._flights.frame(frame)
+
+    def _on_warned(self, warning: Warned) -> None:
+        """Something to be told, in any thread."""
+        if self._journal.warn(warning):
+            text = of_warning(warning.what, warning.detail, warning.good)
+            if text is not None:
+                self._soon(self._tell_pilot, text)
+        self._soon(self._flights.take, warning)
+
+    def _on_telemetry(self, sample: Telemetry) -> None:
+        """A sample, in the event loop."""
+        self._flights.take(sample)
+        if isinstance(sample, AttitudeSample):
+            if self._sender is not None:
+                self._sender.take_attitude(sample)
+        elif isinstance(sample, ArmedSample):
+            self._set_armed(sample.armed)
+
+    def _listener(self, flight: LiveFlight) -> Listener:
+        """What a flight gives comes in here, but only as long as it is the one that flies."""
+
+        def current(take: Callable[[Any], None]) -> Callable[[Any], None]:
+            def later(message: Any) -> None:
+                if self._flights.current is flight:
+                    take(message)
+
+            return lambda message: self._soon(later, message)
+
+        return Listener(
+            current(self._on_odometry),
+            current(self._on_mapped),
+            self._on_warned,
+            lambda: self._soon(self._localisation_died, flight),
+            lambda why: self._soon(self._unusable, why),
+            current(self._on_snapshot),
+        )
+
+    def _on_odometry(self, odometry: Odometry) -> None:
+        self._watch.take_odometry(odometry)
+        if self._sender is not None:
+            self._sender.take(odometry)
+
+    def _on_mapped(self, message: Track | MapUpdate | PointChunk) -> None:
+        self._watch.take_mapped(message)
+        if self._reports is not None:
+            self._reports.take(message)
+
+    def _on_snapshot(self, snapshot: Snapshot) -> None:
+        if self._ground is not None:
+            self._ground.snapshot_told(snapshot)
+
+    # -- flights --------------------------------------------------------------------------------
+
+    def _camera_known(self) -> None:
+        size = self._feed.size
+        if self._camera is not None or size is None:
+            return
+        try:
+            self._camera, remarks = live_camera(self._config.camera, self._config.mount, *size)
+        except CompanionError as error:
+            self._give_up(str(error), BAD_INPUT)
+            return
+        for remark in remarks:
+            self._journal.say(remark, WARNING)
+        self._begin_if_due()
+
+    @property
+    def _always(self) -> bool:
+        return self._config.daemon.flight == "always" or self._link is None
+
+    def _begin_if_due(self, take_up: bool = True) -> None:
+        if self._camera is None or self._flights.current is not None or self._stop.is_set():
+            return
+        if self._always or self._armed:
+            if self._sender is not None:
+                self._sender.restart()
+            if self._reports is not None:
+                self._reports.restart(self._camera)
+            self._watch.restart()
+            self._flights.begin(self._config, self._camera, take_up)
+        else:
+            self._flights.prepare(self._config, self._camera)
+
+    def _set_armed(self, armed: bool) -> None:
+        if self._arming.take(armed, monotonic_s()):
+            self._let_go()
+        if armed:
+            self._hold()
+            if self._stays_off:
+                self._tell_pilot(POSITION_STAYS_OFF())
+        self._stays_off = False
+        if armed == self._armed:
+            return
+        self._armed = armed
+        self._journal.say("armed" if armed else "disarmed")
+        if not armed and not self._always:
+            self._flights.end()
+        self._begin_if_due()
+
+    def _localisation_died(self, flight: LiveFlight) -> None:
+        if self._flights.current is flight:
+            self._flights.end()
+            self._begin_if_due()
+        elif self._flights.is_spare(flight):
+            self._flights.discard_spare()
+            self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+
+    def _unusable(self, why: str) -> None:
+        """On the ground somebody is there to read it; in the air the pose goes on without."""
+        if not self._armed:
+            self._give_up(why, BAD_INPUT)
+
+    # -- watching -------------------------------------------------------------------------------
+
+    async def _run_watch(self) -> None:
+        began_ns = self._clock.now_ns()
+        progress = True
+        while True:
+            await asyncio.sleep(WATCH_S)
+            if self._link_watch is not None:
+                self._link_watch.step(self._clock.now_ns())
+            health = self._watch.health()
+            if self._link is not None:
+                self._link.system_status = component_state(health)
+            if self._flights.current is not None:
+                origin = self._link.origin if self._link is not None else None
+                self._flights.current.tell(health, origin)
+            now_s = (self._clock.now_ns() - began_ns) * 1e-9
+            if not self._is_ready and self._watch.up:
+                self._is_ready = True
+                self._service.ready(health.tracker)
+            elif not self._is_ready and any(each.state in NOT_THERE for each in health.sources):
+                self._service.extend_timeout(START_S)
+            if not self._watch.pose_loop_alive:
+                self._watch.kill_stuck()
+            self._watch.end_stalled()
+            if progress and not self._watch.progress:
+                self._journal.say(NO_PROGRESS, ERROR)
+            progress = self._watch.progress
+            if progress:
+                self._service.alive()
+            line = self._watch.line_due()
+            if line:
+                self._journal.say(line)
+                self._service.status(line)
+            if self._feed.fault is not None:
+                self._give_up(str(self._feed.fault), BAD_INPUT)
+            if self._dates.step():
+                self._loop.run_in_executor(None, self._dates.write)
+            if self._arming.step(monotonic_s()):
+                self._let_go()
+            gone = self._missing.step(health, now_s, self._armed)
+            if gone:
+                self._give_up(gone)
+
+    def _reload(self) -> None:
+        """SIGHUP: take over what can be changed while running, and say what cannot."""
+        if self._is_ready:
+            self._service.reloading()
+        try:
+            read, kept = kept_over(self._load)
+        except CompanionError as error:
+            self._journal.say(f"configuration not taken over: {error}", ERROR)
+        else:
+            config, cannot = reloaded(self._config, read)
+            waiting: dict[str, Any] = {}
+            if self.armed or self._arming.holds:
+                config, waiting = tightened(self._config, config)
+            stays = {*cannot, *waiting}
+            kept |= {name: value for name, value in self._by_ground.items() if name in stays}
+            self._by_ground = self._watch.set_by_ground = kept
+            if self._ground is not None:
+                self._ground.changed = kept
+            self.take_over(config)
+            if "feedback.mode" in self._arming.waiting and read.feedback.mode != "off":
+                waiting["feedback.mode"] = read.feedback.mode
+            self._arming.waiting = waiting
+            text = f"; these need a restart: {', '.join(cannot)}" if cannot else ""
+            if set(waiting) - {"feedback.mode"}:
+                text += f"; these are looser and wait for disarming: {', '.join(waiting)}"
+                self._tell_pilot(LIMITS_WAIT())
+            self._journal.say(f"configuration read again{text}", WARNING if stays else INFO)
+        if self._is_ready:
+            self._service.ready()
+
+    # -- as the ground has a say, see GroundControl ----------------------------------------------
+
+    @property
+    def config(self) -> Config:
+        """What counts now."""
+        return self._config
+
+    @property
+    def armed(self) -> bool:
+        """Whether the motors are; as they last were where nothing is heard."""
+        return self._arming.armed
+
+    def take_over(self, config: Config) -> None:
+        """Go on with another configuration: at once where that can be, else with the next map."""
+        old, self._config = self._config, config
+        if self._arming.holds:
+            for name in list(self._arming.waiting):
+                if value_of_key(config, name) != value_of_key(old, name):
+                    del self._arming.waiting[name]  # whoever has set it since has the last word
+            if config.feedback.mode == "off" != old.feedback.mode and not config.control.keep:
+                self._arming.waiting["feedback.mode"] = old.feedback.mode
+            self._hold()
+        if config.daemon != old.daemon:
+            self._missing = Missing(config.daemon.missing_device_s)
+        self._watch.reconfigure(config)
+        if self._sender is not None:
+            self._sender.reconfigure(config.feedback)
+        flight = self._flights.current
+        if flight is not None and old.feedback.mode == "off" != config.feedback.mode:
+            self._flights.end()  # a map whose scale is the autopilot's own is none to fly on
+            self._begin_if_due(take_up=False)
+            return
+        if flight is not None:
+            flight.set_dense(makes_depth(config))
+            flight.set_budget(config.stream.budget_kbit_s)
+            return
+        self._flights.discard_spare()
+        if self._spare_later is not None:
+            self._spare_later.cancel()
+        self._spare_later = self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+
+    # -- what holds until the motors are disarmed, see Arming ------------------------------------
+
+    def _hold(self) -> None:
+        """What counts now shall count if this ends in the air and is begun again."""
+        self._arming.hold(self._config, self._by_ground, monotonic_s())
+
+    def _let_go(self) -> None:
+        """The motors are disarmed: the configuration has its say again."""
+        waiting = {
+            name: value
+            for name, value in self._arming.let_go().items()
+            if value != value_of_key(self._config, name)
+        }
+        if not waiting:
+            return
+        for name in waiting:
+            self._by_ground.pop(name, None)
+        shown = ", ".join(f"{name} = {value}" for name, value in waiting.items())
+        self._journal.say(f"disarmed: what has waited for that counts now: {shown}", WARNING)
+        if waiting.get("feedback.mode", "off") != "off":
+            self._tell_pilot(POSITION_ENABLED())
+        self.take_over(with_values(self._config, waiting))
+
+    def _say_resumed(
+        self, by_ground: Mapping[str, Any], waiting: Mapping[str, Any], unreadable: str
+    ) -> None:
+        text = "the daemon before ended while armed; until disarmed what counted then counts"
+        if unreadable:
+            text += f", which cannot be read, so that no pose is sent ({unreadable})"
+        else:
+            text += "".join(f"; {k} = {v} (by the ground)" for k, v in by_ground.items())
+        if waiting:
+            text += f"; these wait for disarming: {', '.join(waiting)}"
+        self._journal.say(text, WARNING)
+
+    def _autopilot_boot_s(self) -> float | None:
+        """When the autopilot was started, CLOCK_MONOTONIC; None while its clock is not known."""
+        report = self._link.clock_filter.report() if self._link is not None else None
+        return None if report is None else report.offset_s - self._clock.epoch_ns * 1e-9
+
+    def _is_heard(self) -> bool:
+        return self._link is not None and self._link.alive
+
+    def prepare(self) -> None:
+        """Have a flight at hand beside the one that goes on."""
+        if self._camera is not None:
+            self._flights.prepare(self._config, self._camera)
+
+    def begin_flight(self) -> None:
+        """Begin one with a map of its own, where one is due."""
+        self._begin_if_due(take_up=False)
+
+    def _give_up(self, why: str, status: int = FAULT) -> None:
+        if self._status == 0:
+            self._journal.say(f"error: {why}", ERROR)
+            self._status = status
+        self._stop.set()
+
+    def _tell_pilot(self, text: PilotText) -> None:
+        if self._link is not None:
+            self._link.say(text)
+
+    def _problem(self, text: str) -> None:
+        self._on_warned(Warned(self._clock.now_ns(), text))
+
+    def _soon(self, call: Callable[..., object], *arguments: Any) -> None:
+        """Have something done in the event loop; from any thread, nothing once it has ended."""
+        try:
+            self._loop.call_soon_threadsafe(call, *arguments)
+        except RuntimeError:
+            pass
+
+
+async def _run(load: Callable[[], Config]) -> int:
+    return await Daemon(load).run()
+
+
+def run(load: Callable[[], Config]) -> int:
+    """Run the daemon with the configuration that `load` reads; the exit status."""
+    return asyncio.run(_run(load))

@@ -1,0 +1,1 @@
+"""One live flight after another: its processes, its date, its recording, its results."""

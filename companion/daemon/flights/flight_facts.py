@@ -1,0 +1,40 @@
+"""What the report of a live flight states beside what the flight itself has shown."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+
+from companion.config import Config
+from companion.config_file import command_shown, shown
+from companion.daemon.flights.live_flight import LiveFlight
+from companion.products.flight_result import RunFacts
+from companion.products.surroundings import peak_memory_mb, versions
+from drivers.mavlink.autopilot_link import AutopilotLink
+
+
+def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> RunFacts:
+    """All that is known when its stages have given their last results."""
+    times: dict[str, Mapping[str, float]] = {}
+    device = "none"
+    for stage in flight.stages.values():
+        said = stage.finished or stage.progress
+        if said is not None:
+            times.update(said.times)
+            device = said.device or device
+    return RunFacts(
+        stage_times=times,
+        wall_s=flight.duration_s,
+        clock=link.clock_filter.report() if link is not None else None,
+        origin=link.origin if link is not None and flight.has_origin else None,
+        device=device,
+        config=shown(config),
+        versions=versions(),
+        command=command_shown(sys.argv),
+        peak_memory_mb=peak_memory_mb(),
+        camera=flight.camera,
+        n_frames_total=flight.n_frames,
+        completed=True,
+        dropped=flight.dropped(),
+        rates_hz=dict(link.rates_hz) if link is not None else {},
+    )

@@ -1,0 +1,143 @@
+"""Which flight there is: one that waits, one that goes on, and those whose results are written."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.config import Config
+from companion.daemon.flights.flight_dates import FlightDates
+from companion.daemon.flights.kept_map_place import kept_map_path
+from companion.daemon.flights.live_flight import Listener, LiveFlight
+from companion.geometry.camera import Camera
+from companion.messages import Frame, Telemetry, Warned
+from companion.products.flight_result import RunFacts
+from companion.products.newest_file import NewestFile
+from companion.runtime.stage_protocol import KeepMap
+from companion.timing.clock import FlightClock
+from drivers.recording.flights_folder import COUNTER, flight_name, next_number
+from drivers.recording.recorded_content import HealthNote, LinkBytes
+from drivers.system.journal import WARNING, Journal
+
+
+class Flights:
+    """Begins and ends flights. To be used in the event loop, but for `frame`."""
+
+    def __init__(
+        self,
+        clock: FlightClock,
+        journal: Journal,
+        listener: Callable[[LiveFlight], Listener],
+        facts: Callable[[LiveFlight], RunFacts],
+        dates: FlightDates,
+    ) -> None:
+        self._dates = dates
+        self._counter: NewestFile | None = None
+        self._last_number = 0
+        self._clock, self._journal, self._listener, self._facts = clock, journal, listener, facts
+        self.current: LiveFlight | None = None
+        self._spare: LiveFlight | None = None
+        self._ending: dict[LiveFlight, threading.Thread] = {}
+
+    @property
+    def stages_up(self) -> bool:
+        """Whether the flight that goes on, or else the one that waits, can take frames."""
+        flight = self.current or self._spare
+        return flight is not None and flight.stages_up
+
+    @property
+    def spare(self) -> LiveFlight | None:
+        """The one that waits for its beginning, if any."""
+        return self._spare
+
+    def prepare(self, config: Config, camera: Camera) -> None:
+        """Have processes at hand for the next flight."""
+        if self._spare is None:
+            self._spare = LiveFlight(config, camera, self._clock, self._listener)
+
+    def begin(self, config: Config, camera: Camera, take_up: bool = True) -> LiveFlight:
+        """A flight begins; the one before must have been ended.
+
+        With `take_up` it goes on with the map of a process that died in the air, if there is one
+        and it is recognised.
+        """
+        self.prepare(config, camera)
+        flight, self._spare = self._spare, None
+        assert flight is not None and self.current is None
+        folder = self._named(Path(config.daemon.flights))
+        flight.begin(folder, KeepMap(kept_map_path(config.daemon.socket), take_up))
+        self.current = flight
+        self._journal.say(f"flight {folder.name} begins; its results go to {folder}")
+        return flight
+
+    def end(self) -> None:
+        """The flight is over; its results are written while other things go on."""
+        flight, self.current = self.current, None
+        if flight is None:
+            return
+        thread = threading.Thread(target=self._finish, args=(flight,), name="end", daemon=True)
+        self._ending[flight] = thread
+        thread.start()
+
+    def is_spare(self, flight: LiveFlight) -> bool:
+        """Whether this is the one that waits for its beginning."""
+        return self._spare is flight
+
+    def discard_spare(self) -> None:
+        """The next flight is to be prepared anew."""
+        spare, self._spare = self._spare, None
+        if spare is not None:
+            threading.Thread(target=spare.finish, args=(self._facts,), daemon=True).start()
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame; from the camera's thread."""
+        flight = self.current
+        if flight is not None:
+            flight.frame(frame)
+
+    def take(self, message: Telemetry | Warned) -> None:
+        """Take telemetry or a warning."""
+        if self.current is not None:
+            self.current.take(message)
+
+    def keep(self, message: LinkBytes | HealthNote) -> None:
+        """Have something in the recording."""
+        if self.current is not None:
+            self.current.keep(message)
+
+    async def close(self, patience_s: float, keep_map: bool) -> None:
+        """End all flights in a hurry; with `keep_map` the next daemon may go on with the map."""
+        if self.current is not None:
+            self.current.keep_map = keep_map
+        self.end()
+        for flight in list(self._ending):
+            flight.hurry()
+        self.discard_spare()
+        rounds = round(patience_s / 0.02)
+        while rounds and any(thread.is_alive() for thread in self._ending.values()):
+            await asyncio.sleep(0.02)
+            rounds -= 1
+
+    def _finish(self, flight: LiveFlight) -> None:
+        flight.finish(self._facts)
+        folder = self._dates.ended(flight.folder) if flight.folder is not None else None
+        self._ending.pop(flight, None)
+        self._journal.say(f"flight over: {folder} ({flight.n_frames} frames)")
+
+    def _named(self, parent: Path) -> Path:
+        """The next flight's folder, with a number that none had before, and the time, UTC."""
+        if self._counter is None or self._counter.path.parent != parent:
+            if self._counter is not None:
+                self._counter.close()
+            self._counter, self._last_number = NewestFile(parent / COUNTER, self._not_counted), 0
+        self._last_number = max(next_number(parent), self._last_number + 1)
+        self._counter.put(b"%d\n" % self._last_number)
+        t_ns = self._clock.now_ns()
+        folder = parent / flight_name(self._last_number, self._dates.unix_s(t_ns))
+        self._dates.begun(folder, t_ns)
+        return folder
+
+    def _not_counted(self, why: str) -> None:
+        self._journal.say(f"warning: the number of the flight is not kept: {why}", WARNING)

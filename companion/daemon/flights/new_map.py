@@ -1,0 +1,43 @@
+"""Another map in mid-flight: its stages come up beside the flight that goes on, which then ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from companion.daemon.flights.flights import Flights
+from companion.timing.clock import monotonic_s
+from drivers.mavlink.command_server import ACCEPTED, FAILED, Job
+
+USUAL_S, MOST_S = 5.0, 30.0
+READY_PERCENT = 90
+
+
+class NewMap:
+    """To be used in the event loop; `prepare` has stages brought up, `begin` begins a flight."""
+
+    def __init__(
+        self, flights: Flights, prepare: Callable[[], None], begin: Callable[[], None]
+    ) -> None:
+        self._flights, self._prepare, self._begin = flights, prepare, begin
+        self._job: Job | None = None
+        self._since_s = 0.0
+
+    def start(self, job: Job) -> None:
+        """Bring up the stages; the flight that there is goes on meanwhile."""
+        self._job, self._since_s = job, monotonic_s()
+        self._prepare()
+
+    def step(self) -> None:
+        """Change over once they are up; to be called often."""
+        job = self._job
+        if job is None:
+            return
+        spare, waited_s = self._flights.spare, monotonic_s() - self._since_s
+        if self._flights.current is None or spare is None:
+            job.result, self._job = FAILED, None
+        elif spare.stages["localisation"].progress is not None or waited_s > MOST_S:
+            self._flights.end()
+            self._begin()
+            job.percent, job.result, self._job = 100, ACCEPTED, None
+        else:
+            job.percent = int(READY_PERCENT * min(1.0, waited_s / USUAL_S))

@@ -1,0 +1,66 @@
+"""Recordings that an earlier daemon was not given the time to end, repaired beside the flight.
+
+By `companion flights repair` in a process that gets what nobody else wants, and never while armed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+from asyncio.subprocess import DEVNULL, PIPE, Process
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.messages import Warned
+from companion.timing.clock import FlightClock
+from drivers.system.low_priority import give_way
+
+AFTER_S = 10.0
+"""From the start, or the end of a flight: there is enough to be done then."""
+LOOK_S = 0.2
+CUT_SHORT = "an earlier recording was cut short"
+
+
+class LeftOvers:
+    """Used in the event loop. `warn` hears of each recording."""
+
+    def __init__(
+        self, flights: Path, clock: FlightClock, warn: Callable[[Warned], None],
+        armed: Callable[[], bool],
+    ) -> None:  # fmt: skip
+        self._flights, self._clock, self._warn, self._armed = flights, clock, warn, armed
+
+    async def run(self) -> None:
+        """Repair what there is, now and after each flight, until cancelled."""
+        while True:
+            await asyncio.sleep(AFTER_S)
+            if not self._armed() and await self._repaired():
+                while not self._armed():
+                    await asyncio.sleep(LOOK_S)
+
+    async def _repaired(self) -> bool:
+        """Whether it was not broken off by arming."""
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "companion", "flights", "repair", "--gently",
+            "--flights", str(self._flights), stdin=DEVNULL, stdout=PIPE, stderr=DEVNULL,
+        )  # fmt: skip
+        give_way(process.pid)
+        reading = asyncio.ensure_future(self._read(process))
+        try:
+            while not reading.done() and not self._armed():
+                await asyncio.wait([reading], timeout=LOOK_S)
+            if reading.done():
+                reading.result()
+            return reading.done()
+        finally:  # what is half repaired can be repaired again
+            reading.cancel()
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+
+    async def _read(self, process: Process) -> None:
+        assert process.stdout is not None
+        async for line in process.stdout:
+            text = line.decode("utf-8", "replace").strip()
+            self._warn(Warned(self._clock.now_ns(), CUT_SHORT, text))

@@ -1,0 +1,161 @@
+"""The viewers of a flight: its exporter, and what shows it on board if anything is to.
+
+Whoever calls `take` never waits, and nothing that becomes of a viewer matters to the flight.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
+from companion.config import Config
+from companion.errors import InputError
+from companion.geometry.camera import Camera
+from companion.health import StageHealth
+from companion.messages import Frame
+from companion.streaming.viewer import LiveViewer, Watched
+from companion.timing.clock import monotonic_s
+
+LOOK_S = 0.5
+AGAIN_S = 3.0
+"""Between two attempts to show it."""
+PATIENCE_S, HURRIED_S = 3.0, 0.2
+"""What a viewer may take to show the last of a flight."""
+STALLED_S = 30.0
+"""An exporter that takes nothing for so long is ended, and another takes its place."""
+MANY = 50
+"""So many messages given up between two looks are an exporter that hangs."""
+NOWHERE = "none"
+SHOWN = "the flight can be seen"
+NO_VIEWER = "the viewer cannot be shown"
+GONE = "the viewer has gone"
+BEHIND = "the viewer does not keep up"
+CLOSED = "viewers cannot connect"
+
+
+class Viewing:
+    """Exports to `stream.listen` and keeps `daemon.viewer` shown until `close`.
+
+    `warn` takes what, a detail, and whether it is good.
+    """
+
+    def __init__(
+        self, config: Config, camera: Camera, name: str, warn: Callable[[str, str, bool], None]
+    ) -> None:
+        self._config, self._camera, self._name, self._warn = config, camera, name, warn
+        self._stream = config.stream
+        self.pictures = True
+        """Whether it is given pictures."""
+        self._n_dropped = self._n_seen = self._n_restarted = 0
+        self._where = config.daemon.viewer
+        self._told = ""
+        self._was_shown = False
+        self._over = threading.Event()
+        self._patience_s = PATIENCE_S
+        self._viewer = self._open()
+        self._thread = threading.Thread(target=self._run, name="viewing", daemon=True)
+        self._thread.start()
+
+    @property
+    def n_dropped(self) -> int:
+        """Messages that there was no room for."""
+        return self._n_dropped + self._viewer.n_dropped
+
+    @property
+    def pid(self) -> int:
+        """Of the exporter."""
+        return self._viewer.pid
+
+    def health(self) -> StageHealth:
+        """How the exporter is; what it gave up for want of room on links counts as dropped."""
+        report = self._viewer.report
+        n_viewers = int(report.get("viewers", 0))
+        plural = "" if n_viewers == 1 else "s"
+        detail = f"{n_viewers} viewer{plural}"
+        if n_viewers:
+            detail += f", {report['kbit_s']:.0f} kbit/s"
+        if report.get("budget_kbit_s"):
+            detail += f", budget {report['budget_kbit_s']:.0f} kbit/s"
+        if self._viewer.closed:
+            detail += f"; closed: {self._viewer.closed}"
+        return StageHealth(
+            "viewers", alive=self._viewer.alive, detail=detail,
+            n_dropped=self.n_dropped + int(report.get("skipped", 0)),
+            n_restarted=self._n_restarted,
+        )  # fmt: skip
+
+    def take(self, message: Watched) -> None:
+        """Show a message, or drop it."""
+        if self.pictures or not isinstance(message, Frame):
+            self._viewer.take(message)
+
+    def set_budget(self, kbit_s: float) -> None:
+        """All viewers together get no more from now on; 0 for no limit."""
+        self._stream = replace(self._stream, budget_kbit_s=kbit_s)
+        self._viewer.set_budget(kbit_s)
+
+    def close(self, hurry: bool) -> None:
+        """The flight is over; what viewers have not got by then they never will."""
+        self._patience_s = HURRIED_S if hurry else PATIENCE_S
+        self._over.set()
+        self._thread.join(4 * self._patience_s + 1.0)
+
+    def _open(self) -> LiveViewer:
+        return LiveViewer(
+            self._config.viewer, self._camera, name=self._name, stream=self._stream
+        )
+
+    def _run(self) -> None:
+        wait_s = 0.0
+        while not self._over.wait(wait_s):
+            wait_s = LOOK_S
+            if not self._viewer.alive:
+                self._tell(GONE, "its exporter has ended")
+                self._n_restarted += 1
+                self._close_viewer(HURRIED_S)
+                self._viewer = self._open()
+                wait_s = AGAIN_S
+            elif self._viewer.stalled_s(monotonic_s()) > STALLED_S:
+                self._viewer.interrupt()
+                wait_s = 0.0
+            elif self._where != NOWHERE and not self._viewer.is_shown:
+                wait_s = self._show()
+            self._look()
+        self._close_viewer(self._patience_s)
+
+    def _show(self) -> float:
+        """Show it, for the first time or again; how long to wait after that."""
+        if self._told == "" and self._was_shown:
+            self._tell(GONE, self._where)
+            if self._where == "native":
+                self._where = NOWHERE  # its window was closed by whoever looked at it
+                return LOOK_S
+        try:
+            self._viewer.look(self._where)
+        except InputError as error:
+            self._tell(NO_VIEWER, str(error))
+            return AGAIN_S
+        self._was_shown, self._told = True, ""
+        if self._viewer.page:
+            self._warn(SHOWN, f"open {self._viewer.page}", True)
+        return LOOK_S
+
+    def _look(self) -> None:
+        n_dropped = self._viewer.n_dropped
+        if n_dropped - self._n_seen > MANY:
+            self._tell(BEHIND, f"{n_dropped} messages were not shown")
+        self._n_seen = n_dropped
+        if self._viewer.closed:
+            self._tell(CLOSED, self._viewer.closed)
+
+    def _close_viewer(self, patience_s: float) -> None:
+        self._viewer.close(patience_s)
+        self._n_dropped += self._viewer.n_dropped
+        self._viewer.n_dropped = 0
+
+    def _tell(self, what: str, detail: str) -> None:
+        """Say it, but not again as long as nothing else is to be said."""
+        if what != self._told:
+            self._told = what
+            self._warn(what, detail, False)

@@ -1,0 +1,290 @@
+"""What the daemon knows of itself, put together; and what follows from it while it runs.
+
+The governor's levels go to the flight from here, and a pose loop that hangs is noticed here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from companion import __version__
+from companion.config import Config
+from companion.daemon.flights.flights import Flights
+from companion.daemon.pose.pose_sender import PoseSender
+from companion.health import (
+    ComputerLoad,
+    FeedbackHealth,
+    Health,
+    LatencyMeter,
+    StageHealth,
+    StageMeter,
+    StatusLines,
+)
+from companion.messages import MapUpdate, Odometry, PointChunk, Track, TrackState, Warned
+from companion.runtime.governor import Governor, Pressure
+from companion.timing.clock import FlightClock, monotonic_s
+from drivers.camera.camera_feed import CameraFeed
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.system.journal import Journal
+from drivers.system.system_load import SystemLoad
+
+GOVERN_NS = 1_000_000_000
+STUCK_NS = 3_000_000_000
+"""Frames come but no track does: the pose loop hangs,"""
+BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
+"""unless it works: then the computer has too much else to do, and it is given longer."""
+START_S = 120.0
+"""A localisation that is not ready by then never will be; the first of all compiles its loops."""
+PATIENCE_NS = 20_000_000_000
+"""Frames come, localisation was started again, and still no track: nothing here will help."""
+NO_SIGN_S = 10.0
+"""A stage that has been at one step for so long is not well; when it is ended: see live.flight."""
+SETTLE_NS = 3_000_000_000
+"""Beginning a map takes long, and tells nothing of what comes after."""
+STUCK = "localisation hangs and is ended"
+IN_WORDS = {
+    TrackState.INITIALISING: "initialising",
+    TrackState.TRACKING: "tracking",
+    TrackState.COASTING: "coasting",
+    TrackState.LOST: "lost",
+}
+
+
+class HealthWatch:
+    """Counts what goes by, and says how all is. To be used in the event loop."""
+
+    def __init__(
+        self,
+        config: Config,
+        clock: FlightClock,
+        journal: Journal,
+        feed: CameraFeed,
+        link: AutopilotLink | None,
+        sender: PoseSender | None,
+        flights: Flights,
+        loop_delay: LatencyMeter,
+    ) -> None:
+        self._clock, self._journal, self._flights = clock, journal, flights
+        self._feed, self._link, self._sender = feed, link, sender
+        self._loop_delay = loop_delay
+        self._began_ns = clock.now_ns()
+        self._config = config.daemon
+        self._governor = Governor(config.daemon.hot_c)
+        self._lines = StatusLines(config.daemon.status_every_s)
+        self._load_reader = SystemLoad(Path(config.daemon.flights))
+        self.load = ComputerLoad()
+        self._governed_ns = 0
+        self._settled_ns = 0
+        self._n_dropped = 0
+        self._last_frame_ns = 0
+        self._odometry: Odometry | None = None
+        self._odometry_ns = 0
+        self._progress_ns = self._began_ns
+        self._scale = ""
+        self._recent = LatencyMeter(1.0)
+        self.set_by_ground: Mapping[str, Any] = {}
+        """Keys of the configuration, and what they were set to in flight."""
+        self._pose = StageMeter("localisation")
+        self._depth = StageMeter("depth")
+
+    @property
+    def too_hot(self) -> bool:
+        """Whether work is left out because of the temperature."""
+        return "hot" in self._governor.degraded
+
+    def reconfigure(self, config: Config) -> None:
+        """Take over what has changed."""
+        if config.daemon == self._config:
+            return
+        if config.daemon.hot_c != self._config.hot_c:
+            self._governor = Governor(config.daemon.hot_c)
+            self._apply()
+        self._config = config.daemon
+        self._lines = StatusLines(config.daemon.status_every_s)
+
+    def restart(self) -> None:
+        """Another flight begins."""
+        self._odometry, self._scale, self._n_dropped = None, "", 0
+        self._odometry_ns = self._clock.now_ns()
+        self._governed_ns = 0
+
+    def frame_came(self) -> None:
+        """A frame; from the camera's thread."""
+        now_ns = self._clock.now_ns()
+        self._last_frame_ns = now_ns
+
+    def take_odometry(self, odometry: Odometry) -> None:
+        """The odometry of a frame."""
+        now_ns = self._clock.now_ns()
+        if odometry.state is not TrackState.TRACKING:
+            self._settled_ns = now_ns + SETTLE_NS
+        self._odometry, self._odometry_ns, self._progress_ns = odometry, now_ns, now_ns
+        self._pose.done(now_ns, odometry.t_ns)
+        self._recent.add(now_ns, (now_ns - odometry.t_ns) * 1e-6)
+
+    def take_mapped(self, message: Track | MapUpdate | PointChunk) -> None:
+        """What the map has become."""
+        if isinstance(message, PointChunk):
+            self._depth.done(self._clock.now_ns(), message.t_ns)
+        elif isinstance(message, MapUpdate):
+            found = message.georeference
+            self._scale = found.method if found is not None else ""
+
+    @property
+    def up(self) -> bool:
+        """Whether the stages are ready for frames, and the way to the autopilot is open."""
+        link_open = self._link is None or self._link.health.state != "missing"
+        return link_open and self._flights.stages_up
+
+    @property
+    def progress(self) -> bool:
+        """False where frames come but no pose has for long; to be asked often."""
+        now_ns = self._clock.now_ns()
+        frames_come = now_ns - self._last_frame_ns < GOVERN_NS
+        if self._flights.current is None or not frames_come:
+            self._progress_ns = now_ns
+        return now_ns - self._progress_ns < PATIENCE_NS
+
+    @property
+    def pose_loop_alive(self) -> bool:
+        """False while frames come to a pose loop that gives nothing."""
+        flight, now_ns = self._flights.current, self._clock.now_ns()
+        frames_come = now_ns - self._last_frame_ns < GOVERN_NS
+        if flight is None or not flight.ready or not frames_come:
+            self._odometry_ns = max(self._odometry_ns, now_ns - STUCK_NS // 2)
+            return flight is None or flight.ready or flight.duration_s < START_S
+        works = any(
+            each.name == "localisation" and each.cpu_cores > BUSY_CORES
+            for each in self.load.processes
+        )
+        return now_ns - self._odometry_ns < (BUSY_STUCK_NS if works else STUCK_NS)
+
+    def kill_stuck(self) -> None:
+        """End a localisation that hangs, so that another takes its place."""
+        flight, now_ns = self._flights.current, self._clock.now_ns()
+        if flight is not None:
+            self._odometry_ns = now_ns
+            self._journal.warn(Warned(now_ns, STUCK))
+            flight.kill_localisation()
+
+    def end_stalled(self) -> None:
+        """End whatever other stage hangs."""
+        for flight in (self._flights.current, self._flights.spare):
+            if flight is not None:
+                flight.end_stalled()
+
+    async def govern(self) -> None:
+        """Read the load and leave out work where there is too much; ends by cancellation."""
+        loop = asyncio.get_running_loop()
+        while True:
+            flight = self._flights.current
+            pids = {"daemon": 0} | ({k: s.pid for k, s in flight.stages.items()} if flight else {})
+            if flight is not None and flight.viewing is not None:
+                pids["viewers"] = flight.viewing.pid
+            self.load = await loop.run_in_executor(None, self._load_reader.read, pids)
+            self._step_governor()
+            await asyncio.sleep(GOVERN_NS * 1e-9)
+
+    def _step_governor(self) -> None:
+        flight, now_ns = self._flights.current, self._clock.now_ns()
+        if flight is None or not flight.ready or now_ns < self._settled_ns:
+            return
+        n_dropped = flight.stages["localisation"].n_dropped
+        if not self._governed_ns:  # the levels of the flight before hold for this one
+            self._governed_ns, self._n_dropped = now_ns, n_dropped
+            self._apply()
+            return
+        dropped_hz = (n_dropped - self._n_dropped) * 1e9 / (now_ns - self._governed_ns)
+        self._n_dropped, self._governed_ns = n_dropped, now_ns
+        changed = self._governor.step(now_ns, Pressure(
+            cpu_share=self.load.cpu_share,
+            memory_share=self.load.memory_share,
+            temperature_c=self.load.temperature_c,
+            pose_latency_p95_ms=self._recent.percentile_ms(95, now_ns),
+            pose_dropped_hz=dropped_hz,
+        ))  # fmt: skip
+        if changed:
+            self._apply()
+
+    def _apply(self) -> None:
+        level = self._governor.level
+        if self._flights.current is not None:
+            self._flights.current.set_shares(
+                level.feature_share, level.dense_share, level.viewer
+            )
+
+    def line_due(self) -> str | None:
+        """The status line, if it is due now."""
+        return self._lines.step(self.health())
+
+    def document(self) -> dict[str, Any]:
+        """What `companion status` shows."""
+        return {"version": __version__, **self.health().to_json()}
+
+    def health(self) -> Health:
+        """How all is now."""
+        now_ns, flight = self._clock.now_ns(), self._flights.current
+        odometry = self._odometry if flight is not None else None
+        sources = [self._feed.health] + ([self._link.health] if self._link is not None else [])
+        return Health(
+            t_ns=now_ns,
+            uptime_s=(now_ns - self._began_ns) * 1e-9,
+            sources=tuple(sources),
+            stages=self._stages(now_ns),
+            tracker=self._tracker(),
+            quality=odometry.quality if odometry is not None else -1,
+            scale=self._scale,
+            pose_latency_p95_ms=self._pose.health(now_ns).latency_p95_ms,
+            feedback=self._sender.health() if self._sender is not None else FeedbackHealth(),
+            flight=flight.folder.name if flight is not None and flight.folder is not None else "",
+            load=self.load,
+            degradation=self._governor.level.number,
+            degraded=self._governor.degraded,
+            loop_delay_p99_ms=self._loop_delay.percentile_ms(99, now_ns),
+            n_warnings=dict(self._journal.n_warnings),
+            set_by_ground=dict(self.set_by_ground),
+        )
+
+    def _tracker(self) -> str:
+        flight = self._flights.current
+        if flight is None:
+            there = self._feed.health.state in ("running", "frozen", "silent", "ended")
+            return "waiting for arming" if there else "waiting for the camera"
+        if self._odometry is None:
+            return "starting"
+        return IN_WORDS[self._odometry.state]
+
+    def _stages(self, now_ns: int) -> tuple[StageHealth, ...]:
+        flight = self._flights.current
+        if flight is None:
+            return ()
+        out = []
+        now_s = monotonic_s()
+        for kind, stage in flight.stages.items():
+            meter = {"localisation": self._pose, "depth": self._depth}.get(kind)
+            measured = meter.health(now_ns) if meter is not None else StageHealth(kind)
+            said = stage.progress
+            detail = said.device if said is not None else "starting"
+            no_sign_s = stage.stalled_s(now_s)
+            is_off = kind == "depth" and not flight.dense
+            hangs = said is not None and no_sign_s > NO_SIGN_S and not is_off
+            if is_off:
+                detail = "switched off"
+            out.append(
+                replace(
+                    measured,
+                    alive=stage.alive and not hangs,
+                    n=said.n_done if said is not None else 0,
+                    n_dropped=stage.n_dropped,
+                    waiting_mb=stage.waiting_bytes * 1e-6,
+                    n_restarted=flight.n_restarted.get(kind, 0),
+                    detail=f"no sign of it for {no_sign_s:.0f} s" if hangs else detail,
+                )
+            )
+        if flight.viewing is not None:
+            out.append(flight.viewing.health())
+        return tuple(out)

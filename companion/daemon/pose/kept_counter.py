@@ -1,0 +1,107 @@
+"""The reset counter that an autopilot was last sent, on the disk, for the process after this one.
+
+It is written before the first pose that bears it leaves: what is kept may be ahead of what was
+sent, never behind. The disk is waited for by a thread of its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.estimation.reset_counter import BootIdentity
+from companion.products.atomic_file import write_atomically
+
+NAME = "sent_poses.json"
+
+
+@dataclass(frozen=True, slots=True)
+class KeptCounter:
+    """What one boot of the autopilot was sent."""
+
+    boot: BootIdentity
+    reset_counter: int
+    home_down_m: float | None = None
+    """Where its home is in its local frame; see `drivers.mavlink.autopilot_height`."""
+
+
+def counter_path(flights: str, environment: Mapping[str, str] = os.environ) -> Path:
+    """The file: in the service's state directory, else beside the folder of flights."""
+    state = environment.get("STATE_DIRECTORY", "").split(":")[0]
+    return (Path(state) if state else Path(flights).parent) / NAME
+
+
+def read_counter(path: Path) -> KeptCounter | None:
+    """What the file keeps; None where there is none. OSError, ValueError where it is unreadable."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    try:
+        found: dict[str, Any] = json.loads(data)
+        boot = found["boot"]
+        home = found["home_down_m"]
+        return KeptCounter(
+            BootIdentity(
+                int(boot["system_id"]), float(boot["autopilot_s"]), float(boot["monotonic_s"]),
+                float(boot["unix_s"]), str(boot["computer"]),
+            ),
+            int(found["reset_counter"]), None if home is None else float(home),
+        )  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"it does not hold what it should: {error!r}") from error
+
+
+class CounterFile:
+    """Writes the file; `ask` never waits. To be used from one thread."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        self._wanted: KeptCounter | None = None
+        self._writing = False
+        self._written: KeptCounter | None = None
+        self._failed: tuple[KeptCounter, str] | None = None
+
+    def ask(self, kept: KeptCounter) -> None:
+        """Have it written; what still waits to be is left out."""
+        with self._lock:
+            self._wanted = kept
+            if self._writing:
+                return
+            self._writing = True
+        threading.Thread(target=self._write, name="reset counter", daemon=True).start()
+
+    def has(self, kept: KeptCounter) -> bool:
+        """Whether the disk has it."""
+        with self._lock:
+            return self._written == kept
+
+    def trouble_with(self, kept: KeptCounter) -> str:
+        """Why it could not be written; "" if it could, or is yet to be."""
+        with self._lock:
+            return self._failed[1] if self._failed is not None and self._failed[0] == kept else ""
+
+    def _write(self) -> None:
+        while True:
+            with self._lock:
+                kept, self._wanted = self._wanted, None
+                self._writing = kept is not None
+            if kept is None:
+                return
+            data = json.dumps(dataclasses.asdict(kept), indent=1).encode()
+            try:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(self.path, data, durable=True)
+            except OSError as error:
+                with self._lock:
+                    self._failed = kept, str(error)
+            else:
+                with self._lock:
+                    self._written = kept

@@ -1,0 +1,131 @@
+"""Poses to the autopilot: each frame's at once, predicted ones in between, and what was measured.
+
+Everything here runs in the event loop. What a pose must be to be sent
+`companion.estimation.pose_gate` decides.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.config import FeedbackConfig
+from companion.daemon.pose.sent_counter import SentCounter
+from companion.estimation.pose_gate import PoseGate, PoseToSend
+from companion.estimation.reset_counter import ResetCounter
+from companion.health import FeedbackHealth, LatencyMeter, RateMeter
+from companion.messages import AttitudeSample, Odometry, Warned
+from companion.pilot_messages import POSITION_ON, position_lost
+from companion.timing.clock import FlightClock
+from drivers.mavlink.autopilot_height import AutopilotHeight
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.pose_messages import odometry_message, vision_messages
+
+TICK_S = 0.005
+IDLE_TICK_S = 0.05
+UNHEARD = "the autopilot is silent"
+SWITCHED_OFF = "switched off"
+
+
+class PoseSender:
+    """Odometry of the newest flight in; ODOMETRY or VISION_POSITION_ESTIMATE out, or nothing.
+
+    The file at `counter_path` keeps what reset counter was sent, for the process after this one.
+    """
+
+    def __init__(
+        self,
+        config: FeedbackConfig,
+        link: AutopilotLink,
+        clock: FlightClock,
+        counter_path: Path,
+        warn: Callable[[Warned], None],
+    ) -> None:
+        self._config, self._link, self._clock = config, link, clock
+        counter, height = ResetCounter(), AutopilotHeight(link)
+        self._counter = SentCounter(counter_path, counter, height, link, clock, warn)
+        self._gate = PoseGate(config, counter, height.down_m, self._counter.may_begin)
+        self._rate, self._latency = RateMeter(), LatencyMeter()
+        self._n_sent = 0
+        self._told: str | None = None
+
+    def restart(self) -> None:
+        """Localisation begins anew."""
+        self._gate.restart()
+
+    def reconfigure(self, config: FeedbackConfig) -> None:
+        """Take over other limits, which hold for the next pose, or another way of sending."""
+        self._config = config
+        self._gate.reconfigure(config)
+        if config.mode == "off":
+            self._gate.withhold(SWITCHED_OFF)
+            self._tell()
+
+    def take_attitude(self, sample: AttitudeSample) -> None:
+        """Take the autopilot's attitude."""
+        self._gate.take_attitude(sample)
+
+    def take(self, odometry: Odometry) -> None:
+        """Take the odometry of a frame, and send it if it may be sent."""
+        if self._config.mode == "off":
+            return
+        self._counter.step(self._gate)
+        self._send(self._gate.take(odometry, self._clock.now_ns()))
+        self._tell()
+
+    async def run(self) -> None:
+        """Send predicted poses when they are due, and say when poses cease."""
+        while True:
+            await asyncio.sleep(TICK_S if self._gate.sending else IDLE_TICK_S)
+            self.step()
+
+    def step(self) -> None:
+        """Send a predicted pose if one is due; to be called every few milliseconds."""
+        self._counter.step(self._gate)
+        if self._config.mode != "off" or self._told == "":
+            self._send(self._gate.due(self._clock.now_ns()))
+            self._tell()
+
+    def health(self) -> FeedbackHealth:
+        """As it stands now."""
+        if self._config.mode == "off":
+            return FeedbackHealth(n_resets=self._gate.n_resets)
+        now_ns = self._clock.now_ns()
+        p95_ms = self._latency.percentile_ms(95, now_ns)
+        return FeedbackHealth(
+            mode=self._config.mode,
+            sending=self._gate.sending and self._link.alive,
+            why_not=self._gate.why_not or ("" if self._link.alive else UNHEARD),
+            rate_hz=self._rate.hz(now_ns),
+            latency_p50_ms=self._latency.percentile_ms(50, now_ns),
+            latency_p95_ms=p95_ms,
+            n_sent=self._n_sent,
+            n_resets=self._gate.n_resets,
+        )
+
+    def _send(self, pose: PoseToSend | None) -> None:
+        if pose is None or not self._link.alive:
+            return
+        if self._config.mode == "odometry":
+            self._link.send(odometry_message(pose))
+        else:
+            for message in vision_messages(pose):
+                self._link.send(message)
+        now_ns = self._clock.now_ns()
+        self._n_sent += 1
+        self._rate.add(now_ns)
+        if not pose.predicted:
+            self._latency.add(now_ns, (now_ns - pose.t_ns) * 1e-6)
+
+    def _tell(self) -> None:
+        """The pilot hears when poses begin and cease."""
+        state = "" if self._gate.sending else self._gate.why_not
+        if self._gate.sending and self._told != "":
+            told = self._link.say(POSITION_ON())
+        elif not self._gate.sending and self._told == "":
+            told = self._link.say(position_lost(state))
+        else:
+            return
+        if told:  # else it is tried again
+            self._told = state

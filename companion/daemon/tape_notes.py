@@ -1,0 +1,58 @@
+"""What the daemon itself has to say for the recording: bytes of the link, and how all is."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections import deque
+from typing import Any
+
+from companion.daemon.flights.flights import Flights
+from companion.daemon.health_watch import HealthWatch
+from companion.timing.clock import FlightClock
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.recording.recorded_content import HealthNote, LinkBytes
+
+EVERY_S = 1.0
+LEAD_NS = 10_000_000_000
+"""A flight's recording begins with the bytes of so long before."""
+MOST_IN_LEAD = 10_000
+"""Pieces; more than the fastest link brings in that time."""
+
+
+class TapeNotes:
+    """Used in the event loop."""
+
+    def __init__(
+        self, clock: FlightClock, flights: Flights, watch: HealthWatch, link: AutopilotLink | None
+    ) -> None:
+        self._clock, self._flights, self._watch, self._link = clock, flights, watch, link
+        self._lead: deque[LinkBytes] = deque(maxlen=MOST_IN_LEAD)
+        if link is not None:
+            link.port.set_tap(self._on_bytes)
+
+    async def run(self) -> None:
+        """Note how all is once a second, until cancelled."""
+        while True:
+            await asyncio.sleep(EVERY_S)
+            self._flights.keep(HealthNote(self._clock.now_ns(), self._document()))
+
+    def _on_bytes(self, outgoing: bool, data: bytes, monotonic_ns: int) -> None:
+        taken = LinkBytes(
+            self._clock.from_monotonic_ns(monotonic_ns), monotonic_ns, outgoing, bytes(data)
+        )
+        self._lead.append(taken)
+        while taken.t_ns - self._lead[0].t_ns > LEAD_NS:
+            self._lead.popleft()
+        if self._flights.current is not None:
+            while self._lead:
+                self._flights.keep(self._lead.popleft())
+
+    def _document(self) -> dict[str, Any]:
+        document: dict[str, Any] = {"health": self._watch.document()}
+        link = self._link
+        clock = link.clock_filter.report() if link is not None else None
+        origin = link.origin if link is not None else None
+        document["clock"] = dataclasses.asdict(clock) if clock is not None else None
+        document["origin"] = dataclasses.asdict(origin) if origin is not None else None
+        return document

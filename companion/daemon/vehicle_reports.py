@@ -1,0 +1,127 @@
+"""What the autopilot and the ground are told beside the pose: this computer, and obstacles."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+
+from companion.config import FeedbackConfig
+from companion.daemon.health_watch import HealthWatch
+from companion.dense.obstacles import RecentCloud, obstacles_around
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose
+from companion.messages import MapUpdate, PointChunk, Track, TrackState
+from companion.timing.clock import FlightClock
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.command_server import Command
+from drivers.mavlink.computer_status import computer_status
+from drivers.mavlink.message_requests import (
+    COMPUTER_STATUS,
+    HEARTBEAT,
+    OBSTACLES,
+    ODOMETRY,
+    VISION_POSITION,
+    MessageRequests,
+)
+from drivers.mavlink.obstacle_distance import obstacle_distance
+
+OBSTACLES_HZ, COMPUTER_HZ = 5.0, 1.0
+MAX_AGE_NS = 500_000_000
+
+
+class VehicleReports:
+    """Sends ONBOARD_COMPUTER_STATUS, each second unless asked otherwise, and OBSTACLE_DISTANCE."""
+
+    def __init__(
+        self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, obstacles: bool
+    ) -> None:
+        self._link, self._clock, self._watch = link, clock, watch
+        self._obstacles = obstacles
+        self.computer_hz = COMPUTER_HZ
+        """How often the computer's state is sent, 5 a second at most; 0: not."""
+        self._camera_from_body = Pose.identity()
+        self.restart(None)
+
+    def restart(self, camera: Camera | None) -> None:
+        """Another flight, whose map is another."""
+        self._cloud = RecentCloud()
+        self._track: Track | None = None
+        self._map: MapUpdate | None = None
+        if camera is not None and camera.body_from_camera is not None:
+            self._camera_from_body = camera.body_from_camera.inverse()
+
+    def take(self, message: Track | MapUpdate | PointChunk) -> None:
+        """Take what the map has become."""
+        if isinstance(message, Track):
+            self._track = message
+        elif isinstance(message, MapUpdate):
+            self._map = message
+        elif self._obstacles:
+            self._cloud.add(message)
+
+    async def run(self) -> None:
+        """Send for ever; ends by cancellation."""
+        loop = asyncio.get_running_loop()
+        credit = 0.0
+        while True:
+            await asyncio.sleep(1.0 / OBSTACLES_HZ)
+            credit = min(credit + self.computer_hz / OBSTACLES_HZ, 1.0)
+            if not self._link.alive:
+                continue
+            if credit > 1.0 - 1e-6:
+                credit = 0.0
+                self._link.send(self.computer_status())
+            if self._obstacles:
+                message = await loop.run_in_executor(None, self._obstacle_distance)
+                if message is not None:
+                    self._link.send(message)
+
+    def computer_status(self) -> object:
+        """ONBOARD_COMPUTER_STATUS of now."""
+        message: object = computer_status(
+            self._clock.now_ns(), self._watch.load, too_hot=self._watch.too_hot
+        )
+        return message
+
+    def questions(self, feedback: Callable[[], FeedbackConfig]) -> Mapping[int, Command]:
+        """How it is answered who asks for messages of ours, or for their rates."""
+
+        def set_computer_rate(rate_hz: float | None) -> None:
+            self.computer_hz = COMPUTER_HZ if rate_hz is None else rate_hz
+
+        def rates_hz() -> dict[int, float]:
+            sent = feedback()
+            return {
+                HEARTBEAT: 1.0,
+                COMPUTER_STATUS: self.computer_hz,
+                OBSTACLES: OBSTACLES_HZ if self._obstacles else 0.0,
+                ODOMETRY: sent.rate_hz if sent.mode == "odometry" else 0.0,
+                VISION_POSITION: sent.rate_hz if sent.mode == "vision_position" else 0.0,
+            }
+
+        began_ns = self._clock.now_ns()
+        return MessageRequests(
+            {HEARTBEAT: self._link.heartbeat, COMPUTER_STATUS: self.computer_status},
+            rates_hz,
+            {COMPUTER_STATUS: set_computer_rate},
+            lambda: (self._clock.now_ns() - began_ns) // 1_000_000,
+        ).commands
+
+    def _obstacle_distance(self) -> object | None:
+        """OBSTACLE_DISTANCE of now, from the map's own pose; None while that is not known."""
+        track, update, now_ns = self._track, self._map, self._clock.now_ns()
+        if (
+            track is None or track.state is not TrackState.TRACKING
+            or track.map_from_camera is None or now_ns - track.t_ns > MAX_AGE_NS
+            or update is None or update.georeference is None
+        ):  # fmt: skip
+            return None
+        seen = self._cloud.in_world(now_ns, update)
+        if seen is None:
+            return None
+        world_from_map = update.georeference.world_from_map
+        world_from_body = (
+            world_from_map.apply_to_pose(track.map_from_camera) @ self._camera_from_body
+        )
+        message: object = obstacle_distance(obstacles_around(track.t_ns, world_from_body, *seen))
+        return message

@@ -1,0 +1,232 @@
+"""The depth stage: keyframes and the frames around them become depth maps and points.
+
+A keyframe waits until some later ones have come, so that its frames' poses are adjusted and both
+sides are at hand. Images wait undistorted, and no more of them than a bound.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.config import CloudConfig, DepthConfig
+from companion.dense.device_takeover import Devices, TestedEngine
+from companion.dense.engine import DepthEngine
+from companion.dense.fusion import Fusion, measured_only
+from companion.dense.undistortion import Undistortion
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose, Similarity
+from companion.messages import (
+    Bytes,
+    DepthMap,
+    Frame,
+    KeyframeAdded,
+    MapUpdate,
+    Message,
+    PointChunk,
+    Track,
+)
+from companion.timing.clock import Timer
+
+MAX_HELD = 100
+FIRST_BASELINE = 0.01
+"""Share of the median depth: the first frame has a short search, which is hardly ambiguous."""
+
+
+@dataclass(slots=True, eq=False)
+class _Held:
+    grey: Bytes
+    rgb: Bytes | None
+    track: Track | None = None
+
+
+class DepthStage:
+    """Frames, tracks, keyframes and map updates in; DepthMaps and PointChunks out.
+
+    A Warned says when its device has failed, and which one has taken over if one was left.
+    """
+
+    def __init__(
+        self,
+        config: DepthConfig,
+        cloud: CloudConfig,
+        camera: Camera,
+        devices: Devices,
+        times: Timer,
+    ) -> None:
+        self._config = config
+        self._fusion = Fusion(cloud)
+        self._undistortion = Undistortion(camera)
+        intrinsics = self._undistortion.intrinsics
+        self._engine = TestedEngine(
+            devices,
+            lambda device: DepthEngine(
+                device, camera.width, camera.height, intrinsics, config, eager=False
+            ),
+        )
+        self._times = times
+        self._held: OrderedDict[int, _Held] = OrderedDict()
+        self._waiting: list[KeyframeAdded] = []
+        self._update: MapUpdate | None = None
+        self._last_reference: int | None = None
+        self._share, self._credit = 1.0, 0.0
+        self._half_view_rad = float(np.arctan(0.5 * camera.width / intrinsics.fx))
+
+    def set_share(self, share: float) -> None:
+        """Give only this share of the keyframes a depth map from now on, 0 to 1."""
+        self._share = share
+
+    def step(self, message: Message) -> list[Message]:
+        """Take one message, in order of time."""
+        if isinstance(message, Frame):
+            if not self._engine.off:
+                self._hold(message)
+        elif isinstance(message, Track):
+            held = self._held.get(message.seq)
+            if held is not None:
+                held.track = message
+        elif isinstance(message, KeyframeAdded):
+            self._waiting.append(message)
+        elif isinstance(message, MapUpdate):
+            self._update = message
+            out: list[Message] = []
+            while len(self._waiting) > self._config.lag_keyframes:
+                with self._times("depth"):
+                    out += self._process(self._waiting.pop(0))
+            return [*self._engine.announced(message.t_ns), *out]
+        return []
+
+    def flush(self) -> list[Message]:
+        """Process the keyframes that still wait."""
+        out: list[Message] = []
+        for keyframe in self._waiting:
+            with self._times("depth"):
+                out += self._process(keyframe)
+        self._waiting.clear()
+        if self._update is not None:
+            out += self._fusion.flush(self._update)
+            out += self._engine.announced(self._update.t_ns)
+        return out
+
+    def _hold(self, frame: Frame) -> None:
+        self._held[frame.seq] = _Held(self._undistortion.image(frame.grey), frame.rgb)
+        if len(self._held) > MAX_HELD:
+            # thin out the older half; what a waiting keyframe needs stays
+            needed = {k.seq for k in self._waiting}
+            old = list(self._held)[: MAX_HELD // 2]
+            for seq in old[::2]:
+                if seq not in needed:
+                    del self._held[seq]
+
+    def _process(self, keyframe: KeyframeAdded) -> list[Message]:
+        update, held = self._update, self._held.get(keyframe.seq)
+        place = None if update is None else update.place_of(keyframe.keyframe_id)
+        if update is None or held is None or place is None or len(keyframe.points_camera) < 20:
+            return []
+        z = keyframe.points_camera[:, 2]
+        z = z[z > 0]
+        if not self._view_has_moved(keyframe, place, float(np.median(z))):
+            return []
+        near, far = 0.5 * float(np.quantile(z, 0.02)), 2.5 * float(np.quantile(z, 0.98))
+        chosen = self._choose(keyframe, update, place, float(np.median(z)))
+        if len(chosen) < 3 or not self._may():
+            return []
+        self._last_reference = keyframe.keyframe_id
+        assert held.rgb is not None
+        rgb = self._undistortion.image(held.rgb)
+
+        def depth(engine: DepthEngine) -> DepthMap:
+            engine.begin(held.grey, near, far)
+            for seq, current_from_reference in chosen:
+                engine.update(self._held[seq].grey, current_from_reference)
+            return engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb)
+
+        found = self._engine.run(keyframe.t_ns, depth)
+        self._forget(keyframe)
+        if found is None:
+            return []
+        depth_map = measured_only(found)
+        chunks: list[PointChunk] = self._fusion.add(depth_map, update)
+        return [depth_map, *chunks]
+
+    def _may(self) -> bool:
+        """Whether it is this keyframe's turn, where not all are to have depth."""
+        self._credit = min(self._credit + self._share, 1.0)
+        if self._credit < 1.0 - 1e-9:
+            return False
+        self._credit -= 1.0
+        return True
+
+    def _view_has_moved(
+        self, keyframe: KeyframeAdded, place: Similarity, median_depth: float
+    ) -> bool:
+        """Whether a keyframe sees enough that the last reference did not."""
+        last = self._last_reference
+        update = self._update
+        before = None if last is None or update is None else update.place_of(last)
+        if before is None:
+            return True
+        relative = before.inverse() @ place
+        step = float(np.linalg.norm(relative.translation)) / relative.scale / median_depth
+        turn = float(np.arccos(np.clip(relative.rotation[2, 2], -1, 1)))
+        # a turn by so much shows a sixth of the image anew
+        return step > self._config.reference_step or turn > 0.35 * self._half_view_rad
+
+    def _choose(
+        self, keyframe: KeyframeAdded, update: MapUpdate, place: Similarity, median_depth: float
+    ) -> list[tuple[int, Pose]]:
+        """Frames in order of use: baselines from short to long, both sides in turn."""
+        candidates = []
+        for seq, held in self._held.items():
+            track = held.track
+            if seq == keyframe.seq or track is None or track.keyframe_id is None:
+                continue
+            theirs = update.place_of(track.keyframe_id)
+            if theirs is None or track.keyframe_from_camera is None:
+                continue
+            relative = place.inverse() @ theirs
+            if abs(relative.scale - 1.0) > 1e-9:
+                continue  # another segment
+            reference_from_current = relative.apply_to_pose(track.keyframe_from_camera)
+            baseline = float(np.linalg.norm(reference_from_current.translation)) / median_depth
+            turn = np.arccos(np.clip(reference_from_current.rotation[2, 2], -1, 1))
+            if baseline <= self._config.max_baseline and turn < np.radians(35):
+                candidates.append((baseline, seq, reference_from_current.inverse()))
+        candidates.sort(key=lambda c: (c[0], c[1]))
+        if not candidates:
+            return []
+        longest = min(self._config.max_baseline, candidates[-1][0])
+        targets = np.geomspace(min(FIRST_BASELINE, longest), longest, self._config.n_updates)
+        chosen, used = [], set()
+        for index, target in enumerate(targets):
+            side = index % 2
+            rank = [
+                (
+                    abs(np.log(max(b, 1e-6) / target))
+                    + (0.15 if (seq > keyframe.seq) != bool(side) else 0),
+                    seq,
+                    pose,
+                )
+                for b, seq, pose in candidates
+                if seq not in used
+            ]
+            if not rank:
+                break
+            _, seq, pose = min(rank, key=lambda r: (r[0], r[1]))
+            used.add(seq)
+            chosen.append((seq, pose))
+        baselines = {seq: b for b, seq, _ in candidates}
+        return sorted(chosen, key=lambda c: (baselines[c[0]], c[0]))
+
+    def _forget(self, keyframe: KeyframeAdded) -> None:
+        """Let go of images from before the keyframes that can still use them."""
+        first_needed = keyframe.seq
+        for k in self._waiting[:1]:
+            first_needed = min(first_needed, k.seq)
+        # one keyframe interval back stays: the next references look back too
+        span = (self._waiting[0].seq - keyframe.seq) if self._waiting else 0
+        oldest = first_needed - max(2 * span, 10)
+        for seq in [s for s in self._held if s < oldest]:
+            del self._held[seq]

@@ -1,0 +1,164 @@
+"""How far it is to the nearest obstacle in each direction, out of the newest part of the map.
+
+Directions are sectors of a circle around the vehicle, level, the first centred on straight ahead,
+clockwise as seen from above. What the camera has not seen is unknown, not free: a sector is free
+only where lines of sight lead through it, at the vehicle's height, to something farther away.
+
+What stands still is found; what moves, and what has no texture, is not.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry.transforms import Array, Pose
+from companion.messages import MapUpdate, PointChunk
+
+N_SECTORS = 72
+SECTOR_DEG = 5.0
+UNKNOWN_CM = 65535
+MIN_POINTS = 3
+"""Fewer points than this in a sector are taken for errors."""
+NEAR_SIGHT_M = 1.0
+"""A line of sight counts for the vehicle's surroundings where it passes so near to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Where obstacles are looked for: nearer than `min_m` is the vehicle itself.
+
+    Heights are above and below the vehicle, in the world, whatever its attitude.
+    """
+
+    min_m: float = 0.3
+    max_m: float = 20.0
+    above_m: float = 1.0
+    below_m: float = 0.75
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Obstacles:
+    """Distances (72,) in centimetres: `max_cm` + 1 where it is free, UNKNOWN_CM where not seen."""
+
+    t_ns: int
+    distances_cm: NDArray[np.uint16]
+    min_cm: int
+    max_cm: int
+
+
+def obstacles_around(
+    t_ns: int,
+    world_from_body: Pose,
+    points_world_m: Array,
+    seen_from_world_m: Array,
+    reach: Reach = Reach(),
+) -> Obstacles:
+    """Distances from a pose, of points (N, 3) that were seen from the places (N, 3).
+
+    The pose must be of the map that the points are of: one that is smoothed lies beside it.
+    """
+    position = world_from_body.translation
+    finite = np.isfinite(points_world_m).all(1) & np.isfinite(seen_from_world_m).all(1)
+    points, eyes = points_world_m[finite] - position, seen_from_world_m[finite] - position
+    distance_m = np.hypot(points[:, 0], points[:, 1])
+    sector = _sector(points, world_from_body)
+
+    max_cm = round(reach.max_m * 100)
+    min_cm = round(reach.min_m * 100)
+    distances_cm = np.full(N_SECTORS, UNKNOWN_CM, np.uint16)
+    far = distance_m > reach.max_m
+    through = _seen_through(points[far], eyes[far], reach)
+    distances_cm[np.bincount(sector[far][through], minlength=N_SECTORS) >= MIN_POINTS] = max_cm + 1
+
+    down_m = points[:, 2]
+    hit = (down_m >= -reach.above_m) & (down_m <= reach.below_m)
+    hit &= (distance_m >= reach.min_m) & (distance_m <= reach.max_m)
+    hit_m, hit_sector = distance_m[hit], sector[hit]
+    order = np.lexsort((hit_m, hit_sector))
+    hit_m, hit_sector = hit_m[order], hit_sector[order]
+    found, first, n = np.unique(hit_sector, return_index=True, return_counts=True)
+    # Not the very nearest of a sector, which may be an error.
+    enough = n >= MIN_POINTS
+    nearest_m = hit_m[first[enough] + MIN_POINTS - 1]
+    distances_cm[found[enough]] = np.clip((nearest_m * 100).astype(np.int64), min_cm, max_cm)
+    return Obstacles(t_ns, distances_cm, min_cm, max_cm)
+
+
+def _sector(points: Array, world_from_body: Pose) -> NDArray[np.int64]:
+    """Sector of each point (N, 3), relative to the vehicle, in world axes."""
+    forward = world_from_body.rotation[:, 0]
+    bearing_rad = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(forward[1], forward[0])
+    index: NDArray[np.int64] = np.floor(np.degrees(bearing_rad) / SECTOR_DEG + 0.5).astype(np.int64)
+    return index % N_SECTORS
+
+
+def _seen_through(points: Array, eyes: Array, reach: Reach) -> NDArray[np.bool_]:
+    """Which of these points beyond reach end a line of sight that keeps to the vehicle's height.
+
+    The line begins at the eye and passes near to the vehicle, which is at the origin.
+    """
+    line = points - eyes
+    length_m = np.linalg.norm(line, axis=1)
+    direction = line / np.maximum(length_m, 1e-9)[:, None]
+    along_m = np.clip(-(eyes * direction).sum(1), 0.0, length_m)
+    closest = eyes + along_m[:, None] * direction
+    level = np.hypot(direction[:, 0], direction[:, 1])
+    end_down_m = closest[:, 2] + direction[:, 2] / np.maximum(level, 1e-9) * reach.max_m
+    through: NDArray[np.bool_] = (
+        (np.linalg.norm(closest, axis=1) <= NEAR_SIGHT_M)
+        & (closest[:, 2] >= -reach.above_m)
+        & (closest[:, 2] <= reach.below_m)
+        & (end_down_m >= -reach.above_m)
+        & (end_down_m <= reach.below_m)
+    )
+    return through
+
+
+class RecentCloud:
+    """The newest chunks of the cloud, thinned; what is older than `max_age_s` no longer counts."""
+
+    def __init__(
+        self, max_age_s: float = 15.0, max_chunks: int = 12, max_points: int = 2000
+    ) -> None:
+        self._max_age_ns = round(max_age_s * 1e9)
+        self._max_chunks = max_chunks
+        self._max_points = max_points
+        self._chunks: OrderedDict[int, PointChunk] = OrderedDict()
+
+    def add(self, chunk: PointChunk) -> None:
+        """Take a new chunk, or a new one of a keyframe that had one."""
+        step = -(-len(chunk.points_camera) // self._max_points) or 1
+        thinned = PointChunk(
+            chunk.keyframe_id,
+            chunk.t_ns,
+            chunk.points_camera[::step],
+            chunk.rgb[::step],
+            chunk.confidence[::step],
+            chunk.normals_camera[::step],
+            chunk.sigma[::step],
+        )
+        self._chunks.pop(chunk.keyframe_id, None)
+        self._chunks[chunk.keyframe_id] = thinned
+        while len(self._chunks) > self._max_chunks:
+            self._chunks.popitem(last=False)
+
+    def in_world(self, t_ns: int, update: MapUpdate) -> tuple[Array, Array] | None:
+        """Points (N, 3) and the places (N, 3) that they were seen from, in metres.
+
+        None without a metric scale.
+        """
+        if update.georeference is None:
+            return None
+        points, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for chunk in self._chunks.values():
+            place = update.place_of(chunk.keyframe_id)
+            if place is None or t_ns - chunk.t_ns > self._max_age_ns:
+                continue
+            world_from_camera = update.georeference.world_from_map @ place
+            points.append(world_from_camera.apply(chunk.points_camera.astype(np.float64)))
+            eyes.append(np.broadcast_to(world_from_camera.translation, points[-1].shape))
+        return np.concatenate(points), np.concatenate(eyes)

@@ -1,0 +1,148 @@
+"""Depth of every pixel at once: planes swept through several images, costs summed along paths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pyopencl as cl
+
+from companion.dense.opencl import ComputeDevice
+from companion.dense.view_selection import MAX_VIEWS
+from companion.errors import DeviceError
+from companion.geometry.transforms import Array
+from companion.messages import Bytes
+
+PLANES = (32, 64, 128)
+"""Numbers of planes that there are kernels for; each is a multiple of 16."""
+BLOCK = 8
+SMALL, LARGE = 3.5, 27.0
+"""Penalties of a step by one plane and by more, in bits for each image that counts."""
+SOFT_GREY = 16
+"""Grey levels of an edge at which a large step costs half."""
+UNLOOKED = 18
+"""Bits for each image that a plane costs which is not looked at: more than what does not fit."""
+COARSE_PATHS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+PATHS = (*COARSE_PATHS, (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+Run = Callable[..., None]
+
+
+class PlaneSweep:
+    """Buffers and kernels of a sweep for images of one size; results stay on the device.
+
+    `rho` and `margin` hold, after `run`, inverse depth f32 on the grid (a median of 3 x 3) and by
+    how much, in proportion, the next best plane is worse; `noise` how rough the depth is there.
+    """
+
+    def __init__(self, device: ComputeDevice, width: int, height: int, stride: int) -> None:
+        self._device = device
+        self.size = (width, height)
+        self.stride = stride
+        self.grid = (-(-width // stride), -(-height // stride))
+        self._coarse = (-(-width // (2 * stride)), -(-height // (2 * stride)))
+        n = self.grid[0] * self.grid[1]
+        largest = device.device.max_mem_alloc_size
+        if 2 * PLANES[-1] * n > largest:
+            raise DeviceError(
+                f"{device.name}: images of {width} x {height} need a buffer of "
+                f"{2 * PLANES[-1] * n >> 20} MB, it allows {largest >> 20}: raise depth.stride"
+            )
+        self._kernels = {n: _kernels(device, n) for n in PLANES}
+        self._n_pixels = width * height
+        self.reference = device.buffer(self._n_pixels)
+        self._words_r = device.buffer(4 * self._n_pixels)
+        self.images = [device.buffer(self._n_pixels) for _ in range(MAX_VIEWS)]
+        self._words = device.buffer(4 * self._n_pixels * MAX_VIEWS)
+        self._stale: set[int] = set()
+        self._views = device.buffer(4 * 12 * MAX_VIEWS)
+        self._blocks = device.buffer(4 * n)
+        self._cost, self._sum = device.buffer(PLANES[-1] * n), device.buffer(2 * PLANES[-1] * n)
+        self._winner = device.buffer(4 * n)
+        self.rho, self.margin, self.noise = (device.buffer(4 * n) for _ in range(3))
+
+    def set_reference(self, grey: Bytes, run: Run) -> None:
+        """Take the reference image (H, W)."""
+        self._device.write(self.reference, np.ascontiguousarray(grey))
+        self._census(self.reference, self._words_r, 0, run)
+
+    def set_image(self, slot: int, grey: Bytes) -> None:
+        """Take an image (H, W) into a slot; it is looked at when next a sweep runs."""
+        self._device.write(self.images[slot], np.ascontiguousarray(grey))
+        self._stale.add(slot)
+
+    def run(self, projections: Array, rho_low: float, step: float, n_planes: int, run: Run) -> None:
+        """Sweep planes rho_low + k * step, at most `PLANES[-1]` of them.
+
+        `projections` (n, 12) are those of the images in slots 0 to n - 1.
+        """
+        planes = next(n for n in PLANES if n >= n_planes)
+        looked_at = (1 << -(-n_planes // BLOCK)) - 1
+        n = len(projections)
+        for slot in sorted(self._stale):
+            self._census(self.images[slot], self._words, slot * self._n_pixels, run)
+        self._stale.clear()
+        dropped = 2 if n >= 5 else 1 if n >= 3 else 0
+        self._device.write(self._views, np.ascontiguousarray(projections, np.float32))
+        for coarse in (True, False):
+            if coarse:
+                everywhere = np.full(self._coarse[0] * self._coarse[1], looked_at, np.uint32)
+                self._device.write(self._blocks, everywhere)
+            else:
+                run(
+                    "blocks", self._kernels[planes]["blocks_about"], self.grid, (64, 1), self.rho,
+                    *map(np.int32, self._coarse), np.float32(rho_low), np.float32(step),
+                    np.uint32(looked_at), self._blocks, *map(np.int32, self.grid),
+                )  # fmt: skip
+            self._level(coarse, self._kernels[planes], n, dropped, rho_low, step, run)
+
+    def _level(
+        self, coarse: bool, kernels: dict[str, cl.Kernel], n: int, dropped: int,
+        rho_low: float, step: float, run: Run,
+    ) -> None:  # fmt: skip
+        grid = tuple(map(np.int32, self._coarse if coarse else self.grid))
+        stride = np.int32(self.stride * (2 if coarse else 1))
+        width, height = map(np.int32, self.size)
+        counted = n - dropped
+        small, large = int(SMALL * counted), int(LARGE * counted)
+        level = "coarse" if coarse else "fine"
+        run(
+            f"costs-{level}", kernels["costs"], grid, (16, 1), self._words_r, self._words,
+            width, height, self._views, np.int32(n), np.int32(dropped), np.float32(rho_low),
+            np.float32(step), self._blocks, np.int32(UNLOOKED * counted), self._cost, *grid, stride,
+        )  # fmt: skip
+        for k, (dx, dy) in enumerate(COARSE_PATHS if coarse else PATHS):
+            run(
+                f"aggregate-{level}", kernels["aggregate"], (grid[0] if dy else grid[1],),
+                (8,), self._cost, self._sum, self.reference, width, *grid, stride, np.int32(dx),
+                np.int32(dy), np.int32(small), np.int32(large), np.int32(SOFT_GREY),
+                np.int32(k == 0),
+            )  # fmt: skip
+        n_cells = grid[0] * grid[1]
+        run(
+            f"winner-{level}", kernels["winner"], (n_cells,), (64,), self._sum, n_cells,
+            np.float32(rho_low), np.float32(step), self._winner, self.margin,
+        )  # fmt: skip
+        run(
+            f"median-{level}",
+            kernels["median"],
+            grid,
+            (64, 1),
+            self._winner,
+            *grid,
+            self.rho,
+            self.noise,
+        )
+
+    def _census(self, image: cl.Buffer, words: cl.Buffer, first: int, run: Run) -> None:
+        width, height = self.size
+        run(
+            "census", self._kernels[PLANES[0]]["census"], (-(-width // 8), height), (16, 1), image,
+            np.int32(width), np.int32(height), words, np.int32(first),
+        )  # fmt: skip
+
+
+def _kernels(device: ComputeDevice, planes: int) -> dict[str, cl.Kernel]:
+    program = device.build("sweep.cl", {"PLANES": planes})
+    names = ("census", "costs", "aggregate", "winner", "blocks_about", "median")
+    return {name: cl.Kernel(program, name) for name in names}

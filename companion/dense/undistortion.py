@@ -1,0 +1,53 @@
+"""From a camera's images to those of an ideal pinhole camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.dense.view_selection import Intrinsics
+from companion.geometry.camera import Camera
+from companion.messages import Bytes, Floats
+
+MAX_HFOV_RAD = np.radians(110.0)
+
+
+class Undistortion:
+    """Remaps images of one camera to an ideal pinhole camera's of the same size.
+
+    The focal length is kept, unless the field of view would be too wide for a plane.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        fx, fy = camera.fx, camera.fy
+        widest = 0.5 * camera.width / np.tan(0.5 * MAX_HFOV_RAD)
+        if camera.distortion.value == "equidistant" and fx < widest:
+            fx, fy = widest, widest * camera.fy / camera.fx
+        self.intrinsics = Intrinsics(fx, fy, camera.cx, camera.cy)
+        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        self._normalised = np.stack([(u - camera.cx) / fx, (v - camera.cy) / fy], -1)
+        d = camera.distort(self._normalised.reshape(-1, 2))
+        shape = (camera.height, camera.width)
+        self._map_u = (d[:, 0] * camera.fx + camera.cx).reshape(shape).astype(np.float32)
+        self._map_v = (d[:, 1] * camera.fy + camera.cy).reshape(shape).astype(np.float32)
+        self._fixed = cv2.convertMaps(self._map_u, self._map_v, cv2.CV_16SC2)
+
+    def image(self, image: Bytes) -> Bytes:
+        """The undistorted image, (H, W) or (H, W, 3)."""
+        return np.asarray(cv2.remap(image, *self._fixed, cv2.INTER_LINEAR), np.uint8)
+
+    def grey(self, rgb: Bytes) -> Bytes:
+        """The undistorted image (H, W) of an RGB image (H, W, 3)."""
+        return np.asarray(cv2.cvtColor(self.image(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
+
+    def nearest(self, values: NDArray[Any]) -> Floats:
+        """Values (H, W) that must not be mixed, such as depths; 0 outside."""
+        out = cv2.remap(values, self._map_u, self._map_v, cv2.INTER_NEAREST)
+        return np.asarray(out, np.float32)
+
+    def ray_length(self) -> Floats:
+        """Length (H, W) of the ray to a point at depth 1."""
+        return np.asarray(np.sqrt((self._normalised**2).sum(-1) + 1), np.float32)

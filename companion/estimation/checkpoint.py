@@ -1,0 +1,206 @@
+"""What localisation needs to go on after its process was lost: a value, and its bytes.
+
+A file holds a magic number with the format's version, the CRC-32 of all that follows, and numpy's
+.npz of plain arrays (no pickles), of which `head` is JSON.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from companion.config import Config
+from companion.errors import CompanionError
+from companion.estimation.smooth_odometry import OdometryState
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array, Pose, Similarity
+from companion.messages import Georeference
+from companion.slam.features.orb_features import features_of
+from companion.slam.map.map_part import MapPart
+from companion.slam.map.sparse_map import Keyframe, PointArrays
+
+MAGIC = b"COMPMAP\x01"
+"""Its last byte is the version of the format."""
+CHECK_BYTES = 4
+MOST_BYTES = 4_000_000
+"""Of keyframes and points: the surroundings of some 20 keyframes, and 4 ms to copy."""
+_FEATURES: dict[str, Any] = {
+    "pixels": np.float32, "octaves": np.uint8, "angles_deg": np.float32, "descriptors": np.uint8,
+}  # fmt: skip
+_OF_KEYFRAMES: dict[str, Any] = {
+    "point_ids": np.int32, "refined_for": np.int32, "normalised": np.float32,
+    "whitening": np.float32,
+}  # fmt: skip
+_POINTS: dict[str, Any] = {
+    "positions": np.float64, "descriptors": np.uint8, "normals": np.float32,
+    "base_distance": np.float64, "n_visible": np.int32, "n_found": np.int32, "born": np.int64,
+    "first_seen": np.int64, "first_unproject": np.float32, "patch_centre": np.float32,
+    "patch_level": np.int8, "patch_grey": np.uint8,
+}  # fmt: skip
+"""Types in a file; in the map they are wider."""
+
+
+class CheckpointError(CompanionError):
+    """A checkpoint cannot be used: why, in words."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkpoint:
+    """A place in a map, and what is known of both.
+
+    `t_ns` is the time of the last frame that was tracked; `ned_from_map` (3, 3) how the map's axes
+    lay to the autopilot's in it, None where no attitude was told. `body_from_camera` (3, 3) and
+    `late_ns` are the mount and the delay of stamps as found in flight.
+    """
+
+    t_ns: int
+    part: MapPart
+    next_keyframe_id: int
+    ned_from_map: Array | None
+    georeference: Georeference | None
+    odometry: OdometryState | None
+    body_from_camera: Array
+    late_ns: int
+
+
+def fingerprint(config: Config, camera: Camera) -> str:
+    """What must be the same for a map to be taken up: camera, features, who tells the scale."""
+    mount = camera.body_from_camera
+    features = config.features
+    told = (
+        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+        camera.distortion.value, camera.coefficients, features.n_levels, features.scale_factor,
+        None if mount is None else mount.matrix().tolist(), config.feedback.mode != "off",
+    )  # fmt: skip
+    return hashlib.sha256(repr(told).encode()).hexdigest()
+
+
+def encode(checkpoint: Checkpoint, remarks: dict[str, Any]) -> tuple[bytes, bytes]:
+    """The bytes of a file, in two parts; `remarks` is what its writer has to say, as JSON."""
+    part, found, odometry = checkpoint.part, checkpoint.georeference, checkpoint.odometry
+    head: dict[str, Any] = {
+        "remarks": remarks, "t_ns": checkpoint.t_ns, "late_ns": checkpoint.late_ns,
+        "next_keyframe_id": checkpoint.next_keyframe_id,
+        "first_keyframe_id": part.first_keyframe_id, "level": part.level,
+    }  # fmt: skip
+    arrays: dict[str, Any] = {"body_from_camera": checkpoint.body_from_camera}
+    if checkpoint.ned_from_map is not None:
+        arrays["ned_from_map"] = checkpoint.ned_from_map
+    if found is not None:
+        to_world = found.world_from_map
+        head["georeference"] = [
+            to_world.scale, found.sigma_scale, found.sigma_yaw_rad, found.method,
+            found.n_positions, found.residual_m, found.has_origin,
+        ]  # fmt: skip
+        arrays["world_from_map"] = Pose(to_world.rotation, to_world.translation).matrix()
+    if odometry is not None:
+        head["anchored"] = odometry.anchored
+        arrays["odometry_from_world"] = odometry.odometry_from_world.matrix()
+        arrays["motion"] = np.stack([odometry.place_m, odometry.velocity_m_s])
+    arrays |= _keyframe_arrays(part.keyframes)
+    for name, values in part.points._asdict().items():
+        arrays[f"point_{name}"] = values.astype(_POINTS[name])
+    arrays["head"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    payload = file.getvalue()
+    return MAGIC + zlib.crc32(payload).to_bytes(CHECK_BYTES, "little"), payload
+
+
+def _keyframe_arrays(keyframes: tuple[Keyframe, ...]) -> dict[str, Any]:
+    untold = np.full((3, 3), np.nan)
+    turns = [untold if k.ned_from_camera is None else k.ned_from_camera for k in keyframes]
+    arrays: dict[str, Any] = {
+        "keyframes": np.array(
+            [[k.keyframe_id, k.seq, k.t_ns, len(k.features)] for k in keyframes], np.int64
+        ),
+        "camera_from_map": np.stack([k.camera_from_map.matrix() for k in keyframes]),
+        "ned_from_camera": np.stack(turns),
+    }
+    for name, kind in _FEATURES.items():
+        arrays[name] = np.concatenate([getattr(k.features, name).astype(kind) for k in keyframes])
+    for name, kind in _OF_KEYFRAMES.items():
+        arrays[name] = np.concatenate([getattr(k, name).astype(kind) for k in keyframes])
+    return arrays
+
+
+def opened(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a file's writer said, and its arrays; CheckpointError where it is damaged."""
+    begin = len(MAGIC) + CHECK_BYTES
+    if data[: len(MAGIC)] != MAGIC:
+        raise CheckpointError("it is of another version, or no checkpoint")
+    if zlib.crc32(memoryview(data)[begin:]) != int.from_bytes(data[len(MAGIC) : begin], "little"):
+        raise CheckpointError("it is damaged")
+    try:
+        with np.load(io.BytesIO(data[begin:]), allow_pickle=False) as file:
+            arrays = dict(file)
+        said: dict[str, Any] = json.loads(bytes(arrays["head"]))["remarks"]
+    except (ValueError, KeyError, TypeError, OSError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"it cannot be read ({error})") from error
+    return said, arrays
+
+
+def decode(arrays: dict[str, Any], camera: Camera, scale_factor: float) -> Checkpoint:
+    """The checkpoint in a file's arrays, which is of this camera; CheckpointError if there is none.
+
+    `scale_factor` is that between the octaves of features.
+    """
+    try:
+        return _decoded(arrays, camera, scale_factor)
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise CheckpointError(f"it cannot be read ({error!r})") from error
+
+
+def _decoded(arrays: dict[str, Any], camera: Camera, scale_factor: float) -> Checkpoint:
+    head = json.loads(bytes(arrays["head"]))
+    georeference, odometry = None, None
+    if "georeference" in head:
+        scale, *told = head["georeference"]
+        to_world = arrays["world_from_map"]
+        georeference = Georeference(Similarity(scale, to_world[:3, :3], to_world[:3, 3]), *told)
+    if "motion" in arrays:
+        place_m, velocity_m_s = arrays["motion"]
+        odometry_from_world = Pose.from_matrix(arrays["odometry_from_world"])
+        odometry = OdometryState(odometry_from_world, head["anchored"], place_m, velocity_m_s)
+    points = PointArrays(*(arrays[f"point_{name}"] for name in PointArrays._fields))
+    keyframes = _keyframes(arrays, camera, scale_factor, len(points.positions))
+    return Checkpoint(
+        head["t_ns"],
+        MapPart(head["first_keyframe_id"], head["level"], keyframes, points),
+        head["next_keyframe_id"], arrays.get("ned_from_map"), georeference, odometry,
+        arrays["body_from_camera"], head["late_ns"],
+    )  # fmt: skip
+
+
+def _keyframes(
+    arrays: dict[str, Any], camera: Camera, scale_factor: float, n_points: int
+) -> tuple[Keyframe, ...]:
+    rows = arrays["keyframes"]
+    pixels, octaves = arrays["pixels"], arrays["octaves"].astype(np.int64)
+    point_ids, refined_for = (arrays[k].astype(np.int64) for k in ("point_ids", "refined_for"))
+    if rows[:, 3].sum() != len(pixels) or max(point_ids.max(), refined_for.max()) >= n_points:
+        raise ValueError("features, keyframes and points do not fit together")
+    normalised = camera.normalise(pixels)
+    out, begin = [], 0
+    for n, (keyframe_id, seq, t_ns, size) in enumerate(rows.tolist()):
+        own = slice(begin, begin + size)
+        begin += size
+        turn = arrays["ned_from_camera"][n]
+        features = features_of(
+            camera, scale_factor, pixels[own], normalised[own], octaves[own],
+            arrays["angles_deg"][own], arrays["descriptors"][own],
+        )  # fmt: skip
+        out.append(Keyframe(
+            keyframe_id, seq, t_ns, Pose.from_matrix(arrays["camera_from_map"][n]), features,
+            point_ids[own], arrays["normalised"][own].astype(np.float64),
+            arrays["whitening"][own].astype(np.float64), refined_for[own],
+            ned_from_camera=None if np.isnan(turn).any() else turn,
+        ))  # fmt: skip
+    return tuple(out)

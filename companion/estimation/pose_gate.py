@@ -1,0 +1,295 @@
+"""Which poses the autopilot is given: those that it may fly on, and none else.
+
+A pose must be metric, of a tracked frame, certain and good enough, as level as the autopilot itself
+finds its body, and young. What cannot be checked is not sent. All that must have held for a while
+before the first is sent; afterwards a gap is bridged by prediction, shorter than an autopilot takes
+to notice, and then nothing is sent until belief has held again. So it is after every discontinuity,
+whatever led to it: nothing of the new place is sent before that.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.config import FeedbackConfig
+from companion.estimation.motion_filter import MAX_EXTRAPOLATION_NS, AttitudeHistory
+from companion.estimation.reset_counter import ResetCounter
+from companion.geometry.transforms import Array, Pose
+from companion.messages import AttitudeSample, Odometry, TrackState
+
+MAX_TILT_APART_RAD = np.radians(8.0)
+MAX_AGE_NS = 300_000_000
+"""A pose this old when it comes is of no use to an autopilot."""
+EASE = 0.8
+"""To begin, a pose must be better than the limits by this factor."""
+MAX_EXTENT_M = 1e5
+MIN_SPACING_NS = 4_000_000
+STEADY_PERIODS = 20
+MAX_ATTITUDE_GAP_NS = 2 * MAX_EXTRAPOLATION_NS
+"""Between two samples of attitude: no time between them is further from one than extrapolation."""
+
+OFF = "off"
+NOT_YET = "no pose yet"
+INITIALISING = "initialising"
+LOST = "lost"
+NO_SCALE = "no metric scale"
+UNCERTAIN = "position too uncertain"
+POOR = "quality too low"
+TILTED = "tilt differs from the autopilot's"
+LATE = "poses come too late"
+SILENT = "no frames"
+NO_ATTITUDE = "no autopilot attitude"
+BEGUN_ANEW = "localisation begins anew"
+RESET = "position reset"
+REBOOTED = "autopilot rebooted"
+NO_HEIGHT = "no autopilot height"
+PROVING = "belief must hold first"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseToSend:
+    """A pose for the autopilot, at `t_ns`, in NED-aligned metres; see Odometry.
+
+    Its down axis may be shifted against that of an Odometry, so that it begins at the autopilot's.
+    """
+
+    t_ns: int
+    world_from_body: Pose
+    velocity_world_m_s: Array
+    sigma_position_m: float
+    sigma_velocity_m_s: float
+    sigma_attitude_rad: float
+    sigma_yaw_rad: float
+    quality: int
+    reset_counter: int
+    predicted: bool = False
+
+
+class PoseGate:
+    """Odometry and attitude in; poses to send out. `now_ns` is the time of the call.
+
+    `start_down_m` gives the autopilot's own place along the world's down axis at the time of a
+    frame, None where poses must not begin for want of it; without it poses stay in our world.
+    `may_begin` gives what else stands against the first pose of a row, "" if nothing does.
+    """
+
+    def __init__(
+        self,
+        config: FeedbackConfig,
+        counter: ResetCounter | None = None,
+        start_down_m: Callable[[int], float | None] | None = None,
+        may_begin: Callable[[int], str] = lambda _now_ns: "",
+    ) -> None:
+        self._config = config
+        self._attitude = AttitudeHistory(400, MAX_ATTITUDE_GAP_NS)
+        self._counter = counter or ResetCounter()
+        self._start_down_m, self._may_begin = start_down_m, may_begin
+        self._down_shift_m: float | None = None
+        """Added to our down axis; fixed with the first pose, until a discontinuity."""
+        self._resets_seen: int | None = None
+        self._good: Odometry | None = None
+        self._good_at_ns = 0
+        self._believed_since_ns: int | None = None
+        self._last_stamp_ns = 0
+        self._n_predicted = 0
+        self._periods_ns: deque[int] = deque(maxlen=STEADY_PERIODS)
+        self._newest_ns = 0
+        self._last_doubt = ""
+        self.sending = False
+        self.why_not = NOT_YET
+
+    @property
+    def n_resets(self) -> int:
+        """Discontinuities that the autopilot has been told of, or will be with the next pose."""
+        return self._counter.value
+
+    def restart(self) -> None:
+        """Localisation begins anew: nothing ties its poses to those before."""
+        if self.sending:
+            self._stop(BEGUN_ANEW)
+        self._discontinuity()
+        self._resets_seen = None
+        self._good, self._believed_since_ns = None, None
+        self._periods_ns.clear()
+        self._newest_ns = 0
+
+    def autopilot_booted(self, last_sent: int | None) -> None:
+        """Another boot of the autopilot: the reset counter that it was last sent, None if none."""
+        self._counter.booted(last_sent)
+        self._down_shift_m = None
+        self._stop(REBOOTED if self.sending else self.why_not)
+
+    def reconfigure(self, config: FeedbackConfig) -> None:
+        """Take over other limits; what is believed and what was sent stay as they are."""
+        self._config = config
+
+    def withhold(self, why_not: str) -> None:
+        """Send nothing more until belief has held anew."""
+        self._stop(why_not)
+
+    def take_attitude(self, sample: AttitudeSample) -> None:
+        """Take the autopilot's attitude: poses are checked against it, predictions turn with it."""
+        if not 0.5 < float(np.linalg.norm(sample.ned_from_body)) < 2.0:  # nan neither
+            return
+        rates = sample.rates_body_rad_s
+        if rates is not None and not np.isfinite(rates).all():
+            sample = replace(sample, rates_body_rad_s=None)
+        self._attitude.add(sample)
+
+    def take(self, odometry: Odometry, now_ns: int) -> PoseToSend | None:
+        """Take the odometry of a frame; the pose to send at once, or None."""
+        if odometry.t_ns <= self._newest_ns:
+            return None
+        if self._newest_ns:
+            self._periods_ns.append(odometry.t_ns - self._newest_ns)
+        self._newest_ns = odometry.t_ns
+        was_reset = self._resets_seen not in (None, odometry.reset_counter)
+        self._resets_seen = odometry.reset_counter
+        if was_reset:
+            self._discontinuity()
+            self._stop(RESET)
+            return None
+        if now_ns - self._good_at_ns > self._max_gap_ns:
+            self._cease()
+        why_not = self._doubt(odometry, now_ns)
+        if why_not:
+            self._believed_since_ns = None
+            self.why_not = why_not if not self.sending else ""
+            self._last_doubt = why_not
+            return None
+        self._good, self._good_at_ns, self._n_predicted = odometry, now_ns, 0
+        self._last_doubt = ""
+        if not self.sending:
+            if self._believed_since_ns is None:
+                self._believed_since_ns = now_ns
+            proven = now_ns - self._believed_since_ns >= self._config.resume_after_s * 1e9
+            self.why_not = self._begin(odometry, now_ns) if proven else PROVING
+            if self.why_not:
+                return None
+        return self._stamped(self._pose_of(odometry))
+
+    def due(self, now_ns: int) -> PoseToSend | None:
+        """A predicted pose, where the camera is slower than the rate wanted, or a frame is late.
+
+        To be asked every few milliseconds; this also notices that poses have ceased.
+        """
+        good = self._good
+        if not self.sending or good is None:
+            return None
+        since_ns = now_ns - self._good_at_ns
+        if since_ns > self._max_gap_ns:
+            self._cease()
+            return None
+        period_ns = self._period_ns()
+        n_steps = max(1, int(np.ceil(period_ns * 1e-9 * self._config.rate_hz - 0.1)))
+        step_ns = period_ns // n_steps
+        number = self._n_predicted + 1
+        # where the next frame itself is due it is given some time
+        slack_ns = step_ns // 2 if number >= n_steps else 0
+        if since_ns < number * step_ns + slack_ns:
+            return None
+        self._n_predicted = number
+        predicted = self._predicted(good, number * step_ns)
+        return self._stamped(predicted) if predicted is not None else None
+
+    @property
+    def _max_gap_ns(self) -> int:
+        return int(self._config.max_gap_ms * 1e6)
+
+    def _period_ns(self) -> int:
+        if not self._periods_ns:
+            return int(1e9 / self._config.rate_hz)
+        return int(np.median(self._periods_ns))
+
+    def _doubt(self, odometry: Odometry, now_ns: int) -> str:
+        """Why a frame's pose is not believed; "" if it is."""
+        pose, velocity = odometry.world_from_body, odometry.velocity_world_m_s
+        if odometry.state is TrackState.INITIALISING:
+            return INITIALISING
+        if odometry.state is not TrackState.TRACKING:
+            return LOST
+        if pose is None or velocity is None:
+            return NO_SCALE if self._good is None else LOST
+        numbers = np.r_[pose.rotation.ravel(), pose.translation, velocity]
+        if not np.isfinite(numbers).all() or np.abs(pose.translation).max() > MAX_EXTENT_M:
+            return UNCERTAIN
+        ease = 1.0 if self.sending else EASE
+        if not odometry.sigma_position_m <= ease * self._config.max_sigma_m:
+            return UNCERTAIN
+        if odometry.quality * ease < self._config.min_quality:
+            return POOR
+        if now_ns - odometry.t_ns > MAX_AGE_NS:
+            return LATE
+        attitude = self._attitude.at(odometry.t_ns)
+        if attitude is None:
+            return NO_ATTITUDE
+        cosine = float(np.clip(attitude[2] @ pose.rotation[2], -1.0, 1.0))
+        if not np.arccos(cosine) <= MAX_TILT_APART_RAD * ease:
+            return TILTED
+        return ""
+
+    def _begin(self, odometry: Odometry, now_ns: int) -> str:
+        """Begin to send with a pose that has been proven; why not, if it may not be."""
+        assert odometry.world_from_body is not None
+        shift_m = self._down_shift_m
+        if shift_m is None and self._start_down_m is not None:
+            start_m = self._start_down_m(odometry.t_ns)
+            if start_m is None or not np.isfinite(start_m):
+                return NO_HEIGHT
+            shift_m = start_m - float(odometry.world_from_body.translation[2])
+        why_not = self._may_begin(now_ns)
+        if not why_not:
+            self._down_shift_m = shift_m or 0.0
+            self.sending = self._counter.sent = True
+        return why_not
+
+    def _discontinuity(self) -> None:
+        self._counter.discontinuity()
+        self._down_shift_m = None
+
+    def _cease(self) -> None:
+        """No pose has been believed for too long."""
+        if self.sending:
+            self._stop(self._last_doubt or SILENT)
+        self._believed_since_ns = None
+
+    def _stop(self, why_not: str) -> None:
+        self.sending, self.why_not = False, why_not
+        self._believed_since_ns = None
+
+    def _pose_of(self, odometry: Odometry) -> PoseToSend:
+        assert odometry.world_from_body is not None and odometry.velocity_world_m_s is not None
+        pose, down_m = odometry.world_from_body, self._down_shift_m or 0.0
+        return PoseToSend(
+            odometry.t_ns, Pose(pose.rotation, pose.translation + [0.0, 0.0, down_m]),
+            odometry.velocity_world_m_s, odometry.sigma_position_m, odometry.sigma_velocity_m_s,
+            odometry.sigma_attitude_rad, odometry.sigma_yaw_rad, odometry.quality,
+            self._counter.value & 0xFF,
+        )  # fmt: skip
+
+    def _predicted(self, good: Odometry, ahead_ns: int) -> PoseToSend | None:
+        """The pose a while after a good one: on by its velocity, turned as the autopilot turned.
+
+        None where nobody knows how it turned.
+        """
+        before, now = self._attitude.at(good.t_ns), self._attitude.at(good.t_ns + ahead_ns)
+        if before is None or now is None:
+            self._last_doubt = self._last_doubt or NO_ATTITUDE
+            return None
+        pose = replace(self._pose_of(good), t_ns=good.t_ns + ahead_ns, predicted=True)
+        rotation = pose.world_from_body.rotation @ before.T @ now
+        ahead_s = ahead_ns * 1e-9
+        position = pose.world_from_body.translation + pose.velocity_world_m_s * ahead_s
+        sigma_m = float(np.hypot(pose.sigma_position_m, pose.sigma_velocity_m_s * ahead_s))
+        return replace(pose, world_from_body=Pose(rotation, position), sigma_position_m=sigma_m)
+
+    def _stamped(self, pose: PoseToSend) -> PoseToSend | None:
+        """The same, if its stamp is later than the last that was sent."""
+        if pose.t_ns < self._last_stamp_ns + MIN_SPACING_NS:
+            return None
+        self._last_stamp_ns = pose.t_ns
+        return pose

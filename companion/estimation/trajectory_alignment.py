@@ -1,0 +1,181 @@
+"""A map laid over the autopilot's positions, whose errors wander: generalised least squares.
+
+Position errors of a GPS are modelled as an Ornstein-Uhlenbeck process, so that a metre of drift
+over a minute does not pass for scale; ways travelled by velocity, whose errors do not add up, are
+used beside them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from companion.geometry.transforms import (
+    Array,
+    Similarity,
+    rotation_from_vector,
+    skew,
+    vector_from_rotation,
+)
+
+Bools = NDArray[np.bool_]
+DRIFT_TAU_S = 40.0
+SIGMA_DRIFT_M = 1.0
+SIGMA_WHITE_M = 0.15
+SIGMA_VELOCITY_M_S = 0.15
+VELOCITY_TAU_S = 1.0
+MAX_STEP_S = 5.0
+"""Between two places, for velocity to tell how far that is."""
+SIGMA_TILT_RAD = np.radians(0.5)
+SIGMA_YAW_RAD = np.radians(6.0)
+ITERATIONS, OUTLIERS_AT = 12, 6
+DISAGREE = 3.0
+"""Standard deviations by which two scales differ that cannot both be right."""
+
+
+class Scale(NamedTuple):
+    """Metres per map unit, its relative standard deviation, and what told it."""
+
+    scale: float
+    sigma: float
+    method: str
+    n: int
+
+
+def agreed(first: Scale, second: Scale) -> Scale:
+    """The better of two, no surer than they agree: a rangefinder may see what the map does not."""
+    best = min(first, second, key=lambda scale: scale.sigma)
+    apart = abs(float(np.log(first.scale / second.scale)))
+    if apart < DISAGREE * float(np.hypot(first.sigma, second.sigma)):
+        return best
+    return best._replace(sigma=apart)
+
+
+class _Equations:
+    """Normal equations of (log scale, turn (3), origin (3)), and what they leave unexplained."""
+
+    def __init__(self) -> None:
+        self.information = np.zeros((7, 7))
+        self.gradient = np.zeros(7)
+        self.chi2, self.n_rows = 0.0, 0
+
+    def add(self, jacobian: Array, residual: Array, n_told: int) -> None:
+        """Add rows (N, 7) and (N,), weighted already, `n_told` of which say anything."""
+        self.information += jacobian.T @ jacobian
+        self.gradient += jacobian.T @ residual
+        self.chi2 += float(residual @ residual)
+        self.n_rows += n_told
+
+
+def fit_map(
+    t_s: Array, mapped: Array, target: Array, way: Array, level: Array | None, scale: Scale | None
+) -> tuple[Similarity, Array, float] | None:
+    """Generalised least squares over (log scale, turn (3), origin (3)), N places of which.
+
+    `mapped` (N, 3) in map units are to lie on `target` (N, 3) in metres; `way` (N, 3) is what was
+    travelled so far, nan where it is not known; `level` the rotation world_from_map by attitude;
+    `scale` what others say of it. Gives the similarity, its covariance (7, 7) and the residual,
+    RMS in metres; None where nothing fits.
+    """
+    guess = _start(mapped, target, level)
+    if not np.isfinite(guess.scale) or guess.scale <= 0:
+        return None
+    keep, root, equations = np.ones(len(t_s), bool), np.eye(len(t_s)), _Equations()
+    for iteration in range(ITERATIONS):
+        turned = guess.scale * mapped @ guess.rotation.T
+        residual = target - turned - guess.translation
+        if iteration == OUTLIERS_AT:  # positions that no drift explains
+            size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
+            keep = size < max(5.0 * float(np.median(size)), 3.0)
+        if iteration in (0, OUTLIERS_AT):
+            root = _drift_root(t_s[keep])
+        # derivative of the prediction: scale, turn, origin
+        jacobian = np.zeros((len(t_s), 3, 7))
+        jacobian[:, :, 0] = turned
+        jacobian[:, :, 1:4] = -skew(turned)
+        jacobian[:, :, 4:] = np.eye(3)
+        equations = _Equations()
+        for axis in range(3):
+            j = solve_triangular(root, jacobian[keep, axis], lower=True)
+            r = solve_triangular(root, residual[keep, axis], lower=True)
+            equations.add(j, r, len(r))
+        _add_ways(equations, t_s, jacobian, turned, way, keep)
+        _add_priors(equations, guess, level, scale)
+        try:
+            solved = np.linalg.solve(equations.information, equations.gradient)
+        except np.linalg.LinAlgError:
+            return None
+        delta = np.asarray(solved, np.float64)
+        delta[:4] = np.clip(delta[:4], -0.5, 0.5)
+        guess = Similarity(
+            guess.scale * float(np.exp(delta[0])),
+            rotation_from_vector(delta[1:4]) @ guess.rotation,
+            guess.translation + delta[4:],
+        )
+    inflation = max(equations.chi2 / max(equations.n_rows - 7, 1), 1.0)
+    covariance = np.asarray(np.linalg.inv(equations.information) * inflation, np.float64)
+    error = target - guess.apply(mapped)
+    return guess, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))
+
+
+def _add_ways(
+    equations: _Equations, t_s: Array, jacobian: Array, turned: Array, way: Array, keep: Bools
+) -> None:
+    """From one place to the next, where velocity tells how far that was; robust (Huber)."""
+    dt = np.diff(t_s)
+    known = np.isfinite(way[1:, :2] - way[:-1, :2]).all(1)
+    use = known & (dt > 0) & (dt < MAX_STEP_S) & keep[1:] & keep[:-1]
+    if not use.any():
+        return
+    j = (jacobian[1:] - jacobian[:-1])[use]
+    r = ((way[1:] - way[:-1]) - (turned[1:] - turned[:-1]))[use]
+    told = np.isfinite(r)
+    j, r = j * told[..., None], np.where(told, r, 0.0)
+    sigma_m = SIGMA_VELOCITY_M_S * np.sqrt(dt[use] * np.maximum(dt[use], VELOCITY_TAU_S))
+    weight = 1.0 / sigma_m
+    length = np.linalg.norm(r, axis=1) * weight
+    weight = weight * np.sqrt(np.minimum(1.0, 3.0 / np.maximum(length, 1e-9)))
+    equations.add(
+        (j * weight[:, None, None]).reshape(-1, 7), (r * weight[:, None]).reshape(-1),
+        int(told.sum()),
+    )  # fmt: skip
+
+
+def _add_priors(
+    equations: _Equations, guess: Similarity, level: Array | None, scale: Scale | None
+) -> None:
+    if scale is not None:
+        equations.information[0, 0] += scale.sigma**-2
+        equations.gradient[0] += np.log(scale.scale / guess.scale) / scale.sigma**2
+    weight = np.full(3, 1e-6)
+    if level is not None:
+        weight = np.array([SIGMA_TILT_RAD, SIGMA_TILT_RAD, SIGMA_YAW_RAD]) ** -2
+        turn = vector_from_rotation(guess.rotation @ level.T)
+        equations.gradient[1:4] -= weight * turn
+    equations.information[1:4, 1:4] += np.diag(weight)
+
+
+def _start(mapped: Array, target: Array, level: Array | None) -> Similarity:
+    """Closed form (Umeyama 1991); about the vertical only where the level is known."""
+    ma, mb = mapped.mean(0), target.mean(0)
+    a, b = mapped - ma, target - mb
+    if level is None:
+        u, d, vt = np.linalg.svd(b.T @ a)
+        sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+        rotation = u @ sign @ vt
+        scale = float((d * np.diag(sign)).sum() / (a * a).sum())
+    else:
+        rotation = level
+        a = a @ level.T
+        scale = float(np.sqrt((b * b).sum() / max(float((a * a).sum()), 1e-18)))
+    return Similarity(scale, rotation, mb - scale * rotation @ ma)
+
+
+def _drift_root(t_s: Array) -> Array:
+    """Cholesky factor of the covariance of slowly wandering positions, for one axis."""
+    gap = np.abs(t_s[:, None] - t_s[None, :])
+    covariance = SIGMA_DRIFT_M**2 * np.exp(-gap / DRIFT_TAU_S) + SIGMA_WHITE_M**2 * np.eye(len(gap))
+    return np.asarray(np.linalg.cholesky(covariance), np.float64)

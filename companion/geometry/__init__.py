@@ -1,0 +1,1 @@
+"""Rotations, rigid transforms, camera models, geodesy. numpy only; imports no other room."""

@@ -1,0 +1,158 @@
+"""Camera models: pixels to rays and back. numpy only, pure.
+
+A ray is kept as `normalised` image coordinates (x/z, y/z), so that solvers know no lens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry.transforms import Array, Pose
+
+MAX_OFF_AXIS_RAD = np.radians(80.0)
+"""Beyond this angle from the optical axis a pixel has no usable normalised coordinates."""
+EXACT = 1e-12
+"""In normalised coordinates."""
+
+
+class Distortion(Enum):
+    """Lens distortion models."""
+
+    NONE = "none"
+    RADTAN = "radtan"
+    """Brown-Conrady, coefficients k1 k2 p1 p2 k3."""
+    EQUIDISTANT = "equidistant"
+    """Kannala-Brandt fisheye, coefficients k1 k2 k3 k4."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """Intrinsics of a camera and its place on the body.
+
+    `coefficients` has the length that the model asks for. `body_from_camera` is None when it is
+    not known (a gimbal, a hand-held video): then attitude can level nothing.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Distortion = Distortion.NONE
+    coefficients: tuple[float, ...] = ()
+    body_from_camera: Pose | None = None
+    assumed: bool = field(default=False)
+    """True when no calibration was given and the intrinsics are a guess."""
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length in pixels."""
+        return 0.5 * (self.fx + self.fy)
+
+    def matrix(self) -> Array:
+        """The (3, 3) intrinsic matrix."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def pinhole(self) -> Camera:
+        """The same camera without distortion, same size and focal length."""
+        return Camera(
+            self.width, self.height, self.fx, self.fy, self.cx, self.cy,
+            body_from_camera=self.body_from_camera, assumed=self.assumed,
+        )  # fmt: skip
+
+    def distort(self, normalised: Array) -> Array:
+        """Distorted normalised coordinates (N, 2) of ideal ones (N, 2)."""
+        n = np.asarray(normalised, np.float64)
+        if self.distortion is Distortion.NONE:
+            return n
+        x, y = n[..., 0], n[..., 1]
+        r2 = x * x + y * y
+        if self.distortion is Distortion.RADTAN:
+            k1, k2, p1, p2, k3 = self.coefficients
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            return np.stack(
+                [
+                    x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                    y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+                ],
+                -1,
+            )
+        k1, k2, k3, k4 = self.coefficients
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        t2 = theta * theta
+        theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        scale = np.where(r > 1e-9, theta_d / np.maximum(r, 1e-9), 1.0)
+        out: Array = n * scale[..., None]
+        return out
+
+    def project(self, points_camera: Array) -> Array:
+        """Pixels (N, 2) of points (N, 3) in the camera frame; nan where z <= 0."""
+        p = np.asarray(points_camera, np.float64)
+        z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
+        d = self.distort(p[..., :2] / z[..., None])
+        return np.stack([self.fx * d[..., 0] + self.cx, self.fy * d[..., 1] + self.cy], -1)
+
+    def normalise(self, pixels: NDArray[Any]) -> Array:
+        """Ideal normalised coordinates (N, 2) of distorted pixels (N, 2); nan where none."""
+        px = np.asarray(pixels, np.float64)
+        d = np.stack([(px[..., 0] - self.cx) / self.fx, (px[..., 1] - self.cy) / self.fy], -1)
+        if self.distortion is Distortion.NONE:
+            return d
+        if self.distortion is Distortion.EQUIDISTANT:
+            return self._undistort_equidistant(d)
+        n = d.copy()
+        for _ in range(8):  # Newton on the 2-D model: converges also where plain iteration does not
+            error = self.distort(n) - d
+            if np.abs(error).max(initial=0.0, where=np.isfinite(error)) < EXACT:
+                break
+            j = self._distortion_jacobian(n)
+            (a, b), (c, e) = (j[..., 0, 0], j[..., 0, 1]), (j[..., 1, 0], j[..., 1, 1])
+            x, y = error[..., 0], error[..., 1]
+            n = n - np.stack([e * x - b * y, a * y - c * x], -1) / (a * e - b * c)[..., None]
+        return np.where(np.abs(self.distort(n) - d).max(-1, keepdims=True) < 1e-6, n, np.nan)
+
+    def pixel_from_normalised_jacobian(self, normalised: Array) -> Array:
+        """Derivative (N, 2, 2) of the distorted pixel by ideal normalised coordinates."""
+        j = self._distortion_jacobian(np.asarray(normalised, np.float64))
+        out: Array = j * np.array([[self.fx], [self.fy]])
+        return out
+
+    def _undistort_equidistant(self, distorted: Array) -> Array:
+        k1, k2, k3, k4 = self.coefficients
+        theta_d = np.linalg.norm(distorted, axis=-1)
+        theta = theta_d.copy()
+        for _ in range(10):
+            t2 = theta * theta
+            f = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - theta_d
+            df = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            theta = theta - f / np.where(np.abs(df) > 1e-6, df, 1e-6)
+        good = (theta < MAX_OFF_AXIS_RAD) & (theta >= 0)
+        scale = np.where(
+            theta_d > 1e-9, np.tan(np.where(good, theta, 0)) / np.maximum(theta_d, 1e-9), 1.0
+        )
+        return np.where(good[..., None], distorted * scale[..., None], np.nan)
+
+    def _distortion_jacobian(self, n: Array) -> Array:
+        if self.distortion is Distortion.NONE:
+            return np.broadcast_to(np.eye(2), (*n.shape[:-1], 2, 2))
+        if self.distortion is Distortion.RADTAN:
+            x, y = n[..., 0], n[..., 1]
+            k1, k2, p1, p2, k3 = self.coefficients
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+            cross = slope * x * y + 2 * (p1 * x + p2 * y)
+            dx_dx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+            dy_dy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+            return np.stack([np.stack([dx_dx, cross], -1), np.stack([cross, dy_dy], -1)], -2)
+        step = 1e-6
+        dx = (self.distort(n + [step, 0]) - self.distort(n - [step, 0])) / (2 * step)
+        dy = (self.distort(n + [0, step]) - self.distort(n - [0, step])) / (2 * step)
+        return np.stack([dx, dy], -1)

@@ -1,0 +1,57 @@
+"""A calibration as the TOML file that a live run is given as `camera.calibration`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from companion.calibration.lens_calibration import Calibration
+from companion.config_file import toml_value
+from companion.geometry.camera import Distortion
+
+COEFFICIENTS = {
+    Distortion.NONE: (),
+    Distortion.RADTAN: ("k1", "k2", "p1", "p2", "k3"),
+    Distortion.EQUIDISTANT: ("k1", "k2", "k3", "k4"),
+}
+
+
+def calibration_toml(calibration: Calibration, name: str, board: str, source: str) -> bytes:
+    """The file: the lens, and under [quality] what speaks for it."""
+    camera = calibration.camera
+    lens: dict[str, object] = {
+        "name": name,
+        "width": camera.width, "height": camera.height,
+        "fx": round(camera.fx, 4), "fy": round(camera.fy, 4),
+        "cx": round(camera.cx, 4), "cy": round(camera.cy, 4),
+        "distortion_model": camera.distortion.value,
+    }  # fmt: skip
+    keys = COEFFICIENTS[camera.distortion]
+    for key, value in zip(keys, camera.coefficients, strict=True):
+        lens[key] = round(value, 8)
+    sigmas = zip(("fx", "fy", "cx", "cy"), calibration.sigmas[:4], strict=True)
+    quality: dict[str, object] = {
+        "rms_px": round(calibration.rms_px, 4),
+        "holdout_px": round(calibration.holdout_px, 4),
+        "n_views": len(calibration.views),
+        "n_views_rejected": len(calibration.rejected),
+        "n_corners": sum(view.n_corners for view in calibration.views),
+        "n_corners_rejected": calibration.n_corners_rejected,
+        "coverage": round(calibration.coverage.share, 3),
+        **{f"sigma_{key}": round(float(sigma), 4) for key, sigma in sigmas},
+        "board_sag_mm": round(calibration.sag_m * 1000, 2),
+        "board": board,
+        "source": source,
+    }
+    text = (
+        "# Lens of a camera, written by `companion calibrate`; pixel centres are at integers.\n"
+        f"{_lines(lens)}\n"
+        "# Errors and standard deviations in pixels; holdout_px is in views left out of the fit,\n"
+        "# coverage the share of the picture in which the board was, board_sag_mm how far from\n"
+        "# flat it is, which was allowed for.\n"
+        f"[quality]\n{_lines(quality)}"
+    )
+    return text.encode("utf-8")
+
+
+def _lines(values: Mapping[str, object]) -> str:
+    return "".join(f"{key} = {toml_value(value)}\n" for key, value in values.items())

@@ -1,0 +1,272 @@
+"""What is known of a flight once it is over, gathered message by message."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from companion.dense.local_scale import stretch_of_points
+from companion.geometry.camera import Camera
+from companion.geometry.geodesy import GeoOrigin
+from companion.geometry.transforms import Array, Pose, Similarity
+from companion.messages import (
+    ClockReport,
+    DepthMap,
+    Frame,
+    Georeference,
+    MapUpdate,
+    Message,
+    PointChunk,
+    PositionSample,
+    PositionSource,
+    Reunited,
+    Track,
+    Warned,
+)
+from companion.products.chunk_store import ChunkStore
+from companion.products.cloud import Cloud, no_cloud, placed
+from companion.products.depth_pictures import DepthPicture, DepthPictures
+from companion.products.gathered_cloud import gathered
+from companion.products.track_store import TrackStore
+from companion.timing.clock import StageTimes
+
+POSITION_STEP_NS = 100_000_000
+VOXEL_PER_DEPTH = 0.01
+"""Side of a voxel over the median depth, while there is no metre."""
+GIVEN_UP = "points were given up, as the disk does not take them"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunFacts:
+    """What the messages do not tell of a run; `stage_times` is `StageTimes.summary()`.
+
+    `origin` is where local NED has its zero. `completed` is False when the run was stopped.
+    """
+
+    stage_times: Mapping[str, Mapping[str, float]]
+    wall_s: float
+    clock: ClockReport | None
+    origin: GeoOrigin | None
+    device: str
+    config: Mapping[str, Any]
+    versions: Mapping[str, str]
+    command: str
+    peak_memory_mb: float
+    camera: Camera
+    n_frames_total: int
+    completed: bool
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
+
+
+class WorldPose(NamedTuple):
+    """Where a frame was taken: `world_from_camera` in metres, or in map units without a scale."""
+
+    seq: int
+    t_ns: int
+    world_from_camera: Pose
+
+
+@dataclass(slots=True)
+class WarningCount:
+    """How often one thing was warned of, and what the first said."""
+
+    count: int
+    first_t_ns: int
+    first_detail: str
+
+
+class FlightResult:
+    """A sink that keeps what the results are made of.
+
+    It holds one track for each frame, a dozen small pictures and the autopilot's path at 10 Hz at
+    most. Of the points of all keyframes it holds `memory_mb` at most, if `folder` can take the
+    others.
+    """
+
+    def __init__(self, folder: Path | None = None, memory_mb: float = np.inf) -> None:
+        self.n_frames = 0
+        self.first_t_ns: int | None = None
+        self.last_t_ns: int | None = None
+        self.warnings: dict[str, WarningCount] = {}
+        self.update: MapUpdate | None = None
+        self.reunions: list[Reunited] = []
+        self._tracks = TrackStore()
+        self._chunks = ChunkStore(folder, memory_mb)
+        self._median_depths: dict[int, float] = {}
+        self._kernel_times = StageTimes()
+        self._positions: dict[PositionSource, tuple[array[int], array[float]]] = {}
+        """times, and the coordinates of one place after the other"""
+        self._pictures = DepthPictures()
+
+    def take(self, message: Message) -> None:
+        """Take one message."""
+        if isinstance(message, Frame):
+            self.n_frames += 1
+            if self.first_t_ns is None:
+                self.first_t_ns = message.t_ns
+            self.last_t_ns = message.t_ns
+        elif isinstance(message, Track):
+            self._tracks.put(message)
+        elif isinstance(message, MapUpdate):
+            self.update = message
+        elif isinstance(message, Reunited):
+            self.reunions.append(message)
+        elif isinstance(message, PointChunk):
+            self._take_points(message)
+        elif isinstance(message, DepthMap):
+            self._pictures.take(message)
+            for name, ms in message.kernel_ms.items():
+                self._kernel_times.add(name, ms)
+        elif isinstance(message, PositionSample):
+            times, places = self._positions.setdefault(message.source, (array("q"), array("d")))
+            if not times or message.t_ns - times[-1] >= POSITION_STEP_NS:
+                times.append(message.t_ns)
+                places.extend(message.position_ned_m.tolist())
+        elif isinstance(message, Warned) and not message.good:
+            self._warn(message)
+
+    def _take_points(self, chunk: PointChunk) -> None:
+        given_up = self._chunks.n_given_up
+        self._chunks.put(chunk)
+        if len(chunk.points_camera):
+            depth = float(np.median(chunk.points_camera[:, 2]))
+            self._median_depths[chunk.keyframe_id] = depth
+        if self._chunks.n_given_up > given_up:
+            self._warn(Warned(chunk.t_ns, GIVEN_UP))
+
+    def _warn(self, message: Warned) -> None:
+        warnings = self.warnings.get(message.what)
+        if warnings is None:
+            self.warnings[message.what] = WarningCount(1, message.t_ns, message.detail)
+        else:
+            warnings.count += 1
+
+    def close(self) -> None:
+        """Let go of the points, and of the file that holds them."""
+        self._chunks.close()
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """How the map lies in the world; None without a scale."""
+        return self.update.georeference if self.update is not None else None
+
+    @property
+    def unit(self) -> str:
+        """What lengths are in: m, or map units without a scale."""
+        return "m" if self.georeference is not None else "map units"
+
+    @property
+    def n_keyframes(self) -> int:
+        """Keyframes of the map as it ended."""
+        return self.update.n_keyframes if self.update is not None else 0
+
+    @property
+    def n_points(self) -> int:
+        """Points of all keyframes, before they are thinned together."""
+        return self._chunks.n_points
+
+    @property
+    def n_depth_maps(self) -> int:
+        """Depth maps that were made."""
+        return self._pictures.n_seen
+
+    def kernel_times(self) -> dict[str, dict[str, float]]:
+        """What each kernel took for one depth map, in the form of `StageTimes.summary()`."""
+        return self._kernel_times.summary()
+
+    @property
+    def tracks(self) -> list[Track]:
+        """One track for each frame, in order of frames; of its poses the one by its keyframe."""
+        return list(self._tracks)
+
+    def poses(self) -> list[WorldPose]:
+        """All frames whose place is known, in order, by the map as it ended."""
+        out = []
+        for track in self._tracks:
+            if track.keyframe_id is None or track.keyframe_from_camera is None:
+                continue
+            place = self.update.place_of(track.keyframe_id) if self.update is not None else None
+            if place is None:
+                continue
+            pose = place.apply_to_pose(track.keyframe_from_camera)
+            if self.georeference is not None:
+                pose = self.georeference.world_from_map.apply_to_pose(pose)
+            out.append(WorldPose(track.seq, track.t_ns, pose))
+        return out
+
+    def cloud(self, voxel_m: float) -> Cloud:
+        """All chunks in the world, one point in each cube of side `voxel_m`.
+
+        Without a scale the cube is a hundredth of the median depth. The result does not depend on
+        the order in which chunks came.
+        """
+        gathering = self.gather_cloud(voxel_m)
+        while True:
+            try:
+                next(gathering)
+            except StopIteration as over:
+                cloud: Cloud = over.value
+                return cloud
+
+    def gather_cloud(self, voxel_m: float) -> Generator[float, None, Cloud]:
+        """The same a chunk at a time, for who has other things to do: how far it is, 0 to 1.
+
+        Places are those of when it began; chunks that come meanwhile are left out.
+        """
+        update, georeference = self.update, self.georeference
+        if update is None:
+            return no_cloud()
+        places: dict[int, Similarity] = {}
+        for keyframe_id in self._chunks.keyframe_ids:
+            place = update.place_of(keyframe_id)
+            if place is None or keyframe_id not in self._median_depths:
+                continue
+            places[keyframe_id] = georeference.world_from_map @ place if georeference else place
+        if not places:
+            return no_cloud()
+        metric = georeference is not None
+        depths = [place.scale * self._median_depths[key] for key, place in places.items()]
+        voxel = voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths))
+        stretches: dict[int, float] = {}
+        parts = [partial(self._placed, k, p, update, stretches) for k, p in places.items()]
+        return (yield from gathered(parts, self.n_points, voxel))
+
+    def _placed(
+        self, keyframe_id: int, place: Similarity, update: MapUpdate, stretches: dict[int, float]
+    ) -> Cloud:
+        """A chunk in the world; none where the disk was full meanwhile."""
+        if keyframe_id not in self._chunks:
+            return no_cloud()
+        chunk = self._chunks.get(keyframe_id)
+        if keyframe_id not in stretches:
+            stretches[keyframe_id] = _stretch(chunk, update)
+        return placed(chunk, replace(place, scale=stretches[keyframe_id] * place.scale))
+
+    def autopilot_path(self) -> tuple[PositionSource, Array, Array] | None:
+        """The autopilot's own path from its best source: t_ns (N,), NED metres (N, 3)."""
+        for source in PositionSource:
+            times, places = self._positions.get(source, (array("q"), array("d")))
+            if len(times) >= 2:
+                return source, np.array(times), np.array(places).reshape(-1, 3)
+        return None
+
+    def depth_pictures(self, n: int) -> list[DepthPicture]:
+        """At most `n` pictures of depth maps, spread over the flight."""
+        return self._pictures.spread(n)
+
+
+def _stretch(chunk: PointChunk, update: MapUpdate) -> float:
+    """By what factor points are further away in the map as it is now; by spans if it has few."""
+    place = update.place_of(chunk.keyframe_id)
+    if place is None:
+        return 1.0
+    in_camera = place.inverse().apply(update.points_map)
+    ratio = stretch_of_points(chunk.points_camera.astype(np.float64), in_camera)
+    return update.stretch_of(chunk.keyframe_id, chunk.spans) if ratio is None else ratio

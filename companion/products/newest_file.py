@@ -1,0 +1,75 @@
+"""A small file whose newest content counts, written beside the event loop."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from companion.products.atomic_file import write_atomically
+
+
+class NewestFile:
+    """Writes in a thread of its own: a disk that hangs holds up nothing, and costs no more memory.
+
+    `failed` is called in that thread with what went wrong.
+    """
+
+    def __init__(self, path: Path, failed: Callable[[str], None]) -> None:
+        self.path, self._failed = path, failed
+        self._changed = threading.Condition()
+        self._newest: bytes | None = None
+        self._due = self._busy = self._closed = False
+        threading.Thread(target=self._run, name=f"write {path.name}", daemon=True).start()
+
+    def put(self, data: bytes | None) -> None:
+        """Have this in the file from now on; None: no file."""
+        with self._changed:
+            self._newest, self._due = data, True
+            self._changed.notify_all()
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until all is written, at most so long; whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not (self._due or self._busy), seconds)
+
+    def close(self, seconds: float = 0.0) -> None:
+        """Write what is still to be written, and end; waits for it at most so long."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self.wait(seconds)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._due or self._closed)
+                if not self._due:
+                    return
+                data, self._due, self._busy = self._newest, False, True
+            try:
+                self._write(data)
+            except OSError as error:
+                self._failed(f"{self.path}: {error.strerror}")
+
+    def _write(self, data: bytes | None) -> None:
+        if data is None:
+            self.path.unlink(missing_ok=True)
+        else:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            # there for who comes after a crash at once, for who comes after a power cut a little
+            # later: a disk may take its time
+            write_atomically(self.path, data)
+            _sync(self.path)
+        _sync(self.path.parent)
+
+
+def _sync(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -1,0 +1,72 @@
+"""All flights of a batch on one page: a row and a picture for each."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Protocol
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+
+class Row(Protocol):
+    """What is shown of a flight."""
+
+    @property
+    def name(self) -> str:
+        """Name of its folder beside the page."""
+
+    @property
+    def flight(self) -> Path:
+        """Where it was read."""
+
+    @property
+    def error(self) -> str:
+        """What went wrong; "" where nothing did."""
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The numbers of its report."""
+
+
+def batch_page(rows: Sequence[Row], pictures: Mapping[str, bytes]) -> bytes:
+    """HTML with the pictures, JPEG by name, in it; the reports are linked."""
+    environment = Environment(
+        loader=PackageLoader("companion.products.report", ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("batch.html.j2").render(
+        rows=[_shown(row, pictures.get(row.name, b"")) for row in rows],
+        n_failed=sum(bool(row.error) for row in rows),
+    )
+    return page.encode("utf-8")
+
+
+def _shown(row: Row, picture: bytes) -> dict[str, Any]:
+    report = row.report
+    unit = report.get("unit") or ""
+    duration_s, length = report.get("duration_s"), report.get("path_length")
+    return {
+        "name": row.name,
+        "flight": str(row.flight),
+        "error": row.error,
+        "picture": base64.b64encode(picture).decode() if picture else "",
+        "when": _when(report.get("first_unix_s")),
+        "duration": f"{duration_s / 60:.1f} min" if duration_s is not None else "",
+        "tracked": f"{100 * report['tracked_share']:.1f} %" if "tracked_share" in report else "",
+        "length": f"{length:.0f} {unit}" if length is not None else "",
+        "points": f"{report['points']:,}" if "points" in report else "",
+        "warnings": sum(each.get("count", 0) for each in report.get("warnings", [])),
+    }
+
+
+def _when(unix_s: Any) -> str:
+    if unix_s is None:
+        return ""
+    when = datetime.fromtimestamp(float(unix_s), tz=timezone.utc)
+    return when.strftime("%Y-%m-%d %H:%M UTC") if when.year >= 2000 else ""

@@ -1,0 +1,198 @@
+"""The cloud as pictures: points splatted into a depth buffer, seen without perspective."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry.transforms import Array
+from companion.messages import Bytes
+from companion.products.cloud import Cloud
+
+WIDTH_PX = 1100
+FINER = 2
+"""Views are drawn so much larger and then reduced, which smooths edges."""
+MAX_SPLAT_PX = 25
+COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudView:
+    """A picture (WebP, transparent where nothing is) and what lies over it, in its pixels.
+
+    `paths` are polylines (N, 2) of the camera; `bar` is a round length in the world's unit and
+    `bar_px` how long it is here.
+    """
+
+    title: str
+    north_up: bool
+    webp: bytes
+    width_px: int
+    height_px: int
+    paths: list[Array]
+    bar: float
+    bar_px: float
+
+
+def cloud_views(cloud: Cloud, stretches: Sequence[Array]) -> list[CloudView]:
+    """From above with north up, from the side, and at a slant; none for an empty cloud.
+
+    `stretches` are unbroken parts (N, 3) of the camera's path in the world (north, east, down).
+    """
+    if len(cloud) == 0:
+        return []
+    heading = side_heading_rad(cloud, stretches)
+    side = f"From the side, looking {compass_point(heading)}"
+    slant_heading = heading + np.radians(30)
+    slant = f"At a slant, looking {compass_point(slant_heading)}"
+    return [
+        _view("From above", cloud, stretches, 0.0, np.pi / 2, (1.3, 3.0)),
+        _view(side, cloud, stretches, heading, 0.0, (1.6, 1.6)),
+        _view(slant, cloud, stretches, slant_heading, np.radians(35), (1.6, 1.6)),
+    ]
+
+
+def side_heading_rad(cloud: Cloud, stretches: Sequence[Array]) -> float:
+    """Heading that sees the cloud at its widest, from where the camera flew."""
+    flat = cloud.points[:, :2].astype(np.float64)
+    middle = np.median(flat, axis=0)
+    _, axes = np.linalg.eigh(np.cov((flat - middle).T) if len(flat) > 1 else np.eye(2))
+    across = axes[:, 0]
+    if stretches:
+        ahead = float(across @ (middle - np.median(np.concatenate(stretches)[:, :2], axis=0)))
+    else:
+        ahead = float(across[0])
+    if ahead < 0:
+        across = -across
+    return float(np.arctan2(across[1], across[0]))
+
+
+def compass_point(heading_rad: float) -> str:
+    """The nearest of eight.
+
+    >>> compass_point(-1.6)
+    'west'
+    """
+    return COMPASS[round(float(np.degrees(heading_rad)) / 45) % 8]
+
+
+def view_axes(heading_rad: float, pitch_down_rad: float) -> Array:
+    """Rows right, up and ahead (3, 3) of a view, in the world (north, east, down)."""
+    ch, sh = np.cos(heading_rad), np.sin(heading_rad)
+    cp, sp = np.cos(pitch_down_rad), np.sin(pitch_down_rad)
+    ahead = np.array([ch * cp, sh * cp, sp])
+    right = np.array([-sh, ch, 0.0])
+    return np.stack([right, np.cross(right, ahead), ahead])
+
+
+def round_length(at_most: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is no longer than `at_most`.
+
+    >>> round_length(37.0)
+    20.0
+    """
+    power = 10.0 ** np.floor(np.log10(at_most))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= at_most * (1 + 1e-9)))
+
+
+def splat(
+    pixels: Array, ahead: Array, rgb: Bytes, height: int, width: int, size: int
+) -> tuple[Bytes, Array]:
+    """Draw points (N, 2) as squares of `size`, the nearest on top.
+
+    Returns the picture (H, W, 3) and how far ahead each pixel is (H, W), inf where nothing is.
+    """
+    order = np.argsort(-ahead, kind="stable")
+    columns, rows = np.floor(pixels[order] + 0.5).astype(np.int64).T
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    rank = np.zeros((height, width))  # 0 is nothing, then the nearer the higher
+    rank[rows[inside], columns[inside]] = np.flatnonzero(inside) + 1.0
+    rank = np.asarray(cv2.dilate(rank, np.ones((size, size), np.uint8)))
+    point = order[rank.astype(np.int64) - 1]
+    known = rank > 0
+    picture: Bytes = np.where(known[..., None], rgb[point], np.uint8(0))
+    return picture, np.where(known, ahead[point], np.inf)
+
+
+def _view(
+    title: str,
+    cloud: Cloud,
+    stretches: Sequence[Array],
+    heading_rad: float,
+    pitch_rad: float,
+    aspects: tuple[float, float],
+) -> CloudView:
+    axes = view_axes(heading_rad, pitch_rad)
+    seen = cloud.points.astype(np.float64) @ axes.T
+    flown = [stretch @ axes.T for stretch in stretches]
+    low, high = _frame(seen, flown, aspects)
+    px_per_unit = WIDTH_PX / (high[0] - low[0])
+    width, height = WIDTH_PX, round((high[1] - low[1]) * px_per_unit)
+
+    def to_pixels(points: Array) -> Array:
+        across = (points[:, 0] - low[0]) * px_per_unit
+        return np.stack([across, (high[1] - points[:, 1]) * px_per_unit], 1)
+
+    pixels = to_pixels(seen) * FINER - 0.5
+    size = _splat_px(pixels)
+    picture, nearest = splat(pixels, seen[:, 2], cloud.rgb, height * FINER, width * FINER, size)
+    shaded = picture * _shade(nearest, 1 / (px_per_unit * FINER))[..., None]
+    bar = round_length(width / px_per_unit / 4)
+    return CloudView(
+        title, bool(pitch_rad > 1.5), _encode(shaded, np.isfinite(nearest), width, height),
+        width, height, [to_pixels(stretch) for stretch in flown], bar, float(bar * px_per_unit),
+    )  # fmt: skip
+
+
+def _frame(
+    seen: Array, flown: Sequence[Array], aspects: tuple[float, float]
+) -> tuple[Array, Array]:
+    """Corners (2,), low and high, around the path and all but stray points.
+
+    Width over height lies within `aspects`: what is too narrow or too low gets room beside it.
+    """
+    low, high = np.percentile(seen[:, :2], [0.2, 99.8], axis=0)
+    for line in flown:
+        low = np.minimum(low, line[:, :2].min(0))
+        high = np.maximum(high, line[:, :2].max(0))
+    extent = high - low + 0.08 * max(float((high - low).max()), 1e-6)
+    least, most = aspects
+    width = max(extent[0], least * extent[1])
+    half = np.array([width, max(extent[1], width / most)]) / 2
+    middle = (low + high) / 2
+    return middle - half, middle + half
+
+
+def _splat_px(pixels: Array) -> int:
+    """Side of squares that just close the gaps between neighbours, by how dense points lie."""
+    cells = np.unique(np.floor(pixels / 16).astype(np.int64), axis=0)
+    per_cell = len(pixels) / len(cells)
+    return int(np.clip(np.ceil(1.6 * 16 / np.sqrt(per_cell)), 1, MAX_SPLAT_PX))
+
+
+def _shade(nearest: Array, unit_per_px: float) -> Array:
+    """Darkens what lies behind its neighbours, so that edges show without any light."""
+    reach = 3
+    drop = np.zeros(nearest.shape)
+    filled = np.where(np.isfinite(nearest), nearest, np.nan)
+    for down, along in ((0, reach), (0, -reach), (reach, 0), (-reach, 0)):
+        step = filled - np.roll(filled, (down, along), (0, 1))
+        drop += np.clip(np.nan_to_num(step) / (unit_per_px * 40), 0, 1)
+    out: Array = np.exp(-0.35 * drop)
+    return out
+
+
+def _encode(picture: Array, known: NDArray[np.bool_], width: int, height: int) -> bytes:
+    """Reduce to its size, with soft edges, and encode."""
+    solid = known.astype(np.float32)
+    full = np.dstack([picture[..., ::-1].astype(np.float32) * solid[..., None], solid])
+    small = cv2.resize(full, (width, height), interpolation=cv2.INTER_AREA)
+    alpha = small[..., 3:]
+    colour = small[..., :3] / np.maximum(alpha, 1e-6)
+    image = np.dstack([colour, alpha * 255]).round().clip(0, 255).astype(np.uint8)
+    _, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, 82])
+    return data.tobytes()

@@ -1,0 +1,107 @@
+"""The comparison of two runs as one page that needs no other file."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from companion.geometry.transforms import Array
+from companion.products.report.comparison import Comparison, numbers
+
+A, B, DIFFERENCE = "#9aa0a6", "#0b6bcb", "#d64545"
+STYLE: Any = {
+    "svg.fonttype": "none", "svg.hashsalt": "comparison", "font.size": 10.0,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
+    "grid.color": "#dddbd6", "grid.linewidth": 0.6, "axes.axisbelow": True,
+    "legend.frameon": False,
+}  # fmt: skip
+MAX_POINTS = 3000
+
+
+def comparison_page(found: Comparison, name_a: str, name_b: str) -> bytes:
+    """HTML with all styles and plots in it."""
+    environment = Environment(
+        loader=PackageLoader("companion.products.report", ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(shown=shown)
+    with matplotlib.rc_context(STYLE):
+        page = environment.get_template("comparison.html.j2").render(
+            n=numbers(found), a=name_a, b=name_b, stages=found.stages,
+            path=_path(found), cloud=_cloud(found),
+        )  # fmt: skip
+    return page.encode("utf-8")
+
+
+def shown(value: Any) -> str:
+    """A number as short as it says enough; a dash for none."""
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _path(found: Comparison) -> Markup | None:
+    poses = found.poses
+    if not len(poses.t_ns):
+        return None
+    step = -(-len(poses.t_ns) // MAX_POINTS)
+    figure = Figure(figsize=(11, 4.4), layout="constrained")
+    plan, apart = figure.subplots(1, 2)
+    for centres, colour, width, name in (
+        (poses.centres_a, A, 3.5, "A"),
+        (poses.centres_b, B, 1.2, "B"),
+    ):
+        plan.plot(centres[::step, 1], centres[::step, 0], color=colour, lw=width, label=name)
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.set_xlabel(f"east [{found.unit}]")
+    plan.set_ylabel(f"north [{found.unit}]")
+    plan.legend()
+    seconds = (poses.t_ns - poses.t_ns[0])[::step] * 1e-9
+    apart.plot(seconds, poses.apart_m[::step], color=DIFFERENCE, lw=1)
+    apart.set_xlabel("time [s]")
+    apart.set_ylabel(f"A and B apart [{found.unit}]")
+    apart.set_ylim(bottom=0)
+    turned = apart.twinx()
+    turned.plot(seconds, poses.turned_deg[::step], color=A, lw=1)
+    turned.set_ylabel("turned [deg], grey")
+    turned.set_ylim(bottom=0)
+    turned.grid(False)
+    return _svg(figure)
+
+
+def _cloud(found: Comparison) -> Markup | None:
+    if not len(found.cloud.from_a_m) or found.same_files["cloud.ply"]:
+        return None
+    figure = Figure(figsize=(11, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    for values, colour, name in (
+        (found.cloud.from_a_m, A, "from A to B"),
+        (found.cloud.from_b_m, B, "from B to A"),
+    ):
+        axes.plot(*_shares(values), color=colour, label=name)
+    axes.set_xlabel(f"distance to the nearest point of the other [{found.unit}]")
+    axes.set_ylabel("share of points")
+    axes.set_xlim(left=0)
+    axes.legend(loc="lower right")
+    return _svg(figure)
+
+
+def _shares(values: Array) -> tuple[Array, Array]:
+    shares = np.linspace(0, 0.995, 200)
+    return np.quantile(values, shares), shares
+
+
+def _svg(figure: Figure) -> Markup:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = buffer.getvalue()
+    return Markup(text[text.index("<svg") :])

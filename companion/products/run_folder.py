@@ -1,0 +1,131 @@
+"""A finished run, read back from its folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.errors import InputError
+from companion.geometry.geodesy import GeoOrigin
+from companion.geometry.transforms import Pose, rotation_from_quaternion
+from companion.products.cloud import Cloud
+from companion.products.cloud_ply import KINDS, VERTEX
+from companion.products.flight_result import WorldPose
+
+FORMER_NAMES = ("x", "y", "z", "red", "green", "blue", "confidence")
+MAX_HEAD = 4096
+FORMER_VERTEX = np.dtype([(name, VERTEX[name]) for name in FORMER_NAMES])
+"""As runs of earlier versions wrote it, without normals and standard deviations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedRun:
+    """What a run wrote: its poses and cloud in the world, and its report's numbers.
+
+    The world is local NED in metres if `metric`, else the map's own axes and units. `origin` is
+    where NED has its zero, None where no place on Earth is known.
+    """
+
+    path: Path
+    poses: list[WorldPose]
+    cloud: Cloud
+    report: Mapping[str, Any]
+    metric: bool
+    origin: GeoOrigin | None
+
+
+def read_run(folder: Path) -> FinishedRun:
+    """Read the folder of a run; InputError where it is none, or not whole."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder; wanted is the --out of a replay")
+    report = _report(folder / "report.json")
+    metric = report.get("unit") == "m"
+    return FinishedRun(
+        folder, _poses(folder / "trajectory.tum"), _cloud(folder / "cloud.ply"), report, metric,
+        _origin(folder / "report.json", report) if metric else None,
+    )  # fmt: skip
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: missing; wanted is the folder of a finished run") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _report(path: Path) -> dict[str, Any]:
+    try:
+        report = json.loads(_bytes(path))
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read as JSON: {error}") from error
+    if not isinstance(report, dict):
+        raise InputError(f"{path}: it is no report of a run")
+    return report
+
+
+def _origin(path: Path, report: Mapping[str, Any]) -> GeoOrigin | None:
+    said = report.get("origin")
+    if said is None:
+        return None
+    try:
+        origin = GeoOrigin(
+            *(float(said[key]) for key in ("latitude_deg", "longitude_deg", "altitude_m"))
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: its origin is no place: {said!r}") from error
+    if not (abs(origin.latitude_deg) <= 90 and abs(origin.longitude_deg) <= 180):
+        raise InputError(f"{path}: its origin is no place: {said!r}")
+    return origin
+
+
+def _poses(path: Path) -> list[WorldPose]:
+    out: list[WorldPose] = []
+    for number, line in enumerate(_bytes(path).decode("ascii", "replace").splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            seconds, _, rest = words[0].partition(".")
+            t_ns = int(seconds) * 1_000_000_000 + int(rest.ljust(9, "0"))
+            values = np.array([float(word) for word in words[1:8]])
+        except ValueError:
+            values = np.empty(0)
+        if len(values) != 7 or not np.isfinite(values).all() or not values[3:].any():
+            raise InputError(f"{path}, line {number}: wanted a time and seven numbers")
+        turn = values[[6, 3, 4, 5]]
+        out.append(WorldPose(len(out), t_ns, Pose(rotation_from_quaternion(turn), values[:3])))
+    return out
+
+
+def _cloud(path: Path) -> Cloud:
+    data = _bytes(path)
+    end = data[:MAX_HEAD].find(b"end_header\n")
+    lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
+    said = [line for line in lines if line.startswith("property")]
+    counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
+    layout = next((v for v in (VERTEX, FORMER_VERTEX) if said == _properties(v)), None)
+    if layout is None or len(counts) != 1:
+        raise InputError(f"{path}: not a cloud as a run writes it")
+    body = data[end + len(b"end_header\n") :]
+    if not counts[0].isdigit() or len(body) != int(counts[0]) * layout.itemsize:
+        raise InputError(f"{path}: cut short, or longer than it says: {counts[0]} points")
+    vertices = np.frombuffer(body, layout)
+    points = np.stack([vertices[axis] for axis in "xyz"], 1)
+    rgb = np.stack([vertices[channel] for channel in ("red", "green", "blue")], 1)
+    if layout is FORMER_VERTEX:
+        normals, sigma = np.zeros_like(points), np.full(len(points), np.nan, np.float32)
+    else:
+        normals = np.stack([vertices[axis] for axis in ("nx", "ny", "nz")], 1)
+        sigma = vertices["sigma"].copy()
+    return Cloud(points, rgb, vertices["confidence"].copy(), normals, sigma)
+
+
+def _properties(layout: np.dtype[Any]) -> list[str]:
+    return [f"property {KINDS[layout[name].kind]} {name}" for name in layout.names or ()]

@@ -1,0 +1,72 @@
+"""A cloud that is thinned while it grows, so that what is thinned out takes no room."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry.transforms import Array
+from companion.geometry.voxel import thin_by_voxel
+from companion.messages import Floats
+from companion.products.cloud import Cloud, joined, no_cloud
+
+TILE_VOXELS = 256
+"""Side of a tile, north and east: each is thinned by itself."""
+LEAST_WAITING = 20_000
+"""Points that wait in a tile before it is thinned, or half as many as it has."""
+
+
+Tile = tuple[int, int]
+
+
+def tiles_of(points: Floats, low: Array, voxel: float) -> tuple[list[Tile], NDArray[np.int64]]:
+    """The tiles that points (N, 3) lie in, in their order, and which of them each lies in (N,)."""
+    side = voxel * TILE_VOXELS
+    tiles = np.floor((points[:, :2].astype(np.float64) - low[:2]) / side).astype(np.int64)
+    found, which = np.unique(tiles, axis=0, return_inverse=True)
+    return [(int(i), int(j)) for i, j in found], which.ravel()
+
+
+class VoxelCloud:
+    """One point for each cube of side `voxel`, the most confident, else the earliest.
+
+    The cubes begin at `low` (3,), by default the lowest corner of what is added first. Where
+    `only` some tiles are wanted, points of others are left out.
+    """
+
+    def __init__(
+        self, voxel: float, low: Array | None = None, only: set[Tile] | None = None
+    ) -> None:
+        self._voxel = voxel
+        self._low = low
+        self._only = only
+        self._tiles: dict[Tile, list[Cloud]] = {}
+
+    def add(self, cloud: Cloud) -> None:
+        """Take more points."""
+        if len(cloud) == 0:
+            return
+        if self._low is None:
+            self._low = cloud.points.astype(np.float64).min(0)
+        found, which = tiles_of(cloud.points, self._low, self._voxel)
+        order = np.argsort(which, kind="stable")
+        ends = np.cumsum(np.bincount(which, minlength=len(found)))
+        for tile, part in zip(found, np.split(order, ends[:-1]), strict=True):
+            if self._only is not None and tile not in self._only:
+                continue
+            waiting = self._tiles.setdefault(tile, [no_cloud()])
+            waiting.append(cloud.part(part))
+            if sum(map(len, waiting[1:])) > max(LEAST_WAITING, len(waiting[0]) // 2):
+                waiting[:] = [self._thinned(waiting)]
+
+    def finished(self) -> Iterator[Cloud]:
+        """All of it, tile by tile in their order; nothing is left here."""
+        for tile in sorted(self._tiles):
+            yield self._thinned(self._tiles.pop(tile))
+
+    def _thinned(self, parts: list[Cloud]) -> Cloud:
+        together = joined(parts)
+        kept = thin_by_voxel(together.points, together.confidence, self._voxel, self._low)
+        return together.part(kept)

@@ -1,0 +1,227 @@
+"""The stages in their order, and the two ways to run them.
+
+| stage        | listens to                           | gives                           |
+|--------------|--------------------------------------|---------------------------------|
+| localisation | telemetry, Frame                     | Track, KeyframeAdded, MapUpdate |
+| depth        | Frame, Track, KeyframeAdded, MapUpdate | DepthMap, PointChunk          |
+| sinks        | all of it                            |                                 |
+
+Localisation runs in the caller's thread; depth in one of its own, fed in order through a bounded
+queue. In lockstep the queue makes the caller wait and nothing is lost, so that the results do not
+depend on anybody's speed. Live, a full queue turns a keyframe's depth away, never a pose. A depth
+stage that fails is left out from there on: trajectory, map and what there is of the cloud stay.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterable, Iterator
+from typing import Protocol
+
+from companion.errors import CompanionError
+from companion.estimation.localisation import LocalisationStage
+from companion.messages import (
+    Frame,
+    KeyframeAdded,
+    MapUpdate,
+    Message,
+    Track,
+    Warned,
+)
+from companion.runtime.message_size import size_bytes
+
+DEPTH_QUEUE, DEPTH_QUEUE_BYTES = 64, 128 << 20
+"""Messages that wait for depth, and bytes of them: of large pictures there is room for fewer."""
+DEPTH_FAILED = "the dense map ends here: the depth stage has failed"
+
+
+class Stage(Protocol):
+    """Messages in, messages out; its own state, nobody else's."""
+
+    def step(self, message: Message) -> list[Message]:
+        """Take one message."""
+
+    def flush(self) -> list[Message]:
+        """Finish what is still open."""
+
+
+class Sink(Protocol):
+    """Where messages leave the pipeline."""
+
+    def take(self, message: Message) -> None:
+        """Take one message; must not take long."""
+
+
+class StageThread:
+    """A stage in its own thread; its results wait until they are collected.
+
+    A stage that raises is over: what comes after goes unheard, what it gave before can still be
+    collected, and `fault` says what it raised.
+    """
+
+    def __init__(self, stage: Stage, lossless: bool) -> None:
+        self._stage = stage
+        self._lossless = lossless
+        self._inbox: queue.Queue[Message | None] = queue.Queue(DEPTH_QUEUE)
+        self._outbox: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        self._n_bytes = 0
+        self._taken = threading.Condition()
+        self.fault: BaseException | None = None
+        """What the stage raised; None while it works."""
+        self.n_dropped = 0
+        self._thread = threading.Thread(target=self._work, name="depth", daemon=True)
+        self._thread.start()
+
+    def put(self, message: Message) -> None:
+        """Hand over a message; waits for room in lockstep, else drops frames and keyframes."""
+        size = size_bytes(message)
+        with self._taken:
+            fits = not self._n_bytes or self._n_bytes + size <= DEPTH_QUEUE_BYTES
+            if not self._lossless and isinstance(message, Frame):
+                if not fits or self._inbox.qsize() >= DEPTH_QUEUE // 2:
+                    self.n_dropped += 1
+                    return
+            elif not fits:
+                self._taken.wait_for(
+                    lambda: not self._n_bytes or self._n_bytes + size <= DEPTH_QUEUE_BYTES
+                )
+            self._n_bytes += size
+        self._inbox.put(message)
+
+    def collect(self) -> Iterator[Message]:
+        """Results so far."""
+        while True:
+            try:
+                yield self._outbox.get_nowait()
+            except queue.Empty:
+                return
+
+    def close(self) -> Iterator[Message]:
+        """Finish, and yield the last results."""
+        self._inbox.put(None)
+        self._thread.join()
+        yield from self.collect()
+
+    def _work(self) -> None:
+        is_open = True
+        try:
+            while (message := self._take()) is not None:
+                for out in self._stage.step(message):
+                    self._outbox.put(out)
+            is_open = False
+            for out in self._stage.flush():
+                self._outbox.put(out)
+        except BaseException as fault:  # handed to the caller's thread, which tells of it
+            self.fault = fault
+        while is_open and self._take() is not None:
+            pass  # whoever puts must not wait for ever
+
+    def _take(self) -> Message | None:
+        message = self._inbox.get()
+        if message is not None:
+            with self._taken:
+                self._n_bytes -= size_bytes(message)
+                self._taken.notify()
+        return message
+
+
+class Pipeline:
+    """The stages joined; feed it messages in order of time."""
+
+    def __init__(
+        self,
+        localisation: LocalisationStage,
+        depth: Stage | None,
+        sinks: Iterable[Sink],
+        lossless: bool,
+    ) -> None:
+        self._localisation = localisation
+        self._depth = StageThread(depth, lossless) if depth is not None else None
+        self._fault_told = False
+        self._sinks = list(sinks)
+        self._t_ns = 0
+
+    @property
+    def state(self) -> str:
+        """The tracker's state in a word."""
+        return self._localisation.state.value
+
+    @property
+    def depth_fault(self) -> BaseException | None:
+        """What the depth stage raised; None where it did not."""
+        return self._depth.fault if self._depth is not None else None
+
+    @property
+    def n_depth_frames_dropped(self) -> int:
+        """Frames that the depth stage had no time for (never in lockstep)."""
+        return self._depth.n_dropped if self._depth is not None else 0
+
+    def feed(self, message: Message) -> None:
+        """Take one message through all stages."""
+        self._publish(message)
+        if isinstance(message, Warned):
+            return
+        self._t_ns = message.t_ns
+        if isinstance(message, Frame) and self._depth is not None:
+            self._depth.put(message)
+        for out in self._localisation.step(message):
+            self._pass_on(out)
+        if self._depth is not None:
+            for out in self._depth.collect():
+                self._publish(out)
+            self._tell_fault()
+
+    def finish(self) -> None:
+        """Adjust the map, complete the depth, and pass on the rest."""
+        try:
+            last = self._localisation.finish()
+        finally:
+            if self._depth is not None:
+                for out in self._depth.close():
+                    self._publish(out)
+                self._tell_fault()
+        for out in last:
+            self._publish(out)
+
+    def _tell_fault(self) -> None:
+        """Have it among the warnings, once, that the dense map has ended early."""
+        fault = self.depth_fault
+        if fault is not None and not self._fault_told:
+            self._fault_told = True
+            self._publish(Warned(self._t_ns, DEPTH_FAILED, in_words(fault)))
+
+    def _pass_on(self, message: Message) -> None:
+        if self._depth is not None and isinstance(message, (Track, KeyframeAdded, MapUpdate)):
+            self._depth.put(message)
+        self._publish(message)
+
+    def _publish(self, message: Message) -> None:
+        for sink in self._sinks:
+            sink.take(message)
+
+
+def in_words(fault: BaseException) -> str:
+    """A fault in one line: its own text where it was raised on purpose, else its kind as well."""
+    text = " ".join(str(fault).split())
+    if isinstance(fault, CompanionError):
+        return text
+    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
+
+
+def in_order_of_time(telemetry: Iterable[Message], frames: Iterable[Message]) -> Iterator[Message]:
+    """Merge telemetry (sorted) and frames; a frame comes after all telemetry up to its time.
+
+    Both are sorted; Warned among the frames passes through at once.
+    """
+    samples = iter(telemetry)
+    waiting = next(samples, None)
+    for frame in frames:
+        if isinstance(frame, Frame):
+            while waiting is not None and waiting.t_ns <= frame.t_ns:
+                yield waiting
+                waiting = next(samples, None)
+        yield frame
+    while waiting is not None:
+        yield waiting
+        waiting = next(samples, None)

@@ -1,0 +1,55 @@
+"""A stage as its process sees it, and which module does it."""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+from companion.messages import Message
+from companion.runtime.stage_protocol import Finish, Setup, Snapshot
+from companion.timing.clock import StageTimes
+
+
+class Work(ABC):
+    """What all stages have; `step` and `finish` are theirs."""
+
+    latest_only = False
+    """Whether it wants the latest frame only, and that without its colours."""
+    outlives_daemon = False
+    """Whether it finishes by itself when the daemon is gone; else it ends at once."""
+    device = ""
+
+    def __init__(self) -> None:
+        self.times = StageTimes()
+
+    @property
+    def n_turned_away(self) -> int:
+        """Messages taken and then given up."""
+        return 0
+
+    def begin(self, tell: Callable[[Any], None]) -> None:  # noqa: B027 - most have nothing to do
+        """Before the first message; `tell` takes what the daemon is to know at once."""
+
+    @abstractmethod
+    def step(self, message: Any) -> Iterable[Message | Snapshot]:
+        """Take one message."""
+
+    @abstractmethod
+    def finish(self, finish: Finish) -> Iterable[Message | Snapshot]:
+        """Give what is left."""
+
+
+class WorkModule(Protocol):
+    """A module that makes a stage. Its import loads all that the stage needs."""
+
+    def work(self, setup: Setup) -> Work:
+        """The stage that a setup asks for."""
+
+
+def module_of(kind: str) -> WorkModule:
+    """Load what does a kind of work: localisation, depth or recorder."""
+    module: Any = importlib.import_module(f"companion.stages.{kind}_work")
+    loaded: WorkModule = module
+    return loaded

@@ -1,0 +1,1 @@
+"""ORB features of a frame, their matching and tracking, triangulation. Knows no map."""

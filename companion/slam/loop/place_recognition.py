@@ -1,0 +1,129 @@
+"""Which keyframes show a place seen again: an index of binary descriptors that needs no vocabulary.
+
+Locality-sensitive hashing (Indyk & Motwani 1998): some bits of a descriptor make a word, once for
+each of several tables; keyframes that share rare words are alike, as with a bag of words.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.geometry.transforms import Array
+from companion.messages import Bytes
+from companion.slam.features.orb_features import Ints
+
+N_TABLES = 8
+N_BITS = 18
+BLOCK = 32
+"""Keyframes whose words are sorted together."""
+
+Words = NDArray[np.uint32]
+_CHOSEN = np.random.default_rng(20).permutation(256)[: N_TABLES * N_BITS].reshape(N_TABLES, N_BITS)
+_WEIGHTS = 1 << np.arange(N_BITS, dtype=np.int64)
+
+
+def words_of(descriptors: Bytes) -> Words:
+    """The distinct words (M,) of descriptors (N, 32), sorted."""
+    bits = np.unpackbits(descriptors, axis=1)
+    words = bits[:, _CHOSEN] @ _WEIGHTS + (np.arange(N_TABLES) << N_BITS)
+    return np.unique(words.astype(np.uint32))
+
+
+@dataclass(slots=True, eq=False)
+class _Block:
+    """Words of some keyframes, sorted, and the place in `keys` of each one's keyframe."""
+
+    words: Words = field(default_factory=lambda: np.zeros(0, np.uint32))
+    owners: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    n_keys: int = 0
+
+
+class PlaceIndex:
+    """Keyframes by what they look like. A key is added once; it is left out of answers if asked."""
+
+    def __init__(self) -> None:
+        self._keys: list[int] = []
+        """-1 where one was removed and none has come in its place"""
+        self._block_of: list[_Block] = []
+        self._blocks: list[_Block] = []
+        self._free: list[int] = []
+
+    def __len__(self) -> int:
+        return len(self._keys) - len(self._free)
+
+    def __contains__(self, key: int) -> bool:
+        return key in self._keys
+
+    def add(self, key: int, descriptors: Bytes) -> None:
+        """Take a keyframe's descriptors (N, 32)."""
+        block = next((b for b in self._blocks if b.n_keys < BLOCK), None)
+        if block is None:
+            block = _Block()
+            self._blocks.append(block)
+        if self._free:
+            place = self._free.pop()
+            self._keys[place], self._block_of[place] = key, block
+        else:
+            place = len(self._keys)
+            self._keys.append(key)
+            self._block_of.append(block)
+        words = words_of(descriptors)
+        at = np.searchsorted(block.words, words)
+        block.words = np.insert(block.words, at, words)
+        block.owners = np.insert(block.owners, at, np.full(len(words), place))
+        block.n_keys += 1
+
+    def remove(self, key: int) -> None:
+        """Forget a keyframe."""
+        place = self._keys.index(key)
+        block = self._block_of[place]
+        others = block.owners != place
+        block.words, block.owners = block.words[others], block.owners[others]
+        block.n_keys -= 1
+        self._keys[place] = -1
+        self._free.append(place)
+
+    def alike(self, descriptors: Bytes, n: int, but: set[int] | None = None) -> list[int]:
+        """At most `n` keys that stand out as like these descriptors, the likest first.
+
+        Keys in `but` are not among them.
+        """
+        keys = np.array(self._keys, np.int64)
+        scores, keys = self._scores(words_of(descriptors))[keys >= 0], keys[keys >= 0]
+        if not len(scores):
+            return []
+        usual = float(np.median(scores))
+        spread = 1.4826 * float(np.median(np.abs(scores - usual)))
+        order = np.argsort(-scores, kind="stable")
+        stands_out = scores[order] > usual + 2.0 * spread if len(scores) > 20 else scores[order] > 0
+        out: list[int] = []
+        for key in keys[order[stands_out]].tolist():
+            if but is None or key not in but:
+                out.append(key)
+            if len(out) == n:
+                break
+        return out
+
+    def _scores(self, words: Words) -> Array:
+        """How much each key has in common with these words: rare ones count for more."""
+        found, sizes = [], np.zeros(len(words), np.int64)
+        for block in self._blocks:
+            low = np.searchsorted(block.words, words, "left")
+            high = np.searchsorted(block.words, words, "right")
+            count = high - low
+            sizes += count
+            hit = np.flatnonzero(count)
+            # places of all equal words, one after the other
+            starts = np.repeat(low[hit] - np.r_[0, np.cumsum(count[hit])[:-1]], count[hit])
+            found.append(
+                (np.repeat(hit, count[hit]), block.owners[starts + np.arange(len(starts))])
+            )
+        if not found:
+            return np.zeros(0)
+        rarity = np.log1p(len(self) / (1.0 + sizes))
+        which = np.concatenate([f[0] for f in found])
+        owners = np.concatenate([f[1] for f in found])
+        return np.asarray(np.bincount(owners, rarity[which], len(self._keys)), np.float64)

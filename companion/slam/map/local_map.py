@@ -1,0 +1,97 @@
+"""The part of the map that a camera at a given pose should see, and its search in an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Array, Pose
+from companion.slam.compiled.projecting import (
+    EQUIDISTANT,
+    N_COEFFICIENTS,
+    NO_LENS,
+    RADTAN,
+    visible,
+)
+from companion.slam.features.matching import match_projected
+from companion.slam.features.orb_features import Bools, Features, Ints
+from companion.slam.map.sparse_map import SlamMap
+
+N_NEAREST = 8
+_MODELS = {
+    Distortion.NONE: NO_LENS, Distortion.RADTAN: RADTAN, Distortion.EQUIDISTANT: EQUIDISTANT
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visible:
+    """Points that should be in the image: ids (M,), pixels (M, 2), pyramid levels (M,)."""
+
+    ids: Ints
+    pixels: Array
+    octaves: Ints
+
+
+class Projector:
+    """Projects map points into one camera, with all the reasons not to see a point."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._model = _MODELS[camera.distortion]
+        self._coefficients = np.zeros(N_COEFFICIENTS)
+        self._coefficients[: len(camera.coefficients)] = camera.coefficients
+        self._intrinsics = np.array(
+            [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64
+        )
+        u, v = np.meshgrid(
+            np.linspace(0, camera.width - 1.0, 33), np.linspace(0, camera.height - 1.0, 25)
+        )
+        # all over: at the rim of a fisheye's image there may be no rays
+        rim = camera.normalise(np.stack([u.ravel(), v.ravel()], 1))
+        # a distortion model folds back far outside the image: points there must not come in again
+        self._max_radius = float(np.nanmax(np.linalg.norm(rim, axis=1), initial=0.5)) * 1.05
+
+    def visible(self, slam_map: SlamMap, camera_from_map: Pose, ids: Ints) -> Visible:
+        """Which of the points `ids` a camera at this pose should see, and where."""
+        found, px, octaves = visible(
+            slam_map.positions, slam_map.normals, slam_map.base_distance, ids,
+            camera_from_map.rotation, camera_from_map.translation, self._model,
+            self._coefficients, self._intrinsics, self._max_radius, slam_map.scale_factor,
+            slam_map.n_levels,
+        )  # fmt: skip
+        return Visible(found, px, octaves)
+
+    def search(
+        self,
+        slam_map: SlamMap,
+        seen: Visible,
+        features: Features,
+        radius_px: float,
+        usable: Bools | None = None,
+        max_distance: float = 64,
+        max_octave_gap: int = 2,
+    ) -> tuple[Ints, Ints]:
+        """Look for visible points within a radius (at pyramid level 0; wider above).
+
+        Returns point ids and features.
+        """
+        radius = radius_px * slam_map.scale_factor ** seen.octaves.astype(np.float64)
+        points, found = match_projected(
+            seen.pixels, seen.ids, slam_map.descriptors, seen.octaves, features, radius,
+            usable, max_distance, max_octave_gap=max_octave_gap,
+        )  # fmt: skip
+        return seen.ids[points], found
+
+
+def local_points(slam_map: SlamMap, near_ids: Ints, centre: Array, n_keyframes: int = 20) -> Ints:
+    """Points of the keyframes that share points with `near_ids`, and of the nearest ones in space.
+
+    Keyframes near in space but not in time are how a place seen long ago is taken up again.
+    """
+    chosen = [k for _, k in slam_map.covisible(near_ids, 8)[:n_keyframes]]
+    chosen += slam_map.nearest(centre, N_NEAREST, set(chosen))
+    mask = np.zeros(slam_map.n_points, bool)
+    for keyframe_id in chosen:
+        mask[slam_map.seen_by(slam_map.keyframes[keyframe_id])[1]] = True
+    return np.flatnonzero(mask)

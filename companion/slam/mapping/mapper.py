@@ -1,0 +1,306 @@
+"""From a new keyframe to a better map: new points, longer tracks, bundle adjustment, culling."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import islice
+
+import numpy as np
+
+from companion.config import MappingConfig
+from companion.geometry.camera import Camera
+from companion.messages import Bytes
+from companion.slam.features.matching import match_epipolar
+from companion.slam.features.orb_features import Bools, Ints
+from companion.slam.features.patches import image_levels
+from companion.slam.features.triangulation import consistent, triangulate
+from companion.slam.map.local_map import Projector
+from companion.slam.map.patch_refinement import refine_features
+from companion.slam.map.sparse_map import Keyframe, SlamMap
+from companion.slam.mapping.culling import cull_keyframes
+from companion.slam.mapping.map_adjustment import (
+    WaysOf,
+    no_ways,
+    parts_of,
+    put_back,
+    put_back_later,
+    take,
+)
+from companion.slam.mapping.mapping_worker import MapTurn
+from companion.slam.optimisation.bundle_adjustment import adjust
+
+MIN_PARALLAX_RAD = np.radians(0.8)
+N_NEIGHBOURS = 8
+IMAGES_KEPT = 100
+"""Images of older keyframes are let go; what they show is then only as fine as its corners are."""
+
+
+class Mapper:
+    """Owns the work done once for each keyframe."""
+
+    def __init__(
+        self, config: MappingConfig, camera: Camera, slam_map: SlamMap, turn: MapTurn,
+        ways_of: WaysOf = no_ways,
+    ) -> None:  # fmt: skip
+        self._ways_of = ways_of
+        self._config = config
+        self._turn = turn
+        self._map = slam_map
+        self._projector = Projector(camera)
+
+    def add(self, keyframe: Keyframe) -> list[int]:
+        """Take a keyframe, whose tracked points are set, into the map; which ones went for it."""
+        slam_map = self._map
+        slam_map.keyframes[keyframe.keyframe_id] = keyframe
+        slam_map.poses_changed()
+        for key in islice(reversed(slam_map.keyframes), IMAGES_KEPT, IMAGES_KEPT + 2):
+            slam_map.keyframes[key].grey = None
+        _, points = slam_map.seen_by(keyframe)
+        neighbours = [
+            slam_map.keyframes[k]
+            for _, k in slam_map.covisible(points, 10)
+            if k != keyframe.keyframe_id
+        ][:N_NEIGHBOURS]
+        slam_map.refresh(points, [*reversed(neighbours), keyframe])
+        assert keyframe.grey is not None
+        created = self._triangulate(keyframe, neighbours, image_levels(keyframe.grey))
+        self._extend(keyframe, neighbours, created)
+        self._refine([keyframe, *neighbours])
+        self.adjust_locally(keyframe)
+        self._cull(keyframe)
+        slam_map.reclaim()
+        self._turn.give_way()
+        return cull_keyframes(slam_map, keyframe, self._config.keyframe_spacing_deg)
+
+    def _refine(self, keyframes: list[Keyframe]) -> None:
+        """Make positions finer that were not yet, by the points' patches."""
+        slam_map = self._map
+        for k in keyframes:
+            features, points = slam_map.seen_by(k)
+            new = (k.refined_for[features] != points) & (
+                slam_map.first_seen[points] != k.keyframe_id
+            )
+            features, points = features[new], points[new]
+            if k.grey is None or len(points) == 0:
+                continue
+            self._turn.give_way()
+            finer, white, _ = refine_features(
+                slam_map, k.camera_from_map, k.features, features, points, image_levels(k.grey)
+            )
+            k.normalised[features], k.whitening[features] = finer, white
+            k.refined_for[features] = points
+
+    def _triangulate(
+        self, keyframe: Keyframe, neighbours: list[Keyframe], levels: list[Bytes]
+    ) -> Ints:
+        created = []
+        slam_map = self._map
+        for other in neighbours:
+            self._turn.give_way()
+            free_a = np.flatnonzero(keyframe.point_ids < 0)
+            free_b = np.flatnonzero(other.point_ids < 0)
+            other_from_here = other.camera_from_map @ keyframe.camera_from_map.inverse()
+            depth = np.median(
+                keyframe.camera_from_map.apply(slam_map.positions[slam_map.seen_by(keyframe)[1]])[
+                    :, 2
+                ]
+            )
+            if np.linalg.norm(other_from_here.translation) < 0.01 * depth:
+                continue
+            ia, ib = match_epipolar(
+                keyframe.features, other.features, free_a, free_b, other_from_here
+            )
+            if len(ia) == 0:
+                continue
+            fa, fb = keyframe.features, other.features
+            points, cosine = triangulate(fa.normalised[ia], fb.normalised[ib], other_from_here)
+            ok = consistent(
+                points, other_from_here, fa.normalised[ia], fb.normalised[ib],
+                fa.whitening[ia], fb.whitening[ib],
+            )  # fmt: skip
+            ok &= cosine < np.cos(MIN_PARALLAX_RAD)
+            # the same corner is seen at levels that fit its two distances
+            da = np.linalg.norm(points, axis=1)
+            db = np.linalg.norm(other_from_here.apply(points), axis=1)
+            with np.errstate(invalid="ignore"):
+                gap = (
+                    fa.octaves[ia]
+                    - fb.octaves[ib]
+                    + np.log(da / db) / np.log(slam_map.scale_factor)
+                )
+                ok &= np.abs(gap) < 2.0
+            ia, ib, points = ia[ok], ib[ok], points[ok]
+            if len(ia) == 0:
+                continue
+            ids = slam_map.add_points(
+                keyframe.camera_from_map.inverse().apply(points), keyframe, ia, levels
+            )
+            slam_map.observe(keyframe, ia, ids)
+            slam_map.observe(other, ib, ids)
+            slam_map.refresh(ids, [other, keyframe])
+            created.append(ids)
+        return np.concatenate(created) if created else np.zeros(0, np.int64)
+
+    def _extend(self, keyframe: Keyframe, neighbours: list[Keyframe], created: Ints) -> None:
+        """Look for this keyframe's points in its neighbours, and theirs in it; merge doubles."""
+        slam_map = self._map
+        for other in neighbours:
+            self._turn.give_way()
+            _, mine = slam_map.seen_by(keyframe)
+            self._search_in(other, mine)
+        theirs = (
+            np.unique(np.concatenate([slam_map.seen_by(o)[1] for o in neighbours]))
+            if neighbours
+            else created
+        )
+        self._search_in(keyframe, theirs)
+        _, mine = slam_map.seen_by(keyframe)
+        slam_map.refresh(mine, [*reversed(neighbours), keyframe])
+
+    def _search_in(self, keyframe: Keyframe, points: Ints) -> None:
+        slam_map = self._map
+        known = np.zeros(slam_map.n_points, bool)
+        known[slam_map.seen_by(keyframe)[1]] = True
+        points = points[~known[points] & slam_map.alive[points]]
+        visible = self._projector.visible(slam_map, keyframe.camera_from_map, points)
+        ids, features = self._projector.search(
+            slam_map, visible, keyframe.features, 3.0, max_distance=50
+        )
+        if len(ids) == 0:
+            return
+        old = keyframe.point_ids[features]
+        old = np.where((old >= 0) & slam_map.alive[np.maximum(old, 0)], old, -1)
+        free = old < 0
+        slam_map.observe(keyframe, features[free], ids[free])
+        for point, rival in zip(ids[~free].tolist(), old[~free].tolist(), strict=True):
+            self._merge(point, rival)
+
+    def _merge(self, a: int, b: int) -> None:
+        """One point of two: the one seen more often takes over the other's observations."""
+        slam_map = self._map
+        if a == b or not (slam_map.alive[a] and slam_map.alive[b]):
+            return
+        keep, drop = (a, b) if slam_map.n_observers[a] >= slam_map.n_observers[b] else (b, a)
+        for keyframe in self._observers(drop):
+            feature = np.flatnonzero(keyframe.point_ids == drop)
+            if np.any(keyframe.point_ids == keep):
+                keyframe.point_ids[feature] = -1
+            else:
+                slam_map.observe(keyframe, feature, np.full(len(feature), keep))
+        slam_map.alive[drop] = False
+        slam_map.n_observers[drop] = 0
+        slam_map.n_visible[keep] += slam_map.n_visible[drop]
+        slam_map.n_found[keep] += slam_map.n_found[drop]
+
+    def _observers(self, point: int) -> list[Keyframe]:
+        known = self._map.observers[point]
+        near = [self._map.keyframes.get(k) for k in np.unique(known[known >= 0]).tolist()]
+        return [k for k in near if k is not None and np.any(k.point_ids == point)]
+
+    def unite(self, keyframe: Keyframe, other: Keyframe, seen_there: Ints) -> None:
+        """Let the two parts of the map around a place seen again know each other's points."""
+        slam_map = self._map
+        _, ids = slam_map.seen_by(keyframe)
+        here = [slam_map.keyframes[k] for _, k in slam_map.covisible(ids, 10)][:N_NEIGHBOURS]
+        _, ids = slam_map.seen_by(other)
+        there = [slam_map.keyframes[k] for _, k in slam_map.covisible(ids, 10)][:N_NEIGHBOURS]
+        seen_here = np.unique(np.concatenate([slam_map.seen_by(k)[1] for k in [keyframe, *here]]))
+        for k in [keyframe, *here]:
+            self._search_in(k, seen_there)
+        for k in [other, *there]:
+            self._search_in(k, seen_here)
+        slam_map.sweep([keyframe, other, *here, *there])
+        self.adjust_locally(keyframe)
+
+    def adjust_locally(self, keyframe: Keyframe) -> None:
+        """Adjust a keyframe and those that share most with it, and all points they see."""
+        slam_map, config = self._map, self._config
+        _, points = slam_map.seen_by(keyframe)
+        ranked = [slam_map.keyframes[k] for _, k in slam_map.covisible(points, 15)]
+        variable = [k for k in ranked if k is not keyframe][: config.window - 1] + [keyframe]
+        first = min(slam_map.keyframes)
+        variable = [k for k in variable if k.keyframe_id != first]
+        if not variable:
+            return
+        mask = np.zeros(slam_map.n_points, bool)
+        for k in variable:
+            mask[slam_map.seen_by(k)[1]] = True
+        chosen = {k.keyframe_id for k in variable}
+        fixed = [
+            slam_map.keyframes[k]
+            for _, k in slam_map.covisible(np.flatnonzero(mask), 3)
+            if k not in chosen
+        ][: config.n_fixed]
+        if not fixed:  # hold the gauge: position, attitude and scale
+            variable.sort(key=lambda k: k.keyframe_id)
+            fixed, variable = variable[:2], variable[2:]
+            if not variable:
+                return
+        elif len(fixed) == 1 and len(variable) > 1:
+            variable.sort(key=lambda k: k.keyframe_id)
+            fixed, variable = [*fixed, variable[0]], variable[1:]
+        self._adjust(variable, fixed, mask)
+
+    def adjust_all(self, iterations: int) -> None:
+        """Adjust every keyframe and point, a long flight part by part."""
+        for variable, fixed, mask in parts_of(self._map):
+            self._adjust(variable, fixed, mask, iterations)
+
+    def adjust_all_later(
+        self, iterations: int, meanwhile: Callable[[], None], still: Callable[[], bool]
+    ) -> None:
+        """Adjust every keyframe and point while the map goes on; comes without the map in hand.
+
+        `meanwhile` is called every few milliseconds, and may change the map; what was adjusted is
+        put back where `still` holds.
+        """
+        with self._turn.mapping():
+            parts = list(parts_of(self._map))
+        for variable, fixed, mask in parts:
+            with self._turn.mapping():
+                stayed = self._map.keyframes.keys()
+                variable = [k for k in variable if k.keyframe_id in stayed]
+                fixed = [k for k in fixed if k.keyframe_id in stayed]
+                mask = np.r_[mask, np.zeros(self._map.n_points - len(mask), bool)]
+                if not (variable and fixed):
+                    continue
+                taken = take(self._map, variable, fixed, mask, self._ways_of)
+            if taken is None:
+                continue
+            result = adjust(taken.bundle, iterations, meanwhile)
+            with self._turn.mapping():
+                if not still():
+                    return
+                put_back_later(self._map, taken, result)
+
+    def _adjust(
+        self,
+        variable: list[Keyframe],
+        fixed: list[Keyframe],
+        mask: Bools,
+        iterations: int | None = None,
+    ) -> None:
+        taken = take(self._map, variable, fixed, mask, self._ways_of)
+        if taken is None:
+            return
+        if iterations is None:
+            result = adjust(taken.bundle, self._config.iterations, self._turn.give_way)
+        else:  # it takes long, and works on copies
+            with self._turn.away():
+                result = adjust(taken.bundle, iterations)
+        put_back(self._map, taken, result)
+
+    def _cull(self, keyframe: Keyframe) -> None:
+        """Remove recent points that are seldom found where they should be, or seen by too few."""
+        slam_map = self._map
+        n = slam_map.n_points
+        age = keyframe.keyframe_id - slam_map.born[:n]
+        recent = slam_map.alive[:n] & (age <= 4)
+        seldom = slam_map.n_found[:n] < 0.25 * slam_map.n_visible[:n]
+        few = (age >= 2) & (slam_map.n_observers[:n] <= 2)
+        doomed = recent & (seldom | few)
+        slam_map.alive[:n][doomed] = False
+        slam_map.sweep(
+            [slam_map.keyframes[key] for key in islice(reversed(slam_map.keyframes), 30)]
+        )
+        slam_map.bury()

@@ -1,0 +1,58 @@
+"""The pose of one camera from map points that it sees: robust Gauss-Newton."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from companion.geometry.transforms import Array, Pose, nearest_rotation
+from companion.slam.compiled.pose_sums import CHI2_2D, HUBER, cost, refine
+from companion.slam.features.orb_features import Bools
+
+__all__ = ["CHI2_2D", "HUBER", "other_pose", "refine_pose", "robust_cost"]
+
+
+def robust_cost(
+    camera_from_map: Pose, points_map: Array, normalised: Array, whitening: Array
+) -> float:
+    """Huber's loss of all N points, those behind the camera at a high price."""
+    pose = camera_from_map.rotation, camera_from_map.translation
+    return float(cost(*pose, points_map, normalised, whitening))
+
+
+def other_pose(points_map: Array, normalised: Array) -> Pose | None:
+    """`camera_from_map` that fits N points best, from nowhere (Terzakis & Lourakis, ECCV 2020).
+
+    Before a plane a pose can have two minima; this does not depend on where a search begins. It
+    knows no outliers.
+    """
+    if len(points_map) < 6:
+        return None
+    ok, rotvec, translation = cv2.solvePnP(
+        points_map, normalised, np.eye(3), np.zeros(0), flags=cv2.SOLVEPNP_SQPNP
+    )
+    if not ok:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(rotvec)[0], np.float64)
+    return Pose(rotation, np.asarray(translation, np.float64).ravel())
+
+
+def refine_pose(
+    camera_from_map: Pose,
+    points_map: Array,
+    normalised: Array,
+    whitening: Array,
+    rounds: int = 4,
+    iterations: int = 4,
+) -> tuple[Pose, Bools, Array]:
+    """Refine a pose on N points; after each round points with too large an error are set aside.
+
+    Huber's loss in all rounds but the last. Returns the pose, which points agree with it (N,), and
+    the (6, 6) information matrix (rotation, translation) in the camera frame.
+    """
+    rotation, translation, inlier, information = refine(
+        camera_from_map.rotation, camera_from_map.translation,
+        points_map, normalised, whitening, rounds, iterations,
+    )  # fmt: skip
+    # a pose is refined from one predicted from the last: what rounding adds would grow with each
+    return Pose(nearest_rotation(rotation), translation), inlier, information

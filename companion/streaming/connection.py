@@ -1,0 +1,104 @@
+"""The drone's end of a viewer's connection: a socket that never waits."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import struct
+
+from companion.errors import StreamError
+from companion.streaming.framing import HELLO, HELLO_BYTES, TAKEN, VIEWER_BYTES
+from companion.streaming.session import Session
+
+NOT_SENT_BYTES = 4096
+"""The kernel takes no more than this beyond what the network takes from it."""
+GIVE_UP_MS = 20_000
+"""A viewer that the network does not reach for so long connects anew."""
+HEADERS_BYTES = 66
+"""Of a packet: Ethernet, IP and TCP with time stamps."""
+TCP_INFO_BYTES, SEGMENTS_AT, SENT_AT = 232, 136, 200
+"""Where struct tcp_info (linux/tcp.h) has tcpi_segs_out and tcpi_bytes_sent."""
+MOST_READ = 4096
+
+
+class Connection:
+    """Reads what a viewer says; sends what its session has for it. Raises OSError when it is gone.
+
+    StreamError is raised for a peer that is no viewer.
+    """
+
+    def __init__(self, opened: socket.socket, peer: str, now_s: float) -> None:
+        self.socket, self.peer = opened, peer
+        self.since_s = now_s
+        self.viewer: bytes | None = None
+        """Its name; None until it has said it."""
+        self.session: Session | None = None
+        self._read = bytearray()
+        self._left = b""
+        self._n_charged = 0
+        opened.setblocking(False)
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, NOT_SENT_BYTES)
+        opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, GIVE_UP_MS)
+        with contextlib.suppress(OSError):  # not every kernel has it
+            # which a lossy radio does not make slow
+            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"bbr")
+
+    def read(self, now_s: float) -> bool:
+        """Take in what has come; whether the viewer has said who it is just now."""
+        data = self.socket.recv(MOST_READ)
+        if not data:
+            raise ConnectionResetError("the viewer has closed the connection")
+        self._read += data
+        is_new = False
+        if self.viewer is None:
+            if not HELLO.startswith(bytes(self._read[: len(HELLO)])):
+                raise StreamError("it is no viewer of companion, or one of another version")
+            if len(self._read) < HELLO_BYTES:
+                return False
+            self.viewer = bytes(self._read[HELLO_BYTES - VIEWER_BYTES : HELLO_BYTES])
+            del self._read[:HELLO_BYTES]
+            is_new = True
+        n = len(self._read) // TAKEN.size
+        if n and self.session is not None:
+            (total,) = TAKEN.unpack_from(self._read, (n - 1) * TAKEN.size)
+            self.session.acknowledged(now_s, total)
+            del self._read[: n * TAKEN.size]
+        return is_new
+
+    def send(self, now_s: float, budget_bytes: int) -> int:
+        """Send a piece of what there is, if there is room; how many bytes went."""
+        if self.session is None or not self.is_writable():
+            return 0
+        if not self._left:
+            room = min(self.session.window.room_bytes(), budget_bytes)
+            self._left = self.session.next_piece(now_s, room) or b""
+            if not self._left:
+                return 0
+        n = self.socket.send(self._left)
+        self._left = self._left[n:]
+        return n
+
+    def is_writable(self) -> bool:
+        """Whether the kernel takes more now."""
+        return bool(select.select([], [self.socket], [], 0)[1])
+
+    def wire_bytes(self, n_given: int) -> int:
+        """Bytes on the wire, headers and repeats included, beyond those counted so far.
+
+        `n_given` is what was given to the kernel, which may not have sent it yet.
+        """
+        info = self.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO_BYTES)
+        total = n_given
+        if len(info) >= SENT_AT + 8:
+            (segments,) = struct.unpack_from("=I", info, SEGMENTS_AT)
+            (sent,) = struct.unpack_from("=Q", info, SENT_AT)
+            total = max(total, sent + HEADERS_BYTES * segments)
+        more = max(0, total - self._n_charged)
+        self._n_charged += more
+        return more
+
+    def close(self) -> None:
+        """Let go of it."""
+        self.socket.close()

@@ -1,0 +1,26 @@
+"""Depth as a picture for people: near is red, far is blue, nothing is black."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from companion.messages import DepthMap
+from companion.streaming.items import DepthItem
+
+PNG = "image/png"
+
+
+def depth_picture(depth_map: DepthMap) -> DepthItem | None:
+    """The picture of a depth map; None where it has no depth at all."""
+    depth = depth_map.depth
+    known = depth > 0
+    if not known.any():
+        return None
+    inverse = 1.0 / np.where(known, depth, 1.0)
+    low, high = np.quantile(inverse[known], [0.02, 0.98])
+    level = np.clip((inverse - low) / max(high - low, 1e-12), 0, 1) * 255
+    colour = cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_TURBO)
+    colour[~known] = 0
+    _, png = cv2.imencode(".png", colour)
+    return DepthItem(depth_map.t_ns, png.tobytes(), PNG, dict(depth_map.kernel_ms))

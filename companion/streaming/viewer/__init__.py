@@ -1,0 +1,15 @@
+"""What a person looks at: a flight becomes a Rerun recording. The only room that knows Rerun."""
+
+import os
+
+# before rerun loads: that recordings have no list of their chunks is meant, see rrd_files
+os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
+
+from companion.streaming.scene_encoder import Watched
+from companion.streaming.viewer.colours import Colours
+from companion.streaming.viewer.file_viewer import FileViewer
+from companion.streaming.viewer.ground_viewer import show
+from companion.streaming.viewer.live_viewer import LiveViewer
+from companion.streaming.viewer.screen import Screen
+
+__all__ = ["Colours", "FileViewer", "LiveViewer", "Screen", "Watched", "show"]

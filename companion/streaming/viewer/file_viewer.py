@@ -1,0 +1,81 @@
+"""A flight that goes to files, written by a thread of their own."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from types import TracebackType
+
+from companion.config import ViewerConfig
+from companion.geometry.camera import Camera
+from companion.geometry.geodesy import GeoOrigin
+from companion.streaming.frame_jpeg import picture_of
+from companion.streaming.items import FlightItem, ImageItem, Item
+from companion.streaming.scene_encoder import Story, Watched
+from companion.streaming.viewer.colours import Colours
+from companion.streaming.viewer.drawing import Drawing
+from companion.streaming.viewer.inbox import Inbox
+from companion.streaming.viewer.rrd_files import RrdFiles
+
+ROOM_BYTES = 64 << 20
+
+
+class FileViewer:
+    """Everything, into a .rrd file: the caller waits when the file cannot keep up.
+
+    No more than `rrd_mb` of it is kept, the newest, in several files. What goes wrong in the thread
+    is raised when the file is closed, and not before. `indexed` is not for long flights, see
+    RrdFiles.
+    """
+
+    def __init__(
+        self, config: ViewerConfig, camera: Camera, path: Path, origin: GeoOrigin | None = None,
+        indexed: bool = True,
+    ) -> None:  # fmt: skip
+        self._files = RrdFiles(path, config.rrd_mb << 20, indexed)
+        self._config = config
+        self._story = Story(FlightItem(path.parent.name, path.parent.name, camera, origin))
+        self._inbox = Inbox(ROOM_BYTES)
+        self._fault: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
+
+    def take(self, message: Watched) -> None:
+        """Queue one message."""
+        self._inbox.put(message)
+
+    def __enter__(self) -> FileViewer:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._inbox.close()
+        self._thread.join()
+        self._files.close()
+        if self._fault is not None:
+            raise self._fault
+
+    def _work(self) -> None:
+        try:
+            colours = Colours(self._config.colours)
+            drawing = Drawing(self._files.recording, live=False, colours=colours)
+            drawing.draw(self._story.flight)
+            while (message := self._inbox.get()) is not None:
+                self._draw(drawing, self._story.take(message))
+            self._draw(drawing, self._story.close())
+        except BaseException as fault:
+            self._fault = fault
+            self._inbox.close()
+
+    def _draw(self, drawing: Drawing, items: list[Item]) -> None:
+        for item in items:
+            if isinstance(item, ImageItem):
+                width, quality = self._config.image_width, self._config.jpeg_quality
+                item = picture_of(item, width, quality)
+            drawing.draw(item)
+            if self._files.is_full():
+                drawing.go_on_in(self._files.next())

@@ -1,0 +1,70 @@
+"""The queue before a viewer, bounded by bytes: images are large, all else is small."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+from companion.messages import Frame
+from companion.runtime.message_size import size_bytes
+from companion.streaming.scene_encoder import Watched
+
+
+class Inbox:
+    """Messages on their way from one thread to another, `room_bytes` of them at most.
+
+    A message that is larger than the room is let in when nothing else is there.
+    """
+
+    def __init__(self, room_bytes: int) -> None:
+        self._room = room_bytes
+        self._held: deque[tuple[Watched, int]] = deque()
+        self._bytes = 0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    def put(self, message: Watched) -> None:
+        """Put in a message; wait for room. Does nothing once the inbox is closed."""
+        size = size_bytes(message)
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._fits(size, self._room))
+            if not self._closed:
+                self._append(message, size)
+
+    def offer(self, message: Watched) -> bool:
+        """Put in a message if there is room now; images leave half the room to what is small."""
+        size = size_bytes(message)
+        room = self._room // 2 if isinstance(message, Frame) else self._room
+        with self._changed:
+            if self._closed or not self._fits(size, room):
+                return False
+            self._append(message, size)
+            return True
+
+    def get(self) -> Watched | None:
+        """Take out the oldest message; wait for one. None once it is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or bool(self._held))
+            if not self._held:
+                return None
+            message, size = self._held.popleft()
+            self._bytes -= size
+            self._changed.notify_all()
+            return message
+
+    def close(self) -> None:
+        """Let in nothing more; what is there can still be taken out."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def _fits(self, size: int, room: int) -> bool:
+        return not self._held or self._bytes + size <= room
+
+    def _append(self, message: Watched, size: int) -> None:
+        self._held.append((message, size))
+        self._bytes += size
+        self._changed.notify_all()

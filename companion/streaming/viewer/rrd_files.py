@@ -1,0 +1,74 @@
+"""The .rrd files of a flight: a new one when one has grown, and the oldest goes where room ends.
+
+They are parts of one recording: a viewer that is given several shows them as one.
+"""
+
+from __future__ import annotations
+
+import uuid
+from pathlib import Path
+
+import rerun as rr
+
+from companion.streaming.viewer.layout import layout
+
+APPLICATION = "companion-2"
+"""Viewers remember by this name the layout that they were shown: a new layout has a new number."""
+N_FILES = 4
+"""The files that there is room for; each is one such part of it."""
+LOOK_EVERY = 16
+
+
+class RrdFiles:
+    """`path` and its followers: flight.rrd, flight-2.rrd, …; `most_bytes` is 0 for no limit.
+
+    With `indexed` each ends with a list of its chunks, by which programs find what they look for
+    without reading all of it. Until then that is in memory, and grows by some kilobytes with each
+    frame: not for flights of hours.
+    """
+
+    def __init__(self, path: Path, most_bytes: int, indexed: bool) -> None:
+        self._indexed = indexed
+        self._first, self._each = path, most_bytes // N_FILES
+        self._id = str(uuid.uuid4())
+        self._paths: list[Path] = []
+        self._n_begun = 0
+        self._n_looked = 0
+        self.recording = self._begin()
+
+    def is_full(self) -> bool:
+        """Whether it is time for the next file; looks at the disk now and then only.
+
+        OSError where what was recorded cannot be written.
+        """
+        self._n_looked += 1
+        if not self._each or self._n_looked % LOOK_EVERY:
+            return False
+        try:
+            self.recording.flush()  # what waits for the disk counts too
+        except RuntimeError as error:  # its thread ends with the first thing it cannot write
+            raise OSError(f"{self._paths[-1]}: cannot be written: {error}") from None
+        return self._paths[-1].stat().st_size >= self._each
+
+    def next(self) -> rr.RecordingStream:
+        """Close the file, and begin another; what is in the way of it goes."""
+        self.recording.disconnect()
+        while len(self._paths) >= N_FILES:
+            self._paths.pop(0).unlink(missing_ok=True)
+        self.recording = self._begin()
+        return self.recording
+
+    def close(self) -> None:
+        """Write what is left."""
+        self.recording.disconnect()
+
+    def _begin(self) -> rr.RecordingStream:
+        self._n_begun += 1
+        number = f"-{self._n_begun}" if self._n_begun > 1 else ""
+        path = self._first.with_name(f"{self._first.stem}{number}{self._first.suffix}")
+        self._paths.append(path)
+        recording = rr.RecordingStream(APPLICATION, recording_id=self._id)
+        recording.save(
+            path, default_blueprint=layout(live=False), write_footer=self._indexed
+        )  # fmt: skip
+        return recording

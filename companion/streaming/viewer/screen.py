@@ -1,0 +1,136 @@
+"""Where a flight is looked at: a window, a page in a browser, or a viewer that runs already."""
+
+from __future__ import annotations
+
+import importlib.util
+import socket
+import subprocess
+import threading
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from companion.errors import InputError
+from companion.streaming.viewer.web_gate import LOOPBACK, WebGate, free_ports
+from companion.timing.clock import monotonic_s, wait_s
+
+WEB_PORT = 9090
+GRPC_PORT = 9876
+START_S = 20.0
+MEMORY = "50%"
+"""Of the ground's memory; the oldest poses and pictures go first, the map stays."""
+
+
+SERVER_MEMORY = "256MB"
+"""What is kept for browsers that come late; the map, which is drawn for all times, stays."""
+
+
+class Screen:
+    """A viewer that listens at `address`, and its process where that is ours to end.
+
+    `where` is web, native, or a rerun+http address; `bind` is where the web's two ports are
+    opened. Raises InputError where there is no such viewer.
+    """
+
+    def __init__(self, where: str, bind: str = LOOPBACK) -> None:
+        self.address = f"rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy"
+        self.process: subprocess.Popen[bytes] | None = None
+        self.is_ours = False
+        """Whether it ends with the flight: a page does, a window stays."""
+        self.page = ""
+        """What to open in a browser."""
+        self.gate: WebGate | None = None
+        """Through which browsers come; None where none do."""
+        if where == "web":
+            self._serve(bind)
+        elif where == "native":
+            if not listens(LOOPBACK, GRPC_PORT):
+                self.process = _start(GRPC_PORT, detached=True)
+        else:
+            parts = urlsplit(where.removeprefix("rerun+"))
+            if parts.hostname is None or not listens(parts.hostname, parts.port or GRPC_PORT):
+                raise InputError(
+                    "no viewer listens there; start one with `rerun`, or correct the address"
+                )
+            self.address = where
+
+    def _serve(self, bind: str) -> None:
+        for port in (GRPC_PORT, WEB_PORT):
+            if listens(LOOPBACK, port):
+                raise InputError(
+                    f"port {port} is taken; end what listens there, or give its address"
+                )
+        inner_grpc, inner_web = free_ports(2)
+        self.process = _start(
+            inner_grpc, "--serve-web", "--web-viewer-port", str(inner_web),
+            "--newest-first", "--cors-allow-origin", f"http://*:{WEB_PORT}",
+        )  # fmt: skip
+        self.is_ours = True
+        self.address = f"rerun+http://{LOOPBACK}:{inner_grpc}/proxy"
+        doors = {(bind, GRPC_PORT): inner_grpc, (bind, WEB_PORT): inner_web}
+        try:
+            self.gate = WebGate(doors, watched=GRPC_PORT)
+        except OSError as error:
+            self.process.kill()
+            self.process.wait()
+            raise InputError(f"{bind}: no page can be served there: {error.strerror}") from error
+        self.page = page_of(LOOPBACK if bind in ("0.0.0.0", "::") else bind)
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether a viewer that was started here has ended."""
+        return self.process is not None and self.process.poll() is not None
+
+    def close(self) -> None:
+        """End what is to end with the flight."""
+        if self.gate is not None:
+            self.gate.close()
+        if self.process is not None and self.is_ours:
+            self.process.terminate()
+            self.process.wait()
+
+
+def page_of(host: str) -> str:
+    """The address, for a browser, of a page that shows what is served there."""
+    shown = f"rerun%2Bhttp://{host}:{GRPC_PORT}/proxy"
+    return f"http://{host}:{WEB_PORT}/?url={shown}&theme=dark"
+
+
+def listens(host: str, port: int) -> bool:
+    """Whether something accepts connections there."""
+    try:
+        with socket.create_connection((host, port), timeout=3.0):
+            return True
+    except OSError:
+        return False
+
+
+def _start(port: int, *arguments: str, detached: bool = False) -> subprocess.Popen[bytes]:
+    command = [
+        str(_executable()), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", MEMORY,
+        "--server-memory-limit", SERVER_MEMORY, *arguments,
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL, start_new_session=detached,
+    )  # fmt: skip
+    until_s, never = monotonic_s() + START_S, threading.Event()
+    while not listens(LOOPBACK, port):
+        if process.poll() is not None:
+            raise InputError(
+                f"the viewer ended at once (status {process.returncode}); is there a display?"
+            )
+        if monotonic_s() > until_s:
+            process.kill()
+            raise InputError(f"the viewer did not start within {START_S:.0f} s")
+        wait_s(never, 0.1)
+    return process
+
+
+def _executable() -> Path:
+    """The viewer that came with the library, wherever the shell looks for programs."""
+    spec = importlib.util.find_spec("rerun_cli")
+    for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
+        program = Path(folder) / "rerun"
+        if program.exists():
+            return program
+    raise InputError("the viewer's program is not installed; pip install rerun-sdk brings it")

@@ -1,0 +1,1 @@
+"""Live cameras: one file for each kind, one registry, one supervising thread."""

@@ -1,0 +1,281 @@
+"""The thread that keeps a camera open and hands on what may be believed of its pictures."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.config import CameraConfig
+from companion.errors import CompanionError, ConfigError
+from companion.health import SourceHealth, SourceMeter, SourceState
+from companion.messages import Frame, Warned
+from companion.timing.clock import FlightClock
+from drivers.camera.camera_source import CameraSource, EndOfPictures, Picture
+from drivers.system.fault_trace import FaultTraces
+
+MISSING = "the camera is not there"
+GONE = "the camera has gone"
+BACK = "the camera is back"
+SILENT = "the camera is silent"
+FROZEN = "the camera is frozen"
+WRONG_SIZE = "pictures of another size are refused"
+WRONG_STAMP = "pictures with wrong stamps are refused"
+NOT_AS_ASKED = "the camera does not do as asked"
+ENDED = "the camera's pictures have ended"
+DRIVER_FAULT = "the camera's driver has a fault"
+
+EXPECTED = (CompanionError, OSError)
+"""What a camera or its connection may do at any time; anything else is a bug of its driver."""
+RETRY_S = 0.5
+"""Between two attempts to open a camera that is not there."""
+READ_S = 0.1
+"""A read waits for so long at most, so that stopping does not."""
+STOP_S = 2.0
+"""A thread that has not ended by then never will."""
+FROZEN_S = 1.0
+"""Pictures that have been the same for so long come from a frozen camera."""
+MIN_CONTRAST = 12
+"""Pictures with less than this between dark and bright, as under a lens cap, may well be equal."""
+AMISS_S = 1.5
+"""A camera that has been frozen, or of the wrong size, for so long is opened anew,"""
+BETWEEN_CURES_S = 5.0
+"""but not more often than this."""
+MAX_AHEAD_NS, MAX_BEHIND_NS = 50_000_000, 10_000_000_000
+"""How far a stamp may lie from now."""
+REPEAT_WARNING_S = 10.0
+
+
+@dataclass(slots=True)
+class _Opening:
+    """What is known of the camera since it was opened, CLOCK_MONOTONIC in seconds."""
+
+    since_s: float
+    picture_s: float | None = None
+    """When the last picture of any kind came."""
+    amiss_s: float | None = None
+    """Since when none came that could be handed on, and what is wrong with them."""
+    amiss: str = ""
+
+
+class CameraFeed:
+    """Opens a source, and opens it anew whenever it has gone, for as long as it is to run.
+
+    `deliver` and `warn` are called in its thread and must not block. A picture that repeats the one
+    before, has another size than the first of all, or a stamp that cannot be true, goes no further
+    and is counted.
+    """
+
+    def __init__(
+        self,
+        source: CameraSource,
+        clock: FlightClock,
+        config: CameraConfig,
+        deliver: Callable[[Frame], None],
+        warn: Callable[[Warned], None],
+    ) -> None:
+        self.fault: CompanionError | None = None
+        """Why the configured camera can never be opened; the thread has then ended."""
+        self.size: tuple[int, int] | None = None
+        """Width and height of the first picture, which all others must have."""
+        self._source = source
+        self._clock = clock
+        self._rate_hz = config.rate_hz
+        self._secrets = {config.url: "camera.url", config.pipeline: "camera.pipeline"}
+        self._faults = FaultTraces()
+        self._offset_ns = round(config.stamp_offset_ms * 1e6)
+        self._deliver = deliver
+        self._warn = warn
+        self._meter = SourceMeter("camera")
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
+        self._n_refused = 0
+        self._seq = 0
+        self._last_ns: int | None = None
+        self._previous: Picture | None = None
+        self._cured_s = -BETWEEN_CURES_S
+        self._warned_s: dict[str, float] = {}
+
+    @property
+    def health(self) -> SourceHealth:
+        """As it stands now; may be asked from any thread."""
+        return self._meter.health(self._clock.now_ns())
+
+    def start(self) -> None:
+        """Begin to open the camera."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Close the camera and end; a driver that hangs is left behind."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(STOP_S)
+
+    def _run(self) -> None:
+        n_opened = 0
+        while not self._stop.is_set():
+            try:
+                if self._open(n_opened > 0):
+                    n_opened += 1
+                    self._meter.n_reopened = n_opened - 1
+                    self._read_on()
+            except Exception as error:  # a driver's bug must not end the flight
+                self._set_fault(error)
+            self._close()
+            if self.fault is not None or self._meter.state == "ended":
+                return
+            if self._meter.state in ("missing", "driver fault"):
+                self._stop.wait(RETRY_S)
+
+    def _open(self, opened_before: bool) -> bool:
+        if self._meter.state == "missing":
+            self._meter.state = "opening"
+        try:
+            self._source.open()
+        except ConfigError as error:
+            self._set("missing", MISSING, str(error))
+            if not opened_before:
+                self.fault = error
+            return False
+        except EXPECTED as error:
+            self._set("missing", MISSING, self._in_words(error))
+            return False
+        if self._meter.state == "opening":  # else what was amiss may still be
+            self._meter.detail = self._source.name
+        return True
+
+    def _close(self) -> None:
+        try:
+            self._source.close()
+        except EXPECTED as error:
+            self._meter.detail = self._in_words(error)
+        except Exception as error:  # likewise
+            self._set_fault(error)
+
+    def _read_on(self) -> None:
+        """Hand on pictures until the camera has gone, or should be opened anew."""
+        opening = _Opening(time.monotonic())
+        while not self._stop.is_set():
+            try:
+                picture = self._source.read(READ_S)
+            except EndOfPictures as error:
+                self._set("ended", ENDED, str(error))
+                return
+            except EXPECTED as error:
+                self._set("missing", GONE, self._in_words(error))
+                return
+            now_s = time.monotonic()
+            while self._source.remarks:
+                self._warn(Warned(self._clock.now_ns(), NOT_AS_ASKED, self._source.remarks.pop(0)))
+            if picture is not None:
+                opening.picture_s = now_s
+                opening.amiss = self._take(picture)
+                if not opening.amiss:
+                    opening.amiss_s = None
+                elif opening.amiss_s is None:
+                    opening.amiss_s = now_s
+            self._meter.n_dropped = self._source.n_dropped + self._n_refused
+            if self._should_be_cured(opening, now_s):
+                return
+
+    def _should_be_cured(self, opening: _Opening, now_s: float) -> bool:
+        source = self._source
+        if opening.picture_s is None:
+            silent = now_s - opening.since_s > source.start_s
+        else:
+            silent = now_s - opening.picture_s > max(source.silent_s, 3 / self._rate_hz)
+        if silent:
+            self._set("silent", SILENT, f"{source.name}: no picture comes")
+            return source.live
+        amiss_s = 0.0 if opening.amiss_s is None else now_s - opening.amiss_s
+        if amiss_s > FROZEN_S and self._meter.state == "running":
+            if opening.amiss == FROZEN:
+                self._set("frozen", FROZEN, f"{source.name}: the same picture again and again")
+            else:
+                self._set("silent", opening.amiss, f"{source.name}: {opening.amiss}")
+        if not source.live or amiss_s < AMISS_S or now_s - self._cured_s < BETWEEN_CURES_S:
+            return False
+        self._cured_s = now_s
+        return True
+
+    def _take(self, picture: Picture) -> str:
+        """Hand a picture on, or say what is amiss with it."""
+        now_ns = time.monotonic_ns()
+        amiss = self._amiss(picture, now_ns)
+        if amiss:
+            self._n_refused += 1
+            return amiss
+        if self._meter.state != "running":
+            self._recovered()
+        t_ns = self._clock.from_monotonic_ns(picture.monotonic_ns + self._offset_ns)
+        self._meter.came(self._clock.from_monotonic_ns(now_ns))
+        self._deliver(Frame(self._seq, t_ns, picture.grey, picture.rgb))
+        self._seq += 1
+        return ""
+
+    def _amiss(self, picture: Picture, now_ns: int) -> str:
+        height, width = picture.grey.shape
+        if self.size is None:
+            self.size = width, height
+        if (width, height) != self.size:
+            detail = f"{width} x {height}, wanted are {self.size[0]} x {self.size[1]}"
+            self._set("silent", WRONG_SIZE, f"{self._source.name}: {detail}")
+            return WRONG_SIZE
+        ahead_ns = picture.monotonic_ns - now_ns
+        if not -MAX_BEHIND_NS < ahead_ns < MAX_AHEAD_NS:
+            detail = f"{self._source.name}: {ahead_ns / 1e6:+.0f} ms from now"
+            self._warn_again(WRONG_STAMP, detail)
+            return WRONG_STAMP
+        if self._last_ns is not None and picture.monotonic_ns <= self._last_ns:
+            back_ns = self._last_ns - picture.monotonic_ns
+            detail = f"{self._source.name}: {back_ns / 1e6:.1f} ms before the last one's"
+            self._warn_again(WRONG_STAMP, detail)
+            return WRONG_STAMP
+        self._last_ns = picture.monotonic_ns
+        previous, self._previous = self._previous, picture
+        return FROZEN if previous is not None and _repeats(previous, picture) else ""
+
+    def _recovered(self) -> None:
+        before, self._meter.state = self._meter.state, "running"
+        self._meter.detail = self._source.name
+        if self._seq:
+            detail = f"{self._source.name}: it was {before}"
+            self._warn(Warned(self._clock.now_ns(), BACK, detail, good=True))
+        self._warned_s.clear()
+
+    def _in_words(self, error: Exception) -> str:
+        if isinstance(error, OSError):
+            return f"{self._source.name}: {error.strerror or error}"
+        return str(error)
+
+    def _set_fault(self, error: Exception) -> None:
+        """A bug: where it lies goes to the journal whole, what it is to whoever asks."""
+        self._faults.tell(error, self._secrets)
+        name = type(error).__name__
+        self._set("driver fault", DRIVER_FAULT, f"{self._source.name}: {name}, see the journal")
+
+    def _set(self, state: SourceState, what: str, detail: str) -> None:
+        """Note what is amiss, and tell of it where that is new."""
+        self._meter.state, self._meter.detail = state, detail
+        if what not in self._warned_s:
+            self._warned_s[what] = time.monotonic()
+            self._warn(Warned(self._clock.now_ns(), what, detail))
+
+    def _warn_again(self, what: str, detail: str) -> None:
+        now_s = time.monotonic()
+        if now_s - self._warned_s.get(what, -REPEAT_WARNING_S) >= REPEAT_WARNING_S:
+            self._warned_s[what] = now_s
+            self._warn(Warned(self._clock.now_ns(), what, detail))
+
+
+def _repeats(previous: Picture, picture: Picture) -> bool:
+    # a sensor's noise makes no two pictures equal, not even of a scene that stands still; but in
+    # the dark, under a lens cap, it may be less than the first step
+    return (
+        np.array_equal(previous.grey, picture.grey)
+        and np.array_equal(previous.rgb, picture.rgb)
+        and int(np.ptp(picture.grey)) >= MIN_CONTRAST
+    )

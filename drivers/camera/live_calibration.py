@@ -1,0 +1,71 @@
+"""The camera model of a live run: of its calibration file, or as configured."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+
+from companion.config import CameraConfig, MountConfig
+from companion.errors import ConfigError
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
+from drivers.camera.pattern_camera import pattern_optics
+from drivers.images.calibration_file import FORWARD_UPRIGHT, assumed_camera, read_calibration
+
+
+def live_camera(
+    config: CameraConfig, mount: MountConfig, width: int, height: int
+) -> tuple[Camera, list[str]]:
+    """The camera of a live run with pictures of this size, and in words what is not known of it.
+
+    FlightError or ConfigError where what is configured cannot be. A flight folder played as a
+    camera brings its own calibration, and so does the test pattern.
+    """
+    warnings = []
+    file = _calibration_file(config)
+    if file is not None:
+        camera = read_calibration(file, width, height)
+    elif config.source == "pattern":
+        camera = pattern_optics(config)
+    elif config.assumed_hfov_deg > 0:
+        camera = assumed_camera(width, height, config.assumed_hfov_deg)
+        warnings.append(
+            f"no camera.calibration: the camera is taken to be {config.assumed_hfov_deg:g} degrees "
+            "wide and without distortion"
+        )
+    else:
+        raise ConfigError(
+            "no camera.calibration; give one, or a field of view by camera.assumed_hfov_deg"
+        )
+    if mount.known:
+        if camera.body_from_camera is not None:
+            raise ConfigError(
+                f"{file or 'the test pattern'} says how the camera sits on the body, and so does "
+                "[mount]; set mount.known = false, or take body_from_camera out of the file"
+            )
+        camera = dataclasses.replace(camera, body_from_camera=body_from_camera(mount))
+    elif camera.body_from_camera is None:
+        warnings.append(
+            "how the camera sits on the body is not known, so that the autopilot's attitude cannot "
+            "be used; set [mount]"
+        )
+    return camera, warnings
+
+
+def body_from_camera(mount: MountConfig) -> Pose:
+    """The place of a camera that is mounted as configured."""
+    turned = quaternion_from_euler(
+        math.radians(mount.roll_deg), math.radians(mount.pitch_deg), math.radians(mount.yaw_deg)
+    )
+    place = np.array([mount.x_m, mount.y_m, mount.z_m])
+    return Pose(rotation_from_quaternion(turned) @ FORWARD_UPRIGHT, place)
+
+
+def _calibration_file(config: CameraConfig) -> Path | None:
+    if config.calibration:
+        return Path(config.calibration)
+    own = Path(config.path) / "camera.json"
+    return own if config.source == "file" and config.path and own.exists() else None

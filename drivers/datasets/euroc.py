@@ -1,0 +1,137 @@
+"""Sequences of EuRoC MAV and of what is laid out like it (ASL format): folders in `mav0/`.
+
+The body is the frame that the sequence calls so, which is its IMU's; its axes need not be forward,
+right and down, and nothing here turns them. What the sequence was measured with from outside
+(`state_groundtruth_estimate0`, `leica0`, `vicon0`) is truth, not telemetry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from companion.config import CameraConfig, TelemetryConfig
+from companion.errors import FlightError
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Pose
+from companion.messages import ImuSample
+from drivers.datasets.flight_folder import camera_of
+from drivers.flight import Flight, TruePose
+from drivers.images.calibration_file import MODELS, body_from_camera_of
+from drivers.images.listed_images import listed_images
+from drivers.images.text_table import ns_of_whole, numbers_of, pose_of, read_rows
+from drivers.telemetry.telemetry_folder import aligned, unchanged
+from drivers.telemetry.telemetry_log import LogContent, Pictures, TelemetryCollector, TelemetryLog
+
+MAX_YAML_BYTES = 100_000
+
+
+def is_euroc(path: Path) -> bool:
+    """Whether a folder is such a sequence."""
+    return (_mav(path) / "cam0" / "data.csv").is_file()
+
+
+def open_euroc(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
+    """Camera cam0 and IMU imu0 of a sequence; FlightError where it is not whole."""
+    mav = _mav(path)
+    listing = mav / "cam0" / "data.csv"
+    rows = read_rows(listing, 2)
+    stamped = [(ns_of_whole(listing, t), mav / "cam0" / "data" / name) for t, name, *_ in rows]
+    source, numbers, times_ns, warnings = listed_images(listing, stamped)
+    sensor = mav / "cam0" / "sensor.yaml"
+    if sensor.is_file():
+        camera = _camera(sensor, source.width, source.height)
+    else:
+        camera, assumed = camera_of(path / "camera.json", source, config, times_ns[0])
+        warnings += assumed
+
+    def read_log(pictures: Pictures) -> TelemetryLog:
+        return aligned(_imu(mav), pictures, telemetry)
+
+    return Flight(
+        path, camera, source, numbers, times_ns, warnings, read_log, lambda: _truth(mav, camera)
+    )
+
+
+def _mav(path: Path) -> Path:
+    return path / "mav0" if (path / "mav0").is_dir() else path
+
+
+def _camera(sensor: Path, width: int, height: int) -> Camera:
+    said = _yaml(sensor)
+    size = [int(n) for n in _list(sensor, said, "resolution", 2)]
+    if size != [width, height]:
+        raise FlightError(
+            f"{sensor}: it is for pictures of {size[0]} x {size[1]}, those that are there are "
+            f"{width} x {height}"
+        )
+    if said.get("camera_model", "pinhole") != "pinhole":
+        raise FlightError(f"{sensor}: camera_model {said['camera_model']!r} is not known: pinhole")
+    fx, fy, cx, cy = _list(sensor, said, "intrinsics", 4)
+    if min(fx, fy) <= 0:
+        raise FlightError(f"{sensor}: focal lengths must be positive, they are {fx:g} and {fy:g}")
+    name = str(said.get("distortion_model", "none"))
+    model = {**MODELS, "radial-tangential": Distortion.RADTAN}.get(name)
+    if model is None:
+        raise FlightError(f"{sensor}: distortion_model {name!r} is not known")
+    given = [] if model is Distortion.NONE else _list(sensor, said, "distortion_coefficients", 4)
+    more = [0.0] if model is Distortion.RADTAN else []  # the format has no k3
+    mounted = said.get("T_BS")
+    matrix = _list(sensor, mounted, "data", 16) if isinstance(mounted, dict) else None
+    return Camera(
+        width, height, fx, fy, cx, cy, model, (*given, *more),
+        body_from_camera_of(sensor, None if matrix is None else np.reshape(matrix, (4, 4))),
+    )  # fmt: skip
+
+
+def _yaml(path: Path) -> Mapping[str, Any]:
+    try:
+        if path.stat().st_size > MAX_YAML_BYTES:
+            raise FlightError(f"{path}: too long for a sensor's description")
+        # some of these files begin with a directive of OpenCV that no other parser takes
+        text = path.read_text("utf-8").removeprefix("%YAML:1.0")
+        said = YAML(typ="safe", pure=True).load(text)
+    except OSError as error:
+        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
+    except (YAMLError, ValueError) as error:
+        line = str(error).splitlines()[0]
+        raise FlightError(f"{path}: cannot be read as YAML: {line}") from error
+    if not isinstance(said, dict):
+        raise FlightError(f"{path}: wanted keys and values")
+    return said
+
+
+def _list(path: Path, said: Mapping[str, Any], key: str, n: int) -> list[float]:
+    value = said.get(key)
+    if not isinstance(value, list) or len(value) != n:
+        raise FlightError(f"{path}: {key} must be a list of {n} numbers, it is {value!r}"[:300])
+    return numbers_of(path, [str(each) for each in value])
+
+
+def _imu(mav: Path) -> LogContent:
+    listing = mav / "imu0" / "data.csv"
+    collected = TelemetryCollector("imu0")
+    if listing.is_file():
+        for t, *words in read_rows(listing, 7):
+            values = np.array(numbers_of(listing, words[:6]))
+            sample = ImuSample(0, values[:3], values[3:])
+            collected.add(ns_of_whole(listing, t), 0, sample)
+    return LogContent(collected, unchanged)
+
+
+def _truth(mav: Path, camera: Camera) -> list[TruePose]:
+    listing = mav / "state_groundtruth_estimate0" / "data.csv"
+    if not listing.is_file():
+        return []
+    body_from_camera = camera.body_from_camera or Pose.identity()
+    out = []
+    for t, *words in read_rows(listing, 8):
+        values = numbers_of(listing, words[:7])
+        world_from_body = pose_of(listing, values[:3], values[3:])
+        out.append(TruePose(ns_of_whole(listing, t), world_from_body @ body_from_camera))
+    return out

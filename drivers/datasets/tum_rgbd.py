@@ -1,0 +1,63 @@
+"""Sequences of the TUM RGB-D benchmark and of what is laid out like it: images in `rgb.txt`.
+
+Only the colour images are read: the depth images are no camera's of ours.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from companion.config import CameraConfig, TelemetryConfig
+from companion.geometry.camera import Camera, Distortion
+from companion.messages import Warned
+from drivers.datasets.posed_layouts import TUM_CAMERA, TUM_CAMERAS
+from drivers.flight import Flight, TruePose
+from drivers.images.calibration_file import read_calibration
+from drivers.images.listed_images import listed_images
+from drivers.images.text_table import ns_of_seconds, numbers_of, pose_of, read_rows
+from drivers.telemetry.telemetry_log import no_telemetry
+
+
+def is_tum_rgbd(path: Path) -> bool:
+    """Whether a folder is such a sequence."""
+    return (path / "rgb.txt").is_file()
+
+
+def open_tum_rgbd(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
+    """The colour images of a sequence; FlightError where it is not whole."""
+    listing = path / "rgb.txt"
+    stamped = [(ns_of_seconds(listing, t), path / name) for t, name, *_ in read_rows(listing, 2)]
+    source, numbers, times_ns, warnings = listed_images(listing, stamped)
+    stated = path / "camera.json"
+    if stated.is_file():
+        camera = read_calibration(stated, source.width, source.height)
+    else:
+        camera, of = _usual_camera(path, source.width, source.height)
+        warnings.append(Warned(times_ns[0], "no camera.json: the benchmark's camera is taken", of))
+    return Flight(
+        path, camera, source, numbers, times_ns, warnings, no_telemetry, lambda: _truth(path)
+    )
+
+
+def _usual_camera(path: Path, width: int, height: int) -> tuple[Camera, str]:
+    name = next((name for name in TUM_CAMERAS if name in path.resolve().name), None)
+    fx, fy, cx, cy, distortion = TUM_CAMERAS[name] if name else TUM_CAMERA
+    scale = width / 640
+    model = Distortion.RADTAN if any(distortion) else Distortion.NONE
+    camera = Camera(
+        width, height, fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5,
+        model, distortion if any(distortion) else (), assumed=name is None,
+    )  # fmt: skip
+    return camera, name or "of no known one, so that of ROS's driver"
+
+
+def _truth(path: Path) -> list[TruePose]:
+    listing = path / "groundtruth.txt"
+    if not listing.is_file():
+        return []
+    out = []
+    for t, *words in read_rows(listing, 8):
+        x, y, z, qx, qy, qz, qw = numbers_of(listing, words[:7])
+        pose = pose_of(listing, (x, y, z), (qw, qx, qy, qz))
+        out.append(TruePose(ns_of_seconds(listing, t), pose))
+    return out

@@ -1,0 +1,166 @@
+"""A camera's calibration file: intrinsics, distortion and the camera's place on the body."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.errors import FlightError
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Array, Pose
+from drivers.images.text_table import numbers_of, read_rows
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+MODELS = {
+    "none": Distortion.NONE,
+    "pinhole": Distortion.NONE,
+    "radtan": Distortion.RADTAN,
+    "plumb_bob": Distortion.RADTAN,
+    "equidistant": Distortion.EQUIDISTANT,
+    "fisheye": Distortion.EQUIDISTANT,
+}
+KEYS = {
+    Distortion.NONE: (),
+    Distortion.RADTAN: ("k1", "k2", "p1", "p2", "k3"),
+    Distortion.EQUIDISTANT: ("k1", "k2", "k3", "k4"),
+}
+MAX_TURN_ERROR = 1e-3
+FORWARD_UPRIGHT: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Rotation body_from_camera of a camera that looks forward, upright."""
+
+
+def read_calibration(path: Path, width: int, height: int) -> Camera:
+    """The camera of a JSON or TOML file, which must be for pictures of this size.
+
+    FlightError otherwise. Coefficients stand under their names or as a list `D`, where radtan's
+    fifth may be left out.
+    """
+    content = _content(path)
+    size = tuple(_number(path, content, key) for key in ("width", "height"))
+    if size != (width, height):
+        raise FlightError(
+            f"{path}: it is for pictures of {size[0]:g} x {size[1]:g}, those that come are "
+            f"{width} x {height}; give the calibration for that size"
+        )
+    fx, fy, cx, cy = (_number(path, content, key) for key in ("fx", "fy", "cx", "cy"))
+    if fx <= 0 or fy <= 0:
+        raise FlightError(f"{path}: fx and fy must be positive, they are {fx:g} and {fy:g}")
+    if not (0 < cx < width and 0 < cy < height):
+        raise FlightError(f"{path}: cx, cy = {cx:g}, {cy:g} lie outside of the picture")
+    model = _model(path, content)
+    return Camera(
+        width, height, fx, fy, cx, cy, model, _coefficients(path, content, model),
+        body_from_camera_of(path, content.get("body_from_camera")), content.get("assumed") is True,
+    )  # fmt: skip
+
+
+def read_matrix(path: Path, width: int, height: int) -> Camera:
+    """The camera of an intrinsic matrix as text, three rows of three; FlightError if it is none."""
+    matrix = np.array([numbers_of(path, words[:3]) for words in read_rows(path, 3)])
+    if matrix.shape != (3, 3) or min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise FlightError(f"{path}: wanted an intrinsic matrix, three rows of three numbers")
+    fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if not (0 < cx < width and 0 < cy < height):
+        raise FlightError(f"{path}: cx, cy = {cx:g}, {cy:g} lie outside of the picture")
+    return Camera(width, height, fx, fy, cx, cy)
+
+
+def assumed_camera(width: int, height: int, hfov_deg: float) -> Camera:
+    """A camera without distortion and with this horizontal field of view, marked as assumed."""
+    focal = 0.5 * width / math.tan(math.radians(hfov_deg) / 2)
+    centre = (width - 1) / 2, (height - 1) / 2
+    return Camera(width, height, focal, focal, *centre, assumed=True)
+
+
+def _content(path: Path) -> Mapping[str, Any]:
+    is_toml = path.suffix.lower() == ".toml"
+    try:
+        text = path.read_text("utf-8")
+        content = tomllib.loads(text) if is_toml else json.loads(text)
+    except OSError as error:
+        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # of both formats, and of text that is none
+        raise FlightError(
+            f"{path}: cannot be read as {'TOML' if is_toml else 'JSON'}: {error}"
+        ) from error
+    if not isinstance(content, dict):
+        raise FlightError(f"{path}: wanted an object with keys fx, fy, cx, cy and so on")
+    return content
+
+
+def _number(path: Path, content: Mapping[str, Any], key: str) -> float:
+    if key not in content:
+        raise FlightError(f"{path}: the key {key} is missing")
+    value = content[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise FlightError(f"{path}: {key} must be a number, it is {value!r}")
+    return float(value)
+
+
+def _model(path: Path, content: Mapping[str, Any]) -> Distortion:
+    if "distortion_model" not in content:
+        raise FlightError(f"{path}: the key distortion_model is missing")
+    model = MODELS.get(str(content["distortion_model"]).lower())
+    if model is None:
+        raise FlightError(
+            f"{path}: unknown distortion_model {content['distortion_model']!r}; known are "
+            + ", ".join(MODELS)
+        )
+    return model
+
+
+def _coefficients(path: Path, content: Mapping[str, Any], model: Distortion) -> tuple[float, ...]:
+    keys = KEYS[model]
+    given = content.get("D")
+    if given is None:
+        # k3 is zero in many calibrations, and then often not written
+        optional = {"k3": 0.0} if model is Distortion.RADTAN else {}
+        filled = {**optional, **content}
+        return tuple(_number(path, filled, key) for key in keys)
+    if not isinstance(given, list):
+        raise FlightError(f"{path}: D must be a list of {len(keys)} numbers")
+    if model is Distortion.RADTAN and len(given) == len(keys) - 1:
+        given = [*given, 0.0]
+    if model is Distortion.NONE and not any(given):
+        return ()
+    if len(given) != len(keys):
+        raise FlightError(
+            f"{path}: D has {len(given)} numbers, {model.value} wants {len(keys)}: "
+            + (", ".join(keys) or "none")
+        )
+    return tuple(_number(path, {f"D[{i}]": value}, f"D[{i}]") for i, value in enumerate(given))
+
+
+def body_from_camera_of(path: Path, given: Any) -> Pose | None:
+    """The transform that a 4 x 4 matrix is, None for None; FlightError where it is none."""
+    if given is None:
+        return None
+    try:
+        matrix = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise FlightError(f"{path}: body_from_camera must be a 4 x 4 matrix of numbers")
+    rotation = matrix[:3, :3]
+    away = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if (
+        away > MAX_TURN_ERROR
+        or np.linalg.det(rotation) < 0
+        or (np.abs(matrix[3] - [0, 0, 0, 1]).max() > MAX_TURN_ERROR)
+    ):
+        raise FlightError(
+            f"{path}: body_from_camera is no rigid transform: its 3 x 3 part must be a rotation "
+            "(orthonormal, determinant +1) and its last row 0 0 0 1"
+        )
+    u, _, vt = np.linalg.svd(rotation)  # files round their numbers
+    return Pose(u @ vt, matrix[:3, 3].copy())

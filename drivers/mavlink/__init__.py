@@ -1,0 +1,1 @@
+"""The autopilot and the ground over MAVLink: link, requests, parameters, commands, messages out."""

@@ -1,0 +1,383 @@
+"""The autopilot: found on a port, kept in step with, asked for what is wanted, and listened to.
+
+Which vehicle it is its HEARTBEAT tells; from then on we are a component of that system. What it
+measures goes out as samples on the flight's clock. Whatever goes wrong on the link is named once
+and taken up again when it is over.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.config import LinkConfig
+from companion.geometry.geodesy import GeoOrigin
+from companion.health import RateMeter, SourceHealth, SourceMeter
+from companion.messages import ArmedSample, Telemetry, Warned
+from companion.pilot_messages import PilotText
+from companion.timing.clock import FlightClock
+from companion.timing.link_clock import ClockFilter
+from drivers.mavlink.commands import NO_ANSWER, TRIES, Commands
+from drivers.mavlink.message_rates import MessageRates, wanted
+from drivers.mavlink.status_text import TextLimit, status_text
+from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
+from drivers.mavlink.vehicle import Vehicle, is_autopilot, vehicle_of
+from drivers.mavlink.wire.message_port import MavlinkPort
+from drivers.mavlink.wire.wire import run_together
+from drivers.system.within import within
+from drivers.telemetry.live_samples import LiveSamples
+from drivers.telemetry.mavlink_samples import SAMPLE_OF
+
+FIRST_SYSTEM = 1
+"""Whose component we say we are until the vehicle is heard: on UDP it may answer only then."""
+HEARTBEAT_NS, HEARTBEAT_TICK_S = 1_000_000_000, 0.05
+WATCH_S, ORIGIN_S = 0.1, 5.0
+ANSWER_S, REQUEST_S = 1.0, 0.4
+MAX_ROUND_TRIP_NS = 2_000_000_000
+MAX_QUESTIONS = 64
+"""TIMESYNC without an answer that are remembered."""
+AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
+REFUSALS = (
+    mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
+)  # fmt: skip
+COUNTED = {*SAMPLE_OF, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME}
+
+Take = Callable[[Any, int], None]
+
+
+class AutopilotLink:
+    """One vehicle's autopilot. Used from one event loop; `deliver` and `warn` are called in it."""
+
+    def __init__(
+        self,
+        config: LinkConfig,
+        port: MavlinkPort,
+        clock: FlightClock,
+        deliver: Callable[[Telemetry], None],
+        warn: Callable[[Warned], None],
+    ) -> None:
+        self._config, self.port, self._clock = config, port, clock
+        self._deliver, self._warn = deliver, warn
+        self.vehicle: Vehicle | None = None
+        """None until its first HEARTBEAT; kept while it is silent."""
+        self.alive = False
+        """Whether the autopilot has said something lately."""
+        self.clock_filter = ClockFilter()
+        self.samples = LiveSamples(self.clock_filter, deliver, warn)
+        self._meter = SourceMeter("autopilot")
+        self._rates: defaultdict[str, RateMeter] = defaultdict(RateMeter)
+        self._wanted = MessageRates(wanted(config))
+        self._commands = Commands(self.send)
+        self._text_limit = TextLimit()
+        self.system_status: int = mavlink.MAV_STATE_BOOT
+        """What our HEARTBEAT states: a MAV_STATE."""
+        self.on_request: Take | None = None
+        """Takes what anybody sends, for who answers what is asked of us."""
+        self._takers: defaultdict[int, list[Take]] = defaultdict(list)
+        self._heard_ns = 0
+        self._armed: bool | None = None
+        self._n_reboots = 0
+        self._strangers: set[int] = set()
+        self._missing: set[int] = set()
+        self._questions: dict[int, None] = {}
+        port.identity = (config.system_id or FIRST_SYSTEM, config.component_id)
+        self._on: dict[int, Take] = {
+            mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._take_heartbeat,
+            mavlink.MAVLINK_MSG_ID_TIMESYNC: self._take_timesync,
+            mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._take_acknowledgement,
+        }
+
+    async def run(self) -> None:
+        """Serve the link until cancelled."""
+        await run_together(
+            self.port.run(self._take),
+            self._say_heartbeats(),
+            self._compare_clocks(),
+            self._watch(),
+            self._ask_for_messages(),
+            self._ask_for_origin(),
+        )
+
+    # -- what others ask -------------------------------------------------------------------------
+
+    @property
+    def n_reboots(self) -> int:
+        """Times that the autopilot began anew while we listened."""
+        return self._n_reboots
+
+    @property
+    def rates_hz(self) -> dict[str, float]:
+        """Messages that make samples, by name: how often they really came in the last seconds."""
+        now_ns = self._clock.now_ns()
+        found = {name: round(meter.hz(now_ns), 1) for name, meter in sorted(self._rates.items())}
+        return {name: rate_hz for name, rate_hz in found.items() if rate_hz}
+
+    @property
+    def origin(self) -> GeoOrigin | None:
+        """Where the positions handed on are counted from; None while no place is known."""
+        return self.samples.places.home
+
+    @property
+    def health(self) -> SourceHealth:
+        """As it stands now."""
+        self._meter.n_dropped = sum(self.samples.n_dropped.values())
+        self._meter.detail = self._detail()
+        if self.alive:
+            self._meter.state = "running"
+        elif self._meter.n:
+            self._meter.state = "silent"
+        else:
+            self._meter.state = "opening" if self.port.connected else "missing"
+        return self._meter.health(self._clock.now_ns())
+
+    def listen(self, message_id: int, take: Take) -> Callable[[], None]:
+        """Have every message of a kind that the autopilot sends; what is returned ends that."""
+        self._takers[message_id].append(take)
+
+        def end() -> None:
+            with contextlib.suppress(ValueError):
+                self._takers[message_id].remove(take)
+
+        return end
+
+    # -- what goes out ---------------------------------------------------------------------------
+
+    def send(self, message: Any) -> None:
+        """Send a message as our component; never waits, never fails."""
+        self.port.send(message)
+
+    def heartbeat(self) -> Any:
+        """Our HEARTBEAT as it is now."""
+        return mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
+            self.system_status, 3,
+        )  # fmt: skip
+
+    def say(self, text: PilotText) -> bool:
+        """Tell the pilot, by STATUSTEXT. False for what comes too soon: not told."""
+        said = self._text_limit.passed(text, self._clock.now_ns())
+        for each in said:
+            self.send(status_text(each))
+        return bool(said)
+
+    async def command(
+        self, command: int, *params: float, timeout_s: float = ANSWER_S, tries: int = TRIES
+    ) -> int:
+        """Send a COMMAND_LONG until it is answered: a MAV_RESULT, or NO_ANSWER (-1)."""
+        values = [*params, *[0.0] * (7 - len(params))]
+        system = self._target()
+
+        def make(attempt: int) -> Any:
+            return mavlink.MAVLink_command_long_message(
+                system, AUTOPILOT, command, attempt, *values
+            )
+
+        return await self._commands.ask(command, make, timeout_s, tries)
+
+    async def command_at(
+        self, command: int, place: GeoOrigin, *params: float, timeout_s: float = ANSWER_S,
+        tries: int = TRIES,
+    ) -> int:  # fmt: skip
+        """Send a COMMAND_INT about a place on Earth, altitude above mean sea level; likewise."""
+        values = [*params, *[0.0] * (4 - len(params))]
+        system = self._target()
+
+        def make(_attempt: int) -> Any:
+            return mavlink.MAVLink_command_int_message(
+                system, AUTOPILOT, mavlink.MAV_FRAME_GLOBAL, command, 0, 0, *values,
+                round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7),
+                place.altitude_m,
+            )  # fmt: skip
+
+        return await self._commands.ask(command, make, timeout_s, tries)
+
+    async def request_message(self, message_id: int, timeout_s: float = ANSWER_S) -> Any | None:
+        """A message of the autopilot that it does not send by itself; None if it does not come."""
+        came: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+
+        def take(message: Any, _receive_ns: int) -> None:
+            if not came.done():
+                came.set_result(message)
+
+        end = self.listen(message_id, take)
+        try:
+            result = await self.command(
+                mavlink.MAV_CMD_REQUEST_MESSAGE, message_id, timeout_s=timeout_s
+            )
+            if result in REFUSALS and not came.done():
+                return None
+            with contextlib.suppress(asyncio.TimeoutError):
+                return await within(came, timeout_s)
+            return None
+        finally:
+            end()
+
+    # -- what comes in ---------------------------------------------------------------------------
+
+    def _take(self, message: Any, receive_ns: int) -> None:
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        kind = message.get_msgId()
+        if self.on_request is not None:
+            self.on_request(message, receive_ns)
+        if kind == mavlink.MAVLINK_MSG_ID_HEARTBEAT and is_autopilot(message):
+            if not self._is_ours(system, receive_ns):
+                return
+            if self.vehicle is None:
+                self._found(vehicle_of(message), receive_ns)
+        vehicle = self.vehicle
+        if vehicle is None or system != vehicle.system_id or component != AUTOPILOT:
+            return
+        self._heard(receive_ns)
+        if kind in COUNTED:
+            self._rates[message.get_type()].add(receive_ns)
+            self._wanted.came(kind)
+        own = self._on.get(kind)
+        if own is not None:
+            own(message, receive_ns)
+        else:
+            self.samples.take(message, receive_ns)
+        for take in tuple(self._takers.get(kind, ())):
+            take(message, receive_ns)
+        if self.clock_filter.n_reboots != self._n_reboots:
+            self._rebooted(receive_ns)
+
+    def _is_ours(self, system: int, now_ns: int) -> bool:
+        ours = self._config.system_id or (self.vehicle.system_id if self.vehicle else system)
+        if system == ours:
+            return True
+        if system not in self._strangers:
+            self._strangers.add(system)
+            detail = f"system {system} is ignored; ours is {ours}"
+            self._warn(Warned(now_ns, "another vehicle on the link", detail))
+        return False
+
+    def _found(self, vehicle: Vehicle, now_ns: int) -> None:
+        self.vehicle = vehicle
+        self.port.identity = (vehicle.system_id, self._config.component_id)
+        self._warn(Warned(now_ns, "autopilot found", f"{vehicle} on {self.port.name}", good=True))
+
+    def _heard(self, now_ns: int) -> None:
+        if not self.alive and self._heard_ns:
+            silent_s = (now_ns - self._heard_ns) * 1e-9
+            detail = f"after {silent_s:.1f} s"
+            self._warn(Warned(now_ns, "autopilot heard again", detail, good=True))
+            self._meter.n_reopened += 1
+            self._wanted.restart()
+        self.alive = True
+        self._heard_ns = max(self._heard_ns, now_ns)
+        self._meter.came(now_ns)
+
+    def _take_heartbeat(self, message: Any, receive_ns: int) -> None:
+        self.vehicle = vehicle_of(message)
+        if self.vehicle.armed is not self._armed:
+            self._armed = self.vehicle.armed
+            self._deliver(ArmedSample(receive_ns, self._armed))
+
+    def _take_timesync(self, message: Any, receive_ns: int) -> None:
+        targets = zip(timesync_target(message), self.port.identity, strict=True)
+        if any(target not in (0, ours) for target, ours in targets):
+            return
+        if message.tc1 == 0:  # the autopilot asks, and states its own time in doing so
+            middle_ns = receive_ns + (self._clock.now_ns() - receive_ns) // 2
+            asker = message.get_srcSystem(), message.get_srcComponent()
+            self.send(TimesyncMessage(middle_ns, message.ts1, asker))
+            if message.ts1 > 0:
+                self.clock_filter.one_way(message.ts1, receive_ns)
+        elif message.ts1 in self._questions:  # answers to others are none of ours
+            del self._questions[message.ts1]
+            if message.tc1 > 0 and 0 <= receive_ns - message.ts1 <= MAX_ROUND_TRIP_NS:
+                self.clock_filter.exchange(message.ts1, message.tc1, receive_ns)
+
+    def _take_acknowledgement(self, message: Any, _receive_ns: int) -> None:
+        self._commands.answered(message, self.port.identity)
+
+    def _rebooted(self, now_ns: int) -> None:
+        self._n_reboots = self.clock_filter.n_reboots
+        self._questions.clear()
+        self._wanted.restart()
+        self._warn(Warned(now_ns, "autopilot rebooted", "its boot time went back"))
+
+    # -- what is done in turn --------------------------------------------------------------------
+
+    async def _say_heartbeats(self) -> None:
+        """Once a second, and at once where nobody has heard us under this name on this wire."""
+        said_as: tuple[int, int] | None = None
+        due_ns = 0
+        while True:
+            now_ns = self._clock.now_ns()
+            if not self.port.connected:
+                said_as = None
+            elif said_as != self.port.identity or now_ns >= due_ns:
+                said_as, due_ns = self.port.identity, now_ns + HEARTBEAT_NS
+                self.send(self.heartbeat())
+            await asyncio.sleep(HEARTBEAT_TICK_S)
+
+    async def _compare_clocks(self) -> None:
+        while True:
+            if self.vehicle is not None:
+                while len(self._questions) >= MAX_QUESTIONS:
+                    del self._questions[next(iter(self._questions))]
+                now_ns = self._clock.now_ns()
+                self._questions[now_ns] = None
+                self.send(TimesyncMessage(0, now_ns, (self.vehicle.system_id, AUTOPILOT)))
+            await asyncio.sleep(1 / self._config.timesync_hz)
+
+    async def _watch(self) -> None:
+        while True:
+            await asyncio.sleep(min(WATCH_S, self._config.silent_after_s / 4))
+            now_ns = self._clock.now_ns()
+            silent_s = (now_ns - self._heard_ns) * 1e-9
+            if self.alive and silent_s > self._config.silent_after_s:
+                self.alive = False
+                where = "" if self.port.connected else f", {self.port.name} is not connected"
+                detail = f"nothing for {silent_s:.1f} s{where}"
+                self._warn(Warned(now_ns, "autopilot silent", detail))
+
+    async def _ask_for_messages(self) -> None:
+        while True:
+            now_ns = self._clock.now_ns()
+            if not self.alive:
+                self._wanted.skip(now_ns)
+            elif (due := self._wanted.due(now_ns)) is not None:
+                await self._ask_for(*due)
+                continue
+            await asyncio.sleep(WATCH_S)
+
+    async def _ask_for(self, message_id: int, rate_hz: float) -> None:
+        result = await self.command(
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz,
+            timeout_s=REQUEST_S, tries=2,
+        )  # fmt: skip
+        now_ns = self._clock.now_ns()
+        refused = result in REFUSALS
+        self._wanted.asked(message_id, refused, now_ns)
+        if refused and message_id not in self._missing:
+            self._missing.add(message_id)
+            name = mavlink.mavlink_map[message_id].msgname
+            self._warn(Warned(now_ns, "autopilot does not send a message", name))
+        if result == NO_ANSWER:
+            await asyncio.sleep(WATCH_S)
+
+    async def _ask_for_origin(self) -> None:
+        """A local frame's zero is told once, and we may not have been there."""
+        while True:
+            await asyncio.sleep(ORIGIN_S if self.alive else WATCH_S)
+            if self.alive and self.samples.places.origin is None:
+                await self.request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+
+    def _target(self) -> int:
+        return self.vehicle.system_id if self.vehicle else self._config.system_id
+
+    def _detail(self) -> str:
+        if self.port.trouble:
+            return self.port.trouble
+        if self.vehicle is None:
+            return ""
+        report = self.clock_filter.report()
+        clock = "clock not known" if report is None else f"clock ±{report.sigma_ms:.1f} ms"
+        return f"{self.vehicle}, {clock}"

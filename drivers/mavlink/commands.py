@@ -1,0 +1,65 @@
+"""Commands to the autopilot: sent again until they are answered, one of a kind at a time."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drivers.system.within import within
+
+NO_ANSWER = -1
+"""In the place of a MAV_RESULT: it did not answer, however often it was asked."""
+TRIES = 3
+MOST_PATIENCE_S = 30.0
+"""An answer "in progress" is waited on for so long."""
+
+MakeCommand = Callable[[int], Any]
+"""A message for the so-manieth try, counted from 0."""
+
+
+class Commands:
+    """What was asked and not answered yet."""
+
+    def __init__(self, send: Callable[[Any], None]) -> None:
+        self._send = send
+        self._turns: dict[int, asyncio.Lock] = {}
+        self._answers: dict[int, asyncio.Queue[int]] = {}
+
+    async def ask(self, command: int, make: MakeCommand, timeout_s: float, tries: int) -> int:
+        """The MAV_RESULT of a command, or NO_ANSWER."""
+        async with self._turns.setdefault(command, asyncio.Lock()):
+            answers: asyncio.Queue[int] = asyncio.Queue(maxsize=8)
+            self._answers[command] = answers
+            try:
+                return await self._until_answered(make, answers, timeout_s, tries)
+            finally:
+                del self._answers[command]
+
+    def answered(self, acknowledgement: Any, identity: tuple[int, int]) -> None:
+        """Take a COMMAND_ACK of the autopilot."""
+        targets = acknowledgement.target_system, acknowledgement.target_component
+        for target, ours in zip(targets, identity, strict=True):
+            if target not in (0, ours):
+                return
+        answers = self._answers.get(acknowledgement.command)
+        if answers is not None and not answers.full():
+            answers.put_nowait(acknowledgement.result)
+
+    async def _until_answered(
+        self, make: MakeCommand, answers: asyncio.Queue[int], timeout_s: float, tries: int
+    ) -> int:
+        for attempt in range(tries):
+            self._send(make(attempt))
+            wait_s = timeout_s
+            while True:
+                try:
+                    result = await within(answers.get(), wait_s)
+                except asyncio.TimeoutError:
+                    break
+                if result != mavlink.MAV_RESULT_IN_PROGRESS:
+                    return result
+                wait_s = MOST_PATIENCE_S
+        return NO_ANSWER

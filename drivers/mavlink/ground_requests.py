@@ -1,0 +1,87 @@
+"""Requests to our component from whoever may speak on the link or through the router.
+
+Who that is the link's signing and the router decide; what is here has passed them. Requests beyond
+a rate are not listened to, and answers go out at a rate that leaves the link to the poses.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.messages import Warned
+from companion.timing.clock import FlightClock
+from drivers.mavlink.command_server import CommandServer
+from drivers.mavlink.parameter_server import ParameterServer
+from drivers.mavlink.request_limit import RequestLimit
+from drivers.mavlink.wire.message_port import MavlinkPort
+
+TICK_S = 0.025
+"""A parameter goes out in each: 1.5 kB/s."""
+TELL_NS = 10_000_000_000
+TOO_MANY = "more is asked of the companion over MAVLink than it answers"
+COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
+PARAMETERS = (
+    mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST, mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ,
+    mavlink.MAVLINK_MSG_ID_PARAM_SET,
+)  # fmt: skip
+PING: int = mavlink.MAVLINK_MSG_ID_PING
+KINDS = frozenset({*COMMANDS, *PARAMETERS, PING})
+EVERYBODY = (0, 0)
+
+
+class GroundRequests:
+    """Takes what is addressed to us, or to all; to be used in the event loop."""
+
+    def __init__(
+        self,
+        port: MavlinkPort,
+        clock: FlightClock,
+        commands: CommandServer,
+        parameters: ParameterServer,
+        warn: Callable[[Warned], None],
+    ) -> None:
+        self._port, self._clock, self._warn = port, clock, warn
+        self._commands, self._parameters = commands, parameters
+        self._limit = RequestLimit()
+        self._told_ns: int | None = None
+
+    def take(self, message: Any, now_ns: int) -> None:
+        """Take any message; most are none of ours."""
+        kind = message.get_msgId()
+        if kind not in KINDS:
+            return
+        target, ours = (message.target_system, message.target_component), self._port.identity
+        if target[0] not in (0, ours[0]) or target[1] not in (0, ours[1]):
+            return
+        if kind == PING and target != EVERYBODY:
+            return  # an answer, and we have asked nothing
+        asker = message.get_srcSystem(), message.get_srcComponent()
+        if not self._limit.allows(asker, now_ns):
+            if self._told_ns is None or now_ns - self._told_ns > TELL_NS:
+                self._told_ns = now_ns
+                detail = f"by component {asker[1]} of system {asker[0]}"
+                self._warn(Warned(now_ns, TOO_MANY, detail))
+            return
+        to_all = target != ours
+        if kind == PING:
+            self._port.send(mavlink.MAVLink_ping_message(message.time_usec, message.seq, *asker))
+            return
+        if kind in PARAMETERS:
+            self._parameters.take(message, to_all)
+            return
+        for answer in self._commands.take(message, to_all, now_ns):
+            self._port.send(answer)
+
+    async def run(self) -> None:
+        """Say what waits to be said, until cancelled."""
+        while True:
+            await asyncio.sleep(TICK_S)
+            for answer in self._commands.step(self._clock.now_ns()):
+                self._port.send(answer)
+            value = self._parameters.next_message()
+            if value is not None:
+                self._port.send(value)

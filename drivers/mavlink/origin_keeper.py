@@ -1,0 +1,74 @@
+"""An origin for an autopilot that has none: without one ArduPilot does not use a pose.
+
+One that has an origin, from its own GPS or from anybody else, keeps it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.config import FeedbackConfig
+from companion.geometry.geodesy import GeoOrigin
+from drivers.mavlink.autopilot_link import AutopilotLink
+
+LOOK_EVERY_S = 0.5
+PATIENCE = 12
+"""Looks in a row at an autopilot without an origin, whose own GPS may still find one."""
+AGAIN_AFTER_S = 10.0
+"""After it was given one, and still has none."""
+DO_SET_GLOBAL_ORIGIN = 611
+NOWHERE_DEG = 1e-7
+"""Autopilots take a place of all zeros for none at all."""
+
+
+class OriginKeeper:
+    """Sees to it that the autopilot has an origin; the link itself asks for the one it has."""
+
+    def __init__(
+        self, config: FeedbackConfig, link: AutopilotLink, say: Callable[[str], None],
+        is_wanted: Callable[[], bool] = lambda: True,
+    ) -> None:  # fmt: skip
+        self._link, self._say, self._is_wanted = link, say, is_wanted
+        self._place = GeoOrigin(
+            config.origin_latitude_deg, config.origin_longitude_deg, config.origin_altitude_m
+        )
+
+    async def run(self) -> None:
+        """Look, and set where need be; ends by cancellation."""
+        n_without = 0
+        while True:
+            await asyncio.sleep(LOOK_EVERY_S)
+            without = (
+                self._is_wanted()
+                and self._link.alive
+                and self._link.samples.places.origin is None
+            )
+            n_without = n_without + 1 if without else 0
+            if n_without >= PATIENCE:
+                await self._set()
+                await asyncio.sleep(AGAIN_AFTER_S)
+
+    async def _set(self) -> None:
+        """By the command, and by the message that older firmware knows."""
+        place = self._link.origin or self._place
+        if place.latitude_deg == 0 and place.longitude_deg == 0:
+            place = GeoOrigin(NOWHERE_DEG, NOWHERE_DEG, place.altitude_m)
+            self._say(
+                "feedback.origin_latitude_deg is not set: the autopilot's map has it at 0 N 0 E"
+            )
+        await self._link.command_at(DO_SET_GLOBAL_ORIGIN, place)
+        vehicle = self._link.vehicle
+        self._link.send(
+            mavlink.MAVLink_set_gps_global_origin_message(
+                vehicle.system_id if vehicle is not None else 0,
+                round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7),
+                round(place.altitude_m * 1000),
+            )
+        )  # fmt: skip
+        self._say(
+            f"the autopilot had no origin and is given one: {place.latitude_deg:.7f} "
+            f"{place.longitude_deg:.7f} at {place.altitude_m:.1f} m"
+        )

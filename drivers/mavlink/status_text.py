@@ -1,0 +1,48 @@
+"""STATUSTEXT: what the pilot reads at the ground station, and how much of it.
+
+What there is to be read is in `companion.pilot_messages`, and each text fits into one message.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.pilot_messages import LEFT_OUT, PilotText
+from drivers.mavlink.wire.send_queue import RateLimit
+
+TEXTS_PER_S, TEXTS_AT_ONCE = 1.0, 12
+WARNINGS_ONLY = 4
+"""The last so many of those at once are for warnings."""
+MOST_KEPT_BACK = 100
+
+
+def status_text(text: PilotText) -> Any:
+    """The message that says it."""
+    return mavlink.MAVLink_statustext_message(text.severity, text.text.encode("ascii"))
+
+
+class TextLimit:
+    """How much a pilot is told: some texts at once, then one a second."""
+
+    def __init__(self) -> None:
+        self._limit = RateLimit(TEXTS_PER_S, TEXTS_AT_ONCE)
+        self._kept_back: set[str] = set()
+
+    def passed(self, text: PilotText, now_ns: int) -> list[PilotText]:
+        """The text, and how many others were kept back before; nothing if this one is."""
+        self._limit.refill(now_ns)
+        wanted = 1.0 if text.severity <= mavlink.MAV_SEVERITY_WARNING else 1.0 + WARNINGS_ONLY
+        if self._limit.left < wanted:
+            if len(self._kept_back) < MOST_KEPT_BACK:
+                self._kept_back.add(text.text)
+            return []
+        self._limit.take(1.0)
+        self._kept_back.discard(text.text)
+        if not self._kept_back or self._limit.left < 1.0 + WARNINGS_ONLY:
+            return [text]
+        self._limit.take(1.0)
+        n = len(self._kept_back)
+        self._kept_back.clear()
+        return [text, LEFT_OUT(n=str(n))]

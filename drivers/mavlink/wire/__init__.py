@@ -1,0 +1,1 @@
+"""MAVLink bytes: carriers (serial, UDP, TCP, MAVSDK), packets, signing, queues, router."""

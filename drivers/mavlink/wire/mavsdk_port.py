@@ -1,0 +1,20 @@
+"""MAVLink over a wire that MAVSDK holds; all above the wire is as without it."""
+
+from __future__ import annotations
+
+from companion.config import LinkConfig, RouterConfig
+from companion.timing.clock import FlightClock
+from drivers.mavlink.wire.link_url import link_endpoint
+from drivers.mavlink.wire.mavsdk_wire import MavsdkWire
+from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
+
+
+class MavsdkPort(PymavlinkPort):
+    """The autopilot's link through MAVSDK: the same messages, router and signing.
+
+    MAVSDK's own messages go through JSON, which knows no NaN: integers of PX4's parameters and
+    unknown covariances would be lost. So its packets are taken as they are. See docs/links.md.
+    """
+
+    def __init__(self, config: LinkConfig, router: RouterConfig, clock: FlightClock) -> None:
+        super().__init__(config, router, clock, MavsdkWire(link_endpoint(config.url)))

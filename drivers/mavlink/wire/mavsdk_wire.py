@@ -1,0 +1,212 @@
+"""The wire to the autopilot, held by MAVSDK: it opens, reads, checks and writes in its own threads.
+
+Each packet is stamped in MAVSDK's thread as it comes, and reaches the event loop by a socket pair,
+which bounds what may wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+
+import mavsdk
+
+from companion.errors import ConfigError, SourceError
+from drivers.mavlink.wire.baud import BAUDS, BaudSearch
+from drivers.mavlink.wire.link_url import Endpoint
+from drivers.mavlink.wire.mavsdk_carrier import Carrier, check_library, complaints
+from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from drivers.mavlink.wire.wire import Wire, WireEnd
+
+KIND_OF = {"serial": "serial", "udpin": "udpin", "udpout": "udpout", "tcp": "tcpout"}
+NETWORK_BYTES_PER_S = 1e6
+BURST_S = 0.05
+QUEUE_BYTES = 64_000
+STAMP = struct.Struct("=q")
+LONGEST = 512
+PAIR_BYTES = 1 << 20
+LOOK_S = 0.1
+SILENT_NS = 5_000_000_000
+"""A serial line that spoke and has been silent for so long is opened anew."""
+END_S = 1.5
+
+
+class MavsdkWire(Wire):
+    """What a link's URL names. ConfigError where MAVSDK cannot hold that.
+
+    A listener answers whoever has sent to it, all of them.
+    """
+
+    read_size = LONGEST
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(str(endpoint), NETWORK_BYTES_PER_S, PacketQueue(QUEUE_BYTES))
+        if ":" in endpoint.host:
+            raise ConfigError(
+                f'link.url: "{endpoint}": MAVSDK has no IPv6; set link.backend = "pymavlink"'
+            )
+        check_library()
+        self.n_overrun = 0
+        """Packets that came faster than the event loop took them, and were lost."""
+        self._endpoint = endpoint
+        self._search = BaudSearch((endpoint.baud,) if endpoint.baud else BAUDS)
+        self._searching = False
+        self._pace = RateLimit(self.bytes_per_s, LONGEST)
+        self._carrier: Carrier | None = None
+        self._pair: tuple[socket.socket, socket.socket] | None = None
+        self._device: tuple[int, int, int] | None = None
+        self._heard_ns = 0
+        self._looking: asyncio.TimerHandle | None = None
+        self._ending: asyncio.Task[None] | None = None
+
+    async def run(self, end: WireEnd) -> None:
+        """Keep the wire open until cancelled; then MAVSDK has ended, or is left to."""
+        try:
+            await super().run(end)
+        finally:
+            await self._ended()
+
+    async def serve(self, fd: int, end: WireEnd) -> None:
+        """See `Wire`."""
+        self._look_later()
+        try:
+            await super().serve(fd, end)
+        finally:
+            if self._looking is not None:
+                self._looking.cancel()
+
+    async def _open(self) -> int:
+        await self._ended()
+        if self._is_serial:
+            if not self._searching:
+                self._search.begin(time.monotonic_ns())
+            self._searching = False
+            self.bytes_per_s = self._search.baud / 10
+            self._device = self._identity_of_device()
+        self._pace = RateLimit(self.bytes_per_s, max(LONGEST, self.bytes_per_s * BURST_S))
+        self._heard_ns = 0
+        self._pair = ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        for each in self._pair:
+            each.setblocking(False)
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, PAIR_BYTES)
+
+        def take(packet: bytes) -> None:
+            stamp = STAMP.pack(time.monotonic_ns())
+            try:
+                theirs.send(stamp + packet)
+            except OSError:
+                self.n_overrun += 1
+
+        self._carrier = Carrier(self._mavsdk_url(), take)
+        try:
+            await _in_thread(self._carrier.start, "mavsdk start")
+        except mavsdk.MavsdkError as error:
+            self._close()
+            raise SourceError(f"{self.name}: {complaints.newest or error}") from error
+        except BaseException:
+            self._close()
+            raise
+        return ours.fileno()
+
+    def _close(self) -> None:
+        carrier, pair, self._carrier, self._pair = self._carrier, self._pair, None, None
+
+        def end() -> None:
+            if carrier is not None:
+                carrier.end()
+            for each in pair or ():
+                each.close()
+
+        self._ending = asyncio.ensure_future(_in_thread(end, "mavsdk end"))
+
+    async def _ended(self) -> None:
+        if self._ending is not None:
+            await asyncio.wait((self._ending,), timeout=END_S)
+
+    def _read(self) -> tuple[bytes, int]:
+        assert self._pair is not None
+        data = self._pair[0].recv(self.read_size)
+        return data[STAMP.size :], STAMP.unpack_from(data)[0]
+
+    def _deliver(self, end: WireEnd, data: bytes, monotonic_ns: int) -> None:
+        self._heard_ns = monotonic_ns
+        self.trouble = ""
+        self._search.heard(len(data), end.received(data, monotonic_ns), monotonic_ns)
+
+    def _write(self, data: bytes) -> int:
+        assert self._carrier is not None
+        self._carrier.send(data)
+        self._pace.take(len(data))
+        return len(data)
+
+    def _room(self) -> float:
+        # so that what waits, waits here, where the oldest is given up
+        self._pace.refill(time.monotonic_ns())
+        return self._pace.wait_s() if self._pace.left < 0 else 0.0
+
+    def _look_later(self) -> None:
+        self._looking = asyncio.get_running_loop().call_later(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        """MAVSDK does not see a serial line go, nor take it up again; a network's it does."""
+        self._look_later()
+        now_ns = time.monotonic_ns()
+        if not self._heard_ns and complaints.newest:
+            self.trouble = f"{self.name}: {complaints.newest}"
+        if not self._is_serial:
+            return
+        if self._identity_of_device() != self._device:
+            self.lose("unplugged")
+        elif self._heard_ns and now_ns - self._heard_ns > SILENT_NS:
+            self.lose("fell silent")
+        elif self._search.look(now_ns):
+            self._searching = True
+            self.lose(f"no MAVLink heard yet, listening at {self._search.baud} baud")
+
+    @property
+    def _is_serial(self) -> bool:
+        return self._endpoint.kind == "serial"
+
+    def _identity_of_device(self) -> tuple[int, int, int] | None:
+        try:
+            status = os.stat(self._endpoint.device)
+        except OSError:
+            return None
+        return status.st_dev, status.st_ino, status.st_rdev
+
+    def _mavsdk_url(self) -> str:
+        kind = KIND_OF[self._endpoint.kind]
+        if self._is_serial:
+            return f"{kind}://{self._endpoint.device}:{self._search.baud}"
+        return f"{kind}://{self._endpoint.host}:{self._endpoint.port}"
+
+
+async def _in_thread(call: Callable[[], None], name: str) -> None:
+    """Call what may hang, without holding up the event loop or the program's end."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[Exception | None] = loop.create_future()
+
+    def settle(error: Exception | None) -> None:
+        if not done.done():
+            done.set_result(error)
+
+    def work() -> None:
+        failed: Exception | None = None
+        try:
+            call()
+        except Exception as error:
+            failed = error
+        try:
+            loop.call_soon_threadsafe(settle, failed)
+        except RuntimeError:
+            pass  # the loop has ended meanwhile: nobody asks any more
+
+    threading.Thread(target=work, name=name, daemon=True).start()
+    error = await done
+    if error is not None:
+        raise error

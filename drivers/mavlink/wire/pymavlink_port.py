@@ -1,0 +1,176 @@
+"""MAVLink over our own wires, with pymavlink as the codec of single messages."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.config import LinkConfig, RouterConfig
+from companion.timing.clock import FlightClock
+from drivers.mavlink.wire.link_url import link_endpoint
+from drivers.mavlink.wire.message_port import OnMessage
+from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet, decode
+from drivers.mavlink.wire.router import ClientCounts, Router
+from drivers.mavlink.wire.signing import MavlinkSigning, read_key
+from drivers.mavlink.wire.transport import link_wire
+from drivers.mavlink.wire.wire import Tap, Wire, run_together
+
+FIRST_SYSTEM = 1
+"""What ArduPilot and PX4 are numbered unless somebody changed it."""
+MANY_REFUSED = 10
+
+
+class PymavlinkPort:
+    """One end of the autopilot's link, which others share through the router.
+
+    ConfigError if the configuration names nothing that can be opened, or a key that is none. It
+    begins as a component of the configured vehicle, or of system 1; set `identity` when the vehicle
+    has been heard. With a key only signed messages are delivered, and clients of the router must
+    sign what they send as well; what the autopilot says they get as it is.
+    """
+
+    def __init__(
+        self, config: LinkConfig, router: RouterConfig, clock: FlightClock, wire: Wire | None = None
+    ) -> None:
+        self._wire = link_wire(link_endpoint(config.url)) if wire is None else wire
+        self.name = self._wire.name
+        self.identity = (config.system_id or FIRST_SYSTEM, config.component_id)
+        self.router = Router(
+            router, self._wire, lambda: self.identity, self._deliver, self._is_signed
+        )
+        self.n_received = 0
+        self.n_sent = 0
+        self.n_lost = 0
+        """Packets that others sent and that never came, by their sequence numbers."""
+        self.n_unsigned = 0
+        """Packets of the link refused for want of a valid signature."""
+        self._n_unpacked = 0
+        self._n_refused = 0
+        """Of `n_unsigned`, those since one was good."""
+        self._clock = clock
+        self._stream = MavlinkStream()
+        self._reader = mavlink.MAVLink(None)
+        self._writer = mavlink.MAVLink(None)
+        self._signing: MavlinkSigning | None = None
+        if config.signing_key_file:
+            self._signing = MavlinkSigning(read_key(Path(config.signing_key_file)))
+            self._writer.signing.secret_key = self._signing.key
+            self._writer.signing.sign_outgoing = True
+        self._seq_out: dict[tuple[int, int], int] = {}
+        self._seq_in: dict[tuple[int, int], int] = {}
+        self._on_message: OnMessage = _ignore
+
+    @property
+    def connected(self) -> bool:
+        """Whether the wire is there."""
+        return self._wire.connected
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the wire or the router's places, for people; "" when nothing is."""
+        keyless = ""
+        if self._n_refused > MANY_REFUSED:
+            keyless = f"{self.name}: what comes is not signed with the key of link.signing_key_file"
+        troubles = self._wire.trouble, keyless, self.router.trouble
+        return "; ".join(trouble for trouble in troubles if trouble)
+
+    @property
+    def n_dropped(self) -> int:
+        """Messages not sent: no wire, no room, or a field out of its range; clients' ones too."""
+        return self._wire.n_dropped + self._n_unpacked
+
+    @property
+    def n_bad(self) -> int:
+        """Times that the stream of packets was broken, and packets not signed as they should be."""
+        return self._stream.n_breaks + self.n_unsigned
+
+    @property
+    def n_bad_bytes(self) -> int:
+        """Bytes that belonged to no packet."""
+        return self._stream.n_bad_bytes
+
+    def clients(self) -> list[ClientCounts]:
+        """See `MavlinkPort`."""
+        return self.router.take_departed() + self.router.counts()
+
+    def set_tap(self, tap: Tap | None) -> None:
+        """See `MavlinkPort`."""
+        self._wire.tap = tap
+
+    async def run(self, on_message: OnMessage) -> None:
+        """Receive, and serve the router's clients, until cancelled."""
+        self._on_message = on_message
+        try:
+            await run_together(self._wire.run(self), self.router.run())
+        finally:
+            self._on_message = _ignore
+
+    def send(self, message: Any) -> None:
+        """Pack a message as ours, signed if there is a key, and send it."""
+        writer, identity = self._writer, self.identity
+        writer.srcSystem, writer.srcComponent = identity
+        writer.seq = self._seq_out.get(identity, 0)
+        if self._signing is not None:
+            writer.signing.timestamp = self._signing.next_stamp(self._clock.now_ns())
+        try:
+            raw = bytes(message.pack(writer))
+        except (struct.error, ValueError, TypeError, OverflowError, AttributeError):
+            self._n_unpacked += 1
+            return
+        self._seq_out[identity] = (writer.seq + 1) % 256
+        self._wire.write(raw)
+        self.router.from_us(raw)
+        self.n_sent += 1
+
+    def opened(self) -> None:
+        """See `WireEnd`."""
+        self._stream.restart()
+        self._seq_in.clear()
+
+    def received(self, data: bytes, monotonic_ns: int) -> int:
+        """See `WireEnd`."""
+        ours = self.identity
+        packets = self._stream.feed(data, monotonic_ns)
+        if any((packet.system, packet.component) == ours for packet in packets):
+            # an echo of what we sent: whoever joined the wire's ends, it goes no further
+            packets = [packet for packet in packets if (packet.system, packet.component) != ours]
+        self.n_received += len(packets)
+        try:
+            for packet in packets:
+                self._follow(packet)
+                if self._is_signed(packet, monotonic_ns):
+                    self._n_refused = 0
+                    self._deliver(packet, monotonic_ns)
+                else:
+                    self._n_refused += 1
+                    self.n_unsigned += 1
+        finally:
+            self.router.from_link(packets, monotonic_ns)
+        return sum(packet.known for packet in packets)
+
+    def _follow(self, packet: Packet) -> None:
+        source = packet.system, packet.component
+        last = self._seq_in.get(source)
+        self._seq_in[source] = packet.seq
+        if last is not None:
+            missing = (packet.seq - last - 1) % 256
+            if missing < 128:  # else it came twice or late
+                self.n_lost += missing
+
+    def _is_signed(self, packet: Packet, monotonic_ns: int) -> bool:
+        """As well as it has to be."""
+        if self._signing is None:
+            return True
+        return self._signing.accepts(packet, self._clock.from_monotonic_ns(monotonic_ns))
+
+    def _deliver(self, packet: Packet, monotonic_ns: int) -> None:
+        message = decode(self._reader, packet)
+        if message is not None:
+            self._on_message(message, self._clock.from_monotonic_ns(monotonic_ns))
+
+
+def _ignore(message: Any, t_ns: int) -> None:
+    """Takes messages while nobody receives."""

@@ -1,0 +1,275 @@
+"""Shares the autopilot's link with other programs: ground stations, loggers, another companion.
+
+What the autopilot says goes to all clients, and so does what we say; what a client says goes to the
+autopilot, and to us where it is addressed to us. Clients do not hear each other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from companion.config import RouterConfig
+from drivers.mavlink.wire.link_url import client_endpoint
+from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
+from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from drivers.mavlink.wire.tcp_listener import TcpDoor
+from drivers.mavlink.wire.tcp_wire import TcpConnection
+from drivers.mavlink.wire.udp_wire import UdpWire
+from drivers.mavlink.wire.wire import Wire, run_together
+
+CLIENT_BYTES_PER_S, CLIENT_BURST = 50e3, 20e3
+INBOX_BYTES = 8000
+CLIENT_READ_SIZE = 4096
+MOST_GARBAGE = 64_000
+MOST_DEPARTED = 16
+CLIENTS_SHARE, OWN_SHARE = 0.85, 0.8
+"""Clients get what we leave of the link, and a twentieth of it at least."""
+BURST_S, LEAST_BURST = 0.05, 600
+LOOP_NS = 1_000_000_000
+AUTOPILOT_NS = 5_000_000_000
+AUTOPILOT = 1
+TIMESYNC = 111
+
+
+@dataclass(frozen=True, slots=True)
+class ClientCounts:
+    """How one client is doing."""
+
+    name: str
+    connected: bool
+    n_received: int
+    n_dropped_out: int
+    """Packets that it was too slow for, or not there to take."""
+    n_dropped_in: int
+    """Packets of its own that the link had no room for."""
+    n_bad_bytes: int
+    n_refused: int
+    """Packets that came back in a circle, spoke in the autopilot's name or ours, told it another
+    time than ours, or lacked the signature."""
+
+
+class RouterClient:
+    """One client: its wire, what it sent, and what of that still waits for the link."""
+
+    def __init__(self, router: Router, wire: Wire) -> None:
+        self.wire = wire
+        self.inbox = PacketQueue(INBOX_BYTES)
+        self.n_received = 0
+        self.n_refused = 0
+        self.stream = MavlinkStream()
+        self._router = router
+        self._garbage_from = 0
+        wire.read_size = CLIENT_READ_SIZE
+
+    def opened(self) -> None:
+        """See `WireEnd`."""
+        self.stream.restart()
+        self._garbage_from = self.stream.n_bad_bytes
+
+    def received(self, data: bytes, monotonic_ns: int) -> int:
+        """See `WireEnd`."""
+        packets = self.stream.feed(data, monotonic_ns)
+        n_known = sum(packet.known for packet in packets)
+        self.n_received += len(packets)
+        if n_known:
+            self._garbage_from = self.stream.n_bad_bytes
+        elif self.stream.n_bad_bytes - self._garbage_from > MOST_GARBAGE:
+            self.wire.lose("it does not speak MAVLink")
+        for packet in packets:
+            self._router.from_client(self, packet, monotonic_ns)
+        return n_known
+
+    def counts(self) -> ClientCounts:
+        """So far."""
+        return ClientCounts(
+            self.wire.name, self.wire.connected, self.n_received, self.wire.n_dropped,
+            self.inbox.n_dropped, self.stream.n_bad_bytes, self.n_refused,
+        )  # fmt: skip
+
+
+class Router:
+    """All clients of a link. ConfigError if one of them names nothing that can be opened.
+
+    Clients share what we leave of the link, each in its turn, so that none of them can keep us or
+    another from the autopilot.
+    """
+
+    def __init__(
+        self,
+        config: RouterConfig,
+        link: Wire,
+        identity: Callable[[], tuple[int, int]],
+        deliver: Callable[[Packet, int], None],
+        accepts: Callable[[Packet, int], bool],
+    ) -> None:
+        self._link = link
+        self._identity = identity
+        self._deliver = deliver
+        self._accepts = accepts
+        self._queue_bytes = config.queue_kb * 1000
+        self._clients: list[RouterClient] = []
+        self._doors: list[TcpDoor[RouterClient]] = []
+        self._autopilots: dict[int, int] = {}
+        self._recent: dict[bytes, tuple[RouterClient | None, int]] = {}
+        self._budget = RateLimit(1.0, 1.0)
+        self._turns: deque[RouterClient] = deque()
+        self._departed: deque[ClientCounts] = deque(maxlen=MOST_DEPARTED)
+        self._pump_later: asyncio.TimerHandle | None = None
+        for url in config.clients:
+            endpoint = client_endpoint(url)
+            if endpoint.kind == "tcpin":
+                self._doors.append(TcpDoor(endpoint, self._connection, self._leave))
+                continue
+            queue, limit = PacketQueue(self._queue_bytes), self._read_limit()
+            self._join(UdpWire(endpoint, queue, limit, listens=endpoint.kind == "udpin"))
+
+    async def run(self) -> None:
+        """Serve the clients until cancelled."""
+        fixed = [client.wire.run(client) for client in self._clients]
+        try:
+            await run_together(*fixed, *(door.run() for door in self._doors))
+        finally:
+            if self._pump_later is not None:
+                self._pump_later.cancel()
+                self._pump_later = None
+
+    def counts(self) -> list[ClientCounts]:
+        """Of the clients that there are now."""
+        return [client.counts() for client in self._clients]
+
+    def take_departed(self) -> list[ClientCounts]:
+        """Of the newest of those that have left since the last call: each is told once."""
+        departed = list(self._departed)
+        self._departed.clear()
+        return departed
+
+    @property
+    def n_turned_away(self) -> int:
+        """Connections for which there was no room."""
+        return sum(door.n_turned_away for door in self._doors)
+
+    @property
+    def trouble(self) -> str:
+        """Why a place for clients is not open, for people; "" when all are."""
+        places = [door.trouble for door in self._doors]
+        places += [client.wire.trouble for client in self._clients if not client.wire.connected]
+        return "; ".join(place for place in places if place)
+
+    def from_link(self, packets: list[Packet], monotonic_ns: int) -> None:
+        """Pass on what came from the autopilot's side."""
+        for packet in packets:
+            if packet.component == AUTOPILOT and packet.known:
+                self._autopilots[packet.system] = monotonic_ns
+            self._to_clients(packet.raw, monotonic_ns)
+
+    def from_us(self, raw: bytes) -> None:
+        """Pass on what we have sent to the autopilot."""
+        self._budget.take(OWN_SHARE * len(raw))
+        self._to_clients(raw, time.monotonic_ns())
+
+    def from_client(self, client: RouterClient, packet: Packet, monotonic_ns: int) -> None:
+        """Pass on what a client sent."""
+        if (
+            self._goes_in_circles(client, packet, monotonic_ns)
+            or _answers_timesync(packet)
+            or not self._accepts(packet, monotonic_ns)
+        ):
+            client.n_refused += 1
+            return
+        target = packet.target
+        if target is not None:
+            system, component = self._identity()
+            # the autopilot is on the wire: what calls itself that here is not to be believed
+            meant = target[0] in (0, system) and target[1] in (0, component)
+            if meant and packet.component != AUTOPILOT:
+                self._deliver(packet, monotonic_ns)
+                if target == (system, component):
+                    return
+        if not client.inbox:
+            self._turns.append(client)
+        client.inbox.push(packet.raw)
+        if self._pump_later is None:
+            self._pump()
+
+    def _goes_in_circles(self, client: RouterClient, packet: Packet, monotonic_ns: int) -> bool:
+        source = packet.system, packet.component
+        if source == self._identity():
+            return True
+        if packet.component == AUTOPILOT:
+            heard_ns = self._autopilots.get(packet.system)
+            if heard_ns is not None and monotonic_ns - heard_ns < AUTOPILOT_NS:
+                return True
+        other, heard_ns = self._recent.get(packet.raw, (client, 0))
+        if other is not client and monotonic_ns - heard_ns < LOOP_NS:
+            return True
+        if len(self._clients) > 1:
+            self._remember(packet.raw, client, monotonic_ns)
+        return False
+
+    def _to_clients(self, raw: bytes, monotonic_ns: int) -> None:
+        if not self._clients:
+            return
+        self._remember(raw, None, monotonic_ns)
+        for client in self._clients:
+            client.wire.write(raw)
+
+    def _remember(self, raw: bytes, origin: RouterClient | None, monotonic_ns: int) -> None:
+        recent = self._recent
+        recent.pop(raw, None)
+        recent[raw] = origin, monotonic_ns
+        while True:
+            oldest = next(iter(recent))
+            if monotonic_ns - recent[oldest][1] <= LOOP_NS:
+                return
+            del recent[oldest]
+
+    def _pump(self) -> None:
+        self._pump_later = None
+        rate, budget = self._link.bytes_per_s, self._budget
+        budget.bytes_per_s = max(1.0, CLIENTS_SHARE * rate)
+        budget.burst = max(LEAST_BURST, BURST_S * rate)
+        budget.left = max(budget.left, -budget.burst)
+        budget.refill(time.monotonic_ns())
+        while self._turns:
+            if budget.left <= 0:
+                later = asyncio.get_running_loop().call_later
+                self._pump_later = later(budget.wait_s(1.0), self._pump)
+                return
+            client = self._turns.popleft()
+            raw = client.inbox.pop()
+            self._link.write(raw)
+            budget.take(len(raw))
+            if client.inbox:
+                self._turns.append(client)
+
+    def _join(self, wire: Wire) -> RouterClient:
+        client = RouterClient(self, wire)
+        self._clients.append(client)
+        return client
+
+    def _connection(self, name: str) -> tuple[TcpConnection, RouterClient]:
+        wire = TcpConnection(name, PacketQueue(self._queue_bytes), self._read_limit())
+        return wire, self._join(wire)
+
+    def _leave(self, client: RouterClient) -> None:
+        self._clients.remove(client)
+        self._departed.append(client.counts())
+        client.inbox.clear()
+        if client in self._turns:
+            self._turns.remove(client)
+
+    @staticmethod
+    def _read_limit() -> RateLimit:
+        return RateLimit(CLIENT_BYTES_PER_S, CLIENT_BURST)
+
+
+def _answers_timesync(packet: Packet) -> bool:
+    """Whether an autopilot would set its idea of our clock by this.
+
+    It asks all at once and takes any answer for ours, whose time is in the poses that it gets.
+    """
+    return packet.known and packet.message_id == TIMESYNC and any(packet.payload[:8])

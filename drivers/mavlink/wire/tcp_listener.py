@@ -1,0 +1,130 @@
+"""Where TCP clients of the router come in."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+from typing import Generic, Protocol, TypeVar
+
+from companion.errors import SourceError
+from drivers.mavlink.wire.host_address import resolve
+from drivers.mavlink.wire.link_url import Endpoint
+from drivers.mavlink.wire.tcp_wire import SEND_BUFFER, TcpConnection
+from drivers.mavlink.wire.wire import FIRST_RETRY_S, MOST_RETRY_S, WireEnd
+
+MOST_CONNECTIONS = 8
+ACCEPT_S = 0.02
+"""Between two that come in: who connects again and again costs no more than this."""
+BACKLOG = 32
+
+
+class Guest(WireEnd, Protocol):
+    """What the router has at our end of a connection."""
+
+    n_received: int
+
+
+AnyGuest = TypeVar("AnyGuest", bound=Guest)
+
+
+class TcpDoor(Generic[AnyGuest]):
+    """Listens at an endpoint; `admit` gives a connection its wire and end, `leave` takes them back.
+
+    When all places are taken, the oldest connection that has never sent a packet makes room for a
+    new one; if all have, the new one is turned away.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        admit: Callable[[str], tuple[TcpConnection, AnyGuest]],
+        leave: Callable[[AnyGuest], None],
+    ) -> None:
+        self.name = str(endpoint)
+        self.trouble = ""
+        self.port = 0
+        """That it listens at; 0 while it does not."""
+        self.n_turned_away = 0
+        self._endpoint = endpoint
+        self._admit = admit
+        self._leave = leave
+        self._guests: dict[asyncio.Task[None], tuple[TcpConnection, AnyGuest]] = {}
+
+    async def run(self) -> None:
+        """Let clients in until cancelled."""
+        retry_s = FIRST_RETRY_S
+        try:
+            while True:
+                try:
+                    listener = await self._listen()
+                except SourceError as error:
+                    self.trouble = str(error)
+                    await asyncio.sleep(retry_s)
+                    retry_s = min(2 * retry_s, MOST_RETRY_S)
+                    continue
+                retry_s = FIRST_RETRY_S
+                with listener:
+                    await self._welcome(listener)
+        finally:
+            self.port = 0
+            for task in list(self._guests):
+                task.cancel()
+            await asyncio.gather(*self._guests, return_exceptions=True)
+
+    async def _listen(self) -> socket.socket:
+        family, address = await resolve(self._endpoint.host, self._endpoint.port)
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            listener.setblocking(False)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)  # is inherited
+            listener.bind(address)
+            listener.listen(BACKLOG)
+        except OSError as error:
+            listener.close()
+            raise SourceError(f"{self.name}: {error.strerror}") from error
+        self.port = int(listener.getsockname()[1])
+        self.trouble = ""
+        return listener
+
+    async def _welcome(self, listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                connected, address = await loop.sock_accept(listener)
+            except OSError as error:  # no more files may be open, say
+                self.trouble = f"{self.name}: {error.strerror}"
+                await asyncio.sleep(MOST_RETRY_S)
+                continue
+            self.trouble = ""
+            self._let_in(connected, f"{self.name} from {address[0]}:{address[1]}")
+            await asyncio.sleep(ACCEPT_S)
+
+    def _let_in(self, connected: socket.socket, name: str) -> None:
+        if len(self._guests) >= MOST_CONNECTIONS and not self._make_room():
+            self.n_turned_away += 1
+            connected.close()
+            return
+        wire, guest = self._admit(name)
+        try:
+            fd = wire.take(connected)
+        except OSError:  # it has gone already
+            connected.close()
+            self._leave(guest)
+            return
+        task = asyncio.get_running_loop().create_task(wire.serve(fd, guest))
+        self._guests[task] = wire, guest
+        task.add_done_callback(self._left)
+
+    def _make_room(self) -> bool:
+        for wire, guest in self._guests.values():
+            if wire.connected and guest.n_received == 0:
+                self.n_turned_away += 1
+                wire.lose("made room for another")
+                return True
+        return False
+
+    def _left(self, task: asyncio.Task[None]) -> None:
+        _, guest = self._guests.pop(task)
+        self._leave(guest)

@@ -1,0 +1,234 @@
+"""A wire that bytes come and go on: opened, watched by the event loop, opened anew when lost."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Coroutine
+from typing import Any, Protocol
+
+from companion.errors import SourceError
+from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+
+FIRST_RETRY_S, MOST_RETRY_S = 0.1, 0.5
+STALLED_NS = 30_000_000_000
+
+
+async def run_together(*parts: Coroutine[Any, Any, None]) -> None:
+    """Run all until one fails or this is cancelled; none is left running."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        await asyncio.gather(*tasks)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+Tap = Callable[[bool, bytes, int], None]
+"""Takes whether bytes went out, the bytes, and when by CLOCK_MONOTONIC; must not block."""
+
+
+class WireEnd(Protocol):
+    """Who is at our end of a wire."""
+
+    def opened(self) -> None:
+        """The wire is there, for the first time or again; no bytes of before belong to it."""
+
+    def received(self, data: bytes, monotonic_ns: int) -> int:
+        """Take what came; answers how many packets of known messages there were in it."""
+
+
+class Wire(ABC):
+    """Bytes in and out without waiting.
+
+    Packets are written whole and in turn; while the wire is not ready they wait in `queue`, and
+    while it is not there they are dropped. `read_limit` holds back a peer that sends too much.
+    """
+
+    read_size = 65536
+    reads_at_once = 1
+
+    def __init__(
+        self, name: str, bytes_per_s: float, queue: PacketQueue, read_limit: RateLimit | None = None
+    ) -> None:
+        self.name = name
+        self.bytes_per_s = bytes_per_s
+        """What it carries, as far as that is known."""
+        self.queue = queue
+        self.connected = False
+        self.trouble = ""
+        """Why it is not connected, or what is wrong with what comes; "" when nothing is."""
+        self.n_opened = 0
+        self.n_unsent = 0
+        """Packets dropped while the wire was not there."""
+        self.tap: Tap | None = None
+        """Hears of all bytes as they come and go."""
+        self._read_limit = read_limit
+        self._fd = -1
+        self._lost: asyncio.Future[str] | None = None
+        self._paused: asyncio.TimerHandle | None = None
+        self._delayed: asyncio.TimerHandle | None = None
+        self._waiting = False
+        self._progress_ns = 0
+
+    @property
+    def n_dropped(self) -> int:
+        """Packets that were not sent."""
+        return self.n_unsent + self.queue.n_dropped
+
+    async def run(self, end: WireEnd) -> None:
+        """Keep the wire open until cancelled."""
+        retry_s = FIRST_RETRY_S
+        while True:
+            try:
+                fd = await self._open()
+            except SourceError as error:
+                self.trouble = str(error)
+                await asyncio.sleep(retry_s)
+                retry_s = min(2 * retry_s, MOST_RETRY_S)
+                continue
+            retry_s = FIRST_RETRY_S
+            await self.serve(fd, end)
+            await asyncio.sleep(retry_s)
+
+    async def serve(self, fd: int, end: WireEnd) -> None:
+        """Use what is open as `fd` until it is lost or this is cancelled; then it is closed."""
+        loop = asyncio.get_running_loop()
+        self._fd = fd
+        self._lost = loop.create_future()
+        self._progress_ns = time.monotonic_ns()
+        self.connected, self.trouble = True, ""
+        self.n_opened += 1
+        try:
+            end.opened()
+            loop.add_reader(fd, self._readable, end)
+            self.trouble = await self._lost
+        finally:
+            self.connected = False
+            loop.remove_reader(fd)
+            loop.remove_writer(fd)
+            for timer in (self._paused, self._delayed):
+                if timer is not None:
+                    timer.cancel()
+            self._paused = self._delayed = None
+            self._waiting = False
+            self.queue.clear()
+            self._fd = -1
+            self._close()
+
+    def write(self, packet: bytes) -> None:
+        """Send a whole packet as soon as the wire takes it; never waits, never raises."""
+        if not self.connected:
+            self.n_unsent += 1
+            return
+        self.queue.push(packet)
+        if not self._waiting:
+            self._flush()
+        elif time.monotonic_ns() - self._progress_ns > STALLED_NS:
+            self.lose("nothing was taken for 30 s")
+
+    def lose(self, why: str) -> None:
+        """Give the wire up; what runs it opens it again."""
+        if self._lost is not None and not self._lost.done():
+            self._lost.set_result(f"{self.name}: {why}")
+        self.connected = False
+
+    @abstractmethod
+    async def _open(self) -> int:
+        """Open it; SourceError if it is not there now."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Close what is open."""
+
+    @abstractmethod
+    def _read(self) -> tuple[bytes, int]:
+        """Some bytes and when they came by CLOCK_MONOTONIC; OSError, EOFError."""
+
+    def _deliver(self, end: WireEnd, data: bytes, monotonic_ns: int) -> None:
+        end.received(data, monotonic_ns)
+
+    def _write(self, data: bytes) -> int:
+        return os.write(self._fd, data)
+
+    def _room(self) -> float:
+        """Seconds to wait before more may be written; 0 for now."""
+        return 0.0
+
+    def _readable(self, end: WireEnd) -> None:
+        for _ in range(self.reads_at_once):
+            try:
+                data, monotonic_ns = self._read()
+            except (BlockingIOError, InterruptedError):
+                return
+            except EOFError:
+                self.lose("closed by the other side")
+                return
+            except OSError as error:
+                self.lose(error.strerror or str(error))
+                return
+            if self.tap is not None:
+                self.tap(False, data, monotonic_ns)
+            must_pause = self._has_too_much(data, monotonic_ns, end)
+            self._deliver(end, data, monotonic_ns)
+            if must_pause or not self.connected:
+                return
+
+    def _has_too_much(self, data: bytes, monotonic_ns: int, end: WireEnd) -> bool:
+        limit = self._read_limit
+        if limit is None:
+            return False
+        limit.refill(monotonic_ns)
+        limit.take(max(64, len(data)))  # many small pieces are work too
+        if limit.left >= 0:
+            return False
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._fd)
+        self._paused = loop.call_later(limit.wait_s(limit.burst / 2), self._resume, end)
+        return True
+
+    def _resume(self, end: WireEnd) -> None:
+        self._paused = None
+        if self.connected:
+            asyncio.get_running_loop().add_reader(self._fd, self._readable, end)
+
+    def _flush(self) -> None:
+        if not self._waiting:
+            self._progress_ns = time.monotonic_ns()
+        try:
+            while self.queue:
+                wait_s = self._room()
+                if wait_s > 0:
+                    self._wait(wait_s)
+                    return
+                head = self.queue.head()
+                n_bytes = self._write(head)
+                self.queue.written(n_bytes)
+                self._progress_ns = time.monotonic_ns()
+                if self.tap is not None:
+                    self.tap(True, head[:n_bytes], self._progress_ns)
+        except (BlockingIOError, InterruptedError):
+            self._waiting = True
+            asyncio.get_running_loop().add_writer(self._fd, self._writable)
+            return
+        except OSError as error:
+            self.lose(error.strerror or str(error))
+            return
+        self._waiting = False
+
+    def _wait(self, wait_s: float) -> None:
+        self._waiting = True
+        self._delayed = asyncio.get_running_loop().call_later(wait_s, self._flush_later)
+
+    def _flush_later(self) -> None:
+        self._delayed = None
+        if self.connected:
+            self._flush()
+
+    def _writable(self) -> None:
+        asyncio.get_running_loop().remove_writer(self._fd)
+        if self.connected:
+            self._flush()

@@ -1,0 +1,305 @@
+"""Pictures on their way into a recording and out of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from typing import Any, NamedTuple, Protocol
+
+import av
+import av.error
+import cv2
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
+
+from companion.config import RecorderConfig
+from companion.errors import ConfigError
+from companion.messages import Bytes, Frame
+from drivers.recording.recorded_content import serialised, set_time
+from drivers.recording.recording_topics import GREY, IMAGE, RAW, VIDEO
+
+FRAME_ID = "camera"
+PNG_LEVEL = 1
+MOST_INSIDE = 64
+"""Pictures that an encoder may hold."""
+SOFTWARE = "libx264"
+HARDWARE = ("h264_v4l2m2m", "h264_nvenc")
+"""What of FFmpeg's encoders is tried before the processor has to do it."""
+OPTIONS = {SOFTWARE: {"preset": "ultrafast", "tune": "zerolatency"}}
+_BEGINS = re.compile(rb"\x00\x00\x01(?:[\x25\x45\x65\x05]|[\x27\x47\x67\x07])")
+"""An IDR slice or a sequence parameter set in H.264's byte stream (ITU-T H.264, annex B)."""
+
+
+class Recorded(NamedTuple):
+    """One message of the picture of a frame; unless `alone` it needs the picture before it."""
+
+    topic: str
+    seq: int
+    t_ns: int
+    data: bytes
+    alone: bool = True
+
+
+class PictureEncoder(Protocol):
+    """Pictures to messages; one for each flight."""
+
+    name: str
+    """For people."""
+
+    def encode(self, frame: Frame) -> list[Recorded]:
+        """Take a frame; what is ready, of this one or of one before it."""
+
+    def begin_anew(self) -> None:
+        """Something was lost: the next picture is to need none before it."""
+
+    def finish(self) -> list[Recorded]:
+        """No more frames come; what is left."""
+
+
+def picture_encoder(config: RecorderConfig, width: int, height: int, rate_hz: float) -> (
+    PictureEncoder
+):  # fmt: skip
+    """What is configured; ConfigError where an encoder that is asked for does not work."""
+    if config.codec == "h264":
+        return H264(config, width, height, rate_hz)
+    if config.codec == "mjpeg":
+        return Stills("jpeg", [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
+    if config.codec == "png":
+        return Stills("png", [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
+    return Raw()
+
+
+class Stills:
+    """Each picture by itself: as JPEG, or without loss as PNG, grey ones beside if need be."""
+
+    def __init__(self, form: str, parameters: list[int]) -> None:
+        self.name = form
+        self._parameters = parameters
+
+    def encode(self, frame: Frame) -> list[Recorded]:
+        """See `PictureEncoder`."""
+        bgr = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
+        _, data = cv2.imencode(f".{self.name}", bgr, self._parameters)
+        image = CompressedImage(frame_id=FRAME_ID, format=self.name, data=data.tobytes())
+        set_time(image.timestamp, frame.t_ns)
+        out = [Recorded(IMAGE, frame.seq, frame.t_ns, serialised(image))]
+        return out + _grey_beside(frame) if self.name == "png" else out
+
+    def begin_anew(self) -> None:
+        """See `PictureEncoder`."""
+
+    def finish(self) -> list[Recorded]:
+        """See `PictureEncoder`."""
+        return []
+
+
+class Raw:
+    """Pictures as they are; the chunk's compression makes them a little smaller."""
+
+    name = "raw"
+
+    def encode(self, frame: Frame) -> list[Recorded]:
+        """See `PictureEncoder`."""
+        return [_raw(RAW, frame, frame.rgb, "rgb8"), *_grey_beside(frame)]
+
+    def begin_anew(self) -> None:
+        """See `PictureEncoder`."""
+
+    def finish(self) -> list[Recorded]:
+        """See `PictureEncoder`."""
+        return []
+
+
+class H264:
+    """A video whose pictures come out one by one, as they go in: no picture waits for a later."""
+
+    def __init__(self, config: RecorderConfig, width: int, height: int, rate_hz: float) -> None:
+        self._config, self._size, self._rate_hz = config, (width, height), rate_hz
+        self._inside: dict[int, tuple[int, int]] = {}
+        """By presentation stamp: number and time of the frames in the encoder."""
+        self._number = 0
+        self._anew = False
+        wanted = config.h264_encoder
+        names = (*HARDWARE, SOFTWARE) if wanted == "auto" else (wanted,)
+        for name in names:
+            try:
+                self._codec = self._opened(name)
+            except (av.error.FFmpegError, ValueError, OSError):
+                continue
+            self.name = name
+            return
+        raise ConfigError(
+            f"recorder.h264_encoder = {wanted!r}: it does not encode {width} x {height} here; "
+            "set it to auto, or recorder.codec to mjpeg"
+        )
+
+    def encode(self, frame: Frame) -> list[Recorded]:
+        """See `PictureEncoder`."""
+        return self._encode(self._codec, frame.seq, frame.t_ns, frame.rgb)
+
+    def begin_anew(self) -> None:
+        """See `PictureEncoder`."""
+        self._anew = True
+
+    def finish(self) -> list[Recorded]:
+        """See `PictureEncoder`."""
+        try:
+            return self._messages(self._codec, self._codec.encode(None))
+        except av.error.FFmpegError:
+            return []
+
+    def _opened(self, name: str) -> Any:
+        """An encoder that has shown that it works."""
+        width, height = self._size
+        blank = np.zeros((height, width, 3), np.uint8)
+        with av.logging.Capture():
+            codec = self._open(name)
+            if not any(self._encode(codec, number, number, blank) for number in range(8)):
+                raise ValueError("it gives nothing")
+        self._inside.clear()
+        return self._open(name)
+
+    def _open(self, name: str) -> Any:
+        width, height = self._size
+        codec: Any = av.CodecContext.create(name, "w")
+        codec.width, codec.height, codec.pix_fmt = width, height, "yuv420p"
+        codec.time_base = Fraction(1, 1000)
+        codec.framerate = Fraction(round(self._rate_hz * 1000), 1000)
+        codec.bit_rate = self._config.h264_kbit_s * 1000
+        codec.gop_size = max(1, round(self._rate_hz))  # a second, which a cut may cost
+        codec.max_b_frames = 0
+        codec.thread_count = 1
+        codec.options = OPTIONS.get(name, {})
+        return codec
+
+    def _encode(self, codec: Any, seq: int, t_ns: int, rgb: Bytes) -> list[Recorded]:
+        picture = av.VideoFrame.from_ndarray(rgb, "rgb24").reformat(format="yuv420p")
+        self._number += 1
+        picture.pts = self._number
+        picture.time_base = codec.time_base
+        if self._anew:
+            picture.pict_type = av.video.frame.PictureType.I
+            self._anew = False
+        self._inside[self._number] = seq, t_ns
+        if len(self._inside) > MOST_INSIDE:  # it has dropped that one
+            del self._inside[next(iter(self._inside))]
+        return self._messages(codec, codec.encode(picture))
+
+    def _messages(self, codec: Any, packets: Iterable[Any]) -> list[Recorded]:
+        out = []
+        for packet in packets:
+            if packet.pts not in self._inside:
+                continue
+            seq, t_ns = self._inside.pop(packet.pts)
+            data = bytes(packet)
+            alone = stands_alone(data)
+            if alone and codec.extradata and b"\x00\x00\x01\x67" not in data[:64]:
+                data = codec.extradata + data
+            video = CompressedVideo(frame_id=FRAME_ID, format="h264", data=data)
+            set_time(video.timestamp, t_ns)
+            out.append(Recorded(VIDEO, seq, t_ns, serialised(video), alone))
+        return out
+
+
+def stands_alone(h264: bytes | memoryview) -> bool:
+    """Whether a picture of H.264 in its byte stream can be decoded without those before it."""
+    return _BEGINS.search(bytes(h264[:256])) is not None
+
+
+def still(topic: str, data: bytes | memoryview) -> Bytes | None:
+    """RGB (or grey, of the grey topic) of a picture that stands alone; None if it is damaged."""
+    try:
+        if topic == IMAGE:
+            image = CompressedImage.FromString(bytes(data))
+            packed = np.frombuffer(image.data, np.uint8)
+            if not packed.size:
+                return None
+            bgr = cv2.imdecode(packed, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+            if bgr is None:
+                return None
+            return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+        raw = RawImage.FromString(bytes(data))
+    except (ValueError, cv2.error, DecodeError):
+        return None
+    shape = (raw.height, raw.width, 3) if raw.encoding == "rgb8" else (raw.height, raw.width)
+    if len(raw.data) != int(np.prod(shape)) or raw.encoding not in ("rgb8", "mono8"):
+        return None
+    return np.frombuffer(raw.data, np.uint8).reshape(shape)
+
+
+class VideoDecoder:
+    """Pictures of a video one by one; to be begun with one that stands alone."""
+
+    def __init__(self) -> None:
+        self._codec: Any = av.CodecContext.create("h264", "r")
+        self._codec.thread_count = 1
+        self._codec.options = {"flags": "low_delay"}
+
+    def pictures(
+        self, messages: Iterable[tuple[int, bytes, bool]]
+    ) -> Iterator[tuple[int, Bytes | None]]:
+        """Number and RGB of each; None where one cannot be decoded, or needs one that could not.
+
+        Each message is a number, the bytes, and whether something before it is missing.
+        """
+        waiting: list[int] = []
+        broken = False
+        for number, data, lost in messages:
+            video = _video(data)
+            broken = (broken or lost or video is None) and not stands_alone(video or b"")
+            waiting.append(number)
+            if broken or video is None:
+                continue  # it would be smeared with what it lacks
+            packet: Any = av.Packet(video)
+            packet.pts = packet.dts = number
+            yield from self._given(waiting, packet)
+        yield from self._given(waiting, None)
+        for number in waiting:
+            yield number, None
+
+    def _given(self, waiting: list[int], packet: Any) -> Iterator[tuple[int, Bytes | None]]:
+        try:
+            frames = self._codec.decode(packet)
+        except av.error.FFmpegError:
+            frames = []
+        for frame in frames:
+            while waiting and frame.pts is not None and waiting[0] < frame.pts:
+                yield waiting.pop(0), None
+            if waiting and waiting[0] == frame.pts:
+                rgb = None if frame.is_corrupt else frame.to_ndarray(format="rgb24")
+                yield waiting.pop(0), None if rgb is None else np.asarray(rgb, np.uint8)
+
+
+def _video(data: bytes) -> bytes | None:
+    try:
+        video: bytes = CompressedVideo.FromString(data).data
+    except (ValueError, DecodeError):
+        return None
+    return video or None
+
+
+def grey_of(rgb: Bytes) -> Bytes:
+    """Grey of a colour picture, as all recorded flights have it."""
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _grey_beside(frame: Frame) -> list[Recorded]:
+    """The grey picture, where it is not what the colours give (of a camera that gives Y, say)."""
+    if np.array_equal(frame.grey, grey_of(frame.rgb)):
+        return []
+    return [_raw(GREY, frame, frame.grey, "mono8")]
+
+
+def _raw(topic: str, frame: Frame, pixels: Bytes, encoding: str) -> Recorded:
+    height, width = pixels.shape[:2]
+    step = width * (3 if encoding == "rgb8" else 1)
+    image = RawImage(
+        frame_id=FRAME_ID, width=width, height=height, encoding=encoding, step=step,
+        data=pixels.tobytes(),
+    )  # fmt: skip
+    set_time(image.timestamp, frame.t_ns)
+    return Recorded(topic, frame.seq, frame.t_ns, serialised(image))

@@ -1,0 +1,1 @@
+"""The computer itself: load, serial ports, systemd, journal, status socket, metrics, Zenoh."""

@@ -1,0 +1,214 @@
+"""Messages of a live autopilot to samples on the flight's clock: what a log's reader does, at once.
+
+Of several messages that state one quantity one kind is taken, as from a log: of attitudes the more
+frequent, of the others the first that there is. Stamps that are not of the running clock, or not
+later than the one before, are dropped and counted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.geometry.geodesy import GeoOrigin
+from companion.messages import PositionSample, PositionSource, Telemetry, Warned
+from companion.timing.link_clock import ClockFilter
+from companion.timing.stamp_filter import MAX_BOOT_NS
+from drivers.telemetry.live_positions import LivePlaces
+from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, SAMPLE_OF, boot_ns
+from drivers.telemetry.telemetry_log import GeodeticFix, is_finite
+
+LATE_NS, AHEAD_NS = 2_000_000_000, 100_000_000
+"""A delay that is named; a stamp that is further in the future than this cannot be true."""
+NAME_AGAIN_NS = 10_000_000_000
+CHOOSE_NS = 1_000_000_000
+"""Which of several messages is the more frequent is looked at so often."""
+ABOUT = 1.25
+"""Messages that come at rates within this ratio are about as frequent."""
+MOST_AWAY_M = 1e6
+
+OUT_OF_ORDER, WILD, LATE = "telemetry out of order", "telemetry stamped wildly", "telemetry late"
+AHEAD, UNUSABLE = "telemetry from the future", "telemetry that is not usable"
+
+
+class LiveSamples:
+    """Stamps, places and passes on what the vehicle's autopilot measures."""
+
+    def __init__(
+        self,
+        clock: ClockFilter,
+        deliver: Callable[[Telemetry], None],
+        warn: Callable[[Warned], None],
+    ) -> None:
+        self._clock, self._deliver, self._warn = clock, deliver, warn
+        self.places = LivePlaces()
+        self.n_dropped: Counter[str] = Counter()
+        """By the reason."""
+        self.gps_fix_type = 0
+        """GPS_FIX_TYPE of the newest GPS_RAW_INT; 0 where there is no GPS."""
+        self._unix_minus_boot_ns: int | None = None
+        self._segment = clock.n_segments
+        self._stamps: dict[int, int] = {}
+        self._latest: dict[str, tuple[int, int]] = {}
+        """By quantity: the newest stamp, and the time that it was given."""
+        self._choices = (_Choice(ATTITUDE_IDS, frequent=True), _Choice(IMU_IDS, frequent=False))
+        self._wild = ""
+        self._named_ns: dict[str, int] = {}
+
+    def take(self, message: Any, receive_ns: int) -> None:
+        """Take any message of the autopilot."""
+        kind = message.get_msgId()
+        if kind == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
+            self._take_origin(message, receive_ns)
+            return
+        if kind not in SAMPLE_OF and kind != mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
+            return
+        try:
+            with np.errstate(all="ignore"):  # what comes of infinities is looked at afterwards
+                self._take(kind, message, receive_ns)
+        except (ArithmeticError, ValueError) as error:  # numbers that make no sense together
+            self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: {error}")
+
+    def _take(self, kind: int, message: Any, receive_ns: int) -> None:
+        if kind == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME and message.time_unix_usec:
+            self._unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
+        if kind == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
+            self.gps_fix_type = message.fix_type
+        remote_ns = boot_ns(message, self._unix_minus_boot_ns)
+        if remote_ns is None:
+            self.n_dropped["telemetry without boot time"] += 1
+            return
+        if self._stamps.get(kind) == remote_ns:
+            return  # sent again because nothing newer was measured
+        self._stamps[kind] = remote_ns
+        if not 0 <= remote_ns <= MAX_BOOT_NS or not self._clock.one_way(remote_ns, receive_ns):
+            # named when it is clear that no reboot has begun with it
+            self._wild = f"{message.get_type()} at {remote_ns * 1e-9:.1f} s"
+            self.n_dropped[WILD] += 1
+            return
+        if self._segment != self._clock.n_segments:
+            self._begin()
+        if self._wild:
+            self._name(WILD, receive_ns, self._wild)
+            self._wild = ""
+        sample = SAMPLE_OF[kind](message) if kind in SAMPLE_OF else None
+        if sample is None:
+            return
+        if not is_finite(sample) or not _on_earth(sample):
+            self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
+            return
+        if all(choice.takes(kind, receive_ns) for choice in self._choices):
+            self._pass_on(sample, remote_ns, receive_ns, message.get_type())
+
+    def _pass_on(
+        self, content: Telemetry | GeodeticFix, remote_ns: int, receive_ns: int, name: str
+    ) -> None:
+        t_ns = self._clock.host_ns(remote_ns)
+        if t_ns is None:
+            self.n_dropped["telemetry before the clock was known"] += 1
+            return
+        quantity = _quantity(content)
+        latest_ns, latest_t_ns = self._latest.get(quantity, (-1, -1))
+        if remote_ns <= latest_ns or t_ns <= latest_t_ns:
+            self._drop(OUT_OF_ORDER, receive_ns, name)
+            return
+        if t_ns > receive_ns + max(AHEAD_NS, 5 * self._clock.sigma_ns):
+            self._drop(AHEAD, receive_ns, f"{name} by {(t_ns - receive_ns) * 1e-9:.2f} s")
+            return
+        if receive_ns - t_ns > LATE_NS:
+            self._name(LATE, receive_ns, f"{name} by {(receive_ns - t_ns) * 1e-9:.1f} s")
+        self._latest[quantity] = remote_ns, t_ns
+        sample = self._placed(content, remote_ns)
+        if sample is None:
+            self.n_dropped["positions without an origin"] += 1
+            return
+        self._deliver(dataclasses.replace(sample, t_ns=t_ns))
+
+    def _placed(self, content: Telemetry | GeodeticFix, remote_ns: int) -> Telemetry | None:
+        if isinstance(content, GeodeticFix):
+            return self.places.fix(content, remote_ns)
+        if isinstance(content, PositionSample) and content.source is PositionSource.LOCAL:
+            return self.places.local(content, remote_ns)
+        return content
+
+    def _take_origin(self, message: Any, receive_ns: int) -> None:
+        latitude_deg, longitude_deg = message.latitude * 1e-7, message.longitude * 1e-7
+        if not _is_place(latitude_deg, longitude_deg):
+            self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
+        elif message.latitude or message.longitude:  # both 0 is what is not set
+            self.places.told(GeoOrigin(latitude_deg, longitude_deg, message.altitude * 1e-3))
+
+    def _begin(self) -> None:
+        """Another clock runs: the autopilot has begun anew."""
+        self._segment = self._clock.n_segments
+        self._latest = {quantity: (-1, t_ns) for quantity, (_, t_ns) in self._latest.items()}
+        self._stamps.clear()
+        self._wild = ""
+        self.places.restart()
+
+    def _drop(self, what: str, now_ns: int, detail: str) -> None:
+        self.n_dropped[what] += 1
+        self._name(what, now_ns, detail)
+
+    def _name(self, what: str, now_ns: int, detail: str) -> None:
+        """Say it, but not for every message of a stream."""
+        if now_ns - self._named_ns.get(what, -NAME_AGAIN_NS) >= NAME_AGAIN_NS:
+            self._named_ns[what] = now_ns
+            self._warn(Warned(now_ns, what, detail))
+
+
+class _Choice:
+    """Which of several messages that state the same is taken."""
+
+    def __init__(self, ids: tuple[int, ...], frequent: bool) -> None:
+        self._ids, self._frequent = ids, frequent
+        self._counts: Counter[int] = Counter()
+        self._before: Counter[int] = Counter()
+        self._since_ns = 0
+        self._chosen: int | None = None
+
+    def takes(self, kind: int, now_ns: int) -> bool:
+        """Count a message; whether it is to be taken, as it is if it states something else."""
+        if kind not in self._ids:
+            return True
+        if now_ns - self._since_ns >= CHOOSE_NS:
+            self._since_ns, self._before, self._counts = now_ns, self._counts, Counter()
+            self._choose()
+        self._counts[kind] += 1
+        if self._chosen is None:
+            self._chosen = kind
+        return kind == self._chosen
+
+    def _choose(self) -> None:
+        present = [kind for kind in self._ids if self._before[kind]]
+        if not present:
+            self._chosen = None
+        elif not self._frequent:
+            self._chosen = present[0]
+        else:
+            most = max(self._before.values())
+            # of those about as frequent always the same
+            self._chosen = next(kind for kind in present if ABOUT * self._before[kind] >= most)
+
+
+def _on_earth(content: Telemetry | GeodeticFix) -> bool:
+    if isinstance(content, GeodeticFix):
+        return _is_place(content.latitude_deg, content.longitude_deg)
+    if isinstance(content, PositionSample):
+        return bool(np.abs(content.position_ned_m).max() < MOST_AWAY_M)
+    return True
+
+
+def _is_place(latitude_deg: float, longitude_deg: float) -> bool:
+    return abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180
+
+
+def _quantity(content: Telemetry | GeodeticFix) -> str:
+    if isinstance(content, GeodeticFix | PositionSample):
+        return content.source.value
+    return type(content).__name__

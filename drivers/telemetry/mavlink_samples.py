@@ -1,0 +1,167 @@
+"""MAVLink messages to samples: units, axes and what marks a field as not known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.geometry.transforms import Array, quaternion_from_euler
+from companion.messages import (
+    AttitudeSample,
+    HeightSample,
+    ImuSample,
+    PositionSample,
+    PositionSource,
+    RangeSample,
+    Telemetry,
+)
+from drivers.telemetry.telemetry_log import GeodeticFix
+
+STANDARD_GRAVITY = 9.80665
+GPS_RANGE_ERROR_M = 1.5
+"""One sigma of a GPS position at dilution 1, where the receiver states no accuracy of its own."""
+UNKNOWN_16 = 65535
+FIX_3D = 3
+UNIX_SINCE_NS = 10**17
+"""Stamps larger than this count from 1970, smaller ones from boot."""
+ACCEL_AND_GYRO = 0x3F
+PRESSURE_ALTITUDE = 0x800
+
+ATTITUDE_IDS = (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_ATTITUDE)
+IMU_IDS = (
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU,
+)
+HEIGHT_IDS = (mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,)
+RANGE_IDS = (mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,)
+
+
+def boot_ns(message: Any, unix_minus_boot_ns: int | None) -> int | None:
+    """Autopilot time since boot of a message; None where it has none that can be told."""
+    boot_ms = getattr(message, "time_boot_ms", None)
+    if boot_ms is not None:
+        return int(boot_ms) * 1_000_000
+    stamp_ns = int(getattr(message, "time_usec", 0)) * 1000
+    if stamp_ns == 0:
+        return None
+    if stamp_ns < UNIX_SINCE_NS:
+        return stamp_ns
+    return stamp_ns - unix_minus_boot_ns if unix_minus_boot_ns is not None else None
+
+
+def height_from_pressure(pressure_pa: float) -> float:
+    """Height in metres above the level of 1013.25 hPa in the standard atmosphere (ISO 2533)."""
+    return float(44330.77 * (1 - (pressure_pa / 101325.0) ** 0.1902632))
+
+
+def _attitude(message: Any) -> Telemetry:
+    q = quaternion_from_euler(message.roll, message.pitch, message.yaw)
+    return AttitudeSample(0, q, _rates(message))
+
+
+def _attitude_quaternion(message: Any) -> Telemetry | None:
+    q = np.array([message.q1, message.q2, message.q3, message.q4])
+    norm = float(np.linalg.norm(q))
+    if not 0.5 < norm < 2:
+        return None
+    return AttitudeSample(0, (q if q[0] >= 0 else -q) / norm, _rates(message))
+
+
+def _rates(message: Any) -> Array | None:
+    rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+    return rates if np.isfinite(rates).all() else None
+
+
+def _highres_imu(message: Any) -> Telemetry | None:
+    if message.fields_updated & ACCEL_AND_GYRO != ACCEL_AND_GYRO:
+        return None
+    gyro = np.array([message.xgyro, message.ygyro, message.zgyro])
+    accel = np.array([message.xacc, message.yacc, message.zacc])
+    return ImuSample(0, gyro, accel)
+
+
+def _scaled_imu(message: Any) -> Telemetry:
+    gyro = np.array([message.xgyro, message.ygyro, message.zgyro]) * 1e-3
+    accel = np.array([message.xacc, message.yacc, message.zacc]) * (1e-3 * STANDARD_GRAVITY)
+    return ImuSample(0, gyro, accel)
+
+
+def _local_position(message: Any) -> Telemetry:
+    position = np.array([message.x, message.y, message.z])
+    velocity = np.array([message.vx, message.vy, message.vz])
+    return PositionSample(
+        0, PositionSource.LOCAL, position, velocity if np.isfinite(velocity).all() else None
+    )
+
+
+def _global_position(message: Any) -> GeodeticFix | None:
+    if message.lat == 0 and message.lon == 0:  # what autopilots send before they know
+        return None
+    velocity = np.array([message.vx, message.vy, message.vz]) * 1e-2
+    return GeodeticFix(
+        PositionSource.GLOBAL, message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3, velocity
+    )
+
+
+def _gps(message: Any) -> GeodeticFix | None:
+    if message.fix_type < FIX_3D:
+        return None
+    return GeodeticFix(
+        PositionSource.GPS,
+        message.lat * 1e-7,
+        message.lon * 1e-7,
+        message.alt * 1e-3,
+        _gps_velocity(message),
+        _gps_sigma(message.h_acc, message.eph),
+        _gps_sigma(message.v_acc, message.epv),
+    )
+
+
+def _gps_velocity(message: Any) -> Array | None:
+    """Over ground; the vertical part is nan, since the message has none."""
+    if UNKNOWN_16 in (message.vel, message.cog):
+        return None
+    course, speed = math.radians(message.cog * 1e-2), message.vel * 1e-2
+    return np.array([speed * math.cos(course), speed * math.sin(course), math.nan])
+
+
+def _gps_sigma(accuracy_mm: int, dilution_100: int) -> float | None:
+    if accuracy_mm:
+        return accuracy_mm * 1e-3
+    return None if dilution_100 in (0, UNKNOWN_16) else dilution_100 * 1e-2 * GPS_RANGE_ERROR_M
+
+
+def _range(message: Any) -> Telemetry | None:
+    if message.orientation != mavlink.MAV_SENSOR_ROTATION_PITCH_270:
+        return None
+    if not max(message.min_distance, 1) <= message.current_distance < message.max_distance:
+        return None
+    return RangeSample(0, message.current_distance * 1e-2)
+
+
+def _pressure(message: Any) -> Telemetry | None:
+    if not 100 < message.press_abs < 1200:
+        return None
+    return HeightSample(0, height_from_pressure(message.press_abs * 100))
+
+
+SAMPLE_OF: dict[int, Callable[[Any], Telemetry | GeodeticFix | None]] = {
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _attitude_quaternion,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: _scaled_imu,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: _scaled_imu,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: _scaled_imu,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _global_position,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: _gps,
+    mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: _range,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: _pressure,
+}
+"""What each message says; samples bear no time yet, None where a message says nothing usable."""

@@ -1,0 +1,165 @@
+"""Telemetry as a companion or a ground station received it: MAVLink in a .tlog.
+
+Only the autopilot's own messages are taken, and of those never a simulator's truth (SIM_STATE,
+SIMSTATE, SIM2, HIL_STATE_QUATERNION): a program in flight has none.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from itertools import compress
+from pathlib import Path
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.geometry.geodesy import GeoOrigin
+from companion.messages import ArmedSample, Warned
+from companion.timing.log_clock import BootSegments, estimate_clock
+from companion.timing.stamp_filter import believable
+from drivers.telemetry.mavlink_samples import (
+    ATTITUDE_IDS,
+    HEIGHT_IDS,
+    IMU_IDS,
+    RANGE_IDS,
+    SAMPLE_OF,
+    boot_ns,
+)
+from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector
+from drivers.telemetry.tlog_records import LEAST_US, MOST_US, Record, TlogRecords
+
+AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
+MAX_ROUND_TRIP_NS = 2_000_000_000
+
+
+def read_tlog(path: Path) -> LogContent:
+    """All that the autopilot of one vehicle said; an empty log where there is nothing to read."""
+    log = path.read_bytes()
+    packets = TlogRecords(log)
+    found = list(packets)
+    times_ns = [record.unix_us * 1000 for record in found]
+    good = believable(times_ns, LEAST_US * 1000, MOST_US * 1000)
+    records = list(compress(found, good))
+    warnings = []
+    first_ns = records[0].unix_us * 1000 if records else 0
+    if packets.n_damaged:
+        detail = f"{packets.n_damaged} of {len(log)} bytes of {path.name} passed over"
+        warnings.append(Warned(first_ns, "damaged telemetry", detail))
+    vehicle, n_vehicles = _vehicle(records)
+    if vehicle is None:
+        warnings.append(Warned(first_ns, "no autopilot in the telemetry", path.name))
+        return LogContent(TelemetryCollector(path.name), warnings=tuple(warnings))
+    if n_vehicles > 1:
+        detail = f"{n_vehicles} in {path.name}; taken is system {vehicle}"
+        warnings.append(Warned(first_ns, "several vehicles in the telemetry", detail))
+    return _Reader(path.name, packets, vehicle).read(records, warnings)
+
+
+def _vehicle(records: Iterable[Record]) -> tuple[int | None, int]:
+    """The system whose autopilot says most of its attitude, and how many do."""
+    counts: Counter[int] = Counter()
+    for record in records:
+        if record.component == AUTOPILOT_COMPONENT:
+            counts[record.system] += record.message_id in ATTITUDE_IDS
+    flying = [system for system, n in counts.items() if n]
+    # in order of system ids where two say as much
+    best = max(sorted(counts), key=lambda system: counts[system], default=None)
+    return best, len(flying)
+
+
+class _Reader:
+    def __init__(self, name: str, packets: TlogRecords, vehicle: int) -> None:
+        self._packets = packets
+        self._vehicle = vehicle
+        self._collected = TelemetryCollector(name)
+        self._exchanges: list[tuple[int, int, int, int]] = []
+        self._one_way: list[tuple[int, int, int]] = []
+        self._unstamped: list[ArmedSample] = []
+        self._segments = BootSegments()
+        self._armed: bool | None = None
+        self._unix_minus_boot_ns: int | None = None
+
+    def read(self, records: list[Record], warnings: list[Warned]) -> LogContent:
+        mine = [
+            record
+            for record in records
+            if record.system == self._vehicle and record.component == AUTOPILOT_COMPONENT
+        ]
+        counts = Counter(record.message_id for record in mine)
+        chosen = _chosen(counts)
+        for record in mine:
+            if record.message_id in chosen:
+                self._take(record)
+        clock = estimate_clock(self._exchanges, self._one_way)
+        return LogContent(
+            self._collected,
+            clock.host_ns if clock else None,
+            clock.report if clock else None,
+            tuple(warnings),
+            tuple(self._unstamped),
+        )
+
+    def _take(self, record: Record) -> None:
+        message = self._packets.decode(record)
+        if message is None:
+            self._collected.count("damaged messages left out")
+            return
+        receive_ns = record.unix_us * 1000
+        kind = record.message_id
+        if kind == mavlink.MAVLINK_MSG_ID_TIMESYNC:
+            self._take_timesync(message.tc1, message.ts1, receive_ns)
+            return
+        if kind == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            if armed is not self._armed:
+                self._unstamped.append(ArmedSample(receive_ns, armed))
+                self._armed = armed
+            return
+        if kind == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME and message.time_unix_usec:
+            self._unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
+        sample = SAMPLE_OF[kind](message) if kind in SAMPLE_OF else None
+        remote_ns = boot_ns(message, self._unix_minus_boot_ns)
+        if remote_ns is None:
+            if sample is not None:
+                self._collected.count("messages without boot time left out")
+            return
+        segment = self._segments.segment_of(remote_ns)
+        self._one_way.append((remote_ns, receive_ns, segment))
+        if kind == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
+            self._collected.origin.setdefault(
+                segment,
+                GeoOrigin(
+                    message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3
+                ),
+            )
+        elif sample is not None:
+            self._collected.add(remote_ns, segment, sample)
+
+    def _take_timesync(self, tc1: int, ts1: int, receive_ns: int) -> None:
+        if tc1 == 0:  # the autopilot asks, and states its own time in doing so
+            segment = self._segments.segment_of(ts1)
+            self._one_way.append((ts1, receive_ns, segment))
+            return
+        # an answer to another computer has that one's time in it, which is not the log's
+        if 0 <= receive_ns - ts1 <= MAX_ROUND_TRIP_NS:
+            segment = self._segments.segment_of(tc1)
+            self._exchanges.append((ts1, tc1, receive_ns, segment))
+
+
+def _chosen(counts: Counter[int]) -> set[int]:
+    """Ids of the messages to read: one kind for each quantity that several state."""
+    chosen = {
+        mavlink.MAVLINK_MSG_ID_TIMESYNC,
+        mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+        mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+        mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+    }
+    # of attitudes the more frequent; of the others the first that there is
+    chosen.add(max(ATTITUDE_IDS, key=lambda kind: counts[kind]))
+    for kinds in (IMU_IDS, HEIGHT_IDS, RANGE_IDS):
+        present = [kind for kind in kinds if counts[kind]]
+        chosen.update(present[:1])
+    return chosen

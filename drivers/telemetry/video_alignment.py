@@ -1,0 +1,163 @@
+"""A log put on the time of a video by the turns that both saw, where no clock does it.
+
+What the camera saw is told by its own gyro, where the video has that, else by the pictures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from companion.config import TelemetryConfig
+from companion.errors import FlightError
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array, rotation_from_quaternion, vector_from_rotation
+from companion.messages import AttitudeSample, ClockReport, Frame, ImuSample, Telemetry, Warned
+from companion.timing.image_rotation import RotationMeter
+from companion.timing.turn_alignment import TimeAlignment, TurnRecord, align_turns
+from drivers.telemetry.gpmf_gyro import gyro_turns
+from drivers.telemetry.gpmf_track import blocks_of
+from drivers.telemetry.telemetry_folder import aligned, read_log_file, read_telemetry
+from drivers.telemetry.telemetry_log import Pictures, TelemetryLog
+
+MAX_FRAMES = 6000
+LEAST_SAMPLES = 20
+Frames = Callable[[], Iterator[Frame | Warned]]
+
+
+def read_unaligned(
+    paths: Sequence[Path], pictures: Pictures, config: TelemetryConfig, camera: Camera,
+    frames: Frames,
+) -> TelemetryLog:  # fmt: skip
+    """The log of a video whose times are its own; of several the one whose turns agree best.
+
+    As `telemetry.align` says. FlightError where no log agrees so well that it must be the one.
+    """
+    if not paths or config.align == "never" or config.offset_s:
+        return read_telemetry(paths, pictures, config)
+    free = dataclasses.replace(config, starts_with_video=True)
+    logs = [(path, aligned(read_log_file(path), pictures, free)) for path in paths]
+    reasons: list[str] = []
+    for see in (_felt, _seen):
+        seen = see(camera, frames, pictures)
+        found = None if seen is None else _best(seen, logs, pictures.start_ns, reasons)
+        if seen is not None and found is not None:
+            return _moved(*found, seen.by_what, pictures)
+    raise FlightError(
+        f"{pictures.path}: no log can be put on its time by rotation ({'; '.join(reasons)}); "
+        "say the shift by --offset S, seconds added to the log's times, or give frames.csv, or "
+        "--set telemetry.align=never to trust the clocks"
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turns:
+    by_what: str
+    record: TurnRecord
+    body_from_camera: Array | None
+    """Rotation (3, 3), where it is known and so are the axes."""
+
+
+def _best(
+    seen: _Turns, logs: Sequence[tuple[Path, TelemetryLog]], start_ns: int, reasons: list[str]
+) -> tuple[TelemetryLog, TimeAlignment, Path] | None:
+    found = []
+    for path, log in logs:
+        logged = _logged(log.samples, start_ns)
+        if logged is None:
+            reasons.append(f"{path.name} has neither rates nor attitude")
+            continue
+        t_s = seen.record.t_s
+        step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+        by_turns = None
+        if step_s > 0:
+            by_turns = align_turns(seen.record, logged, step_s, seen.body_from_camera)
+        if by_turns is None:
+            reasons.append(f"{path.name}: too little is in both")
+        elif by_turns.why_not is not None:
+            reasons.append(f"{path.name}: {by_turns.why_not}")
+        else:
+            found.append((log, by_turns, path))
+    return max(found, key=lambda each: each[1].score, default=None)
+
+
+def _moved(
+    log: TelemetryLog, by_turns: TimeAlignment, path: Path, by_what: str, pictures: Pictures
+) -> TelemetryLog:
+    shift_ns = round(by_turns.offset_s * 1e9)
+    samples = [dataclasses.replace(sample, t_ns=sample.t_ns + shift_ns) for sample in log.samples]
+    clock = ClockReport(
+        f"rotation of {by_what}", by_turns.offset_s, 0.0, by_turns.sigma_s * 1e3,
+        log.clock.n_reboots if log.clock is not None else 0,
+    )  # fmt: skip
+    how = f"put on the time of {pictures.path.name} by rotation of {by_what}"
+    remark = f"{path.name} {how}: {by_turns}"
+    warnings = tuple(w for w in log.warnings if "begin with the video" not in w.what)
+    return dataclasses.replace(
+        log, samples=samples, clock=clock, warnings=warnings, remarks=(remark,)
+    )
+
+
+def _mount(camera: Camera) -> Array | None:
+    return None if camera.body_from_camera is None else camera.body_from_camera.rotation
+
+
+def _felt(camera: Camera, frames: Frames, pictures: Pictures) -> _Turns | None:
+    """By the camera's gyro; None where the video has nothing of it."""
+    turns = gyro_turns(blocks_of(pictures.path)) if pictures.path.is_file() else None
+    if turns is None:
+        return None
+    host_ns = pictures.host_from_file_ns(np.rint(turns.t_ns).astype(np.int64))
+    t_s = np.asarray((host_ns - pictures.start_ns) * 1e-9, np.float64)
+    mount = _mount(camera) if turns.axes_known else None
+    return _Turns("the camera's gyro", TurnRecord(t_s, turns.angle_rad), mount)
+
+
+def _seen(camera: Camera, frames: Frames, pictures: Pictures) -> _Turns:
+    """By the pictures."""
+    meter = RotationMeter(camera)
+    times_s: list[float] = []
+    angles: list[Array] = []
+    angle = np.zeros(3)
+    for frame in frames():
+        if not isinstance(frame, Frame):
+            continue
+        turn = meter.turn(frame)
+        angle = angle if turn is None else angle + turn
+        times_s.append((frame.t_ns - pictures.start_ns) * 1e-9)
+        angles.append(angle)
+        if len(times_s) == MAX_FRAMES:
+            break
+    record = TurnRecord(np.array(times_s), np.array(angles).reshape(-1, 3))
+    return _Turns("the pictures", record, _mount(camera))
+
+
+def _logged(samples: Sequence[Telemetry], start_ns: int) -> TurnRecord | None:
+    """The turns of the kind of sample that there is most of; times after `start_ns`."""
+    rates = [(s.t_ns, s.gyro_rad_s) for s in samples if isinstance(s, ImuSample)]
+    attitudes = [s for s in samples if isinstance(s, AttitudeSample)]
+    if max(len(rates), len(attitudes)) < LEAST_SAMPLES:
+        return None
+    if len(rates) >= len(attitudes):
+        t_s, gyro = _ascending([(t_ns - start_ns) * 1e-9 for t_ns, _ in rates],
+                               [rate for _, rate in rates])  # fmt: skip
+        turns = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(t_s)[:, None]
+    else:
+        t_s, quaternions = _ascending(
+            [(s.t_ns - start_ns) * 1e-9 for s in attitudes], [s.ned_from_body for s in attitudes]
+        )
+        turned = [rotation_from_quaternion(q) for q in quaternions]
+        turns = np.array([
+            vector_from_rotation(a.T @ b) for a, b in pairwise(turned)
+        ])  # fmt: skip
+    return TurnRecord(t_s, np.vstack([np.zeros(3), np.cumsum(turns, axis=0)]))
+
+
+def _ascending(t_s: Sequence[float], values: Sequence[Array]) -> tuple[Array, Array]:
+    times, first = np.unique(np.array(t_s), return_index=True)
+    return times, np.stack(values)[first]

@@ -1,0 +1,169 @@
+"""A network camera that does what it is told, rightly or wrongly: JPEG pictures over HTTP.
+
+    with HttpCamera() as camera:
+        ... camera.url, camera.write_calibration(path)
+        camera.frozen = True
+
+What it films is the test pattern, from where it is told to be, or else from where every pose is
+known: `world_from_body(monotonic_ns)`, which goes round faster than the pattern camera's own, so
+that scale is found sooner.
+
+    on            False: nobody answers at its port, and whoever was connected is cut off
+    stalled       True: the connection stays, and nothing comes
+    frozen        True: the same picture again and again
+    size          (width, height) of what it sends
+    covered       True: it is dark, but for the sensor's noise
+    lost          the share of pictures that never leave it
+    sent_ns       CLOCK_MONOTONIC of the last picture that a client was sent
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from companion.config import CameraConfig
+from companion.geometry.transforms import Pose
+from companion.messages import Bytes
+from drivers.camera import pattern_camera
+from drivers.camera.pattern_camera import BODY_FROM_CAMERA, PatternScene, pattern_optics
+
+RATE_HZ = 15.0
+FASTER = 2.0
+LEAD_NS, MOST_LATE_NS = 50_000_000, 20_000_000
+"""A picture that could not be sent at the time that it shows is left out."""
+BOUNDARY = b"picture"
+HEAD = (
+    b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=" + BOUNDARY + b"\r\n"
+    b"Cache-Control: no-cache\r\n\r\n"
+)
+
+
+def world_from_body(monotonic_ns: int) -> Pose:
+    """Where what carries it is, in local NED."""
+    return pattern_camera.world_from_body(round(monotonic_ns * FASTER))
+
+
+class HttpCamera:
+    """See above. One client at a time; `on` may be set before it is started."""
+
+    def __init__(
+        self, width: int = 320, height: int = 240, on: bool = True,
+        world_from_body: Callable[[int], Pose] = world_from_body,
+    ) -> None:  # fmt: skip
+        self._world_from_body = world_from_body
+        self._full_size = width, height
+        self.heal()
+        self.on = on
+        self.sent_ns = 0
+        self._optics = pattern_optics(CameraConfig(width=width, height=height))
+        self._scene = PatternScene()
+        self._last: Bytes | None = None
+        self._random, self._noise = random.Random(1), np.random.default_rng(1)
+        self._stop, self._there = threading.Event(), threading.Event()
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._port = int(probe.getsockname()[1])
+        self.url = f"http://127.0.0.1:{self._port}/stream"
+        self._thread = threading.Thread(target=self._live, name="http camera", daemon=True)
+        self.fault: BaseException | None = None
+
+    def __enter__(self) -> HttpCamera:
+        self._thread.start()
+        if self.on:
+            self._there.wait(10.0)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        self._stop.set()
+        self._thread.join()
+        if self.fault is not None:
+            raise self.fault
+
+    def heal(self) -> None:
+        """Be there, and do as a camera should."""
+        self.size, self.on, self.lost = self._full_size, True, 0.0
+        self.stalled = self.frozen = self.covered = False
+
+    def write_calibration(self, path: Path) -> Path:
+        """As the daemon is given it."""
+        c, mount = self._optics, BODY_FROM_CAMERA.matrix().tolist()
+        content = {
+            "width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
+            "distortion_model": "none", "body_from_camera": mount,
+        }  # fmt: skip
+        path.write_text(json.dumps(content))
+        return path
+
+    def _live(self) -> None:
+        try:
+            while not self._stop.is_set():
+                if self.on:
+                    self._be_there()
+                else:
+                    self._stop.wait(0.01)
+        except BaseException as error:
+            self.fault = error
+
+    def _be_there(self) -> None:
+        with socket.socket() as door:
+            door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            door.bind(("127.0.0.1", self._port))
+            door.listen(1)
+            self._there.set()
+            door.settimeout(0.05)
+            while self.on and not self._stop.is_set():
+                try:
+                    client, _ = door.accept()
+                except TimeoutError:
+                    continue
+                with client:
+                    try:
+                        client.settimeout(2.0)
+                        client.recv(4096)
+                        client.sendall(HEAD)
+                        self._film(client)
+                    except OSError:
+                        continue  # it has gone
+
+    def _film(self, client: socket.socket) -> None:
+        due_ns = time.monotonic_ns() + LEAD_NS
+        while self.on and not self._stop.is_set():
+            due_ns = max(due_ns + round(1e9 / RATE_HZ), time.monotonic_ns())
+            # drawn beforehand for the time at which it is sent: whoever gets it takes that for its
+            picture = self._picture(due_ns)
+            self._stop.wait((due_ns - time.monotonic_ns()) * 1e-9)
+            if self.stalled or self._random.random() < self.lost:
+                continue
+            if time.monotonic_ns() - due_ns > MOST_LATE_NS:
+                continue
+            head = b"--" + BOUNDARY + b"\r\nContent-Type: image/jpeg\r\nContent-Length: "
+            data = head + str(len(picture)).encode() + b"\r\n\r\n" + picture + b"\r\n"
+            if self.on:  # which may have changed meanwhile
+                client.sendall(data)
+                self.sent_ns = time.monotonic_ns()
+
+    def _picture(self, monotonic_ns: int) -> bytes:
+        if self._last is None or not self.frozen:
+            pose = self._world_from_body(monotonic_ns) @ BODY_FROM_CAMERA
+            self._last = self._scene.picture(self._optics, pose)[1]
+        seen = self._last
+        if self.covered:
+            seen = np.asarray(self._noise.integers(0, 8, seen.shape), np.uint8)
+        if seen.shape[1::-1] != self.size:
+            seen = np.asarray(cv2.resize(seen, self.size), np.uint8)
+        done, data = cv2.imencode(".jpg", seen[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+        assert done
+        return bytes(data)

@@ -1,0 +1,92 @@
+"""A textured world of planes, rendered exactly: known answers for whatever looks at it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array, Pose
+from companion.messages import Bytes, Floats
+
+
+def texture(rng: np.random.Generator, size: int = 1024) -> Bytes:
+    """Detail at all scales, so that every distance shows corners."""
+    out = np.zeros((size, size))
+    for octave in range(2, 9):
+        n = 2**octave
+        noise = rng.normal(size=(n, n)).astype(np.float32)
+        out += cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC) / octave**0.5
+    out = (out - out.min()) / (out.max() - out.min())
+    return np.asarray(out * 255, np.uint8)
+
+
+class PlaneWorld:
+    """Planes z = const in NED (down positive), each a rectangle; the highest is seen first."""
+
+    def __init__(self, rng: np.random.Generator, metres_per_texel: float = 0.05) -> None:
+        self._metres_per_texel = metres_per_texel
+        ground = np.array([-1e6, -1e6, 1e6, 1e6])
+        self._planes = [(0.0, ground, texture(rng))]
+        for k in range(6):
+            north, east = rng.uniform(-15, 15, 2)
+            size = rng.uniform(4, 8)
+            rectangle = np.array([north, east, north + size, east + size])
+            self._planes.append((-1.5 - 0.5 * k, rectangle, texture(rng)))
+
+    def render(self, camera: Camera, world_from_camera: Pose) -> tuple[Bytes, Floats]:
+        """Grey image and z-depth (0: nothing) of an undistorted or distorted camera."""
+        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        n = camera.normalise(np.stack([u.ravel(), v.ravel()], 1).astype(float))
+        rays = np.c_[n, np.ones(len(n))] @ world_from_camera.rotation.T
+        centre = world_from_camera.translation
+        image = np.full(len(n), 128.0)
+        depth = np.full(len(n), np.inf)
+        for height, (n0, e0, n1, e1), pattern in self._planes:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                z = (height - centre[2]) / rays[:, 2]
+                hit = centre + z[:, None] * rays
+            ok = (
+                (z > 0.1)
+                & (z < depth)
+                & (hit[:, 0] > n0)
+                & (hit[:, 0] < n1)
+                & (hit[:, 1] > e0)
+                & (hit[:, 1] < e1)
+            )
+            texel = np.mod(hit[ok, :2] / self._metres_per_texel, len(pattern) - 2)
+            image[ok] = _sample(pattern, texel)
+            depth[ok] = z[ok]
+        depth[~np.isfinite(depth)] = 0
+        shape = (camera.height, camera.width)
+        return image.reshape(shape).astype(np.uint8), depth.reshape(shape).astype(np.float32)
+
+
+def _sample(pattern: Bytes, texel: Array) -> Array:
+    i = np.floor(texel).astype(int)
+    f = texel - i
+    p = pattern.astype(np.float64)
+    i1 = i + 1
+    out: Array = (
+        p[i[:, 0], i[:, 1]] * (1 - f[:, 0]) * (1 - f[:, 1])
+        + p[i1[:, 0], i[:, 1]] * f[:, 0] * (1 - f[:, 1])
+        + p[i[:, 0], i1[:, 1]] * (1 - f[:, 0]) * f[:, 1]
+        + p[i1[:, 0], i1[:, 1]] * f[:, 0] * f[:, 1]
+    )
+    return out
+
+
+DOWN_LOOKING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Rotation world_from_camera of a camera that looks straight down, image right to the east."""
+
+
+def aligned_error(estimated: Array, truth: Array) -> tuple[float, float]:
+    """RMSE after the best similarity (Umeyama 1991), and its scale truth / estimated."""
+    ma, mb = estimated.mean(0), truth.mean(0)
+    a, b = estimated - ma, truth - mb
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ sign @ vt
+    scale = float((d * np.diag(sign)).sum() / (a * a).sum())
+    error = scale * a @ rotation.T - b
+    return float(np.sqrt((error**2).sum(1).mean())), scale

@@ -1,0 +1,94 @@
+"""While armed what decides about poses becomes tighter, whatever way a change comes."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from companion.config import Config, FeedbackConfig, GeoreferenceConfig, TrackingConfig
+from companion.daemon.control.flight_parameters import PARAMETERS
+from companion.daemon.control.tightening import (
+    WHILE_ARMED,
+    may_change,
+    tightened,
+    value_of_key,
+    with_values,
+)
+
+FLYING = Config(feedback=FeedbackConfig(mode="odometry"))
+TIGHTER: dict[str, Any] = {
+    "feedback.mode": "off", "feedback.max_sigma_m": 0.5, "feedback.min_quality": 40,
+    "feedback.max_gap_ms": 100.0, "feedback.resume_after_s": 2.0, "feedback.max_jump_m": 0.5,
+    "georeference.min_travel_m": 6.0, "georeference.max_sigma_scale": 0.05,
+    "tracking.min_inliers": 30,
+}  # fmt: skip
+LOOSER: dict[str, Any] = {
+    "feedback.mode": "vision_position", "feedback.max_sigma_m": 2.0, "feedback.min_quality": 10,
+    "feedback.max_gap_ms": 300.0, "feedback.resume_after_s": 0.5, "feedback.max_jump_m": 2.0,
+    "georeference.min_travel_m": 1.0, "georeference.max_sigma_scale": 0.3,
+    "tracking.min_inliers": 10,
+}  # fmt: skip
+FREE = {"feedback.rate_hz": 60.0}
+FIXED: dict[str, Any] = {
+    "feedback.set_origin": False, "feedback.origin_latitude_deg": 47.0,
+    "feedback.origin_longitude_deg": 8.0, "feedback.origin_altitude_m": 400.0,
+    "feedback.obstacle_distance": True,
+}  # fmt: skip
+
+
+def test_each_key_of_feedback_is_in_the_table() -> None:
+    keys = {f"feedback.{each.name}" for each in dataclasses.fields(FeedbackConfig)}
+    assert {name for name in WHILE_ARMED if name.startswith("feedback.")} == keys
+    assert {*TIGHTER, *FREE, *FIXED} == {*LOOSER, *FREE, *FIXED} == set(WHILE_ARMED)
+
+
+@pytest.mark.parametrize("name", WHILE_ARMED)
+def test_each_key_goes_one_way(name: str) -> None:
+    now = value_of_key(FLYING, name)
+    assert may_change(name, now, now)
+    if name in FREE:
+        assert may_change(name, now, FREE[name]) and may_change(name, FREE[name], now)
+    elif name in FIXED:
+        assert not may_change(name, now, FIXED[name]) and not may_change(name, FIXED[name], now)
+    else:
+        assert may_change(name, now, TIGHTER[name])
+        assert not may_change(name, now, LOOSER[name])
+        assert not may_change(name, TIGHTER[name], now)
+
+
+@pytest.mark.parametrize("name", sorted({*LOOSER, *FIXED}))
+def test_what_is_read_again_waits_where_it_is_looser(name: str) -> None:
+    wanted = with_values(FLYING, {name: (LOOSER | FIXED)[name], "depth.stride": 4})
+    going_on, waiting = tightened(FLYING, wanted)
+    assert waiting == {name: (LOOSER | FIXED)[name]}
+    assert going_on == with_values(FLYING, {"depth.stride": 4})
+    assert with_values(going_on, waiting) == wanted
+
+
+@pytest.mark.parametrize("name", sorted({*TIGHTER, *FREE}))
+def test_what_is_read_again_counts_where_it_is_tighter(name: str) -> None:
+    wanted = with_values(FLYING, {name: (TIGHTER | FREE)[name]})
+    assert tightened(FLYING, wanted) == (wanted, {})
+
+
+def test_feedback_that_is_off_stays_off() -> None:
+    off = Config(feedback=FeedbackConfig(mode="off"))
+    assert tightened(off, FLYING)[0].feedback.mode == "off"
+    vision = with_values(FLYING, {"feedback.mode": "vision_position"})
+    assert tightened(vision, FLYING)[0].feedback.mode == "vision_position"
+
+
+def test_a_map_begun_in_the_air_believes_no_sooner() -> None:
+    eager = dataclasses.replace(
+        FLYING, georeference=GeoreferenceConfig(min_travel_m=0.5, max_sigma_scale=0.5),
+        tracking=TrackingConfig(min_inliers=5),
+    )  # fmt: skip
+    assert tightened(FLYING, eager)[0] == FLYING
+
+
+def test_parameters_of_other_sections_are_free() -> None:
+    others = [each.full_key for each in PARAMETERS.values() if each.full_key not in WHILE_ARMED]
+    assert "depth.enabled" in others
+    assert all(may_change(name, 1, 2) and may_change(name, 2, 1) for name in others)

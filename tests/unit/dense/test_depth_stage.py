@@ -1,0 +1,178 @@
+"""The depth stage on a rendered flight: points in the right place, memory bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from companion.config import CloudConfig, DepthConfig
+from companion.dense import device_takeover
+from companion.dense.depth_stage import MAX_HELD, DepthStage
+from companion.dense.device_takeover import NONE_LEFT, TOOK_OVER, Devices
+from companion.dense.self_test import SelfTest
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Pose
+from companion.messages import (
+    DepthMap,
+    Frame,
+    Message,
+    PointChunk,
+    Track,
+    TrackState,
+    Warned,
+)
+from tests.support.flights.mapped_plane import at, told
+from tests.support.reference import at_hand
+from tests.support.reference.failing_driver import WrongDevice
+
+RADTAN = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
+FISHEYE = Camera(242, 181, 170.0, 170.0, 121.0, 90.0, Distortion.EQUIDISTANT, (0.01, 0, 0, 0))
+
+
+def stage(camera: Camera, devices: Devices | None = None) -> DepthStage:
+    return DepthStage(
+        DepthConfig(), CloudConfig(), camera, devices or at_hand.devices(), lambda _: nullcontext()
+    )
+
+
+def fly(
+    camera: Camera, n: int = 34, unit_of: dict[int, float] | None = None, *,
+    devices: Devices | None = None, before: Callable[[int], object] = int,
+) -> list[Message]:  # fmt: skip
+    """A flight with true poses and a keyframe every fourth frame; all that the stage gives.
+
+    `before` is told each frame's number before the stage gets it.
+    """
+    it, out, last = stage(camera, devices), [], -1
+    for k, message in told(camera, n, unit_of):
+        if k != last:
+            before(k)
+        last = k
+        out += it.step(message)
+    return out + it.flush()
+
+
+@pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=["radtan", "fisheye"])
+def test_points_lie_on_the_surfaces(camera: Camera) -> None:
+    out = fly(camera)
+    chunks = [m for m in out if isinstance(m, PointChunk)]
+    assert [m for m in out if isinstance(m, DepthMap)]
+    assert sum(len(c.points_camera) for c in chunks) > 1000
+    heights = np.concatenate(
+        [at(4 * c.keyframe_id).apply(c.points_camera.astype(np.float64))[:, 2] for c in chunks]
+    )
+    # the ground, and the roofs of PlaneWorld half a metre apart
+    surfaces = np.array([0.0, -1.5, -2.0, -2.5, -3.0, -3.5, -4.0])
+    off = np.abs(heights[:, None] - surfaces).min(1)
+    assert np.median(off) < 0.06  # metres, from 12 m above
+    assert (off < 0.24).mean() > 0.95
+    normalised = off / np.concatenate([c.sigma for c in chunks])
+    assert 0.4 < np.quantile(normalised, 0.68) < 1.2, "sigma is what it says"
+    assert np.quantile(normalised, 0.95) < 2.5
+    for chunk in chunks:
+        assert len(chunk.points_camera) == len(chunk.rgb) == len(chunk.confidence)
+        assert ((chunk.confidence >= 0) & (chunk.confidence <= 1)).all()
+        assert (chunk.sigma > 0).all()
+        assert np.median(chunk.sigma) < 0.15  # a hundredth of 12 m
+        # ground and roofs are level; at their edges are a few points that are not
+        up = (chunk.normals_camera @ at(4 * chunk.keyframe_id).rotation.T)[:, 2]
+        assert np.median(up) < -0.98
+
+
+def test_keyframes_of_other_segments_do_not_meet() -> None:
+    alone = fly(RADTAN, unit_of={k: 1.0 + 0.1 * k for k in range(20)})
+    assert not [m for m in alone if isinstance(m, PointChunk)], "no two keyframes share a unit"
+
+
+def test_images_do_not_pile_up_while_hovering() -> None:
+    it = stage(RADTAN)
+    grey = np.zeros((RADTAN.height, RADTAN.width), np.uint8)
+    for k in range(3 * MAX_HELD):
+        it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
+        it.step(Track(k, k, TrackState.TRACKING, Pose.identity(), 0, Pose.identity(), 50))
+    assert len(it._held) <= MAX_HELD + 1
+
+
+# -- devices that fail in flight -----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> list[Message]:
+    return fly(RADTAN)
+
+
+def twice() -> Devices:
+    """The best device, and once more to take over from itself."""
+    best = next(each for each in at_hand.known() if each.number == at_hand.working()[0])
+    return Devices([best, best], lambda _: "")
+
+
+def lose(devices: Devices) -> None:
+    """Whatever is asked of the device in use is refused by its driver from now on."""
+    assert devices.current is not None
+    devices.current.queue = cl.CommandQueue(cl.Context([devices.current.device]))
+
+
+def spoil(devices: Devices) -> None:
+    """The next test of the device in use finds that it computes wrongly."""
+    assert devices.current is not None and devices._taken is not None
+    listed, _ = devices._taken
+    devices._taken = (listed, SelfTest(WrongDevice(devices.current.device)))
+
+
+def points(out: list[Message]) -> list[bytes]:
+    return [m.points_camera.tobytes() for m in out if isinstance(m, PointChunk)]
+
+
+@pytest.mark.parametrize(
+    ("fault", "in_words"),
+    [(lose, "fails while it computes"), (spoil, "self-test failed: only")],
+)
+def test_the_next_device_takes_over_and_nothing_is_missing(
+    fault: Callable[[Devices], None], in_words: str, undisturbed: list[Message],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(device_takeover, "TEST_EVERY_NS", 1)
+    devices = twice()
+    out = fly(RADTAN, devices=devices, before=lambda k: fault(devices) if k == 18 else None)
+    (warned,) = [m for m in out if isinstance(m, Warned)]
+    assert (warned.what, warned.good) == (TOOK_OVER, False) and 18 <= warned.t_ns < 24
+    assert devices.current is not None
+    assert warned.detail.startswith(f"{devices.current.name}; {devices.current.name}: {in_words}")
+    assert ("may be wrong" in warned.detail) == (fault is spoil)
+    assert points(out) == points(undisturbed) != []
+    assert f"failed: {devices.current.name}: {in_words}" in devices.described
+
+
+@pytest.mark.parametrize("fault", [lose, spoil])
+def test_without_another_device_depth_ends_and_the_stage_goes_on(
+    fault: Callable[[Devices], None], undisturbed: list[Message], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device_takeover, "TEST_EVERY_NS", 1)
+    devices = twice()
+    out = fly(RADTAN, devices=devices, before=lambda k: fault(devices) if k in (12, 26) else None)
+    assert [m.what for m in out if isinstance(m, Warned)] == [TOOK_OVER, NONE_LEFT]
+    maps = [m.depth.tobytes() for m in out if isinstance(m, DepthMap)]
+    whole = [m.depth.tobytes() for m in undisturbed if isinstance(m, DepthMap)]
+    assert 0 < len(maps) < len(whole) and maps == whole[: len(maps)]
+    assert devices.described.startswith("none is left; failed: ")
+
+
+def test_a_stage_that_begins_with_a_failed_device_says_so() -> None:
+    """As one does that is started again in flight."""
+    best = next(each for each in at_hand.known() if each.number == at_hand.working()[0])
+    out = fly(RADTAN, 12, devices=Devices([best], lambda _: "", ["another: was lost"]))
+    (warned,) = [m for m in out if isinstance(m, Warned)]
+    assert (warned.what, warned.detail) == (TOOK_OVER, f"{best.named}; another: was lost")
+    out = fly(RADTAN, 12, devices=Devices([], lambda _: "", ["another: was lost"]))
+    assert len(out) == 1 and isinstance(out[0], Warned)  # and nothing else
+    warned = out[0]
+    assert (warned.what, warned.detail) == (NONE_LEFT, "another: was lost")
+
+
+def test_the_autopilot_can_be_told_in_one_message() -> None:
+    assert all(len(f"Companion: {what}") <= 50 for what in (TOOK_OVER, NONE_LEFT))

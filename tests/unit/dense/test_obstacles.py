@@ -1,0 +1,213 @@
+"""Obstacles at known places around vehicles that are turned, tilted and not at the origin."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.dense.obstacles import UNKNOWN_CM, Reach, RecentCloud, obstacles_around
+from companion.geometry.transforms import (
+    Array,
+    Pose,
+    Similarity,
+    quaternion_from_euler,
+    rotation_from_quaternion,
+    rotation_from_vector,
+)
+from companion.messages import Georeference, MapUpdate, PointChunk
+from drivers.mavlink.obstacle_distance import obstacle_distance
+
+PLACE = np.array([103.0, -57.0, -12.0])
+FREE = 2001
+
+
+def vehicle(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Pose:
+    q = quaternion_from_euler(*np.radians([roll_deg, pitch_deg, yaw_deg]))
+    return Pose(rotation_from_quaternion(q), PLACE)
+
+
+def at(
+    bearing_deg: float, distance_m: float, down_m: float = 0.0, n: int = 10
+) -> Array:
+    """A small cluster of points at a true bearing from the vehicle, clockwise from north."""
+    b = math.radians(bearing_deg)
+    centre = PLACE + [distance_m * math.cos(b), distance_m * math.sin(b), down_m]
+    offsets = np.linspace(-0.02, 0.02, n)
+    out: Array = centre + offsets[:, None] * np.ones(3)
+    return out
+
+
+def distances(pose: Pose, points: Array, eyes: Array | None = None) -> dict[int, int]:
+    """Sectors that are not unknown."""
+    seen_from = np.broadcast_to(pose.translation, points.shape) if eyes is None else eyes
+    found = obstacles_around(7, pose, points, seen_from)
+    assert found.distances_cm.shape == (72,)
+    return {i: int(d) for i, d in enumerate(found.distances_cm) if d != UNKNOWN_CM}
+
+
+def test_nothing_seen_is_unknown_everywhere() -> None:
+    assert distances(vehicle(30), np.zeros((0, 3))) == {}
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "bearing_deg", "sector"),
+    [
+        (0, 0, 0),
+        (0, 30, 6),
+        (0, -30, 66),
+        (0, 90, 18),  # east, to the right of one that looks north
+        (90, 90, 0),
+        (90, 0, 54),  # north, to the left of one that looks east
+        (130, 170, 8),  # ahead and to the right
+        (-170, 175, 69),  # across the seam
+        (0, 2.3, 0),  # sectors are centred on their bearing
+        (0, -2.3, 0),
+        (0, 2.7, 1),
+    ],
+)
+def test_sector_is_clockwise_from_the_heading(
+    yaw_deg: float, bearing_deg: float, sector: int
+) -> None:
+    found = distances(vehicle(yaw_deg), at(bearing_deg, 8.0))
+    assert list(found) == [sector]
+    assert found[sector] == pytest.approx(800, abs=4)
+
+
+def test_tilting_changes_neither_sector_nor_height() -> None:
+    for pitch_deg, roll_deg in ((-25, 0), (0, 30), (20, -20)):
+        found = distances(vehicle(130, pitch_deg, roll_deg), at(170, 15.0, 0.5))
+        assert list(found) == [8]
+        assert found[8] == pytest.approx(1500, abs=4)
+
+
+def test_the_nearest_counts_but_not_a_single_point() -> None:
+    points = np.concatenate([at(40, 12.0), at(40, 6.0), at(40, 3.0, n=2)])
+    assert distances(vehicle(0), points) == {8: pytest.approx(600, abs=4)}
+
+
+@pytest.mark.parametrize(
+    ("down_m", "seen"), [(-0.9, True), (-1.2, False), (0.6, True), (0.9, False)]
+)
+def test_only_its_own_height_counts(down_m: float, seen: bool) -> None:
+    assert bool(distances(vehicle(0), at(40, 6.0, down_m))) is seen
+
+
+def test_the_vehicle_itself_is_no_obstacle() -> None:
+    assert distances(vehicle(0), at(40, 0.2)) == {}
+    assert distances(vehicle(0), at(40, 0.4)) == {8: pytest.approx(40, abs=3)}
+
+
+def test_free_is_only_what_was_seen_through() -> None:
+    """A far wall ahead, seen from here; a far one aside, seen from elsewhere."""
+    ahead, aside = at(20, 40.0), at(110, 40.0)
+    eyes = np.concatenate(
+        [np.broadcast_to(PLACE, ahead.shape), np.broadcast_to(PLACE + [30.0, 0, 0], aside.shape)]
+    )
+    assert distances(vehicle(20), np.concatenate([ahead, aside]), eyes) == {0: FREE}
+
+
+def test_a_line_of_sight_that_began_behind_and_passes_by_counts() -> None:
+    """Flying ahead: the keyframe lies behind, its view led through here."""
+    wall = at(0, 40.0)
+    behind = np.broadcast_to(PLACE - [15.0, 0.3, 0.1], wall.shape)
+    beyond = np.broadcast_to(PLACE + [15.0, 0.0, 0.0], wall.shape)
+    assert distances(vehicle(0), wall, behind) == {0: FREE}
+    assert distances(vehicle(0), wall, beyond) == {}
+
+
+def test_looking_down_at_the_ground_frees_nothing() -> None:
+    assert distances(vehicle(0), at(0, 40.0, down_m=12.0)) == {}
+
+
+def test_an_obstacle_before_what_is_free_is_an_obstacle() -> None:
+    found = distances(vehicle(0), np.concatenate([at(0, 40.0), at(0, 10.0)]))
+    assert found == {0: pytest.approx(1000, abs=4)}
+
+
+def test_points_that_are_no_numbers_are_passed_over() -> None:
+    points = at(40, 6.0)
+    points[3] = np.nan
+    points[4, 1] = np.inf
+    assert distances(vehicle(0), points) == {8: pytest.approx(600, abs=4)}
+
+
+def test_message_is_as_autopilots_read_it() -> None:
+    points = np.concatenate([at(170, 8.0), at(130, 40.0)])
+    pose = vehicle(130)
+    eyes = np.broadcast_to(PLACE, points.shape)
+    found = obstacles_around(1_790_000_000_123_456_789, pose, points, eyes, Reach())
+    link = mavlink.MAVLink(None, 1, 197)
+    message = link.parse_buffer(obstacle_distance(found).pack(link))[0]
+    assert message.get_type() == "OBSTACLE_DISTANCE"
+    assert message.time_usec == 1_790_000_000_123_456
+    assert (message.min_distance, message.max_distance) == (30, 2000)
+    assert (message.increment, message.increment_f, message.angle_offset) == (5, 5.0, 0.0)
+    assert message.frame == 12  # MAV_FRAME_BODY_FRD
+    assert message.sensor_type == 4  # unknown
+    assert message.distances[0] == 2001
+    assert message.distances[8] == pytest.approx(800, abs=4)
+    assert set(message.distances) == {2001, message.distances[8], 65535}
+
+
+def chunk(keyframe_id: int, t_s: float, points: Array) -> PointChunk:
+    n = len(points)
+    return PointChunk(
+        keyframe_id,
+        round(t_s * 1e9),
+        points.astype(np.float32),
+        np.zeros((n, 3), np.uint8),
+        np.ones(n, np.float32),
+        np.zeros((n, 3), np.float32),
+        np.ones(n, np.float32),
+    )
+
+
+def map_update(world_from_map: Similarity | None) -> MapUpdate:
+    camera = Pose(rotation_from_vector(np.array([0.1, 0.4, -0.2])), np.array([1.0, 2.0, 3.0]))
+    georeference = (
+        None if world_from_map is None else Georeference(world_from_map, 0.01, 0.01, "", 9, 0.1)
+    )
+    return MapUpdate(1, 0, {5: camera}, np.zeros((0, 3)), georeference, {5: 0.5})
+
+
+def test_recent_cloud_is_placed_by_the_map_of_the_moment() -> None:
+    turn = rotation_from_vector(np.array([0.0, 0.0, 0.7]))
+    update = map_update(Similarity(4.0, turn, PLACE))
+    cloud = RecentCloud(max_age_s=10)
+    points = np.array([[0.5, 0.25, 2.0], [1.0, 0.0, 3.0]])
+    cloud.add(chunk(5, 100, points))
+    cloud.add(chunk(6, 100, points))  # of a keyframe that the map does not have
+    placed = cloud.in_world(105 * 10**9, update)
+    assert placed is not None
+    camera = update.map_from_camera[5]
+    wanted = 4.0 * (0.5 * points @ camera.rotation.T + camera.translation) @ turn.T + PLACE
+    np.testing.assert_allclose(placed[0], wanted, atol=1e-9)
+    eye = 4.0 * turn @ camera.translation + PLACE
+    np.testing.assert_allclose(placed[1], [eye, eye], atol=1e-9)
+    old = cloud.in_world(111 * 10**9, update)
+    assert old is not None
+    assert len(old[0]) == 0
+
+
+def test_without_a_scale_there_are_no_distances() -> None:
+    cloud = RecentCloud()
+    cloud.add(chunk(5, 100, np.ones((5, 3))))
+    assert cloud.in_world(100 * 10**9, map_update(None)) is None
+
+
+def test_recent_cloud_is_bounded() -> None:
+    cloud = RecentCloud(max_chunks=3, max_points=100)
+    update = MapUpdate(
+        1, 0, {i: Pose.identity() for i in range(10)}, np.zeros((0, 3)),
+        Georeference(Similarity.identity(), 0.01, 0.01, "", 9, 0.1),
+    )  # fmt: skip
+    for i in range(10):
+        cloud.add(chunk(i, 100 + i, np.full((950, 3), float(i))))
+        cloud.add(chunk(i, 100 + i, np.full((1050, 3), float(i))))
+    placed = cloud.in_world(110 * 10**9, update)
+    assert placed is not None
+    assert sorted(set(placed[0][:, 0])) == [7, 8, 9]
+    assert len(placed[0]) <= 300

@@ -1,0 +1,149 @@
+import os
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.config import CameraConfig, Config, RecorderConfig, TelemetryConfig
+from companion.messages import Frame, Warned
+from drivers.recording.disk_writer import FULL, PRUNED, SLOW
+from drivers.recording.flights_folder import flights_in, may_go
+from drivers.recording.recorded_content import LinkBytes
+from drivers.recording.recorded_flight import RecordedFlight, open_recording
+from drivers.recording.recorder import Recorder
+from tests.support.flights.recorded import SIZE, START_NS, STEP_NS, camera, record
+
+DISK_MB = 12
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk that is soon full."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(place)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("may not mount a file system")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def noise(seq: int) -> Frame:
+    rgb = np.random.default_rng(seq).integers(0, 256, (SIZE[1], SIZE[0], 3), np.uint8)
+    return Frame(seq, START_NS + seq * STEP_NS, rgb[:, :, 0], rgb)
+
+
+def fly(recorder: Recorder, n: int, every_s: float = 0.0) -> list[Warned]:
+    told = []
+    for seq in range(n):
+        recorder.take(noise(seq))
+        t_ns = START_NS + seq * STEP_NS + 1
+        recorder.take(LinkBytes(t_ns, t_ns, False, b"x"))
+        time.sleep(every_s)
+        told += recorder.warnings()
+    recorder.close()
+    return told + recorder.warnings()
+
+
+def recorder_in(folder: Path, **changes: object) -> Recorder:
+    folder.mkdir(parents=True)
+    values: dict[str, object] = {"codec": "raw", "flush_s": 0.1, "least_free_mb": 1, **changes}
+    config = Config(recorder=RecorderConfig(**values))  # type: ignore[arg-type]
+    return Recorder(folder, config, camera(), {})
+
+
+def opened(folder: Path) -> RecordedFlight:
+    return open_recording(folder / "flight.mcap", CameraConfig(), TelemetryConfig())
+
+
+def old_flight(place: Path, name: str, megabytes: int) -> Path:
+    folder = place / name
+    record(folder, 3)
+    (folder / "cloud.ply").write_bytes(b"\0" * (megabytes << 20))
+    return folder
+
+
+def test_on_a_full_disk_recording_ends_with_a_warning_and_what_there_is_is_whole(
+    small_disk: Path,
+) -> None:
+    recorder = recorder_in(small_disk / "2026-01-01T00-00-00Z", when_full="stop")
+    told = fly(recorder, 250, 0.002)  # 19 MB
+    assert [w.what for w in told] == [FULL]
+    assert recorder.n_dropped["pictures"] > 0
+    flight = opened(small_disk / "2026-01-01T00-00-00Z")
+    assert flight.warnings == () and flight.n_frames >= 80
+    n_read = sum(isinstance(frame, Frame) for frame in flight.frames())
+    assert n_read == flight.n_frames
+
+
+def test_a_disk_that_fills_up_between_two_looks_is_no_different(small_disk: Path) -> None:
+    recorder = recorder_in(small_disk / "2026-01-01T00-00-00Z", when_full="stop", least_free_mb=0)
+    told = fly(recorder, 250, 0.001)
+    assert [w.what for w in told] == [FULL]
+    assert opened(small_disk / "2026-01-01T00-00-00Z").n_frames >= 100
+
+
+def test_the_oldest_flights_make_room_but_not_those_to_be_kept(small_disk: Path) -> None:
+    kept = old_flight(small_disk, "2025-01-01T00-00-00Z", 2)
+    (kept / "keep").touch()
+    oldest = old_flight(small_disk, "2025-01-02T00-00-00Z", 2)
+    older = old_flight(small_disk, "2025-01-02T00-00-00Z-2", 2)
+    foreign = old_flight(small_disk, "holiday", 1)
+    recorder = recorder_in(small_disk / "2026-01-01T00-00-00Z", when_full="prune")
+    told = fly(recorder, 75, 0.002)  # 5.6 MB
+    assert [w.what for w in told] == [PRUNED, PRUNED][: len(told)] and told
+    assert told[0].detail.startswith(oldest.name)
+    assert not oldest.exists() and kept.exists() and foreign.exists()
+    assert older.exists() == (len(told) == 1)
+    assert opened(small_disk / "2026-01-01T00-00-00Z").n_frames == 75
+
+
+def test_a_slow_disk_makes_nobody_wait_and_costs_pictures_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    really = os.fdatasync
+
+    def slow(fd: int) -> None:
+        time.sleep(0.4)
+        really(fd)
+
+    monkeypatch.setattr(os, "fdatasync", slow)
+    recorder = recorder_in(tmp_path / "2026-01-01T00-00-00Z", buffer_mb=4, least_free_mb=0)
+    longest_s = 0.0
+    for seq in range(150):  # 11 MB in less than a second
+        began_s = time.perf_counter()
+        recorder.take(noise(seq))
+        t_ns = START_NS + seq * STEP_NS + 1
+        recorder.take(LinkBytes(t_ns, t_ns, False, b"x"))
+        longest_s = max(longest_s, time.perf_counter() - began_s)
+    recorder.close()
+    assert longest_s < 0.3
+    assert [w.what for w in recorder.warnings()] == [SLOW]
+    assert recorder.n_dropped["pictures"] > 10 and recorder.n_dropped["messages"] == 0
+    flight = opened(tmp_path / "2026-01-01T00-00-00Z")
+    assert flight.n_frames == 150 - recorder.n_dropped["pictures"]
+    assert flight.recording.counts["/mavlink/received"] == 150
+
+
+def test_what_is_recorded_now_is_never_deleted(tmp_path: Path) -> None:
+    recorder = recorder_in(tmp_path / "2025-01-01T00-00-00Z")
+    record(tmp_path / "2025-02-01T00-00-00Z", 3)
+    flights = flights_in(tmp_path)
+    assert [f.growing for f in flights] == [True, False]
+    assert [f.path.name for f in may_go(flights)] == ["2025-02-01T00-00-00Z"]
+    recorder.close()
+
+
+def test_a_bug_in_the_thread_that_writes_is_not_kept_secret(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(fd: int) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(os, "fdatasync", broken)
+    recorder = recorder_in(tmp_path / "f")
+    with pytest.raises(ZeroDivisionError):
+        fly(recorder, 100, 0.01)

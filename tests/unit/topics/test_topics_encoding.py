@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from companion.errors import StreamError
+from companion.geometry.camera import Camera, Distortion
+from companion.geometry.transforms import Pose
+from companion.messages import Odometry, PointChunk, TrackState
+from companion.topics.camera_fields import camera_fields, camera_of
+from companion.topics.envelope import Envelope, unpack
+from companion.topics.image_jpeg import image_of, jpeg_of, size_of
+from companion.topics.keyframe_bundle import MapChange, MapChanges, MapMirror, bundle_of, frame_of
+from companion.topics.message_codec import (
+    cloud_envelope,
+    cloud_of_envelope,
+    depth_envelope,
+    depth_of_envelope,
+    map_envelope,
+    map_of_envelope,
+    pose_envelope,
+    pose_of_envelope,
+)
+from tests.support.flights import flown, topic_flight
+
+
+def test_an_envelope_is_as_it_was() -> None:
+    arrays: dict[str, NDArray[Any]] = {
+        "a": np.arange(6, dtype=np.float64).reshape(2, 3), "none": np.zeros((0, 3), np.uint8),
+    }  # fmt: skip
+    back = unpack(Envelope("kind", {"t_ns": 1_700_000_000_123_456_789, "x": None}, arrays).pack())
+    assert back.kind == "kind" and back.fields["t_ns"] == 1_700_000_000_123_456_789
+    assert np.array_equal(back.arrays["a"], arrays["a"]) and back.arrays["none"].shape == (0, 3)
+
+
+def test_what_is_no_envelope_is_refused() -> None:
+    good = Envelope("kind", {}, {"a": np.zeros(4, np.float32)}).pack()
+    for bad in (b"", b"\xff\xff\xff\xff", good[:-1], good + b"x", good.replace(b"<f4", b"<O8")):
+        with pytest.raises(StreamError):
+            unpack(bad)
+    with pytest.raises(StreamError):
+        unpack(good.replace(b"[4]", b"[9]"))
+
+
+def test_a_pose_is_as_it_was() -> None:
+    where = Pose(flown.WORLD_FROM_MAP.rotation, np.array([1.0, 2.0, -3.5]))
+    sent = Odometry(
+        5, 123, TrackState.TRACKING, 2, 80, where, np.array([0.1, 0.2, 0.3]), 0.05, 0.02, 0.01, 0.04
+    )
+    back = pose_of_envelope(unpack(pose_envelope("f", sent).pack()))
+    assert back.world_from_body is not None and back.velocity_world_m_s is not None
+    assert np.allclose(back.world_from_body.matrix(), where.matrix(), atol=1e-12)
+    assert np.allclose(back.velocity_world_m_s, [0.1, 0.2, 0.3])
+    assert (back.seq, back.quality, back.sigma_position_m) == (5, 80, 0.05)
+    assert (back.sigma_attitude_rad, back.sigma_yaw_rad) == (0.01, 0.04)
+    lost = pose_of_envelope(unpack(pose_envelope("f", Odometry(6, 124, TrackState.LOST, 2)).pack()))
+    assert lost.world_from_body is None and lost.sigma_position_m == float("inf")
+
+
+def test_a_cloud_says_where_it_lies_in_the_world() -> None:
+    chunk = flown.chunk(3, 50)
+    chunk = replace(chunk, spans={1: 0.75, 4: 2.5})
+    envelope = unpack(cloud_envelope("f", chunk, flown.update()).pack())
+    back = cloud_of_envelope(envelope)
+    assert back.spans == chunk.spans
+    for name in ("points_camera", "rgb", "confidence", "normals_camera", "sigma"):
+        assert np.array_equal(getattr(back, name), getattr(chunk, name))
+    scale, *place = envelope.fields["world_from_camera"]
+    assert scale == pytest.approx(flown.METRES_PER_UNIT)
+    true = flown.world_from_camera(3 * flown.PER_KEYFRAME)
+    assert np.allclose(place[:3], true.translation)
+    before = unpack(cloud_envelope("f", chunk, None).pack())
+    assert before.fields["world_from_camera"] is None
+
+
+def test_map_and_depth_are_as_they_were() -> None:
+    update = replace(flown.update(), unit_of={2: 1.5}, n_retired=1)
+    back = map_of_envelope(unpack(map_envelope("f", update).pack()))
+    assert list(back.map_from_camera) == list(update.map_from_camera) and back.n_retired == 1
+    assert back.georeference is not None and back.georeference.method == "GPS positions"
+    place, true = back.place_of(2), update.place_of(2)
+    assert place is not None and true is not None and place.scale == 1.5
+    assert np.allclose(place.rotation, true.rotation, atol=1e-12)
+    depth = flown.depth_map(4)
+    got = depth_of_envelope(unpack(depth_envelope("f", depth, update).pack()))
+    assert np.array_equal(got.depth, depth.depth) and got.kernel_ms == dict(depth.kernel_ms)
+    assert np.abs(got.rgb.astype(int) - depth.rgb).mean() < 8
+
+
+def test_cameras_are_as_they_were() -> None:
+    lens = Camera(
+        640, 480, 500.0, 501.0, 320.5, 239.5, Distortion.RADTAN, (0.1, -0.05, 0.0, 0.001, 0.0),
+        Pose(flown.WORLD_FROM_MAP.rotation, np.array([0.1, 0.0, 0.05])),
+    )  # fmt: skip
+    about = unpack(Envelope("flight", {"camera": camera_fields(lens)}, {}).pack())
+    back = camera_of(about.part("camera"))
+    assert [getattr(back, n) for n in ("width", "fy", "cx")] == [640, 501.0, 320.5]
+    assert back.coefficients == lens.coefficients and back.distortion is lens.distortion
+    assert back.body_from_camera is not None and lens.body_from_camera is not None
+    assert np.allclose(back.body_from_camera.matrix(), lens.body_from_camera.matrix(), atol=1e-12)
+    for wrong in ({"width": 10**6}, {"fx": 0}, {"coefficients": [1]}, {"distortion": "fish"}):
+        with pytest.raises(StreamError):
+            camera_of(Envelope("flight.camera", {**camera_fields(lens), **wrong}, {}))
+
+
+def test_bundles_are_as_they_were() -> None:
+    for sent in topic_flight.bundles(20):
+        back = bundle_of(unpack(sent.pack()))
+        assert back.pictures == list(sent.pictures) and back.number == sent.number
+        assert [t.seq for t in back.tracks] == [t.seq for t in sent.tracks]
+        for mine, true in zip(back.tracks, sent.tracks, strict=True):
+            assert mine.keyframe_from_camera is not None and true.keyframe_from_camera is not None
+            there = true.keyframe_from_camera.translation
+            assert np.array_equal(mine.keyframe_from_camera.translation, there)
+        assert [k.keyframe_id for k in back.keyframes] == [k.keyframe_id for k in sent.keyframes]
+        for picture in back.pictures:
+            image = frame_of(picture, topic_flight.CAMERA)
+            true_frame = topic_flight.frame(picture.seq, topic_flight.wall())
+            assert np.abs(image.grey.astype(int) - true_frame.grey).mean() < 3
+
+
+def test_a_map_is_told_by_its_changes() -> None:
+    changes, mirror = MapChanges(), MapMirror()
+    first = mirror.take(changes.since_last(flown.update()))
+    assert len(first.map_from_camera) == len(flown.update().map_from_camera)
+    moved = {**flown.update(without=(3,)).map_from_camera, 5: flown.map_from_camera(1)}
+    change = changes.since_last(replace(flown.update(), map_from_camera=moved))
+    assert set(change.update.map_from_camera) == {5} and change.removed == [3] and not change.whole
+    second = mirror.take(change)
+    assert 3 not in second.map_from_camera
+    assert np.array_equal(second.map_from_camera[5].translation, moved[5].translation)
+    whole = mirror.take(MapChange(flown.update(without=(7,)), (), True))
+    assert 7 not in whole.map_from_camera and 3 in whole.map_from_camera
+
+
+def test_a_small_file_cannot_be_a_large_picture() -> None:
+    jpeg = jpeg_of(np.zeros((48, 64), np.uint8), 90)
+    assert size_of(jpeg) == (64, 48) and image_of(jpeg, 64, 48, False).shape == (48, 64)
+    at = jpeg.index(b"\xff\xc0") + 5
+    huge = jpeg[:at] + b"\xff\xff\xff\xff" + jpeg[at + 4 :]
+    for bad in (huge, jpeg[:40], b"", b"\xff\xd8\xff"):
+        with pytest.raises(StreamError):
+            image_of(bad, 64, 48, False)
+
+
+def test_points_of_a_chunk_must_belong_together() -> None:
+    chunk = flown.chunk(1, 20)
+    short = PointChunk(
+        1, 2, chunk.points_camera, chunk.rgb[:-1], chunk.confidence, chunk.normals_camera,
+        chunk.sigma,
+    )  # fmt: skip
+    with pytest.raises(StreamError, match="rgb"):
+        cloud_of_envelope(unpack(cloud_envelope("f", short, None).pack()))
