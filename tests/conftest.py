@@ -6,11 +6,14 @@ import ipaddress
 import os
 import random
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+
+from tests.support.left_behind import left_since, running, watch_tasks
 
 ALONE = [Path(__file__).with_name(name) for name in ("live", "system")]
 
@@ -24,6 +27,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20260101)
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A test ends what it began: later ones are slower, or fail, by what is left."""
+    before = running()
+    tasks = watch_tasks(monkeypatch)
+    yield
+    left = left_since(before) + tasks
+    assert not left, f"left behind: {left}"
 
 
 @pytest.fixture(autouse=True)

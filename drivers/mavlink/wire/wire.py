@@ -17,14 +17,21 @@ STALLED_NS = 30_000_000_000
 
 
 async def run_together(*parts: Coroutine[Any, Any, None]) -> None:
-    """Run all until one fails or this is cancelled; none is left running."""
+    """Run all until one fails or this is cancelled; none is left running.
+
+    Each is cancelled once only: again, as a cancelled `gather` does, would break off its ending.
+    """
     tasks = [asyncio.ensure_future(part) for part in parts]
     try:
-        await asyncio.gather(*tasks)
+        if tasks:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
     finally:
         for task in tasks:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        ended = await asyncio.gather(*tasks, return_exceptions=True)
+    for failure in ended:
+        if isinstance(failure, Exception):
+            raise failure
 
 
 Tap = Callable[[bool, bytes, int], None]

@@ -69,6 +69,7 @@ class Vehicle:
         await asyncio.sleep(0)
         await asyncio.sleep(0)
         task.cancel()  # it listens, and shall do nothing by itself
+        await asyncio.gather(task, return_exceptions=True)
         self._reset_counter = 0
 
     def _deliver(self, sample: Telemetry) -> None:
