@@ -171,12 +171,12 @@ class V4l2Camera:
         if not ready:
             return None
         newest = None
-        while True:
+        for _ in stream.buffers:  # no more: where pictures come faster than they go there is no end
             buffer = stream.node.dequeue()
             if buffer is None:
                 if newest is None and ready[0][1] & (select.POLLERR | select.POLLHUP):
                     raise OSError(errno.ENODEV, "no longer there")
-                return newest
+                break
             if newest is not None:
                 stream.node.enqueue(newest.index)
                 self.n_dropped += 1
@@ -184,6 +184,7 @@ class V4l2Camera:
             if stream.sequence is not None:  # gaps are what the driver itself had to drop
                 self.n_dropped += max(0, buffer.sequence - stream.sequence - 1)
             stream.sequence = buffer.sequence
+        return newest
 
     def _picture(self, stream: _Stream, buffer: FilledBuffer) -> Picture | None:
         now_ns = time.monotonic_ns()

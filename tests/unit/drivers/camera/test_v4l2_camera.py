@@ -19,7 +19,7 @@ from drivers.camera.camera_devices import cameras
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_source import Picture
 from drivers.camera.v4l2_camera import V4l2Camera
-from tests.support.cameras.fake_v4l2 import MONOTONIC_EOF, FakeV4l2, install
+from tests.support.cameras.fake_v4l2 import MONOTONIC_EOF, N_BUFFERS, FakeV4l2, install
 
 
 @pytest.fixture
@@ -52,6 +52,15 @@ def test_the_only_camera_is_found_by_its_stable_path(webcam: FakeV4l2, camera: V
     assert picture.grey.std() > 20
     assert webcam.format == ("YUYV", 640, 480)  # as fast as MJPG, and nothing to decode
     assert camera.remarks == []
+
+
+def test_pictures_that_come_faster_than_they_are_taken_do_not_hold_it_up(
+    webcam: FakeV4l2, camera: V4l2Camera
+) -> None:
+    camera.open()
+    webcam.rate_hz = 1e9
+    assert first(camera)
+    assert 0 < camera.n_dropped < N_BUFFERS
 
 
 @pytest.mark.parametrize("camera", [{"width": 1280, "height": 720}], indirect=True)
