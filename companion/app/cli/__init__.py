@@ -1,9 +1,9 @@
 """The command line: what was asked, handed on; what came of it, as an exit status.
 
-0 done; 1 a fault; 2 bad input or usage; 130 and 143 stopped by Ctrl-C and SIGTERM; 141 the reader of
-its output has gone, as in `companion status | head -1`. An error that the program raises on purpose
-is one line; anything else is a bug and shows its traceback, that of a stage which was survived before
-the line that says so.
+0 done; 1 a fault; 2 bad input or usage; 130 and 143 stopped by Ctrl-C and SIGTERM; 141 nobody reads
+its output any more, as behind `| head -1`. An error that the program raises on purpose is one line;
+anything else is a bug and shows its traceback, that of a stage which was survived before the line
+that says so.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ COMMANDS: dict[str, Command] = {
 
 
 READER_GONE = 128 + signal.SIGPIPE
+"""As of a program that SIGPIPE ends."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status, quietly where nobody reads its output any more."""
+    """Run one command and return its exit status; no traceback where nobody reads its output."""
     try:
         try:
             return _run(argv)

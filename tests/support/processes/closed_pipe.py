@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def into_closed_pipe(*arguments: str | Path) -> tuple[int, str]:
-    """Exit status and standard error of `companion ARGUMENTS` whose standard output is such a pipe."""
+    """Exit status and standard error of `companion ARGUMENTS` that writes into such a pipe."""
     reader, writer = os.pipe()
     os.close(reader)
     try:
