@@ -1,5 +1,5 @@
 # make demo: install and replay the sample flight. make test: everything that CI checks.
-# make deb: a package for Debian or Ubuntu, for this machine's architecture.
+# make deb: a package for Debian or Ubuntu, for this machine's architecture. make docs: the site.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 FLIGHT ?= sample/survey
 OUT ?= out/demo
 
-.PHONY: demo test lint opencl clean reference regression deb system-test
+.PHONY: demo test lint opencl clean reference regression deb system-test docs
 
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
@@ -38,6 +38,11 @@ reference: opencl
 opencl: $(VENV)/.installed
 	@sh packaging/opencl.sh $(VENV)
 
+# out/site/index.html; a broken link ends it. That of the other texts is tested by test_documents.py.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo out/site/index.html
+
 deb:
 	sh packaging/build_deb.sh
 
@@ -52,6 +57,10 @@ $(VENV)/.installed: pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@ $(VENV)/.installed
 
 $(BIN)/python:

@@ -2,7 +2,7 @@
 # dist/companion_VERSION_ARCHITECTURE.deb, for the distribution and architecture that this runs on:
 # the environment in /opt/companion is bound to the system's Python, and filled from PyPI here.
 # On a Jetson or Raspberry Pi it is run there, or in a container of the same system; see
-# systemd/README.md.
+# docs/installation.md.
 #
 #   PYTHON=/usr/bin/python3.11   another Python of the system
 set -eu
@@ -43,7 +43,8 @@ install -D -m 644 systemd/companion.service "$root/usr/lib/systemd/system/compan
 install -D -m 644 systemd/99-companion.rules "$root/usr/lib/udev/rules.d/99-companion.rules"
 install -D -m 644 LICENSE "$root/usr/share/doc/companion/copyright"
 install -D -m 644 CHANGELOG.md "$root/usr/share/doc/companion/CHANGELOG.md"
-install -D -m 644 systemd/README.md "$root/usr/share/doc/companion/README.md"
+install -D -m 644 README.md "$root/usr/share/doc/companion/README.md"
+(cd docs && find . -type f -exec install -D -m 644 {} "$root/usr/share/doc/companion/docs/{}" \;)
 mkdir -p "$root/usr/bin" "$root/DEBIAN"
 ln -s /opt/companion/bin/companion "$root/usr/bin/companion"
 

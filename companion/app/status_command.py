@@ -50,7 +50,7 @@ def status_table(document: Mapping[str, Any]) -> str:
             "",
             *_table(
                 ("stage", "state", "rate", "p50", "p95", "done", "dropped", "restarted", ""),
-                [_stage(each) for each in document.get("stages") or ()],
+                [row for each in document.get("stages") or () for row in _stage(each)],
             ),
             *_processes((document.get("load") or {}).get("processes") or ()),
             *_warnings(document.get("n_warnings") or {}),
@@ -118,8 +118,13 @@ def _source(source: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _stage(stage: Mapping[str, Any]) -> tuple[str, ...]:
-    return (
+def _stage(stage: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Its row, and below it a line for each other part of its detail.
+
+    Those of the dense map's stage are the OpenCL devices that were refused, slower, or have failed.
+    """
+    detail, *others = str(stage.get("detail", "")).split("; ")
+    row = (
         str(stage.get("name", NOTHING)),
         "runs" if stage.get("alive") else "down",
         _number(stage.get("rate_hz"), "/s", 1),
@@ -128,8 +133,9 @@ def _stage(stage: Mapping[str, Any]) -> tuple[str, ...]:
         _number(stage.get("n")),
         _number(stage.get("n_dropped")),
         _number(stage.get("n_restarted")),
-        str(stage.get("detail", "")),
+        detail,
     )
+    return [row, *[("",) * (len(row) - 1) + (f"  {other}",) for other in others]]
 
 
 def _processes(processes: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -38,7 +38,11 @@ class MeasuredDevice(ListedDevice):
 def measured(
     listed: ListedDevice, frames_per_s: float | None, problem: str = "", detail: str = ""
 ) -> MeasuredDevice:
-    """A device with what its test has shown."""
+    """A device with what its test has shown; a problem is one line without a semicolon.
+
+    Semicolons stand between devices, for `companion status` to tell them apart.
+    """
+    problem = " ".join(problem.split()).replace("; ", ", ")
     return MeasuredDevice(
         **asdict(listed), frames_per_s=frames_per_s, problem=problem, detail=detail
     )

@@ -74,7 +74,7 @@ def test_the_page_has_exactly_these() -> None:
     assert all(explained)
     listed = re.findall(r"^\| ([^|{]+?) \| ([^|A-Z][^|]*) \|$", PAGE.read_text("utf-8"), re.M)
     assert [reason for reason, _ in listed] == [*REASONS.values(), pilot_messages.OTHER_REASON]
-    for page in ("docs/control.md", "systemd/README.md"):
+    for page in ("docs/control.md", "docs/troubleshooting.md"):
         assert "pilot_messages.md" in (ROOT / page).read_text("utf-8")
 
 

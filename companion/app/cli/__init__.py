@@ -1,16 +1,21 @@
 """The command line: what was asked, handed on; what came of it, as an exit status.
 
-0 done; 1 a fault; 2 bad input or usage; 130 and 143 stopped by Ctrl-C and SIGTERM. An error that
-the program raises on purpose is one line; anything else is a bug and shows its traceback, that of
-a stage which was survived before the line that says so.
+0 done; 1 a fault; 2 bad input or usage; 130 and 143 stopped by Ctrl-C and SIGTERM; 141 nobody reads
+its output any more, as behind `| head -1`. An error that the program raises on purpose is one line;
+anything else is a bug and shows its traceback, that of a stage which was survived before the line
+that says so.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import select
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from typing import TextIO
 
 from companion import __version__
 from companion.app.cli import flying, hardware, measuring, recordings, replaying, service_commands
@@ -25,8 +30,25 @@ COMMANDS: dict[str, Command] = {
 }
 
 
+READER_GONE = 128 + signal.SIGPIPE
+"""As of a program that SIGPIPE ends."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status."""
+    """Run one command and return its exit status; no traceback where nobody reads its output."""
+    try:
+        try:
+            return _run(argv)
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # --help too, which leaves by SystemExit
+    except BrokenPipeError:
+        if not _readers_gone():
+            raise
+        return READER_GONE
+
+
+def _run(argv: Sequence[str] | None) -> int:
     arguments = _parser().parse_args(argv)
     with StopSignals() as signals:
         try:
@@ -40,6 +62,28 @@ def main(argv: Sequence[str] | None = None) -> int:
                 traceback.print_exception(cause, file=sys.stderr)
             print(f"companion: error: {error}", file=sys.stderr)
             return 2 if isinstance(error, InputError) else 1
+
+
+def _readers_gone() -> bool:
+    """Whether standard output or error is a pipe without a reader; such a one leads nowhere then.
+
+    What is still buffered for it would fail once more when the interpreter ends.
+    """
+    gone = [each for each in (sys.stdout, sys.stderr) if each is not None and _reader_gone(each)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in gone:
+        os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+    return bool(gone)
+
+
+def _reader_gone(stream: TextIO) -> bool:
+    try:
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)  # POLLERR and POLLHUP are always reported
+    except (OSError, ValueError):
+        return False  # not a file, or closed
+    return any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -126,9 +126,9 @@ __kernel void verify(__global const float *reference, __global const float *valu
     const int8 fits = seen & (explained > limits.x * limits.x * tt) & (gain > 0.25f) & (gain < 4.0f)
                       & (way < limits.z) & (way > -limits.z);
     const float8 zero = 0.0f, one = 1.0f;
-    const float8 more_good = fits ? one : zero, more_bad = seen & ~fits ? one : zero;
+    const float8 more_good = fits ? one : zero, more_bad = (seen & ~fits) ? one : zero;
     /* 0 counts none: less than nothing is rounding */
-    const float8 more_alike = seen & ~fits & (tt + ww - 2.0f * tw < limits.w) ? one : zero;
+    const float8 more_alike = (seen & ~fits & (tt + ww - 2.0f * tw < limits.w)) ? one : zero;
     if (x == 8 * (int)get_global_id(0)) {
         *(__global float8_anywhere *)(good + cell) += more_good;
         *(__global float8_anywhere *)(bad + cell) += more_bad;
@@ -156,7 +156,7 @@ __kernel void verify(__global const float *reference, __global const float *valu
  *   accept  relative sigma of a converged pixel; its least inlier ratio; inlier ratio below which one
  *           has diverged; images that must fit
  * The error of a winner was found to be 0.15 planes where it stands out, and 0.2 planes / margin where
- * it does not, whatever the scene (companion/dense/README.md). */
+ * it does not, whatever the scene (docs/dense_depth.md). */
 __kernel void judge(__global const float *rho, __global const float *margin, __global const float *good,
                     __global const float *bad, __global const float *alike, __global const float *noise,
                     const float step, const float4 accept, const int border,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from companion import __version__
+from companion.app.cli import READER_GONE
 from companion.config import Config
 from companion.config_file import load_config
+from tests.support.processes.closed_pipe import into_closed_pipe
 
 
 def companion(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -79,3 +82,24 @@ def test_usage(arguments: list[str], named: str) -> None:
     assert result.returncode == 2
     assert named in result.stderr.splitlines()[-1]
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"], ["replay", "--help"], ["--version"], ["check-config"], ["devices"],
+        ["devices", "--opencl"], ["flights", "list", "--flights", "."],
+    ],
+)  # fmt: skip
+def test_output_that_nobody_reads_is_no_error(arguments: list[str]) -> None:
+    assert into_closed_pipe(*arguments) == (READER_GONE, "")
+    assert READER_GONE == 141
+
+
+def test_errors_that_nobody_reads_end_it_too() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "companion", "replay", "none", "--out", "none"]
+    ended = subprocess.run(command, stdout=writer, stderr=writer, timeout=60, check=False)
+    os.close(writer)
+    assert ended.returncode == READER_GONE

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +40,25 @@ def sweep(device: ComputeDevice) -> cl.Program:
 @pytest.fixture(scope="module")
 def measure(device: ComputeDevice) -> cl.Program:
     return device.build("measure.cl", {})
+
+
+BUILT = """
+import sys
+from companion.dense.opencl import devices_of, open_device, platform_names
+listed = [each for i in range(len(platform_names())) for each in devices_of(i)]
+device = open_device(next(each for each in listed if each.named == sys.argv[1]))
+for source, constants in (("sweep.cl", {"PLANES": 32}), ("measure.cl", {}), ("regularise.cl", {})):
+    device.build(source, constants)
+"""
+
+
+def test_compilers_have_nothing_to_remark(device: ComputeDevice, tmp_path: Path) -> None:
+    """What they say goes to standard error, past pyopencl, and is not said of what is cached."""
+    built = subprocess.run(
+        [sys.executable, "-c", BUILT, device.name], capture_output=True, text=True, timeout=120,
+        env={**os.environ, "POCL_CACHE_DIR": str(tmp_path), "PYOPENCL_NO_CACHE": "1"}, check=False,
+    )  # fmt: skip
+    assert (built.returncode, built.stderr) == (0, "")
 
 
 def put(device: ComputeDevice, array: NDArray[Any]) -> cl.Buffer:

@@ -17,7 +17,10 @@ from typing import Any
 
 import pytest
 
+from companion.app.cli import READER_GONE
 from companion.app.status_command import show_status, status_table
+from companion.dense.device_choice import measured, why_taken
+from companion.dense.opencl import ListedDevice
 from companion.errors import ConfigError, SourceError
 from companion.health import ComputerLoad, FeedbackHealth, Health, SourceHealth, StageHealth
 from drivers.system import short_answers
@@ -27,6 +30,7 @@ from drivers.system.status_socket import (
     found_socket_path,
     own_socket_path,
 )
+from tests.support.processes.closed_pipe import into_closed_pipe
 
 ROOT = Path(__file__).parents[4]
 HEALTH = Health(
@@ -301,3 +305,27 @@ def test_watching_ends_when_the_daemon_does(path: Path, monkeypatch: pytest.Monk
 
     run(test)
     assert len(out.getvalue().splitlines()) > 2
+
+
+def test_a_device_that_is_refused_has_a_line_of_its_own() -> None:
+    slow = measured(ListedDevice("0:0", "A", "P"), None, "kernels do not build; 3 errors\nof clang")
+    fast = measured(ListedDevice("1:0", "B", "P"), 40.0)
+    detail = f"{fast.named}, {why_taken(fast, [slow, fast])}"
+    depth = StageHealth("depth", True, 1.0, n=12, detail=detail)
+    lines = status_table(Health(1, stages=(depth,)).to_json()).splitlines()
+    row = next(i for i, line in enumerate(lines) if line.startswith("depth"))
+    assert lines[row].endswith("B (P), the only one of 2 that works: 40 frames/s")
+    assert lines[row + 1].split() == "A kernels do not build, 3 errors of clang".split()
+    assert lines[row + 1].index("A") > lines[row].index("B (P)")
+
+
+def test_status_ends_quietly_where_its_reader_has_gone(path: Path) -> None:
+    async def test() -> None:
+        async with served(path):
+            for options in ([], ["--json"], ["--watch"]):
+                status, said = await asyncio.to_thread(
+                    into_closed_pipe, "status", *options, "--set", f"daemon.socket={path}"
+                )
+                assert (status, said) == (READER_GONE, "")
+
+    asyncio.run(asyncio.wait_for(test(), 60))
