@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from companion.products.atomic_file import write_atomically
+from companion.products.atomic_file import sync, write_atomically
 
 
 class NewestFile:
@@ -63,13 +62,5 @@ class NewestFile:
             # there for who comes after a crash at once, for who comes after a power cut a little
             # later: a disk may take its time
             write_atomically(self.path, data)
-            _sync(self.path)
-        _sync(self.path.parent)
-
-
-def _sync(path: Path) -> None:
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+            sync(self.path)
+        sync(self.path.parent)
