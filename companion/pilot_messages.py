@@ -162,7 +162,8 @@ OTHER_REASON = "see its log"
 SWITCHED_OFF = ("off", "switched off")
 """Reasons that are the pilot's own, or the ground's."""
 PARTS: Mapping[str, str] = {
-    "depth": "dense map", "tape": "recording", "recorder": "results", "topics": "remote map link",
+    "depth": "dense map", "recorder": "recording", "results": "results",
+    "topics": "remote map link",
 }  # fmt: skip
 
 OF_WARNING: Mapping[str, PilotMessage] = {

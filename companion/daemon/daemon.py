@@ -31,8 +31,8 @@ from companion.daemon.loop_delay import measure_loop_delay
 from companion.daemon.missing_devices import Missing
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.pose_sender import PoseSender
+from companion.daemon.recorder_notes import RecorderNotes
 from companion.daemon.reload import reloaded
-from companion.daemon.tape_notes import TapeNotes
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.errors import CompanionError
 from companion.geometry.camera import Camera
@@ -144,7 +144,7 @@ class Daemon:
             config, clock, self._journal, self._feed, self._link, self._sender, self._flights,
             self._loop_delay,
         )  # fmt: skip
-        self._notes = TapeNotes(clock, self._flights, self._watch, self._link)
+        self._notes = RecorderNotes(clock, self._flights, self._watch, self._link)
         self._reports: VehicleReports | None = None
         if self._link is not None:
             self._reports = VehicleReports(

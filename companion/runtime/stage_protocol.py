@@ -14,7 +14,7 @@ from companion.products.flight_result import RunFacts
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """The first thing a stage's process is told; the recorder gets the flight's folder."""
+    """The first thing a stage's process is told; recorder and results get the flight's folder."""
 
     config: Config
     camera: Camera
@@ -27,7 +27,7 @@ class Setup:
 class Finish:
     """The last thing it is told: give the last results.
 
-    With `hurry` what takes long is left out. The recorder gets what its report states. With
+    With `hurry` what takes long is left out. `results` gets the facts of its report. With
     `keep_map` the vehicle flies on, and another process may go on with the map.
     """
 
@@ -53,7 +53,7 @@ class SetShare:
 
 @dataclass(frozen=True, slots=True)
 class TakeSnapshot:
-    """Have the recorder write the cloud as it is now; `origin` where the world has a known one."""
+    """Have `results` write the cloud as it is now; `origin` where the world has a known one."""
 
     number: int
     origin: GeoOrigin | None = None

@@ -49,7 +49,7 @@ class WorkModule(Protocol):
 
 
 def module_of(kind: str) -> WorkModule:
-    """Load what does a kind of work: localisation, depth or recorder."""
+    """Import the module `companion.stages.<kind>_work`."""
     module: Any = importlib.import_module(f"companion.stages.{kind}_work")
     loaded: WorkModule = module
     return loaded

@@ -1,4 +1,4 @@
-"""The cloud as it is in mid-flight, as a file: gathered between the recorder's other work."""
+"""Cloud snapshots in flight, gathered in slices between the messages that stage `results` takes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.runtime.stage_protocol import Snapshot, TakeSnapshot
 from companion.timing.clock import monotonic_s
 
 WORK_S = 0.01
-"""For so long it holds up a message that the recorder has to take."""
+"""Longest delay of a message to stage `results`, seconds."""
 GATHERED_PERCENT = 90
 NO_POINTS = "there are no points yet"
 BUSY = "another is being written"

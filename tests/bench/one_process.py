@@ -6,7 +6,7 @@
 `soak` flies laps, each of which has processes of its own. Here a short flight goes to and fro as
 one long one, with time stamps that only grow, as fast as localisation answers: the next frame is
 given when the pose of the last has come. All else is as in flight: LiveFlight with localisation,
-recorder, tape and exporter as processes, its health asked each second of the flight. Depth is off
+results, recorder and exporter as processes; health is read once a second of flight. Depth is off
 unless set.
 
 A row for every minute of flight: processor time of localisation's main thread for a frame (50 and

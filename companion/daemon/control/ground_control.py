@@ -134,7 +134,7 @@ class GroundControl:
             answering.cancel()
 
     def snapshot_told(self, snapshot: Snapshot) -> None:
-        """The recorder says how far a snapshot is."""
+        """Take the progress of a snapshot from the results stage."""
         self._snapshots.take(snapshot)
 
     # -- parameters, as drivers.mavlink.parameter_server wants them ------------------------------

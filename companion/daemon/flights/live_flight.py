@@ -1,11 +1,11 @@
 """One live flight: its stages, each in a process, joined from the first frame to the report.
 
-    frames, telemetry -> localisation -> depth -> recorder, viewer
-    all that comes in, poses, warnings -> tape
-    frames, all that stages give -> topics, if nodes elsewhere are to have it
+    frames, telemetry -> localisation -> depth -> results, viewer
+    all input, poses, warnings -> recorder
+    frames, all stage output -> topics, if other nodes need it
 
 Whoever calls `frame` or `telemetry` never waits. A stage that dies takes nothing with it but its
-own state: depth and recorder begin again within the flight, localisation ends it.
+own state: every other stage begins again within the flight, localisation ends it.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ from companion.streaming.viewer import Watched
 from companion.timing.clock import FlightClock, monotonic_s
 from drivers.recording.recorded_content import HealthNote, LinkBytes
 
-NICE = {"localisation": 0, "tape": 5, "topics": 10, "recorder": 10, "depth": 20}
+NICE = {"localisation": 0, "recorder": 5, "topics": 10, "results": 10, "depth": 20}
 """The pose comes first; the others take what is left over."""
 PATIENCE_S = {
-    "localisation": 120.0, "depth": 60.0, "tape": 60.0, "recorder": 180.0, "topics": 15.0,
+    "localisation": 120.0, "depth": 60.0, "recorder": 60.0, "results": 180.0, "topics": 15.0,
 }  # fmt: skip
-HURRIED_S = {"localisation": 0.7, "depth": 0.2, "tape": 0.3, "recorder": 1.6, "topics": 0.2}
+HURRIED_S = {"localisation": 0.7, "depth": 0.2, "recorder": 0.3, "results": 1.6, "topics": 0.2}
 START_S = 300.0
 """Who has not begun its work by then never will. On a computer with far too much to do the imports
 alone take a minute and more, and the first start of all compiles loops or kernels."""
-ANSWER_S = {"depth": 120.0, "tape": 60.0, "recorder": 60.0, "topics": 30.0}
+ANSWER_S = {"depth": 120.0, "recorder": 60.0, "results": 60.0, "topics": 30.0}
 """Who is at one step for longer hangs, and is ended and started again: depth may wait for a driver
 that compiles and has the least right to the processor, the others for a slow disk or network."""
-IN_FOLDER = ("tape", "recorder")
+IN_FOLDER = ("recorder", "results")
 """Stages that leave something in the flight's folder."""
 WITH_FLIGHT = (*IN_FOLDER, "topics")
 """Stages that cannot begin before the flight does."""
@@ -104,7 +104,7 @@ class LiveFlight:
         self._listener = listener(self)
         self.folder: Path | None = None
         """Where the results go; None until it has begun."""
-        self.n_restarted = {"depth": 0, "recorder": 0, "tape": 0, "topics": 0}
+        self.n_restarted = {"depth": 0, "results": 0, "recorder": 0, "topics": 0}
         self._ring = FrameRing(camera.width, camera.height)
         self._lock = threading.Lock()
         self._over = threading.Event()
@@ -124,8 +124,8 @@ class LiveFlight:
         """Those that were at work when it was ended for not answering."""
         self._began_later: set[str] = set()
         """Stages that were not wanted at first."""
-        kinds = ["localisation", "recorder"]
-        kinds += ["tape"] * config.recorder.enabled + ["depth"] * self._dense
+        kinds = ["localisation", "results"]
+        kinds += ["recorder"] * config.recorder.enabled + ["depth"] * self._dense
         kinds += ["topics"] * config.distributed.enabled
         self.stages = {kind: self._start(kind) for kind in kinds}
         for kind in kinds:
@@ -178,8 +178,8 @@ class LiveFlight:
 
     def keep(self, message: Message | LinkBytes | HealthNote) -> None:
         """Have something in the recording; nobody else hears of it."""
-        if "tape" in self.stages and self.folder is not None and not self._over.is_set():
-            self.stages["tape"].offer(message)
+        if "recorder" in self.stages and self.folder is not None and not self._over.is_set():
+            self.stages["recorder"].offer(message)
 
     def tell(self, health: Health, origin: GeoOrigin | None) -> None:
         """Have viewers and recording told how all is, once a second, and where the world lies."""
@@ -231,7 +231,7 @@ class LiveFlight:
 
     def take_snapshot(self, number: int, origin: GeoOrigin | None) -> None:
         """Have the cloud written as it is now; the listener hears how far that is."""
-        self.stages["recorder"].offer(TakeSnapshot(number, origin))
+        self.stages["results"].offer(TakeSnapshot(number, origin))
 
     @property
     def has_origin(self) -> bool:
@@ -272,10 +272,10 @@ class LiveFlight:
         if self.folder is not None:
             for kind in ("localisation", "depth"):
                 self._finish(kind)
-            self._ask("tape")
+            self._ask("recorder")
             self._ask("topics")
-            self._finish("recorder", facts(self))
-            self._wait("tape")
+            self._finish("results", facts(self))
+            self._wait("recorder")
             self._wait("topics")
         for stage in self.stages.values():
             stage.kill()
@@ -313,7 +313,7 @@ class LiveFlight:
             self._ended(kind, why)
 
         return StageProcess(
-            kind, NICE[kind], self._ring, self._deliver, ended, every_frame=kind == "tape"
+            kind, NICE[kind], self._ring, self._deliver, ended, every_frame=kind == "recorder"
         )
 
     def _set_up(self, kind: str) -> None:
@@ -403,7 +403,7 @@ class LiveFlight:
         self._record(message)
 
     def _record(self, message: Watched) -> None:
-        self.stages["recorder"].offer(message)
+        self.stages["results"].offer(message)
         self._show(message)
 
     def _show(self, message: Watched) -> None:

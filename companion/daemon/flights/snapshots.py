@@ -12,7 +12,7 @@ from companion.pilot_messages import CLOUD_NOT_SAVED, CLOUD_SAVED, PilotText
 from companion.runtime.stage_protocol import Snapshot
 from drivers.mavlink.command_server import ACCEPTED, FAILED, Job
 
-RECORDER_GONE = "its recorder is gone"
+RESULTS_GONE = "the results stage has died"
 
 
 class Snapshots:
@@ -31,11 +31,11 @@ class Snapshots:
         """Have one written into the flight's folder."""
         self._number = self._number + 1 if flight is self._flight else 1
         self._flight, self._job = flight, job
-        self._n_restarted = flight.n_restarted["recorder"]
+        self._n_restarted = flight.n_restarted["results"]
         flight.take_snapshot(self._number, origin if flight.has_origin else None)
 
     def take(self, snapshot: Snapshot) -> None:
-        """The recorder says how far it is."""
+        """Take the progress that the results stage reports."""
         if self._job is None or snapshot.number != self._number:
             return
         self._job.percent = snapshot.percent
@@ -58,9 +58,9 @@ class Snapshots:
             self._job = None
         elif (
             flight is not self._flights.current
-            or flight.n_restarted["recorder"] != self._n_restarted
+            or flight.n_restarted["results"] != self._n_restarted
         ):
-            self._fail(RECORDER_GONE)
+            self._fail(RESULTS_GONE)
 
     def _fail(self, why_not: str) -> None:
         assert self._job is not None
