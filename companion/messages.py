@@ -103,7 +103,7 @@ class TrackState(Enum):
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
-    COASTING = "coasting"
+    DEAD_RECKONING = "coasting"
     """Nothing is recognised; the pose is carried on by the autopilot's attitude and velocity."""
     LOST = "lost"
 
@@ -174,7 +174,7 @@ class KeyframeAdded:
 
 
 @dataclass(frozen=True, slots=True)
-class Reunited:
+class LoopClosed:
     """A place was known again: keyframe `keyframe_id` shows what `other_id` showed before.
 
     Within the same map a loop closed, which moved the newer end by `moved` map units; else two maps
@@ -216,7 +216,7 @@ SPANS_REACH = 6
 class MapUpdate:
     """The map as it now stands: every keyframe's pose, and the sparse points (N, 3) in map units.
 
-    `unit_of` holds, for keyframes of segments with a scale of their own, how many map units one
+    `scale_of` holds, for keyframes of segments with a scale of their own, how many map units one
     unit of the keyframe's camera frame is; all others are 1. A keyframe that is missing here has no
     known place, and what hangs on it has none either. `n_retired` of them have left the map, their
     neighbours showing all that they showed, and move with those.
@@ -227,7 +227,7 @@ class MapUpdate:
     map_from_camera: Mapping[int, Pose]
     points_map: Array
     georeference: Georeference | None
-    unit_of: Mapping[int, float] = field(default_factory=dict)
+    scale_of: Mapping[int, float] = field(default_factory=dict)
     n_retired: int = 0
 
     @property
@@ -240,7 +240,7 @@ class MapUpdate:
         pose = self.map_from_camera.get(keyframe_id)
         if pose is None:
             return None
-        return Similarity(self.unit_of.get(keyframe_id, 1.0), pose.rotation, pose.translation)
+        return Similarity(self.scale_of.get(keyframe_id, 1.0), pose.rotation, pose.translation)
 
     def spans_of(self, keyframe_id: int) -> dict[int, float]:
         """How far some keyframes of about then are from one, in the unit of its camera frame."""
@@ -251,7 +251,7 @@ class MapUpdate:
         others = [k for k in around if k != keyframe_id and self._with(place, k)]
         return {k: self._span(place, k) for k in others}
 
-    def stretch_of(self, keyframe_id: int, spans: Mapping[int, float]) -> float:
+    def local_scale_of(self, keyframe_id: int, spans: Mapping[int, float]) -> float:
         """By what factor measures about a keyframe are longer now than when it had these spans.
 
         The median of the spans, each with the weight of its length; 1 where none tells.
@@ -273,7 +273,7 @@ class MapUpdate:
 
     def _with(self, place: Similarity, other_id: int) -> bool:
         """Whether a keyframe is there, and in the same unit."""
-        unit = self.unit_of.get(other_id, 1.0)
+        unit = self.scale_of.get(other_id, 1.0)
         return other_id in self.map_from_camera and abs(unit / place.scale - 1.0) < 1e-9
 
     def _span(self, place: Similarity, other_id: int) -> float:
@@ -355,7 +355,7 @@ class ClockReport:
 
 
 Message = (
-    Frame | Telemetry | Track | Odometry | KeyframeAdded | Reunited | MapUpdate | DepthMap
+    Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
     | PointChunk | Warned
 )  # fmt: skip
 

@@ -15,10 +15,10 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from companion.messages import Frame, Warned
 from drivers.images.frame_source import FrameSource
-from drivers.images.prefetch import Ahead
+from drivers.images.prefetch import Prefetch
 from drivers.telemetry.telemetry_log import Pictures, TelemetryLog
 
-FRAMES_AHEAD = 4
+PREFETCHED = 4
 ENDS_EARLY = "the video ends early"
 """What a flight with fewer frames than its list of times warns of."""
 
@@ -94,11 +94,11 @@ class Flight:
         `seq` is the number in the source. A picture that cannot be decoded comes as a Warned.
         """
         first, beyond = self._part(start_ns, stop_ns)
-        ahead = Ahead(self._decode(first, beyond), FRAMES_AHEAD)
+        prefetch = Prefetch(self._decode(first, beyond), PREFETCHED)
         try:
-            yield from ahead
+            yield from prefetch
         finally:
-            ahead.close()
+            prefetch.close()
 
     def telemetry(self) -> TelemetryLog:
         """Everything that the autopilot logged, on the flight's clock; read once, then kept.

@@ -243,7 +243,7 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
             if picture is None:
                 progress.update(number, "no picture comes", len(gathered.views))
                 continue
-            amiss = gathered.look(number, picture.grey, only_new=True)
+            problem = gathered.look(number, picture.grey, only_new=True)
             number += 1
             covered = gathered.covered()
             wanted = advice(gathered.views, covered, made)
@@ -255,8 +255,8 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
             if not wanted:
                 break
             # what to do is said where the board is seen well, else why it is not
-            seen_well = amiss in ("", "move the board")
-            progress.update(number, wanted if seen_well else amiss, len(gathered.views))
+            seen_well = problem in ("", "move the board")
+            progress.update(number, wanted if seen_well else problem, len(gathered.views))
     except (KeyboardInterrupt, EndOfPictures):
         pass  # what there is must do; if it does not, the reason is told
     finally:

@@ -123,11 +123,11 @@ def verify_flights(paths: Sequence[Path], progress: Progress) -> tuple[str, bool
     for path in paths:
         before = done
 
-        def told(n_bytes: int, before: int = before) -> None:
+        def on_progress(n_bytes: int, before: int = before) -> None:
             progress.update((before + n_bytes) // MB, "checked", 0)
 
         try:
-            summary = summarise(path, told)
+            summary = summarise(path, on_progress)
         except FlightError as error:
             lines.append(str(error))
             good = False

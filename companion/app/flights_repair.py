@@ -29,14 +29,14 @@ def repair_flights(
     for path in found:
         rested = 0
 
-        def told(n_bytes: int, before: int = before) -> None:
+        def on_progress(n_bytes: int, before: int = before) -> None:
             nonlocal rested
             progress.update((before + n_bytes) // MB, "read", 0)
             if gently and n_bytes - rested >= STEP_BYTES:
                 rested = n_bytes
                 wait_s(never, REST_S)
 
-        mended = in_place(path, told)
+        mended = in_place(path, on_progress)
         before += path.stat().st_size
         yield _in_words(path, mended), mended is not None
     progress.finish()

@@ -24,11 +24,11 @@ from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.live_flight import Listener, LiveFlight, makes_depth
-from companion.daemon.flights.recording_recovery import LeftOvers
+from companion.daemon.flights.recording_recovery import RecordingRecovery
 from companion.daemon.health_watch import HealthWatch
 from companion.daemon.link_watch import LinkWatch
 from companion.daemon.loop_delay import measure_loop_delay
-from companion.daemon.missing_devices import Missing
+from companion.daemon.missing_devices import MissingDevices
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.daemon.recorder_notes import RecorderNotes
@@ -79,7 +79,7 @@ START_S = 180.0
 FAULT, BAD_INPUT = 1, 2
 """Exit statuses."""
 NO_PROGRESS = "frames come and no pose, whatever is tried: left to the service manager's watchdog"
-SPARE_AGAIN_S = 1.0
+STANDBY_RETRY_S = 1.0
 WRITE_S = 0.2
 """What counts while armed may take so long to be written down at the end."""
 END_S = 2.6
@@ -150,11 +150,11 @@ class Daemon:
             self._reports = VehicleReports(
                 self._link, clock, self._watch, config.feedback.obstacle_distance
             )
-        self._left_overs = LeftOvers(
+        self._recovery = RecordingRecovery(
             Path(config.daemon.flights), clock, self._on_warned, lambda: self._armed
         )
-        self._missing = Missing(config.daemon.missing_device_s)
-        self._spare_later: asyncio.TimerHandle | None = None
+        self._missing = MissingDevices(config.daemon.missing_device_s)
+        self._standby_later: asyncio.TimerHandle | None = None
         self._by_ground = self._watch.set_by_ground = kept
         self._ground: GroundControl | None = None
         if self._link is not None and self._reports is not None and config.control.enabled:
@@ -182,7 +182,7 @@ class Daemon:
             self._watch.govern(),
             measure_loop_delay(self._clock, self._loop_delay),
             self._notes.run(),
-            self._left_overs.run(),
+            self._recovery.run(),
         ]
         if self._link is not None:
             work.append(self._link.run())
@@ -338,9 +338,9 @@ class Daemon:
         if self._flights.current is flight:
             self._flights.end()
             self._begin_if_due()
-        elif self._flights.is_spare(flight):
-            self._flights.discard_spare()
-            self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+        elif self._flights.is_standby(flight):
+            self._flights.discard_standby()
+            self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
 
     def _unusable(self, why: str) -> None:
         """On the ground somebody is there to read it; in the air the pose goes on without."""
@@ -361,7 +361,7 @@ class Daemon:
                 self._link.system_status = component_state(health)
             if self._flights.current is not None:
                 origin = self._link.origin if self._link is not None else None
-                self._flights.current.tell(health, origin)
+                self._flights.current.publish_health(health, origin)
             now_s = (self._clock.now_ns() - began_ns) * 1e-9
             if not self._is_ready and self._watch.up:
                 self._is_ready = True
@@ -443,7 +443,7 @@ class Daemon:
                 self._arming.waiting["feedback.mode"] = old.feedback.mode
             self._hold()
         if config.daemon != old.daemon:
-            self._missing = Missing(config.daemon.missing_device_s)
+            self._missing = MissingDevices(config.daemon.missing_device_s)
         self._watch.reconfigure(config)
         if self._sender is not None:
             self._sender.reconfigure(config.feedback)
@@ -456,10 +456,10 @@ class Daemon:
             flight.set_dense(makes_depth(config))
             flight.set_budget(config.stream.budget_kbit_s)
             return
-        self._flights.discard_spare()
-        if self._spare_later is not None:
-            self._spare_later.cancel()
-        self._spare_later = self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+        self._flights.discard_standby()
+        if self._standby_later is not None:
+            self._standby_later.cancel()
+        self._standby_later = self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
 
     # -- what holds until the motors are disarmed, see Arming ------------------------------------
 

@@ -25,7 +25,7 @@ from companion.health import (
     StatusLines,
 )
 from companion.messages import MapUpdate, Odometry, PointChunk, Track, TrackState, Warned
-from companion.runtime.governor import Governor, Pressure
+from companion.runtime.governor import Governor, LoadSample
 from companion.timing.clock import FlightClock, monotonic_s
 from drivers.camera.camera_feed import CameraFeed
 from drivers.mavlink.autopilot_link import AutopilotLink
@@ -49,7 +49,7 @@ STUCK = "localisation hangs and is ended"
 IN_WORDS = {
     TrackState.INITIALISING: "initialising",
     TrackState.TRACKING: "tracking",
-    TrackState.COASTING: "coasting",
+    TrackState.DEAD_RECKONING: "coasting",
     TrackState.LOST: "lost",
 }
 
@@ -173,7 +173,7 @@ class HealthWatch:
 
     def end_stalled(self) -> None:
         """End whatever other stage hangs."""
-        for flight in (self._flights.current, self._flights.spare):
+        for flight in (self._flights.current, self._flights.standby):
             if flight is not None:
                 flight.end_stalled()
 
@@ -200,7 +200,7 @@ class HealthWatch:
             return
         dropped_hz = (n_dropped - self._n_dropped) * 1e9 / (now_ns - self._governed_ns)
         self._n_dropped, self._governed_ns = n_dropped, now_ns
-        changed = self._governor.step(now_ns, Pressure(
+        changed = self._governor.step(now_ns, LoadSample(
             cpu_share=self.load.cpu_share,
             memory_share=self.load.memory_share,
             temperature_c=self.load.temperature_c,
@@ -213,7 +213,7 @@ class HealthWatch:
     def _apply(self) -> None:
         level = self._governor.level
         if self._flights.current is not None:
-            self._flights.current.set_shares(
+            self._flights.current.set_load_levels(
                 level.feature_share, level.dense_share, level.viewer
             )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from companion.health import Health
 
 
-class Missing:
+class MissingDevices:
     """Tells when a camera or an autopilot has been missing for too long; never in the air."""
 
     def __init__(self, limit_s: float) -> None:

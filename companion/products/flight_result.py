@@ -20,12 +20,12 @@ from companion.messages import (
     DepthMap,
     Frame,
     Georeference,
+    LoopClosed,
     MapUpdate,
     Message,
     PointChunk,
     PositionSample,
     PositionSource,
-    Reunited,
     Track,
     Warned,
 )
@@ -96,7 +96,7 @@ class FlightResult:
         self.last_t_ns: int | None = None
         self.warnings: dict[str, WarningCount] = {}
         self.update: MapUpdate | None = None
-        self.reunions: list[Reunited] = []
+        self.loop_closures: list[LoopClosed] = []
         self._tracks = TrackStore()
         self._chunks = ChunkStore(folder, memory_mb)
         self._median_depths: dict[int, float] = {}
@@ -116,8 +116,8 @@ class FlightResult:
             self._tracks.put(message)
         elif isinstance(message, MapUpdate):
             self.update = message
-        elif isinstance(message, Reunited):
-            self.reunions.append(message)
+        elif isinstance(message, LoopClosed):
+            self.loop_closures.append(message)
         elif isinstance(message, PointChunk):
             self._take_points(message)
         elif isinstance(message, DepthMap):
@@ -234,20 +234,20 @@ class FlightResult:
         metric = georeference is not None
         depths = [place.scale * self._median_depths[key] for key, place in places.items()]
         voxel = voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths))
-        stretches: dict[int, float] = {}
-        parts = [partial(self._placed, k, p, update, stretches) for k, p in places.items()]
+        local_scales: dict[int, float] = {}
+        parts = [partial(self._placed, k, p, update, local_scales) for k, p in places.items()]
         return (yield from gathered(parts, self.n_points, voxel))
 
     def _placed(
-        self, keyframe_id: int, place: Similarity, update: MapUpdate, stretches: dict[int, float]
+        self, keyframe_id: int, place: Similarity, update: MapUpdate, local_scales: dict[int, float]
     ) -> Cloud:
         """A chunk in the world; none where the disk was full meanwhile."""
         if keyframe_id not in self._chunks:
             return no_cloud()
         chunk = self._chunks.get(keyframe_id)
-        if keyframe_id not in stretches:
-            stretches[keyframe_id] = _stretch(chunk, update)
-        return placed(chunk, replace(place, scale=stretches[keyframe_id] * place.scale))
+        if keyframe_id not in local_scales:
+            local_scales[keyframe_id] = _local_scale(chunk, update)
+        return placed(chunk, replace(place, scale=local_scales[keyframe_id] * place.scale))
 
     def autopilot_path(self) -> tuple[PositionSource, Array, Array] | None:
         """The autopilot's own path from its best source: t_ns (N,), NED metres (N, 3)."""
@@ -262,11 +262,11 @@ class FlightResult:
         return self._pictures.spread(n)
 
 
-def _stretch(chunk: PointChunk, update: MapUpdate) -> float:
+def _local_scale(chunk: PointChunk, update: MapUpdate) -> float:
     """By what factor points are further away in the map as it is now; by spans if it has few."""
     place = update.place_of(chunk.keyframe_id)
     if place is None:
         return 1.0
     in_camera = place.inverse().apply(update.points_map)
     ratio = stretch_of_points(chunk.points_camera.astype(np.float64), in_camera)
-    return update.stretch_of(chunk.keyframe_id, chunk.spans) if ratio is None else ratio
+    return update.local_scale_of(chunk.keyframe_id, chunk.spans) if ratio is None else ratio

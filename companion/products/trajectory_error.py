@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array, Similarity, quaternion_from_rotation
 
-MAX_APART_NS = 4_000_000
+MAX_TIME_DIFFERENCE_NS = 4_000_000
 """Poses belong to the same frame when their times are no further apart."""
 
 
@@ -61,7 +61,7 @@ def paired(estimate: Path, truth: Path) -> tuple[Path, Path]:
         truth.t_ns[after] - estimate.t_ns
     )
     nearest = np.where(before_is_nearer, after - 1, after)
-    same = np.abs(truth.t_ns[nearest] - estimate.t_ns) < MAX_APART_NS
+    same = np.abs(truth.t_ns[nearest] - estimate.t_ns) < MAX_TIME_DIFFERENCE_NS
     return estimate.at(np.flatnonzero(same)), truth.at(nearest[same])
 
 

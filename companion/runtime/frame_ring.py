@@ -29,13 +29,13 @@ import numpy as np
 from companion.errors import StageError
 from companion.messages import Bytes, Frame
 
-ROOM_BYTES = 64 << 20
+CAPACITY_BYTES = 64 << 20
 LEAST_SLOTS, MOST_SLOTS = 8, 48
 NO_COLOUR = np.zeros((0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
-class FrameInRing:
+class FrameHandle:
     """Where a frame lies; `serial` says whether it still does."""
 
     seq: int
@@ -53,7 +53,7 @@ class FrameRing:
         self._pixels = width * height
         self._shape = (height, width)
         self.frame_bytes = frame_bytes = 4 * self._pixels
-        self.n_slots = int(np.clip(ROOM_BYTES // frame_bytes, LEAST_SLOTS, MOST_SLOTS))
+        self.n_slots = int(np.clip(CAPACITY_BYTES // frame_bytes, LEAST_SLOTS, MOST_SLOTS))
         self._begin = 8 * self.n_slots
         """of the first slot, behind all serials"""
         size = self.n_slots * (frame_bytes + 8)
@@ -66,7 +66,7 @@ class FrameRing:
         self._slots = whole[8 * self.n_slots :].reshape(self.n_slots, frame_bytes)
         self._next = 1
 
-    def put(self, frame: Frame) -> FrameInRing:
+    def put(self, frame: Frame) -> FrameHandle:
         """Copy a frame in; it must be of the ring's size."""
         for _ in range(self.n_slots):
             serial, self._next = self._next, self._next + 1
@@ -79,10 +79,10 @@ class FrameRing:
                 slot[: self._pixels].reshape(self._shape)[:] = frame.grey
                 slot[self._pixels :].reshape(*self._shape, 3)[:] = frame.rgb
                 self._serials[at] = serial
-                return FrameInRing(frame.seq, frame.t_ns, serial)
+                return FrameHandle(frame.seq, frame.t_ns, serial)
         raise StageError("more readers than the ring of frames has slots")
 
-    def get(self, place: FrameInRing, colour: bool = True) -> Frame | None:
+    def get(self, place: FrameHandle, colour: bool = True) -> Frame | None:
         """A copy of a frame, without its colours if not wanted; None if it was overwritten."""
         at = place.serial % self.n_slots
         with self._locked(at, fcntl.LOCK_SH) as is_whole:
@@ -90,7 +90,7 @@ class FrameRing:
                 return None
             return self._copy(place, colour)
 
-    def _copy(self, place: FrameInRing, colour: bool) -> Frame:
+    def _copy(self, place: FrameHandle, colour: bool) -> Frame:
         slot = self._slots[place.serial % self.n_slots]
         grey: Bytes = slot[: self._pixels].reshape(self._shape).copy()
         rgb = slot[self._pixels :].reshape(*self._shape, 3).copy() if colour else NO_COLOUR

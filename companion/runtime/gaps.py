@@ -24,7 +24,7 @@ STILL_GREY = 0.3
 SAMPLE_STEP = 8
 
 
-class Rhythm:
+class IntervalMonitor:
     """How often something comes: its usual interval and its last time."""
 
     def __init__(self, min_gap_s: float) -> None:
@@ -41,21 +41,21 @@ class Rhythm:
         limit_s = max(self._min_gap_s, GAP_IN_INTERVALS * usual_s)
         return silence_s if silence_s > limit_s else None
 
-    def beat(self, t_ns: int) -> None:
+    def arrived(self, t_ns: int) -> None:
         """It came."""
         if self._last_ns is not None:
             self._intervals_s.append((t_ns - self._last_ns) * 1e-9)
         self._last_ns = t_ns
 
 
-class GapWatch:
+class GapMonitor:
     """Hears every message, in order of time, and says what is amiss."""
 
     def __init__(self) -> None:
-        self._frames = Rhythm(MIN_FRAME_GAP_S)
+        self._frames = IntervalMonitor(MIN_FRAME_GAP_S)
         self._telemetry = {
-            "attitude": Rhythm(MIN_TELEMETRY_GAP_S),
-            "position": Rhythm(MIN_TELEMETRY_GAP_S),
+            "attitude": IntervalMonitor(MIN_TELEMETRY_GAP_S),
+            "position": IntervalMonitor(MIN_TELEMETRY_GAP_S),
         }
         self._silent: set[str] = set()
         self._image: Bytes | None = None
@@ -65,9 +65,9 @@ class GapWatch:
     def step(self, message: Message) -> list[Warned]:
         """Take one message."""
         if isinstance(message, AttitudeSample):
-            self._hear("attitude", message.t_ns)
+            self._arrived("attitude", message.t_ns)
         elif isinstance(message, PositionSample):
-            self._hear("position", message.t_ns)
+            self._arrived("position", message.t_ns)
         elif isinstance(message, Frame):
             return [
                 *self._missing_frames(message),
@@ -76,19 +76,19 @@ class GapWatch:
             ]
         return []
 
-    def _hear(self, kind: str, t_ns: int) -> None:
-        self._telemetry[kind].beat(t_ns)
+    def _arrived(self, kind: str, t_ns: int) -> None:
+        self._telemetry[kind].arrived(t_ns)
         self._silent.discard(kind)
 
     def _missing_frames(self, frame: Frame) -> Iterator[Warned]:
         silence_s = self._frames.silence_s(frame.t_ns)
-        self._frames.beat(frame.t_ns)
+        self._frames.arrived(frame.t_ns)
         if silence_s is not None:
             yield Warned(frame.t_ns, "frames are missing", f"none for {silence_s:.1f} s")
 
     def _silent_telemetry(self, t_ns: int) -> Iterator[Warned]:
-        for kind, rhythm in self._telemetry.items():
-            silence_s = rhythm.silence_s(t_ns)
+        for kind, monitor in self._telemetry.items():
+            silence_s = monitor.silence_s(t_ns)
             if silence_s is not None and kind not in self._silent:
                 self._silent.add(kind)
                 yield Warned(t_ns, f"{kind} telemetry stops", f"none for {silence_s:.1f} s")
@@ -103,9 +103,9 @@ class GapWatch:
             yield Warned(frame.t_ns, "the image stands still", f"for {STILL_S:g} s or more")
 
 
-def with_gaps_named(messages: Iterable[Message]) -> Iterator[Message]:
+def with_gap_warnings(messages: Iterable[Message]) -> Iterator[Message]:
     """The same messages, and before the one that shows a gap a `Warned`."""
-    watch = GapWatch()
+    watch = GapMonitor()
     for message in messages:
         yield from watch.step(message)
         yield message

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 
-class Fate(IntEnum):
+class DropPolicy(IntEnum):
     """What becomes of a message that waits. Where room is short the lowest kind goes first."""
 
     LATEST_WINS = 0
@@ -27,17 +27,23 @@ class Fate(IntEnum):
 
 
 class Mailbox(Generic[T]):
-    """Messages in order, `room_bytes` of them at most; may be used from any thread.
+    """Messages in order, `capacity_bytes` of them at most; may be used from any thread.
 
     A message that is larger than the room is let in when nothing else is there that could go.
     """
 
     def __init__(
-        self, fate_of: Callable[[T], Fate], bytes_of: Callable[[T], int], room_bytes: int
+        self,
+        policy_of: Callable[[T], DropPolicy],
+        bytes_of: Callable[[T], int],
+        capacity_bytes: int,
     ) -> None:
-        self._fate_of, self._bytes_of, self._room_bytes = fate_of, bytes_of, room_bytes
-        self._waiting: dict[Fate, deque[tuple[int, int, T]]] = {fate: deque() for fate in Fate}
-        """by fate: how many came before it, its bytes, the message"""
+        self._policy_of, self._bytes_of = policy_of, bytes_of
+        self._capacity_bytes = capacity_bytes
+        self._waiting: dict[DropPolicy, deque[tuple[int, int, T]]] = {
+            policy: deque() for policy in DropPolicy
+        }
+        """By policy: arrival number, size in bytes, message."""
         self._n_put = 0
         self._closed = False
         self._changed = threading.Condition()
@@ -45,7 +51,7 @@ class Mailbox(Generic[T]):
         """Of what waits."""
         self.n_dropped = 0
         """Frames that gave way to a newer one."""
-        self.n_overflown = 0
+        self.n_overflowed = 0
         """Other messages given up for want of room."""
 
     def __len__(self) -> int:
@@ -54,16 +60,16 @@ class Mailbox(Generic[T]):
 
     def put(self, message: T) -> None:
         """Add a message; never waits."""
-        fate, size = self._fate_of(message), self._bytes_of(message)
+        policy, size = self._policy_of(message), self._bytes_of(message)
         with self._changed:
-            if fate is Fate.LATEST_WINS and self._waiting[fate]:
-                self._drop(fate)
+            if policy is DropPolicy.LATEST_WINS and self._waiting[policy]:
+                self._drop(policy)
                 self.n_dropped += 1
-            self._waiting[fate].append((self._n_put, size, message))
+            self._waiting[policy].append((self._n_put, size, message))
             self._n_put += 1
             self.n_bytes += size
-            while self.n_bytes > self._room_bytes and self._make_room():
-                self.n_overflown += 1
+            while self.n_bytes > self._capacity_bytes and self._drop_lowest():
+                self.n_overflowed += 1
             self._changed.notify()
 
     def get(self) -> T | None:
@@ -83,13 +89,13 @@ class Mailbox(Generic[T]):
             self._closed = True
             self._changed.notify_all()
 
-    def _make_room(self) -> bool:
+    def _drop_lowest(self) -> bool:
         """Give up a message, but not the one that came last; whether there was one to give up."""
-        for fate in (Fate.PICTURE, Fate.MAP, Fate.LOSSLESS):
-            if self._waiting[fate] and self._waiting[fate][0][0] < self._n_put - 1:
-                self._drop(fate)
+        for policy in (DropPolicy.PICTURE, DropPolicy.MAP, DropPolicy.LOSSLESS):
+            if self._waiting[policy] and self._waiting[policy][0][0] < self._n_put - 1:
+                self._drop(policy)
                 return True
         return False
 
-    def _drop(self, fate: Fate) -> None:
-        self.n_bytes -= self._waiting[fate].popleft()[1]
+    def _drop(self, policy: DropPolicy) -> None:
+        self.n_bytes -= self._waiting[policy].popleft()[1]

@@ -10,11 +10,11 @@ import threading
 from collections.abc import Iterable, Iterator
 
 from companion.messages import Frame, Message
-from companion.runtime.mailbox import Fate, Mailbox
+from companion.runtime.mailbox import DropPolicy, Mailbox
 from companion.runtime.message_size import size_bytes
 from companion.timing.clock import monotonic_s, wait_s
 
-ROOM_BYTES = 256 << 20
+CAPACITY_BYTES = 256 << 20
 """Of telemetry that waits: more than that of an hour."""
 
 
@@ -25,8 +25,8 @@ class PacedFeed:
         self._messages = messages
         self._speed = speed
         self._waiting: Mailbox[Message] = Mailbox(
-            lambda m: Fate.LATEST_WINS if isinstance(m, Frame) else Fate.LOSSLESS,
-            size_bytes, ROOM_BYTES,
+            lambda m: DropPolicy.LATEST_WINS if isinstance(m, Frame) else DropPolicy.LOSSLESS,
+            size_bytes, CAPACITY_BYTES,
         )  # fmt: skip
         self._stop = threading.Event()
         self._fault: BaseException | None = None

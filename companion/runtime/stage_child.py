@@ -28,8 +28,8 @@ from typing import Any  # noqa: E402
 
 from companion.errors import CompanionError, InputError  # noqa: E402
 from companion.messages import Frame  # noqa: E402
-from companion.runtime.frame_ring import FrameInRing, FrameRing  # noqa: E402
-from companion.runtime.mail_policy import FRAMES_SHARE, IN_BYTES, fate_of  # noqa: E402
+from companion.runtime.frame_ring import FrameHandle, FrameRing  # noqa: E402
+from companion.runtime.mail_policy import FRAMES_SHARE, IN_BYTES, drop_policy_of  # noqa: E402
 from companion.runtime.mailbox import Mailbox  # noqa: E402
 from companion.runtime.message_size import size_bytes  # noqa: E402
 from companion.runtime.stage_protocol import Failed, Finish, Finished, Progress, Setup  # noqa: E402
@@ -91,7 +91,7 @@ class _Loop:
     def __init__(self, ring: FrameRing, work: Work) -> None:
         self._ring, self._work = ring, work
         self._inbox: Mailbox[Any] = Mailbox(
-            lambda message: fate_of(message, work.latest_only), size_bytes, IN_BYTES
+            lambda message: drop_policy_of(message, work.latest_only), size_bytes, IN_BYTES
         )
         self._n_done = 0
         self._n_overwritten = 0
@@ -104,7 +104,7 @@ class _Loop:
         try:
             while True:
                 message = pipe.recv()
-                if isinstance(message, FrameInRing) and not work.latest_only:
+                if isinstance(message, FrameHandle) and not work.latest_only:
                     room = self._inbox.n_bytes + ring.frame_bytes <= FRAMES_SHARE * IN_BYTES
                     frame = ring.get(message) if room or not len(self._inbox) else None
                     if frame is None:
@@ -122,10 +122,10 @@ class _Loop:
         while True:
             wait_s(threading.Event(), REPORT_EVERY_S)
             inbox, work = self._inbox, self._work
-            n_dropped = inbox.n_dropped + inbox.n_overflown + self._n_overwritten
+            n_dropped = inbox.n_dropped + inbox.n_overflowed + self._n_overwritten
             send(
                 Progress(
-                    self._n_done, n_dropped + work.n_turned_away, self._busy_since_s,
+                    self._n_done, n_dropped + work.n_rejected, self._busy_since_s,
                     inbox.n_bytes, work.times.summary(), work.device,
                 )
             )  # fmt: skip
@@ -141,7 +141,7 @@ class _Loop:
                 for out in work.finish(message):
                     send(out)
                 return
-            if isinstance(message, FrameInRing):
+            if isinstance(message, FrameHandle):
                 frame = self._ring.get(message, colour=False)
                 if frame is None:
                     self._n_overwritten += 1

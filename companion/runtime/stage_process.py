@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from companion.runtime.frame_ring import FrameRing
-from companion.runtime.mail_policy import OUT_BYTES, fate_of
+from companion.runtime.mail_policy import OUT_BYTES, drop_policy_of
 from companion.runtime.mailbox import Mailbox
 from companion.runtime.message_size import size_bytes
 from companion.runtime.stage_protocol import DriverAtWork, Failed, Finish, Finished, Progress, Setup
@@ -63,7 +63,7 @@ class StageProcess:
         """Whether it was told to end, one way or the other."""
         self._driver = DriverAtWork()
         self._outbox: Mailbox[Any] = Mailbox(
-            lambda message: fate_of(message, not every_frame), size_bytes, OUT_BYTES
+            lambda message: drop_policy_of(message, not every_frame), size_bytes, OUT_BYTES
         )
         ours, theirs = socket.socketpair()
         self._child = subprocess.Popen(
@@ -92,7 +92,7 @@ class StageProcess:
     def n_dropped(self) -> int:
         """Frames that it did not get or did not get round to."""
         inside = self.progress.n_dropped if self.progress is not None else 0
-        return self._outbox.n_dropped + self._outbox.n_overflown + inside
+        return self._outbox.n_dropped + self._outbox.n_overflowed + inside
 
     @property
     def waiting_bytes(self) -> int:
@@ -117,7 +117,7 @@ class StageProcess:
         self._begun_s = monotonic_s()
 
     def offer(self, message: Any) -> None:
-        """Hand over a message or a FrameInRing; a frame that waits gives way to a newer one.
+        """Hand over a message or a FrameHandle; a frame that waits gives way to a newer one.
 
         Where more than OUT_BYTES wait, depth maps give way first; see companion.runtime.mailbox.
         """

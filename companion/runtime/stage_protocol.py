@@ -45,10 +45,10 @@ class KeepMap:
 
 
 @dataclass(frozen=True, slots=True)
-class SetShare:
+class SetLoadLevel:
     """How much of its work a stage is to do, 0 to 1; see companion.runtime.governor."""
 
-    share: float
+    level: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ class Work(ABC):
         self.times = StageTimes()
 
     @property
-    def n_turned_away(self) -> int:
+    def n_rejected(self) -> int:
         """Messages taken and then given up."""
         return 0
 

@@ -20,8 +20,8 @@ def flights_meant(
     what the first of the services says in its own configuration, from its working directory. With
     no service either: what the defaults say, from here.
     """
-    told = config is not None or any(each.startswith("daemon.flights") for each in overrides)
-    service = None if told or not services else services[0]
+    given = config is not None or any(each.startswith("daemon.flights") for each in overrides)
+    service = None if given or not services else services[0]
     if service is not None:
         config = service.config
     elif config is not None:

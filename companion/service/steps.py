@@ -29,15 +29,15 @@ class Step:
     undo: Callable[[], None] = nothing
 
 
-def carry_out(steps: Sequence[Step], told: Callable[[str], None], dry_run: bool) -> None:
+def carry_out(steps: Sequence[Step], notify: Callable[[str], None], dry_run: bool) -> None:
     """Do what is not done yet; InstallError where that fails, with all as it was before."""
     begun: list[Step] = []
     for step in steps:
         if step.is_done():
-            told(f"already there: {step.what}")
+            notify(f"already there: {step.what}")
             continue
         if dry_run:
-            told(f"would do: {step.what}")
+            notify(f"would do: {step.what}")
             continue
         begun.append(step)
         try:
@@ -49,7 +49,7 @@ def carry_out(steps: Sequence[Step], told: Callable[[str], None], dry_run: bool)
             after = f"; not undone: {', '.join(left)}" if left else "; nothing is left of it"
             why = error.strerror if isinstance(error, OSError) and error.strerror else error
             raise InstallError(f"{step.what}: {why}{after}") from None
-        told(f"done: {step.what}")
+        notify(f"done: {step.what}")
 
 
 def _undo(begun: list[Step]) -> list[str]:

@@ -12,7 +12,7 @@ from companion.dense.depth_stage import DepthStage
 from companion.dense.device_takeover import Devices
 from companion.dense.opencl import ListedDevice
 from companion.messages import DepthMap, Message
-from companion.runtime.stage_protocol import DriverAtWork, Finish, SetShare, Setup
+from companion.runtime.stage_protocol import DriverAtWork, Finish, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 
 FIRST_PATIENCE_S = 120.0
@@ -48,8 +48,8 @@ class _Depth(Work):
 
     def step(self, message: Any) -> Iterable[Message]:
         assert self._stage is not None and self._devices is not None
-        if isinstance(message, SetShare):
-            self._stage.set_share(message.share)
+        if isinstance(message, SetLoadLevel):
+            self._stage.set_share(message.level)
             return []
         out = self._stage.step(message)
         if any(isinstance(each, DepthMap) for each in out):

@@ -10,7 +10,7 @@ from typing import Any
 from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, Message, Warned
-from companion.runtime.stage_protocol import Finish, KeepMap, SetShare, Setup
+from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import not_kept
 from companion.stages.map_keeper import Kept, MapKeeper
@@ -39,8 +39,8 @@ class _Localisation(Work):
         self._kept_ns = 0
 
     def step(self, message: Any) -> Iterable[Message]:
-        if isinstance(message, SetShare):
-            self._stage.set_effort(message.share)
+        if isinstance(message, SetLoadLevel):
+            self._stage.set_effort(message.level)
             return []
         if isinstance(message, KeepMap):
             self._begin_keeping(message)

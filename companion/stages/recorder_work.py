@@ -24,7 +24,7 @@ class _Recorder(Work):
         self._recorder = Recorder(setup.folder, setup.config, setup.camera, versions())
 
     @property
-    def n_turned_away(self) -> int:
+    def n_rejected(self) -> int:
         """Images and other messages dropped because the disk was full or too slow."""
         return self._recorder.n_dropped.total()
 

@@ -74,16 +74,16 @@ class Topics(Work):
         ).pack()
         self.bus = ZenohBus(config)
         for topic, priority in TOPICS.items():
-            self.bus.announce(topic, priority)
+            self.bus.declare_publisher(topic, priority)
         self.bus.serve("flight", lambda asked: self.about)
         self.bus.serve("map", lambda asked: self._map())
         self.bus.serve("depth_input", self._depth_input)
         self.device = "nobody fetches"
 
     @property
-    def n_turned_away(self) -> int:
+    def n_rejected(self) -> int:
         """Frames that the budget had no room for, and bundles that nobody came for in time."""
-        return self._gatherer.n_dropped + self._backlog.n_given_up
+        return self._gatherer.n_dropped + self._backlog.n_evicted
 
     def step(self, message: Any) -> Iterable[Message]:
         """Take one message; says when somebody begins or ceases to fetch."""
@@ -126,7 +126,7 @@ class Topics(Work):
 
     def _publish(self, topic: str, envelope: Callable[[], Envelope]) -> None:
         """Send what somebody has subscribed to; else it is not even made."""
-        if self.bus.is_wanted(topic):
+        if self.bus.has_subscribers(topic):
             self.bus.publish(topic, envelope().pack())
 
     def _map(self) -> bytes | None:

@@ -8,7 +8,7 @@ import socket
 import struct
 
 from companion.errors import StreamError
-from companion.streaming.framing import HELLO, HELLO_BYTES, TAKEN, VIEWER_BYTES
+from companion.streaming.framing import ACKNOWLEDGED, HELLO, HELLO_BYTES, VIEWER_BYTES
 from companion.streaming.session import Session
 
 NOT_SENT_BYTES = 4096
@@ -60,11 +60,11 @@ class Connection:
             self.viewer = bytes(self._read[HELLO_BYTES - VIEWER_BYTES : HELLO_BYTES])
             del self._read[:HELLO_BYTES]
             is_new = True
-        n = len(self._read) // TAKEN.size
+        n = len(self._read) // ACKNOWLEDGED.size
         if n and self.session is not None:
-            (total,) = TAKEN.unpack_from(self._read, (n - 1) * TAKEN.size)
+            (total,) = ACKNOWLEDGED.unpack_from(self._read, (n - 1) * ACKNOWLEDGED.size)
             self.session.acknowledged(now_s, total)
-            del self._read[: n * TAKEN.size]
+            del self._read[: n * ACKNOWLEDGED.size]
         return is_new
 
     def send(self, now_s: float, budget_bytes: int) -> int:
@@ -72,7 +72,7 @@ class Connection:
         if self.session is None or not self.is_writable():
             return 0
         if not self._left:
-            room = min(self.session.window.room_bytes(), budget_bytes)
+            room = min(self.session.window.available_bytes(), budget_bytes)
             self._left = self.session.next_piece(now_s, room) or b""
             if not self._left:
                 return 0

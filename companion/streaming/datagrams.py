@@ -6,19 +6,19 @@ import contextlib
 import socket
 from dataclasses import dataclass
 
-from companion.streaming.framing import greeted
+from companion.streaming.framing import read_hello
 
 HEADERS_BYTES = 42
 """Of a datagram: Ethernet, IP and UDP."""
-DEAF_AFTER_S = 3.0
+UNREACHABLE_AFTER_S = 3.0
 """A viewer that has got none for so long is taken to get none."""
 
 
 @dataclass(slots=True)
-class _Ear:
+class _Peer:
     address: tuple[str, int]
-    n_came: int
-    came_s: float
+    n_received: int
+    received_s: float
 
 
 class Datagrams:
@@ -32,9 +32,9 @@ class Datagrams:
             self.socket.close()
             raise
         self.socket.setblocking(False)
-        self._ears: dict[bytes, _Ear] = {}
+        self._peers: dict[bytes, _Peer] = {}
 
-    def hear(self, now_s: float, peers: dict[bytes, str]) -> None:
+    def receive(self, now_s: float, peers: dict[bytes, str]) -> None:
         """Take in what viewers say; `peers` are the addresses from which viewers are connected.
 
         Whoever is not among them is sent nothing.
@@ -42,29 +42,33 @@ class Datagrams:
         with contextlib.suppress(OSError):
             while True:
                 data, address = self.socket.recvfrom(256)
-                found = greeted(data)
+                found = read_hello(data)
                 if found is None or peers.get(found[0]) != address[0]:
                     continue
-                viewer, n_came = found
-                before = self._ears.get(viewer)
-                gets_any = before is not None and n_came != before.n_came
-                came_s = now_s if gets_any or before is None else before.came_s
-                self._ears[viewer] = _Ear(address, n_came, came_s)
-        self._ears = {viewer: ear for viewer, ear in self._ears.items() if viewer in peers}
+                viewer, n_received = found
+                before = self._peers.get(viewer)
+                gets_any = before is not None and n_received != before.n_received
+                received_s = now_s if gets_any or before is None else before.received_s
+                self._peers[viewer] = _Peer(address, n_received, received_s)
+        self._peers = {viewer: peer for viewer, peer in self._peers.items() if viewer in peers}
 
-    def work(self, viewer: bytes, now_s: float) -> bool:
+    def get_through(self, viewer: bytes, now_s: float) -> bool:
         """Whether datagrams get through to a viewer."""
-        ear = self._ears.get(viewer)
-        return ear is not None and ear.n_came > 0 and now_s - ear.came_s < DEAF_AFTER_S
+        peer = self._peers.get(viewer)
+        return (
+            peer is not None
+            and peer.n_received > 0
+            and now_s - peer.received_s < UNREACHABLE_AFTER_S
+        )
 
-    def is_heard(self, viewer: bytes) -> bool:
+    def has_peer(self, viewer: bytes) -> bool:
         """Whether it is known where to send them."""
-        return viewer in self._ears
+        return viewer in self._peers
 
     def send(self, viewer: bytes, data: bytes) -> int:
         """Send one; how many bytes that takes. Nothing where the network has no room now."""
         try:
-            self.socket.sendto(data, self._ears[viewer].address)
+            self.socket.sendto(data, self._peers[viewer].address)
         except OSError:
             return 0
         return len(data) + HEADERS_BYTES

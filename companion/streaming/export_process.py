@@ -18,10 +18,10 @@ from typing import Any
 
 from companion.config import StreamConfig
 from companion.streaming.exporter import Exporter, open_listener
-from companion.streaming.item_store import Store
+from companion.streaming.item_store import ItemStore
 from companion.streaming.items import FlightItem, Item
 from companion.streaming.parts import parts_of
-from companion.streaming.scene_encoder import Story
+from companion.streaming.scene_encoder import SceneEncoder
 from companion.timing.clock import monotonic_s, wait_s
 
 OWN = "127.0.0.1:0"
@@ -64,7 +64,7 @@ def main() -> int:
     except EOFError:
         return 0
     config = setup.stream
-    exporter = Exporter(Store(config.store_mb << 20), config.most_viewers, config.budget_kbit_s)
+    exporter = Exporter(ItemStore(config.store_mb << 20), config.most_viewers, config.budget_kbit_s)
     own = open_listener(OWN)
     exporter.listen(own)
     _say({"own": own.getsockname()[1]})
@@ -90,7 +90,7 @@ def main() -> int:
 
 
 def _take_in(exporter: Exporter, flight: FlightItem, ended: threading.Event) -> None:
-    story = Story(flight, PATH_STEP_NS)
+    encoder = SceneEncoder(flight, PATH_STEP_NS)
     try:
         _give(exporter, [flight])
         while True:
@@ -98,9 +98,9 @@ def _take_in(exporter: Exporter, flight: FlightItem, ended: threading.Event) -> 
             if isinstance(message, SetBudget):
                 exporter.set_budget(message.kbit_s)
             else:
-                _give(exporter, story.take(message))
+                _give(exporter, encoder.take(message))
     except (EOFError, OSError):  # the flight is over
-        _give(exporter, story.close())
+        _give(exporter, encoder.close())
     finally:
         ended.set()
 

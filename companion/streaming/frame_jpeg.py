@@ -43,7 +43,7 @@ def as_wide(picture: PictureItem, width: int) -> PictureItem:
     return PictureItem(picture.t_ns, jpeg.tobytes(), width, found)
 
 
-class Pictures:
+class AdaptiveJpeg:
     """Makes pictures for one viewer."""
 
     def __init__(self) -> None:

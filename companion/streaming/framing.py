@@ -22,7 +22,7 @@ from companion.errors import StreamError
 HELLO = b"CMPV\x01"
 VIEWER_BYTES = 16
 HELLO_BYTES = len(HELLO) + VIEWER_BYTES
-TAKEN = struct.Struct("<Q")
+ACKNOWLEDGED = struct.Struct("<Q")
 COUNT = struct.Struct("<I")
 HEAD = struct.Struct("<BH")
 HEAD_BYTES = HEAD.size
@@ -35,17 +35,17 @@ def frame(kind: int, piece: bytes, is_last: bool) -> bytes:
     return HEAD.pack(kind | (LAST if is_last else 0), len(piece)) + piece
 
 
-def greeting(viewer: bytes, n_came: int) -> bytes:
+def hello_datagram(viewer: bytes, n_received: int) -> bytes:
     """The viewer's datagram."""
-    return HELLO + viewer + COUNT.pack(n_came & 0xFFFFFFFF)
+    return HELLO + viewer + COUNT.pack(n_received & 0xFFFFFFFF)
 
 
-def greeted(data: bytes) -> tuple[bytes, int] | None:
+def read_hello(data: bytes) -> tuple[bytes, int] | None:
     """Name and count of such a datagram; None for any other."""
     if len(data) != HELLO_BYTES + COUNT.size or not data.startswith(HELLO):
         return None
-    (n_came,) = COUNT.unpack(data[HELLO_BYTES:])
-    return data[len(HELLO) : HELLO_BYTES], n_came
+    (n_received,) = COUNT.unpack(data[HELLO_BYTES:])
+    return data[len(HELLO) : HELLO_BYTES], n_received
 
 
 class Reassembly:

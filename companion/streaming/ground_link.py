@@ -14,7 +14,13 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 
 from companion.errors import StreamError
-from companion.streaming.framing import HELLO, TAKEN, VIEWER_BYTES, Reassembly, greeting
+from companion.streaming.framing import (
+    ACKNOWLEDGED,
+    HELLO,
+    VIEWER_BYTES,
+    Reassembly,
+    hello_datagram,
+)
 from companion.streaming.item_codec import decode
 from companion.streaming.items import Item, PoseItem
 from companion.timing.clock import monotonic_s, wait_s
@@ -26,22 +32,22 @@ through shall do so soon."""
 SILENT_S = 3.0
 """The drone says something twice a second; after so long without, the connection is taken to be
 dead."""
-TAKE_EVERY_S, TAKE_EVERY_BYTES = 0.04, 8192
+ACKNOWLEDGE_EVERY_S, ACKNOWLEDGE_EVERY_BYTES = 0.04, 8192
 RECEIVE_BYTES = 65536
-GREET_EVERY_S = 1.0
+HELLO_EVERY_S = 1.0
 
 
 class GroundLink:
-    """`items` gives them until `stop` is set; `told` hears in words what becomes of the link.
+    """`items` gives them until `stop` is set; `notify` hears in words what becomes of the link.
 
     Without `again` the end of the first connection is the end.
     """
 
     def __init__(
-        self, host: str, port: int, told: Callable[[str], None], again: bool = True
+        self, host: str, port: int, notify: Callable[[str], None], again: bool = True
     ) -> None:
         self.host, self.port = host, port
-        self._told, self._again = told, again
+        self._notify, self._again = notify, again
         self._viewer = os.urandom(VIEWER_BYTES)
         self.n_connections = 0
         self.n_bytes = self.n_datagrams = 0
@@ -58,18 +64,18 @@ class GroundLink:
                 opened = self._connect()
             except OSError as error:
                 if not is_away:
-                    self._told(f"waiting for {self.host}:{self.port} ({error.strerror or error})")
+                    self._notify(f"waiting for {self.host}:{self.port} ({error.strerror or error})")
                 is_away = True
                 wait_s(stop, 0.2)
                 continue
-            self._told(f"connected to {self.host}:{self.port}")
+            self._notify(f"connected to {self.host}:{self.port}")
             is_away = False
             self.n_connections += 1
             with closing(opened), closing(self._datagrams()) as datagrams:
                 try:
                     yield from self._received(opened, datagrams, stop)
                 except OSError as error:
-                    self._told(f"the link to {self.host} is lost ({error.strerror or error})")
+                    self._notify(f"the link to {self.host} is lost ({error.strerror or error})")
                     if not self._again:
                         return
                     wait_s(stop, 0.2)
@@ -109,7 +115,7 @@ class GroundLink:
         greeted_s = 0.0
         self._pose_ns = -(2**63)
         while not stop.is_set():
-            select.select([opened, datagrams], [], [], TAKE_EVERY_S)
+            select.select([opened, datagrams], [], [], ACKNOWLEDGE_EVERY_S)
             yield from self._poses(datagrams)
             try:
                 data = opened.recv(RECEIVE_BYTES)
@@ -118,10 +124,10 @@ class GroundLink:
             if data == b"":
                 raise ConnectionResetError("closed by the drone")
             now_s = monotonic_s()
-            if now_s - greeted_s > GREET_EVERY_S:
+            if now_s - greeted_s > HELLO_EVERY_S:
                 greeted_s = now_s
                 with suppress(OSError):  # nobody hears it, and TCP brings all
-                    datagrams.send(greeting(self._viewer, self.n_datagrams))
+                    datagrams.send(hello_datagram(self._viewer, self.n_datagrams))
             if data is not None:
                 heard_s = now_s
                 for kind, payload in parts.take(data):
@@ -140,9 +146,11 @@ class GroundLink:
                 raise TimeoutError("nothing has come for a while")
             n_new = n_taken - n_acknowledged
             if n_new and (
-                n_new >= TAKE_EVERY_BYTES or now_s - acknowledged_s >= TAKE_EVERY_S or data is None
+                n_new >= ACKNOWLEDGE_EVERY_BYTES
+                or now_s - acknowledged_s >= ACKNOWLEDGE_EVERY_S
+                or data is None
             ):
-                opened.sendall(TAKEN.pack(n_taken))
+                opened.sendall(ACKNOWLEDGED.pack(n_taken))
                 n_acknowledged, acknowledged_s = n_taken, now_s
 
 

@@ -18,31 +18,31 @@ MOST_LOG_LINES = 200
 MOST_PIECES = 20_000
 
 
-class Follower(Protocol):
+class StoreListener(Protocol):
     """Who hears of what is new."""
 
     def changed(self, kind: Kind, key: Hashable) -> None:
         """There is a new one of a kind."""
 
 
-class Store:
+class ItemStore:
     """Takes items, and tells its followers. To be used by one thread at a time."""
 
-    def __init__(self, room_bytes: int) -> None:
-        self._room = room_bytes
+    def __init__(self, available_bytes: int) -> None:
+        self._capacity_bytes = available_bytes
         self._held: dict[Kind, OrderedDict[Hashable, bytes]] = {k: OrderedDict() for k in Kind}
         self._n_logged = 0
         self.points_bytes = 0
         self.image: ImageItem | None = None
         self.flight: FlightItem | None = None
         self.status: StatusItem | None = None
-        self.n_given_up: Counter[str] = Counter()
+        self.n_evicted: Counter[str] = Counter()
         """What there was no room for, by what it was."""
-        self._followers: list[Follower] = []
+        self._listeners: list[StoreListener] = []
 
-    def follow(self, follower: Follower) -> None:
+    def subscribe(self, follower: StoreListener) -> None:
         """Have somebody told of all there is, oldest first, and from now on of all that is new."""
-        self._followers.append(follower)
+        self._listeners.append(follower)
         for kind, held in self._held.items():
             for key in held:
                 follower.changed(kind, key)
@@ -51,9 +51,9 @@ class Store:
         if self.status is not None:
             follower.changed(Kind.STATUS, NEWEST)
 
-    def leave(self, follower: Follower) -> None:
+    def unsubscribe(self, follower: StoreListener) -> None:
         """Somebody is told nothing any more."""
-        self._followers.remove(follower)
+        self._listeners.remove(follower)
 
     def get(self, kind: Kind, key: Hashable) -> bytes | None:
         """What there is now; None where it was given up."""
@@ -81,10 +81,10 @@ class Store:
         for kind, most in ((Kind.LOG, MOST_LOG_LINES), (Kind.PATH, MOST_PIECES),
                            (Kind.AUTOPILOT, MOST_PIECES)):  # fmt: skip
             while len(self._held[kind]) > most:
-                self._drop_oldest(kind)
+                self._evict_oldest(kind)
         for kind in (Kind.FINE, Kind.COARSE):
-            while self.points_bytes > self._room and self._held[kind]:
-                self._drop_oldest(kind)
+            while self.points_bytes > self._capacity_bytes and self._held[kind]:
+                self._evict_oldest(kind)
 
     def _hold(self, kind: Kind, key: Hashable, payload: bytes) -> None:
         before = self._held[kind].pop(key, b"")  # so that the newest is the last
@@ -93,12 +93,12 @@ class Store:
             self.points_bytes += len(payload) - len(before)
         self._tell(kind, key)
 
-    def _drop_oldest(self, kind: Kind) -> None:
+    def _evict_oldest(self, kind: Kind) -> None:
         _, payload = self._held[kind].popitem(last=False)
         if kind in (Kind.COARSE, Kind.FINE):
             self.points_bytes -= len(payload)
-        self.n_given_up[kind.name.lower()] += 1
+        self.n_evicted[kind.name.lower()] += 1
 
     def _tell(self, kind: Kind, key: Hashable) -> None:
-        for follower in self._followers:
+        for follower in self._listeners:
             follower.changed(kind, key)

@@ -28,7 +28,7 @@ class Shown(Enum):
     WAITING = "Waiting"
     INITIALISING = "Initialising"
     TRACKING = "Tracking"
-    COASTING = "Coasting"
+    DEAD_RECKONING = "Coasting"
     LOST = "Lost"
 
 

@@ -42,7 +42,7 @@ from companion.streaming.items import (
     SparseItem,
     StatusItem,
 )
-from companion.streaming.keyframe_placement import Placing
+from companion.streaming.keyframe_placement import KeyframePlacement
 from companion.streaming.status_facts import StatusFacts
 
 Watched = Message | Health | GeoOrigin
@@ -60,7 +60,7 @@ MOST_IMAGES_HELD = 4
 IN_WORDS = {
     TrackState.INITIALISING: Shown.INITIALISING,
     TrackState.TRACKING: Shown.TRACKING,
-    TrackState.COASTING: Shown.COASTING,
+    TrackState.DEAD_RECKONING: Shown.DEAD_RECKONING,
     TrackState.LOST: Shown.LOST,
 }
 
@@ -75,7 +75,7 @@ class _Piece:
     n_waiting: int = 0
 
 
-class Story:
+class SceneEncoder:
     """A flight as it is told. `path_step_ns` thins the camera's path."""
 
     def __init__(self, flight: FlightItem, path_step_ns: int = 0) -> None:
@@ -85,7 +85,7 @@ class Story:
         self._facts = StatusFacts()
         self._status_ns = -(2**63)
         self._update: MapUpdate | None = None
-        self._placing = Placing()
+        self._placement = KeyframePlacement()
         self._path, self._autopilot_path = _Piece(), _Piece()
         self._path_ns, self._autopilot_ns = -(2**63), -(2**63)
         self._last_position_map: Array | None = None
@@ -121,7 +121,7 @@ class Story:
             out += self._map(message)
         elif isinstance(message, PointChunk):
             self._facts.points_came(message.keyframe_id, len(message.points_camera))
-            out += self._placing.measured(message)
+            out += self._placement.measured(message)
             out.append(PointsItem(
                 message.t_ns, message.keyframe_id, WHOLE, message.points_camera, message.rgb,
                 message.confidence,
@@ -130,7 +130,7 @@ class Story:
             item = depth_picture(message)
             out += [item] if item is not None else []
         elif isinstance(message, KeyframeAdded):
-            out += self._placing.added(message)
+            out += self._placement.added(message)
         elif isinstance(message, PositionSample):
             out += self._autopilot(message)
         elif isinstance(message, Warned):
@@ -146,7 +146,7 @@ class Story:
         out: list[Item] = list(self._images.values())
         self._images.clear()
         for piece in (self._path, self._autopilot_path):
-            out += self._told(piece, max(self._path_ns, self._autopilot_ns))
+            out += self._items_of(piece, max(self._path_ns, self._autopilot_ns))
         return out
 
     # -- the camera ------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ class Story:
             return []
         self._shown = shown
         self._facts.shown = shown
-        bad = shown in (Shown.COASTING, Shown.LOST)
+        bad = shown in (Shown.DEAD_RECKONING, Shown.LOST)
         return [LogItem(track.t_ns, f"Tracker: {shown.value.lower()}", bad)]
 
     def _image_of(self, track: Track) -> list[Item]:
@@ -190,7 +190,7 @@ class Story:
 
     def _pose(self, track: Track, pose: Pose) -> PoseItem:
         height = None
-        world = self._placing.world
+        world = self._placement.world
         if world is not None:
             pose = world.apply_to_pose(pose)
             height = float(-pose.translation[2])
@@ -220,20 +220,20 @@ class Story:
         self._path_ns = track.t_ns
         piece, out = self._path, []
         if keyframe_id != piece.keyframe_id or len(piece.strip) > PIECE:
-            out += self._told(piece, track.t_ns)
+            out += self._items_of(piece, track.t_ns)
             before = self._last_position_map if piece.strip else None
             self._path = piece = _Piece(piece.number + 1, keyframe_id)
             if before is not None:  # a piece begins where the last one ends
-                place = self._place_now(track, track.map_from_camera, relative)
+                place = self._keyframe_pose(track, track.map_from_camera, relative)
                 piece.strip.append(place.inverse().apply(before).astype(np.float32))
         piece.strip.append(relative.translation.astype(np.float32))
         piece.n_waiting += 1
         self._last_position_map = track.map_from_camera.translation
-        return out + (self._told(piece, track.t_ns) if piece.n_waiting >= PIECE_STEP else [])
+        return out + (self._items_of(piece, track.t_ns) if piece.n_waiting >= PIECE_STEP else [])
 
-    def _place_now(self, track: Track, pose: Pose, relative: Pose) -> Similarity:
+    def _keyframe_pose(self, track: Track, pose: Pose, relative: Pose) -> Similarity:
         """Where the tracker has its keyframe, of which the map may not have told yet."""
-        units = self._update.unit_of if self._update is not None else {}
+        units = self._update.scale_of if self._update is not None else {}
         scale = units.get(track.keyframe_id or 0, 1.0)
         rotation = pose.rotation @ relative.rotation.T
         return Similarity(
@@ -241,11 +241,11 @@ class Story:
         )
 
     def _break_path(self, t_ns: int) -> list[Item]:
-        out = self._told(self._path, t_ns)
+        out = self._items_of(self._path, t_ns)
         self._path = _Piece(self._path.number + 1)
         return out
 
-    def _told(self, piece: _Piece, t_ns: int) -> list[Item]:
+    def _items_of(self, piece: _Piece, t_ns: int) -> list[Item]:
         if piece.n_waiting == 0 or len(piece.strip) < 2:
             return []
         piece.n_waiting = 0
@@ -266,10 +266,10 @@ class Story:
         piece.strip.append(np.asarray(sample.position_ned_m, np.float32))
         piece.n_waiting += 1
         if len(piece.strip) > PIECE:
-            out = self._told(piece, sample.t_ns)
+            out = self._items_of(piece, sample.t_ns)
             self._autopilot_path = _Piece(piece.number + 1, strip=piece.strip[-1:])
         elif piece.n_waiting >= PIECE_STEP:
-            out = self._told(piece, sample.t_ns)
+            out = self._items_of(piece, sample.t_ns)
         return out
 
     # -- the map ---------------------------------------------------------------------------------
@@ -278,7 +278,7 @@ class Story:
         self._update = update
         self._facts.mapped(update)
         out = self._origin_if_known()
-        out += self._placing.mapped(update)
+        out += self._placement.mapped(update)
         if update.revision % SPARSE_EVERY == 1:
             out.append(SparseItem(update.t_ns, update.points_map.astype(np.float32)))
         return out
@@ -301,4 +301,4 @@ class Story:
         if not isinstance(message, (Track, Health)) or since < STATUS_EVERY_NS:
             return []
         self._status_ns = message.t_ns
-        return [StatusItem(message.t_ns, self._facts.as_told(self._quality))]
+        return [StatusItem(message.t_ns, self._facts.facts(self._quality))]

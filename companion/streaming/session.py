@@ -12,12 +12,12 @@ from collections import Counter, deque
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
 
-from companion.streaming.frame_jpeg import Pictures
+from companion.streaming.frame_jpeg import AdaptiveJpeg
 from companion.streaming.framing import HEAD_BYTES, frame
 from companion.streaming.item_codec import Kind, encode
-from companion.streaming.item_store import Store
+from companion.streaming.item_store import ItemStore
 from companion.streaming.parts import NEWEST
-from companion.streaming.send_window import Window
+from companion.streaming.send_window import SendWindow
 
 ORDER = (
     Kind.FLIGHT, Kind.POSE, Kind.STATUS, Kind.LOG, Kind.PLACES, Kind.PATH, Kind.AUTOPILOT,
@@ -42,7 +42,7 @@ Keys = list[Hashable]
 
 
 @dataclass(slots=True)
-class _Going:
+class _Partial:
     """An item that is partly sent."""
 
     keys: Keys
@@ -53,14 +53,14 @@ class _Going:
 class Session:
     """One viewer, over all of its connections; times are seconds of one monotonic clock."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: ItemStore) -> None:
         self._store = store
-        self.window = Window()
+        self.window = SendWindow()
         self._waiting: dict[Kind, dict[Hashable, None]] = {kind: {} for kind in ORDER}
-        self._going: dict[Kind, _Going] = {}
-        self._on_way: deque[tuple[int, Kind, Keys]] = deque()
-        self._went_s = dict.fromkeys((*ORDER, None), -1e9)
-        self._pictures = Pictures()
+        self._partial: dict[Kind, _Partial] = {}
+        self._in_flight: deque[tuple[int, Kind, Keys]] = deque()
+        self._sent_s = dict.fromkeys((*ORDER, None), -1e9)
+        self._pictures = AdaptiveJpeg()
         self._credit = 0.0
         self.is_connected = True
         """Whether there is somebody for whom what it is not given counts as skipped."""
@@ -74,7 +74,7 @@ class Session:
         """Poses and pictures that gave way to newer ones."""
         self.n_sent: Counter[str] = Counter()
         """Bytes, by kind."""
-        store.follow(self)
+        store.subscribe(self)
 
     def changed(self, kind: Kind, key: Hashable) -> None:
         """There is a new one of a kind."""
@@ -89,21 +89,21 @@ class Session:
 
     def reconnected(self) -> None:
         """Another connection: what was not acknowledged by the one before is sent again."""
-        for _, kind, keys in self._on_way:
-            self._again(kind, keys)
-        for kind, going in self._going.items():
-            self._again(kind, going.keys)
-        self._on_way.clear()
-        self._going.clear()
-        self.window = Window()
-        self._went_s = dict.fromkeys(self._went_s, -1e9)
+        for _, kind, keys in self._in_flight:
+            self._queue_again(kind, keys)
+        for kind, partial in self._partial.items():
+            self._queue_again(kind, partial.keys)
+        self._in_flight.clear()
+        self._partial.clear()
+        self.window = SendWindow()
+        self._sent_s = dict.fromkeys(self._sent_s, -1e9)
         self.changed(Kind.FLIGHT, NEWEST)
 
     def acknowledged(self, now_s: float, total_bytes: int) -> None:
         """The viewer has taken so much in all of this connection."""
         self.window.acknowledged(now_s, total_bytes)
-        while self._on_way and self._on_way[0][0] <= self.window.acknowledged_bytes:
-            self._on_way.popleft()
+        while self._in_flight and self._in_flight[0][0] <= self.window.acknowledged_bytes:
+            self._in_flight.popleft()
 
     @property
     def rate_bytes_s(self) -> float:
@@ -119,7 +119,7 @@ class Session:
     @property
     def is_complete(self) -> bool:
         """Whether it has taken all there is."""
-        return not self._on_way and not self._going and not any(self._waiting.values())
+        return not self._in_flight and not self._partial and not any(self._waiting.values())
 
     def next_datagram(self, now_s: float) -> bytes | None:
         """The newest pose, if it is time for it and it has not been sent."""
@@ -138,22 +138,22 @@ class Session:
             return None
         kind = self._next_kind(now_s, rate)
         if kind is None:
-            if now_s - self._went_s[None] < ALIVE_EVERY_S:
+            if now_s - self._sent_s[None] < ALIVE_EVERY_S:
                 return None
             return self._sent(now_s, None, frame(0, b"", True))
-        going = self._going[kind]
-        piece = going.payload[going.at : going.at + most]
-        going.at += len(piece)
-        is_last = going.at >= len(going.payload)
+        partial = self._partial[kind]
+        piece = partial.payload[partial.at : partial.at + most]
+        partial.at += len(piece)
+        is_last = partial.at >= len(partial.payload)
         framed = self._sent(now_s, kind, frame(kind, piece, is_last))
         if is_last:
-            del self._going[kind]
-            self._on_way.append((self.window.sent_bytes, kind, going.keys))
+            del self._partial[kind]
+            self._in_flight.append((self.window.sent_bytes, kind, partial.keys))
         return framed
 
     def _sent(self, now_s: float, kind: Kind | None, framed: bytes) -> bytes:
         self.window.sent(now_s, len(framed))
-        self._went_s[None] = now_s
+        self._sent_s[None] = now_s
         if kind is not None:
             self.n_sent[kind.name.lower()] += len(framed)
         earned = -len(framed) if kind in PICTURES else PICTURE_SHARE * len(framed)
@@ -165,28 +165,28 @@ class Session:
         for kind in ORDER:
             if kind is Kind.COARSE and self._credit > 0:
                 for picture in PICTURES:
-                    if self._may_go(picture, now_s, rate, PICTURE_SHARE * rate):
+                    if self._can_send(picture, now_s, rate, PICTURE_SHARE * rate):
                         return picture
             share = rate
             if kind in PICTURES:
                 # one that fits in the share goes on in it
                 busy = self._waiting[Kind.COARSE] or self._waiting[Kind.FINE]
                 share = PICTURE_SHARE * rate if busy else rate / 2
-            if self._may_go(kind, now_s, rate, share):
+            if self._can_send(kind, now_s, rate, share):
                 return kind
         return None
 
-    def _may_go(self, kind: Kind, now_s: float, rate: float, share: float) -> bool:
+    def _can_send(self, kind: Kind, now_s: float, rate: float, share: float) -> bool:
         """Whether something of a kind is going, or can begin to."""
-        if kind in self._going:
+        if kind in self._partial:
             return True
-        if now_s - self._went_s[kind] < self._every_s(kind, rate):
+        if now_s - self._sent_s[kind] < self._every_s(kind, rate):
             return False
         while self._waiting[kind]:
             keys, payload = self._taken(kind, now_s, share)
             if payload is not None:  # else the store has given it up
-                self._went_s[kind] = now_s
-                self._going[kind] = _Going(keys, payload)
+                self._sent_s[kind] = now_s
+                self._partial[kind] = _Partial(keys, payload)
                 return True
         return False
 
@@ -232,11 +232,11 @@ class Session:
             "budget_kbit_s": round(self.limit_bytes_s / 125) or None,
             "waiting": self.n_waiting,
             "skipped": dict(self.n_skipped),
-            "given_up": dict(self._store.n_given_up),
+            "given_up": dict(self._store.n_evicted),
         }
         return encode(replace(status, facts={**status.facts, **link}))
 
-    def _again(self, kind: Kind, keys: Keys) -> None:
+    def _queue_again(self, kind: Kind, keys: Keys) -> None:
         for key in keys:
             if key not in self._waiting[kind]:
                 self._waiting[kind] = {key: None, **self._waiting[kind]}

@@ -56,7 +56,7 @@ class StatusFacts:
             self._warned.pop(warning.what, None)
             self._warned[warning.what] = warning.t_ns
 
-    def as_told(self, quality: int) -> dict[str, Any]:
+    def facts(self, quality: int) -> dict[str, Any]:
         """All of them."""
         found = self._update.georeference if self._update is not None else None
         span_ns = self._tracked[-1] - self._tracked[0] if len(self._tracked) > 1 else 0

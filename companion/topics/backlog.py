@@ -29,14 +29,14 @@ class _Held:
 class Backlog:
     """To be used by several threads. A budget of 0 is no limit."""
 
-    def __init__(self, run: str, room_bytes: int, budget_bytes_s: float) -> None:
-        self._run, self._room_bytes, self._budget_bytes_s = run, room_bytes, budget_bytes_s
+    def __init__(self, run: str, capacity_bytes: int, budget_bytes_s: float) -> None:
+        self._run, self._capacity_bytes, self._budget_bytes_s = run, capacity_bytes, budget_bytes_s
         self._held: deque[_Held] = deque()
         self._n_bytes = 0
         self._map: MapUpdate | None = None
         self._lock = threading.Lock()
         self._allowed_bytes, self._allowed_s = 0.0, 0.0
-        self.n_given_up = 0
+        self.n_evicted = 0
         """Bundles that had to go before anybody had fetched them."""
         self.fetched = -1
         """The newest that was fetched."""
@@ -52,10 +52,10 @@ class Backlog:
             self._n_bytes += len(held.data)
             self.newest = held.number
             self._map = update
-            while self._n_bytes > self._room_bytes and len(self._held) > 1:
+            while self._n_bytes > self._capacity_bytes and len(self._held) > 1:
                 oldest = self._held.popleft()
                 self._n_bytes -= len(oldest.data)
-                self.n_given_up += oldest.number > self.fetched
+                self.n_evicted += oldest.number > self.fetched
 
     def after(self, run: str, number: int, now_s: float, whole: bool = False) -> bytes:
         """What follows bundle `number` of a run, as bytes: a bundle, or `wait` where none may go.
@@ -95,5 +95,5 @@ class Backlog:
 def _without_points(update: MapUpdate) -> MapUpdate:
     return MapUpdate(
         update.revision, update.t_ns, update.map_from_camera, np.zeros((0, 3)),
-        update.georeference, update.unit_of, update.n_retired,
+        update.georeference, update.scale_of, update.n_retired,
     )  # fmt: skip

@@ -44,7 +44,7 @@ class Gatherer:
         self._tracked: dict[int, Track] = {}
         self._changes = MapChanges()
         self._number = 0
-        self._room_bytes, self._room_ns = SAVED_NS * 1e-9 * budget_bytes_s, 0
+        self._budget_left_bytes, self._budget_at_ns = SAVED_NS * 1e-9 * budget_bytes_s, 0
         self._last_place: tuple[float, ...] | None = None
         self.keyframe_jpegs: dict[int, bytes] = {}
         """Pictures of the keyframes of the last bundle, by number of keyframe."""
@@ -71,10 +71,14 @@ class Gatherer:
         jpeg = jpeg_of(frame.rgb, self._quality)
         self._frames[frame.seq] = (frame.t_ns, jpeg)
         self._frame_bytes += len(jpeg)
-        if self._room_ns:
-            self._room_bytes += max(frame.t_ns - self._room_ns, 0) * 1e-9 * self._budget_bytes_s
-        self._room_bytes = min(self._room_bytes, SAVED_NS * 1e-9 * self._budget_bytes_s)
-        self._room_ns = frame.t_ns
+        if self._budget_at_ns:
+            self._budget_left_bytes += (
+                max(frame.t_ns - self._budget_at_ns, 0) * 1e-9 * self._budget_bytes_s
+            )
+        self._budget_left_bytes = min(
+            self._budget_left_bytes, SAVED_NS * 1e-9 * self._budget_bytes_s
+        )
+        self._budget_at_ns = frame.t_ns
         while len(self._frames) > MOST_WAITING or self._frame_bytes > MOST_WAITING_BYTES:
             seq = next(iter(self._frames))
             self._forget(seq)
@@ -105,7 +109,7 @@ class Gatherer:
             if seq not in owners:
                 jpeg = without_colour(jpeg, self._quality)
             out.append(Picture(seq, t_ns, jpeg, seq in owners))
-            self._room_bytes -= len(jpeg)
+            self._budget_left_bytes -= len(jpeg)
         self.n_dropped += len(useful) - len(chosen)
         for seq in [s for s in self._frames if s <= newest]:
             self._forget(seq)
@@ -139,7 +143,7 @@ class Gatherer:
         if self._budget_bytes_s and others:
             own_bytes = sum(len(self._frames[seq][1]) for seq in keyframes)
             each_bytes = GREY_SHARE * float(np.mean([len(self._frames[s][1]) for s in others]))
-            room = min(room, int((self._room_bytes - own_bytes) / each_bytes))
+            room = min(room, int((self._budget_left_bytes - own_bytes) / each_bytes))
             if room < min(LEAST_FRAMES, len(others)):
                 return []
         if len(others) > room:

@@ -148,15 +148,15 @@ class MapChanges:
             k: pose for k, pose in update.map_from_camera.items() if now[k] != self._told.get(k)
         }
         removed = [k for k in self._told if k not in now]
-        units = {k: unit for k, unit in update.unit_of.items() if k in changed}
+        units = {k: unit for k, unit in update.scale_of.items() if k in changed}
         whole, self._is_first, self._told = self._is_first, False, now
-        part = replace(update, map_from_camera=changed, unit_of=units, points_map=np.zeros((0, 3)))
+        part = replace(update, map_from_camera=changed, scale_of=units, points_map=np.zeros((0, 3)))
         return MapChange(part, removed, whole)
 
 
 def _state(update: MapUpdate, keyframe_id: int) -> tuple[object, ...]:
     pose = update.map_from_camera[keyframe_id]
-    unit = update.unit_of.get(keyframe_id, 1.0)
+    unit = update.scale_of.get(keyframe_id, 1.0)
     return unit, pose.rotation.tobytes(), pose.translation.tobytes()
 
 

@@ -40,7 +40,7 @@ FROZEN_S = 1.0
 """Pictures that have been the same for so long come from a frozen camera."""
 MIN_CONTRAST = 12
 """Pictures with less than this between dark and bright, as under a lens cap, may well be equal."""
-AMISS_S = 1.5
+INVALID_S = 1.5
 """A camera that has been frozen, or of the wrong size, for so long is opened anew,"""
 BETWEEN_CURES_S = 5.0
 """but not more often than this."""
@@ -56,9 +56,9 @@ class _Opening:
     since_s: float
     picture_s: float | None = None
     """When the last picture of any kind came."""
-    amiss_s: float | None = None
+    invalid_s: float | None = None
     """Since when none came that could be handed on, and what is wrong with them."""
-    amiss: str = ""
+    invalid: str = ""
 
 
 class CameraFeed:
@@ -172,11 +172,11 @@ class CameraFeed:
                 self._warn(Warned(self._clock.now_ns(), NOT_AS_ASKED, self._source.remarks.pop(0)))
             if picture is not None:
                 opening.picture_s = now_s
-                opening.amiss = self._take(picture)
-                if not opening.amiss:
-                    opening.amiss_s = None
-                elif opening.amiss_s is None:
-                    opening.amiss_s = now_s
+                opening.invalid = self._take(picture)
+                if not opening.invalid:
+                    opening.invalid_s = None
+                elif opening.invalid_s is None:
+                    opening.invalid_s = now_s
             self._meter.n_dropped = self._source.n_dropped + self._n_refused
             if self._should_be_cured(opening, now_s):
                 return
@@ -190,13 +190,13 @@ class CameraFeed:
         if silent:
             self._set("silent", SILENT, f"{source.name}: no picture comes")
             return source.live
-        amiss_s = 0.0 if opening.amiss_s is None else now_s - opening.amiss_s
-        if amiss_s > FROZEN_S and self._meter.state == "running":
-            if opening.amiss == FROZEN:
+        invalid_s = 0.0 if opening.invalid_s is None else now_s - opening.invalid_s
+        if invalid_s > FROZEN_S and self._meter.state == "running":
+            if opening.invalid == FROZEN:
                 self._set("frozen", FROZEN, f"{source.name}: the same picture again and again")
             else:
-                self._set("silent", opening.amiss, f"{source.name}: {opening.amiss}")
-        if not source.live or amiss_s < AMISS_S or now_s - self._cured_s < BETWEEN_CURES_S:
+                self._set("silent", opening.invalid, f"{source.name}: {opening.invalid}")
+        if not source.live or invalid_s < INVALID_S or now_s - self._cured_s < BETWEEN_CURES_S:
             return False
         self._cured_s = now_s
         return True
@@ -204,10 +204,10 @@ class CameraFeed:
     def _take(self, picture: Picture) -> str:
         """Hand a picture on, or say what is amiss with it."""
         now_ns = time.monotonic_ns()
-        amiss = self._amiss(picture, now_ns)
-        if amiss:
+        invalid = self._why_invalid(picture, now_ns)
+        if invalid:
             self._n_refused += 1
-            return amiss
+            return invalid
         if self._meter.state != "running":
             self._recovered()
         t_ns = self._clock.from_monotonic_ns(picture.monotonic_ns + self._offset_ns)
@@ -216,7 +216,7 @@ class CameraFeed:
         self._seq += 1
         return ""
 
-    def _amiss(self, picture: Picture, now_ns: int) -> str:
+    def _why_invalid(self, picture: Picture, now_ns: int) -> str:
         height, width = picture.grey.shape
         if self.size is None:
             self.size = width, height

@@ -30,7 +30,7 @@ TUM_CAMERAS = {
     "freiburg3": (535.4, 539.2, 320.1, 247.6, (0.0, 0.0, 0.0, 0.0, 0.0)),
 }
 TUM_CAMERA = (525.0, 525.0, 319.5, 239.5, (0.0, 0.0, 0.0, 0.0, 0.0))
-TUM_APART_S = 0.02
+TUM_TIME_DIFFERENCE_S = 0.02
 POSE_GAP_S = 0.5
 """Poses of a flight further apart than this say nothing of what is between them."""
 
@@ -95,7 +95,7 @@ def _tum(path: Path) -> PosedImages:
         camera = Camera(width, height, *named[:4], distortion, coefficients)
     nearest = [int(np.abs(pose_s - stamp).argmin()) for stamp in stamps]
     poses = tuple(
-        known[i] if abs(pose_s[i] - stamp) <= TUM_APART_S else None
+        known[i] if abs(pose_s[i] - stamp) <= TUM_TIME_DIFFERENCE_S else None
         for stamp, i in zip(stamps, nearest, strict=True)
     )
     depth_rows = list(_rows(path / "depth.txt", 2)) if (path / "depth.txt").exists() else []
@@ -105,7 +105,7 @@ def _tum(path: Path) -> PosedImages:
         if len(depth_s) == 0:
             return None
         i = int(np.abs(depth_s - stamps[position]).argmin())
-        if abs(depth_s[i] - stamps[position]) > TUM_APART_S:
+        if abs(depth_s[i] - stamps[position]) > TUM_TIME_DIFFERENCE_S:
             return None
         return read_depth(path / depth_rows[i][1], 5000.0)
 

@@ -15,7 +15,7 @@ class _Ended:
         self.error = error
 
 
-class Ahead(Generic[T]):
+class Prefetch(Generic[T]):
     """Iterates over `source` in a thread of its own, at most `depth` items ahead of the consumer.
 
     An error in the source is raised where its item would have come. The thread ends when the

@@ -120,7 +120,7 @@ class AutopilotLink:
     @property
     def origin(self) -> GeoOrigin | None:
         """Where the positions handed on are counted from; None while no place is known."""
-        return self.samples.places.home
+        return self.samples.positions.home
 
     @property
     def health(self) -> SourceHealth:
@@ -367,7 +367,7 @@ class AutopilotLink:
         """A local frame's zero is told once, and we may not have been there."""
         while True:
             await asyncio.sleep(ORIGIN_S if self.alive else WATCH_S)
-            if self.alive and self.samples.places.origin is None:
+            if self.alive and self.samples.positions.origin is None:
                 await self.request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
 
     def _target(self) -> int:

@@ -44,7 +44,7 @@ class OriginKeeper:
             without = (
                 self._is_wanted()
                 and self._link.alive
-                and self._link.samples.places.origin is None
+                and self._link.samples.positions.origin is None
             )
             n_without = n_without + 1 if without else 0
             if n_without >= PATIENCE:

@@ -43,14 +43,14 @@ class FlightSummary:
         return (self.stop_ns - self.start_ns) * 1e-9
 
 
-def summarise(path: Path, told: Callable[[int], None] | None = None) -> FlightSummary:
+def summarise(path: Path, on_progress: Callable[[int], None] | None = None) -> FlightSummary:
     """What there is in a recording; changes nothing.
 
-    With `told`, which hears of bytes read, every chunk is read and its checksum looked at.
+    With `on_progress`, which hears of bytes read, every chunk is read and its checksum looked at.
     FlightError where it is no MCAP file.
     """
     with McapFile(path) as file:
-        found = (None if told is not None else summary(file)) or scan(file, told)
+        found = (None if on_progress is not None else summary(file)) or scan(file, on_progress)
         growing = is_growing(file.fd)
         n_bytes = file.size
     contents = found.contents

@@ -24,10 +24,11 @@ RATE_HZ = 30.0
 """Told to the encoder, which for still pictures does not matter."""
 
 
-def write_recording(flight: Flight, out: Path, told: Callable[[int], None]) -> int:
+def write_recording(flight: Flight, out: Path, on_progress: Callable[[int], None]) -> int:
     """Write a flight as the recording `out`, which must not be there; return how many frames.
 
-    `told` hears of them on the way. FlightError where it cannot be written, and then nothing is.
+    `on_progress` takes the number of frames done. FlightError where it cannot be written; then
+    nothing is left.
     """
     if out.exists():
         raise FlightError(f"{out}: is there already; give another name")
@@ -37,7 +38,7 @@ def write_recording(flight: Flight, out: Path, told: Callable[[int], None]) -> i
         part.unlink(missing_ok=True)
         file = GrowingFile(part)
         try:
-            n = _write(flight, file, told)
+            n = _write(flight, file, on_progress)
             file.sync()
             part.rename(out)
         except BaseException:
@@ -49,7 +50,7 @@ def write_recording(flight: Flight, out: Path, told: Callable[[int], None]) -> i
     return n
 
 
-def _write(flight: Flight, file: GrowingFile, told: Callable[[int], None]) -> int:
+def _write(flight: Flight, file: GrowingFile, on_progress: Callable[[int], None]) -> int:
     log = flight.telemetry()
     camera, start_ns = flight.camera, flight.start_ns
     encoder = picture_encoder(RecorderConfig(codec="png"), camera.width, camera.height, RATE_HZ)
@@ -81,7 +82,7 @@ def _write(flight: Flight, file: GrowingFile, told: Callable[[int], None]) -> in
             for picture in encoder.encode(message):
                 put(picture.topic, message.t_ns, picture.data, message.seq)
             n += 1
-            told(n)
+            on_progress(n)
         elif isinstance(message, Warned):
             put(EVENTS, message.t_ns, event_bytes(message))
         else:

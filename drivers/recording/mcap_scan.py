@@ -88,8 +88,8 @@ def summary(file: McapFile) -> Scan | None:
     return found
 
 
-def scan(file: McapFile, told: Callable[[int], None] | None = None) -> Scan:
-    """Go through all of it; `told` hears how many bytes are done.
+def scan(file: McapFile, on_progress: Callable[[int], None] | None = None) -> Scan:
+    """Go through all of it; `on_progress` hears how many bytes are done.
 
     Chunks whose checksum is wrong are left out and counted.
     """
@@ -118,8 +118,8 @@ def scan(file: McapFile, told: Callable[[int], None] | None = None) -> Scan:
             found.n_lost_bytes += chunk - at
             found.n_lost_places += 1
             at, lost = chunk, True
-        if told is not None:
-            told(at)
+        if on_progress is not None:
+            on_progress(at)
     if in_data:
         found.n_cut_bytes = file.size - found.good_end
         found.n_lost_bytes += found.n_cut_bytes

@@ -30,18 +30,18 @@ SOFTWARE = "libx264"
 HARDWARE = ("h264_v4l2m2m", "h264_nvenc")
 """What of FFmpeg's encoders is tried before the processor has to do it."""
 OPTIONS = {SOFTWARE: {"preset": "ultrafast", "tune": "zerolatency"}}
-_BEGINS = re.compile(rb"\x00\x00\x01(?:[\x25\x45\x65\x05]|[\x27\x47\x67\x07])")
+_IDR_OR_SPS = re.compile(rb"\x00\x00\x01(?:[\x25\x45\x65\x05]|[\x27\x47\x67\x07])")
 """An IDR slice or a sequence parameter set in H.264's byte stream (ITU-T H.264, annex B)."""
 
 
-class Recorded(NamedTuple):
-    """One message of the picture of a frame; unless `alone` it needs the picture before it."""
+class EncodedPicture(NamedTuple):
+    """One message of the picture of a frame; unless `intra` it needs the picture before it."""
 
     topic: str
     seq: int
     t_ns: int
     data: bytes
-    alone: bool = True
+    intra: bool = True
 
 
 class PictureEncoder(Protocol):
@@ -50,13 +50,13 @@ class PictureEncoder(Protocol):
     name: str
     """For people."""
 
-    def encode(self, frame: Frame) -> list[Recorded]:
+    def encode(self, frame: Frame) -> list[EncodedPicture]:
         """Take a frame; what is ready, of this one or of one before it."""
 
-    def begin_anew(self) -> None:
+    def request_intra(self) -> None:
         """Something was lost: the next picture is to need none before it."""
 
-    def finish(self) -> list[Recorded]:
+    def finish(self) -> list[EncodedPicture]:
         """No more frames come; what is left."""
 
 
@@ -80,19 +80,19 @@ class Stills:
         self.name = form
         self._parameters = parameters
 
-    def encode(self, frame: Frame) -> list[Recorded]:
+    def encode(self, frame: Frame) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         bgr = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
         _, data = cv2.imencode(f".{self.name}", bgr, self._parameters)
         image = CompressedImage(frame_id=FRAME_ID, format=self.name, data=data.tobytes())
         set_time(image.timestamp, frame.t_ns)
-        out = [Recorded(IMAGE, frame.seq, frame.t_ns, serialised(image))]
-        return out + _grey_beside(frame) if self.name == "png" else out
+        out = [EncodedPicture(IMAGE, frame.seq, frame.t_ns, serialised(image))]
+        return out + _lossless_grey(frame) if self.name == "png" else out
 
-    def begin_anew(self) -> None:
+    def request_intra(self) -> None:
         """See `PictureEncoder`."""
 
-    def finish(self) -> list[Recorded]:
+    def finish(self) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         return []
 
@@ -102,14 +102,14 @@ class Raw:
 
     name = "raw"
 
-    def encode(self, frame: Frame) -> list[Recorded]:
+    def encode(self, frame: Frame) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
-        return [_raw(RAW, frame, frame.rgb, "rgb8"), *_grey_beside(frame)]
+        return [_raw(RAW, frame, frame.rgb, "rgb8"), *_lossless_grey(frame)]
 
-    def begin_anew(self) -> None:
+    def request_intra(self) -> None:
         """See `PictureEncoder`."""
 
-    def finish(self) -> list[Recorded]:
+    def finish(self) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         return []
 
@@ -122,7 +122,7 @@ class H264:
         self._inside: dict[int, tuple[int, int]] = {}
         """By presentation stamp: number and time of the frames in the encoder."""
         self._number = 0
-        self._anew = False
+        self._intra_requested = False
         wanted = config.h264_encoder
         names = (*HARDWARE, SOFTWARE) if wanted == "auto" else (wanted,)
         for name in names:
@@ -137,15 +137,15 @@ class H264:
             "set it to auto, or recorder.codec to mjpeg"
         )
 
-    def encode(self, frame: Frame) -> list[Recorded]:
+    def encode(self, frame: Frame) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         return self._encode(self._codec, frame.seq, frame.t_ns, frame.rgb)
 
-    def begin_anew(self) -> None:
+    def request_intra(self) -> None:
         """See `PictureEncoder`."""
-        self._anew = True
+        self._intra_requested = True
 
-    def finish(self) -> list[Recorded]:
+    def finish(self) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         try:
             return self._messages(self._codec, self._codec.encode(None))
@@ -176,38 +176,38 @@ class H264:
         codec.options = OPTIONS.get(name, {})
         return codec
 
-    def _encode(self, codec: Any, seq: int, t_ns: int, rgb: Bytes) -> list[Recorded]:
+    def _encode(self, codec: Any, seq: int, t_ns: int, rgb: Bytes) -> list[EncodedPicture]:
         picture = av.VideoFrame.from_ndarray(rgb, "rgb24").reformat(format="yuv420p")
         self._number += 1
         picture.pts = self._number
         picture.time_base = codec.time_base
-        if self._anew:
+        if self._intra_requested:
             picture.pict_type = av.video.frame.PictureType.I
-            self._anew = False
+            self._intra_requested = False
         self._inside[self._number] = seq, t_ns
         if len(self._inside) > MOST_INSIDE:  # it has dropped that one
             del self._inside[next(iter(self._inside))]
         return self._messages(codec, codec.encode(picture))
 
-    def _messages(self, codec: Any, packets: Iterable[Any]) -> list[Recorded]:
+    def _messages(self, codec: Any, packets: Iterable[Any]) -> list[EncodedPicture]:
         out = []
         for packet in packets:
             if packet.pts not in self._inside:
                 continue
             seq, t_ns = self._inside.pop(packet.pts)
             data = bytes(packet)
-            alone = stands_alone(data)
-            if alone and codec.extradata and b"\x00\x00\x01\x67" not in data[:64]:
+            intra = is_intra(data)
+            if intra and codec.extradata and b"\x00\x00\x01\x67" not in data[:64]:
                 data = codec.extradata + data
             video = CompressedVideo(frame_id=FRAME_ID, format="h264", data=data)
             set_time(video.timestamp, t_ns)
-            out.append(Recorded(VIDEO, seq, t_ns, serialised(video), alone))
+            out.append(EncodedPicture(VIDEO, seq, t_ns, serialised(video), intra))
         return out
 
 
-def stands_alone(h264: bytes | memoryview) -> bool:
+def is_intra(h264: bytes | memoryview) -> bool:
     """Whether a picture of H.264 in its byte stream can be decoded without those before it."""
-    return _BEGINS.search(bytes(h264[:256])) is not None
+    return _IDR_OR_SPS.search(bytes(h264[:256])) is not None
 
 
 def still(topic: str, data: bytes | memoryview) -> Bytes | None:
@@ -250,7 +250,7 @@ class VideoDecoder:
         broken = False
         for number, data, lost in messages:
             video = _video(data)
-            broken = (broken or lost or video is None) and not stands_alone(video or b"")
+            broken = (broken or lost or video is None) and not is_intra(video or b"")
             waiting.append(number)
             if broken or video is None:
                 continue  # it would be smeared with what it lacks
@@ -287,14 +287,14 @@ def grey_of(rgb: Bytes) -> Bytes:
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _grey_beside(frame: Frame) -> list[Recorded]:
+def _lossless_grey(frame: Frame) -> list[EncodedPicture]:
     """The grey picture, where it is not what the colours give (of a camera that gives Y, say)."""
     if np.array_equal(frame.grey, grey_of(frame.rgb)):
         return []
     return [_raw(GREY, frame, frame.grey, "mono8")]
 
 
-def _raw(topic: str, frame: Frame, pixels: Bytes, encoding: str) -> Recorded:
+def _raw(topic: str, frame: Frame, pixels: Bytes, encoding: str) -> EncodedPicture:
     height, width = pixels.shape[:2]
     step = width * (3 if encoding == "rgb8" else 1)
     image = RawImage(
@@ -302,4 +302,4 @@ def _raw(topic: str, frame: Frame, pixels: Bytes, encoding: str) -> Recorded:
         data=pixels.tobytes(),
     )  # fmt: skip
     set_time(image.timestamp, frame.t_ns)
-    return Recorded(topic, frame.seq, frame.t_ns, serialised(image))
+    return EncodedPicture(topic, frame.seq, frame.t_ns, serialised(image))

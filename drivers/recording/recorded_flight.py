@@ -66,7 +66,7 @@ class RecordedPictures:
             return
         every = self.recording.pictures
         first = every.index(places[0])
-        begin = max((k for k in range(first + 1) if every[k].alone), default=first)
+        begin = max((k for k in range(first + 1) if every[k].intra), default=first)
         run = every[begin : first + len(places)]
         wanted = set(places)
         for number, rgb in VideoDecoder().pictures(self._packets(run)):

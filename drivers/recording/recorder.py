@@ -33,7 +33,7 @@ from drivers.recording.disk_writer import DiskWriter, Entry
 from drivers.recording.flights_folder import RECORDING, TLOG
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.picture_codec import Recorded, picture_encoder
+from drivers.recording.picture_codec import EncodedPicture, picture_encoder
 from drivers.recording.recorded_content import (
     HealthNote,
     LinkBytes,
@@ -86,7 +86,7 @@ class Recorder:
         self._streams = {False: MavlinkStream(), True: MavlinkStream()}
         self._map: MapUpdate | None = None
         self._camera: Camera | None = camera
-        self._skips_until_alone = False
+        self._skips_until_intra = False
         self.n_frames = 0
         """Pictures taken in, written or not."""
         self._encoder = picture_encoder(
@@ -163,15 +163,15 @@ class Recorder:
             return
         self._put_pictures(self._encoder.encode(frame))
 
-    def _put_pictures(self, messages: list[Recorded]) -> None:
-        for topic, seq, t_ns, data, alone in messages:
-            if self._skips_until_alone and not alone:
+    def _put_pictures(self, messages: list[EncodedPicture]) -> None:
+        for topic, seq, t_ns, data, intra in messages:
+            if self._skips_until_intra and not intra:
                 self._disk.n_dropped["pictures"] += 1
                 continue
             entry = Entry(self._channels[topic], t_ns, data, seq)
-            self._skips_until_alone = not self._disk.put(entry, "pictures", is_picture=True)
-            if self._skips_until_alone:
-                self._encoder.begin_anew()
+            self._skips_until_intra = not self._disk.put(entry, "pictures", is_picture=True)
+            if self._skips_until_intra:
+                self._encoder.request_intra()
                 return
 
     def _link(self, taken: LinkBytes) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from companion.errors import FlightError
 from companion.messages import Bytes, Telemetry, Warned
 from drivers.recording.mcap_file import DAMAGED, ChunkPlace, McapMessage
-from drivers.recording.picture_codec import stands_alone, still
+from drivers.recording.picture_codec import is_intra, still
 from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recording_topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
 from drivers.recording.repair import n_cut_bytes, opened, was_cut
@@ -25,16 +25,16 @@ class PicturePlace(NamedTuple):
     t_ns: int
     chunk: int
     message: int
-    alone: bool
+    intra: bool
 
 
 class Recording:
     """An open recording and what is in it; FlightError where it is none.
 
-    `told` hears, chunk by chunk, how many bytes have been read.
+    `on_progress` hears, chunk by chunk, how many bytes have been read.
     """
 
-    def __init__(self, path: Path, told: Callable[[int], None] = lambda _: None) -> None:
+    def __init__(self, path: Path, on_progress: Callable[[int], None] = lambda _: None) -> None:
         self.path = path
         self.file, self.found = opened(path)
         self.pictures: list[PicturePlace] = []
@@ -54,7 +54,7 @@ class Recording:
             raise FlightError(f"{path}: an MCAP file, but not a recording of companion")
         for number, chunk in enumerate(self.found.chunks):
             self._index(number, chunk)
-            told(chunk.end)
+            on_progress(chunk.end)
         self.pictures = _once_in_order(self.pictures)
         self.samples.sort(key=lambda sample: sample.t_ns)
 
@@ -119,8 +119,8 @@ class Recording:
 
     def _take(self, topic: str, number: int, at: int, message: McapMessage) -> None:
         if topic in PICTURES:
-            alone = topic != VIDEO or stands_alone(message.data[:512])
-            self.pictures.append(PicturePlace(message.sequence, message.t_ns, number, at, alone))
+            intra = topic != VIDEO or is_intra(message.data[:512])
+            self.pictures.append(PicturePlace(message.sequence, message.t_ns, number, at, intra))
         elif topic == GREY:
             self.greys[message.t_ns] = number, at
         elif is_sample_topic(topic):

@@ -53,13 +53,13 @@ def unfinished(path: Path) -> bool:
         return file.end_of_data() is None and not is_growing(file.fd)
 
 
-def in_place(path: Path, told: Callable[[int], None] | None = None) -> int | None:
+def in_place(path: Path, on_progress: Callable[[int], None] | None = None) -> int | None:
     """Repair a file; how many bytes were cut off, None where that could not be done.
 
-    `told` hears of bytes read. FlightError where it is no MCAP file.
+    `on_progress` hears of bytes read. FlightError where it is no MCAP file.
     """
     with McapFile(path) as file:
-        found = scan(file, told)
+        found = scan(file, on_progress)
     return found.n_cut_bytes if found.whole or repair(path, found) else None
 
 

@@ -42,7 +42,7 @@ class ZenohBus:
             where = ", ".join([*settings["listen/endpoints"], *settings["connect/endpoints"]])
             raise InputError(f"[distributed]: {where}: {_brief(error)}") from error
 
-    def announce(self, topic: str, priority: str) -> None:
+    def declare_publisher(self, topic: str, priority: str) -> None:
         """Be about to publish on a topic."""
         self._publishers[topic] = self._session.declare_publisher(
             f"{self._prefix}/{topic}",
@@ -50,7 +50,7 @@ class ZenohBus:
             congestion_control=self._zenoh.CongestionControl.DROP,
         )
 
-    def is_wanted(self, topic: str) -> bool:
+    def has_subscribers(self, topic: str) -> bool:
         """Whether anybody has subscribed to a topic that was announced."""
         return bool(self._publishers[topic].matching_status.matching)
 

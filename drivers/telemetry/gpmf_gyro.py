@@ -27,7 +27,7 @@ NAMED = re.compile(r"\(([xyzXYZ]),([xyzXYZ]),([xyzXYZ])\)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GyroTurns:
+class GyroRotation:
     """Turns `angle_rad` (N, 3), summed up from the first of `t_ns` (N,) of the video's own time.
 
     About the camera's axes where `axes_known`, else about three that stand on one another.
@@ -38,7 +38,7 @@ class GyroTurns:
     axes_known: bool
 
 
-def gyro_turns(blocks: Sequence[tuple[int, int, bytes]]) -> GyroTurns | None:
+def gyro_rotation(blocks: Sequence[tuple[int, int, bytes]]) -> GyroRotation | None:
     """What the gyro says; `blocks` are begin and end in ns, and content. None where there is none.
 
     Damaged blocks are gaps.
@@ -68,7 +68,7 @@ def gyro_turns(blocks: Sequence[tuple[int, int, bytes]]) -> GyroTurns | None:
     turns = 0.5 * (gyro[1:] + gyro[:-1]) * np.where(steps_s > LONGEST_STEP_S, 0, steps_s)[:, None]
     angle = np.vstack([np.zeros(3), np.cumsum(turns, axis=0)])
     even_ns = np.arange(t_ns[0], t_ns[-1], STEP_S * 1e9)
-    return GyroTurns(
+    return GyroRotation(
         even_ns, np.stack([np.interp(even_ns, t_ns, a) for a in angle.T], 1),
         camera_from_rows is not None,
     )  # fmt: skip

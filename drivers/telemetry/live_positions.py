@@ -21,7 +21,7 @@ SAME_M = 0.5
 """Origins nearer than this to each other are the same, seen with different rounding."""
 
 
-class LivePlaces:
+class LivePositions:
     """Takes positions in order of time; `remote_ns` is the autopilot's, within one boot."""
 
     def __init__(self) -> None:
@@ -36,9 +36,9 @@ class LivePlaces:
         """The autopilot has begun anew."""
         self.origin = self._local = self._first_fix_ns = None
 
-    def told(self, origin: GeoOrigin) -> None:
+    def set_origin(self, origin: GeoOrigin) -> None:
         """The autopilot states where its local frame has its zero."""
-        if self.origin is not None and _apart_m(self.origin, origin) < SAME_M:
+        if self.origin is not None and _distance_m(self.origin, origin) < SAME_M:
             return
         self._set_origin(origin)
 
@@ -75,7 +75,7 @@ class LivePlaces:
         )  # fmt: skip
 
     def _set_origin(self, origin: GeoOrigin) -> None:
-        if self.home is not None and _apart_m(self.home, origin) < SAME_M:
+        if self.home is not None and _distance_m(self.home, origin) < SAME_M:
             origin = self.home
         self.origin = origin
         if self.home is None:
@@ -92,6 +92,6 @@ class LivePlaces:
         return moved
 
 
-def _apart_m(a: GeoOrigin, b: GeoOrigin) -> float:
+def _distance_m(a: GeoOrigin, b: GeoOrigin) -> float:
     x, y, z = ned_from_geodetic(b.latitude_deg, b.longitude_deg, b.altitude_m, a)
     return float((x * x + y * y + z * z) ** 0.5)

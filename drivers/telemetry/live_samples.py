@@ -19,7 +19,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.messages import PositionSample, PositionSource, Telemetry, Warned
 from companion.timing.link_clock import ClockFilter
 from companion.timing.stamp_filter import MAX_BOOT_NS
-from drivers.telemetry.live_positions import LivePlaces
+from drivers.telemetry.live_positions import LivePositions
 from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, SAMPLE_OF, boot_ns
 from drivers.telemetry.telemetry_log import GeodeticFix, is_finite
 
@@ -46,7 +46,7 @@ class LiveSamples:
         warn: Callable[[Warned], None],
     ) -> None:
         self._clock, self._deliver, self._warn = clock, deliver, warn
-        self.places = LivePlaces()
+        self.positions = LivePositions()
         self.n_dropped: Counter[str] = Counter()
         """By the reason."""
         self.gps_fix_type = 0
@@ -131,9 +131,9 @@ class LiveSamples:
 
     def _placed(self, content: Telemetry | GeodeticFix, remote_ns: int) -> Telemetry | None:
         if isinstance(content, GeodeticFix):
-            return self.places.fix(content, remote_ns)
+            return self.positions.fix(content, remote_ns)
         if isinstance(content, PositionSample) and content.source is PositionSource.LOCAL:
-            return self.places.local(content, remote_ns)
+            return self.positions.local(content, remote_ns)
         return content
 
     def _take_origin(self, message: Any, receive_ns: int) -> None:
@@ -141,7 +141,9 @@ class LiveSamples:
         if not _is_place(latitude_deg, longitude_deg):
             self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
         elif message.latitude or message.longitude:  # both 0 is what is not set
-            self.places.told(GeoOrigin(latitude_deg, longitude_deg, message.altitude * 1e-3))
+            self.positions.set_origin(
+                GeoOrigin(latitude_deg, longitude_deg, message.altitude * 1e-3)
+            )
 
     def _begin(self) -> None:
         """Another clock runs: the autopilot has begun anew."""
@@ -149,7 +151,7 @@ class LiveSamples:
         self._latest = {quantity: (-1, t_ns) for quantity, (_, t_ns) in self._latest.items()}
         self._stamps.clear()
         self._wild = ""
-        self.places.restart()
+        self.positions.restart()
 
     def _drop(self, what: str, now_ns: int, detail: str) -> None:
         self.n_dropped[what] += 1

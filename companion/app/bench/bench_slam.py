@@ -181,7 +181,7 @@ def _row(
         [p.t_ns for p in poses],
         [(p.world_from_camera.rotation, p.world_from_camera.translation) for p in poses],
     )
-    due = _due(np.array(frame_t_ns), truth, fault.blind_ns(span), above_m)
+    due = _due(np.array(frame_t_ns), truth, fault.dropout_ns(span), above_m)
     known = np.asarray(np.isin(due, estimate.t_ns), bool)
     live = [(t, k.map_from_camera) for t, k in listener.live if k.map_from_camera is not None]
     live_errors = path_errors(
@@ -196,7 +196,7 @@ def _row(
         _nees_yaw(listener.odometry, truth, stage),
         max((o.reset_counter for o in listener.odometry), default=0),
         _longest_gap_s(due, known),
-        sum(o.state is TrackState.COASTING for o in listener.odometry),
+        sum(o.state is TrackState.DEAD_RECKONING for o in listener.odometry),
         update.n_keyframes if update is not None else 0, stage.n_segments, stage.n_loops,
         found.method if found is not None else "none",
         round(float(np.median(cost.frame_ms)), 2),
@@ -215,12 +215,12 @@ def _path_of(t_ns: Sequence[int], poses: Sequence[tuple[Array, Array]]) -> Path:
 
 
 def _due(
-    t_ns: Array, truth: Path, blind_ns: tuple[int, int] | None, above_m: float | None
+    t_ns: Array, truth: Path, dropout_ns: tuple[int, int] | None, above_m: float | None
 ) -> Array:
     """Times of the frames that ought to be tracked."""
     keep = np.ones(len(t_ns), bool)
-    if blind_ns is not None:
-        keep &= (t_ns < blind_ns[0]) | (t_ns >= blind_ns[1])
+    if dropout_ns is not None:
+        keep &= (t_ns < dropout_ns[0]) | (t_ns >= dropout_ns[1])
     if above_m is not None:
         height_m = -np.interp(t_ns, truth.t_ns, truth.centres[:, 2])
         keep &= height_m > above_m

@@ -51,7 +51,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         viewer=arguments.viewer,
         paced=arguments.paced,
         progress=signals.between_frames(progress_on(sys.stderr)),
-        told=print,
+        notify=print,
     )
     if config.export.formats:
         _export_into(arguments.out, arguments.out, config.export)

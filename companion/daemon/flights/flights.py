@@ -38,24 +38,24 @@ class Flights:
         self._last_number = 0
         self._clock, self._journal, self._listener, self._facts = clock, journal, listener, facts
         self.current: LiveFlight | None = None
-        self._spare: LiveFlight | None = None
+        self._standby: LiveFlight | None = None
         self._ending: dict[LiveFlight, threading.Thread] = {}
 
     @property
     def stages_up(self) -> bool:
         """Whether the flight that goes on, or else the one that waits, can take frames."""
-        flight = self.current or self._spare
+        flight = self.current or self._standby
         return flight is not None and flight.stages_up
 
     @property
-    def spare(self) -> LiveFlight | None:
+    def standby(self) -> LiveFlight | None:
         """The one that waits for its beginning, if any."""
-        return self._spare
+        return self._standby
 
     def prepare(self, config: Config, camera: Camera) -> None:
         """Have processes at hand for the next flight."""
-        if self._spare is None:
-            self._spare = LiveFlight(config, camera, self._clock, self._listener)
+        if self._standby is None:
+            self._standby = LiveFlight(config, camera, self._clock, self._listener)
 
     def begin(self, config: Config, camera: Camera, take_up: bool = True) -> LiveFlight:
         """A flight begins; the one before must have been ended.
@@ -64,7 +64,7 @@ class Flights:
         and it is recognised.
         """
         self.prepare(config, camera)
-        flight, self._spare = self._spare, None
+        flight, self._standby = self._standby, None
         assert flight is not None and self.current is None
         folder = self._named(Path(config.daemon.flights))
         flight.begin(folder, KeepMap(kept_map_path(config.daemon.socket), take_up))
@@ -81,15 +81,15 @@ class Flights:
         self._ending[flight] = thread
         thread.start()
 
-    def is_spare(self, flight: LiveFlight) -> bool:
+    def is_standby(self, flight: LiveFlight) -> bool:
         """Whether this is the one that waits for its beginning."""
-        return self._spare is flight
+        return self._standby is flight
 
-    def discard_spare(self) -> None:
+    def discard_standby(self) -> None:
         """The next flight is to be prepared anew."""
-        spare, self._spare = self._spare, None
-        if spare is not None:
-            threading.Thread(target=spare.finish, args=(self._facts,), daemon=True).start()
+        standby, self._standby = self._standby, None
+        if standby is not None:
+            threading.Thread(target=standby.finish, args=(self._facts,), daemon=True).start()
 
     def frame(self, frame: Frame) -> None:
         """Take a frame; from the camera's thread."""
@@ -102,10 +102,10 @@ class Flights:
         if self.current is not None:
             self.current.take(message)
 
-    def keep(self, message: LinkBytes | HealthNote) -> None:
+    def record(self, message: LinkBytes | HealthNote) -> None:
         """Have something in the recording."""
         if self.current is not None:
-            self.current.keep(message)
+            self.current.record(message)
 
     async def close(self, patience_s: float, keep_map: bool) -> None:
         """End all flights in a hurry; with `keep_map` the next daemon may go on with the map."""
@@ -114,7 +114,7 @@ class Flights:
         self.end()
         for flight in list(self._ending):
             flight.hurry()
-        self.discard_spare()
+        self.discard_standby()
         rounds = round(patience_s / 0.02)
         while rounds and any(thread.is_alive() for thread in self._ending.values()):
             await asyncio.sleep(0.02)

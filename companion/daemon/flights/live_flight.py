@@ -40,7 +40,7 @@ from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import (
     Finish,
     KeepMap,
-    SetShare,
+    SetLoadLevel,
     Setup,
     Snapshot,
     TakeSnapshot,
@@ -72,7 +72,7 @@ STALLED = "it hung for {:.0f} s and was ended"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
 """Between two starts of a stage that dies again and again."""
-TELL_NS = 1_000_000_000
+HEALTH_EVERY_NS = 1_000_000_000
 NOT_FINISHED = "a stage did not give its last results in time"
 
 
@@ -114,7 +114,7 @@ class LiveFlight:
         self.n_frames = 0
         self._viewing: Viewing | None = None
         self._last_map: MapUpdate | None = None
-        self._told_ns = 0
+        self._health_ns = 0
         self._origin: GeoOrigin | None = None
         self._dense = makes_depth(config)
         self._dense_share = 1.0
@@ -173,37 +173,39 @@ class LiveFlight:
             return
         if not isinstance(message, Warned):
             self.stages["localisation"].offer(message)
-        self.keep(message)
-        self._record(message)
+        self.record(message)
+        self._to_results(message)
 
-    def keep(self, message: Message | LinkBytes | HealthNote) -> None:
+    def record(self, message: Message | LinkBytes | HealthNote) -> None:
         """Have something in the recording; nobody else hears of it."""
         if "recorder" in self.stages and self.folder is not None and not self._over.is_set():
             self.stages["recorder"].offer(message)
 
-    def tell(self, health: Health, origin: GeoOrigin | None) -> None:
+    def publish_health(self, health: Health, origin: GeoOrigin | None) -> None:
         """Have viewers and recording told how all is, once a second, and where the world lies."""
-        if self.folder is None or self._over.is_set() or health.t_ns - self._told_ns < TELL_NS:
+        if self.folder is None or self._over.is_set():
             return
-        self._told_ns = health.t_ns
-        self._record(health)
+        if health.t_ns - self._health_ns < HEALTH_EVERY_NS:
+            return
+        self._health_ns = health.t_ns
+        self._to_results(health)
         if origin is not None and origin != self._origin:
             self._origin = origin
-            self._record(origin)
+            self._to_results(origin)
 
     @property
     def viewing(self) -> Viewing | None:
         """Who looks on; None if nobody may."""
         return self._viewing
 
-    def set_shares(self, features: float, dense: float, viewer: bool) -> None:
+    def set_load_levels(self, features: float, dense: float, viewer: bool) -> None:
         """Leave out some of the work, or take it up again; see companion.runtime.governor."""
         if self._viewing is not None:
             self._viewing.pictures = viewer
-        self.stages["localisation"].offer(SetShare(features))
+        self.stages["localisation"].offer(SetLoadLevel(features))
         self._dense_share = dense
         if "depth" in self.stages:
-            self.stages["depth"].offer(SetShare(dense))
+            self.stages["depth"].offer(SetLoadLevel(dense))
 
     @property
     def dense(self) -> bool:
@@ -222,7 +224,7 @@ class LiveFlight:
             self._dense = dense
         if not dense:
             return
-        self._take_up("depth")
+        self._bring_up_to_date("depth")
 
     def set_budget(self, kbit_s: float) -> None:
         """All viewers together get no more from now on; 0 for no limit."""
@@ -354,7 +356,7 @@ class LiveFlight:
             self.stages[kind] = self._start(kind)
             gone.kill()
             self._set_up(kind)
-        self._take_up(kind)
+        self._bring_up_to_date(kind)
 
     def _blame_driver(self, gone: StageProcess, why: str) -> None:
         """A device whose driver has ended a stage is not used again in this flight.
@@ -369,10 +371,10 @@ class LiveFlight:
             return
         self._failed_devices[driver.identity] = f"{driver.named}: {why}"
 
-    def _take_up(self, kind: str) -> None:
+    def _bring_up_to_date(self, kind: str) -> None:
         """A stage begins in mid-flight: it has to know what the others do."""
         if kind == "depth":
-            self.stages[kind].offer(SetShare(self._dense_share))
+            self.stages[kind].offer(SetLoadLevel(self._dense_share))
         if self._last_map is not None:
             self.stages[kind].offer(self._last_map)
 
@@ -386,7 +388,7 @@ class LiveFlight:
         if isinstance(message, Odometry):
             self._listener.odometry(message)
             self._show(message)
-            self.keep(message)
+            self.record(message)
             return
         if isinstance(message, (Track, KeyframeAdded, MapUpdate)) and self._dense:
             self.stages["depth"].offer(message)
@@ -399,10 +401,10 @@ class LiveFlight:
             if not self._over.is_set():
                 return  # the listener hands it back, see `take`
         if isinstance(message, (MapUpdate, PointChunk)) and self._config.recorder.point_cloud:
-            self.keep(message)
-        self._record(message)
+            self.record(message)
+        self._to_results(message)
 
-    def _record(self, message: Watched) -> None:
+    def _to_results(self, message: Watched) -> None:
         self.stages["results"].offer(message)
         self._show(message)
 

@@ -32,10 +32,10 @@ class NewMap:
         job = self._job
         if job is None:
             return
-        spare, waited_s = self._flights.spare, monotonic_s() - self._since_s
-        if self._flights.current is None or spare is None:
+        standby, waited_s = self._flights.standby, monotonic_s() - self._since_s
+        if self._flights.current is None or standby is None:
             job.result, self._job = FAILED, None
-        elif spare.stages["localisation"].progress is not None or waited_s > MOST_S:
+        elif standby.stages["localisation"].progress is not None or waited_s > MOST_S:
             self._flights.end()
             self._begin()
             job.percent, job.result, self._job = 100, ACCEPTED, None

@@ -22,7 +22,7 @@ LOOK_S = 0.2
 CUT_SHORT = "an earlier recording was cut short"
 
 
-class LeftOvers:
+class RecordingRecovery:
     """Used in the event loop. `warn` hears of each recording."""
 
     def __init__(

@@ -51,7 +51,7 @@ class DepthNode:
         self._devices = choose_devices(config.opencl, self._journal.say)
         self._bus = ZenohBus(config.distributed)
         for topic in ("depth", "cloud"):
-            self._bus.announce(topic, LAST)
+            self._bus.declare_publisher(topic, LAST)
         self._flight: RemoteFlight | None = None
         self._run = ""
         self._after = -1
@@ -166,7 +166,7 @@ class DepthNode:
             )
 
     def _publish(self, topic: str, envelope: Callable[[], Envelope]) -> None:
-        if self._bus.is_wanted(topic):
+        if self._bus.has_subscribers(topic):
             self._bus.publish(topic, envelope().pack())
 
     def _heard(self, is_heard: bool) -> None:

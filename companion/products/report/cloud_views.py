@@ -38,32 +38,32 @@ class CloudView:
     bar_px: float
 
 
-def cloud_views(cloud: Cloud, stretches: Sequence[Array]) -> list[CloudView]:
+def cloud_views(cloud: Cloud, segments: Sequence[Array]) -> list[CloudView]:
     """From above with north up, from the side, and at a slant; none for an empty cloud.
 
-    `stretches` are unbroken parts (N, 3) of the camera's path in the world (north, east, down).
+    `segments` are unbroken parts (N, 3) of the camera's path in the world (north, east, down).
     """
     if len(cloud) == 0:
         return []
-    heading = side_heading_rad(cloud, stretches)
+    heading = side_heading_rad(cloud, segments)
     side = f"From the side, looking {compass_point(heading)}"
     slant_heading = heading + np.radians(30)
     slant = f"At a slant, looking {compass_point(slant_heading)}"
     return [
-        _view("From above", cloud, stretches, 0.0, np.pi / 2, (1.3, 3.0)),
-        _view(side, cloud, stretches, heading, 0.0, (1.6, 1.6)),
-        _view(slant, cloud, stretches, slant_heading, np.radians(35), (1.6, 1.6)),
+        _view("From above", cloud, segments, 0.0, np.pi / 2, (1.3, 3.0)),
+        _view(side, cloud, segments, heading, 0.0, (1.6, 1.6)),
+        _view(slant, cloud, segments, slant_heading, np.radians(35), (1.6, 1.6)),
     ]
 
 
-def side_heading_rad(cloud: Cloud, stretches: Sequence[Array]) -> float:
+def side_heading_rad(cloud: Cloud, segments: Sequence[Array]) -> float:
     """Heading that sees the cloud at its widest, from where the camera flew."""
     flat = cloud.points[:, :2].astype(np.float64)
     middle = np.median(flat, axis=0)
     _, axes = np.linalg.eigh(np.cov((flat - middle).T) if len(flat) > 1 else np.eye(2))
     across = axes[:, 0]
-    if stretches:
-        ahead = float(across @ (middle - np.median(np.concatenate(stretches)[:, :2], axis=0)))
+    if segments:
+        ahead = float(across @ (middle - np.median(np.concatenate(segments)[:, :2], axis=0)))
     else:
         ahead = float(across[0])
     if ahead < 0:
@@ -121,14 +121,14 @@ def splat(
 def _view(
     title: str,
     cloud: Cloud,
-    stretches: Sequence[Array],
+    segments: Sequence[Array],
     heading_rad: float,
     pitch_rad: float,
     aspects: tuple[float, float],
 ) -> CloudView:
     axes = view_axes(heading_rad, pitch_rad)
     seen = cloud.points.astype(np.float64) @ axes.T
-    flown = [stretch @ axes.T for stretch in stretches]
+    flown = [segment @ axes.T for segment in segments]
     low, high = _frame(seen, flown, aspects)
     px_per_unit = WIDTH_PX / (high[0] - low[0])
     width, height = WIDTH_PX, round((high[1] - low[1]) * px_per_unit)
@@ -144,7 +144,7 @@ def _view(
     bar = round_length(width / px_per_unit / 4)
     return CloudView(
         title, bool(pitch_rad > 1.5), _encode(shaded, np.isfinite(nearest), width, height),
-        width, height, [to_pixels(stretch) for stretch in flown], bar, float(bar * px_per_unit),
+        width, height, [to_pixels(segment) for segment in flown], bar, float(bar * px_per_unit),
     )  # fmt: skip
 
 

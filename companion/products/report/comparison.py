@@ -23,7 +23,7 @@ COUNTS = ("frames", "tracked", "segments", "keyframes", "depth_maps", "points", 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseDifference:
-    """Of the frames that both runs placed, by their times: `apart_m`, `turned_deg` (N,).
+    """Of the frames that both runs placed, by their times: `distance_m`, `rotation_deg` (N,).
 
     Both in the world as each run has it; `aligned_rms_m` is what is left after the best similarity,
     whose scale is `scale`.
@@ -34,15 +34,15 @@ class PoseDifference:
     t_ns: Array
     centres_a: Array
     centres_b: Array
-    apart_m: Array
-    turned_deg: Array
+    distance_m: Array
+    rotation_deg: Array
     aligned_rms_m: float
     scale: float
 
     @property
     def rms_m(self) -> float:
         """Root mean square of the distances; 0 where no frame is in both."""
-        return float(np.sqrt((self.apart_m**2).mean())) if len(self.apart_m) else 0.0
+        return float(np.sqrt((self.distance_m**2).mean())) if len(self.distance_m) else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,8 +107,8 @@ def numbers(found: Comparison) -> dict[str, Any]:
         "unit": found.unit,
         "poses": {
             "common": len(poses.t_ns), "only_a": poses.n_only_a, "only_b": poses.n_only_b,
-            "rms": poses.rms_m, "max": _largest(poses.apart_m),
-            "turned_deg_max": _largest(poses.turned_deg),
+            "rms": poses.rms_m, "max": _largest(poses.distance_m),
+            "turned_deg_max": _largest(poses.rotation_deg),
             "aligned_rms": poses.aligned_rms_m, "scale": poses.scale,
         },
         "cloud": {

@@ -51,9 +51,9 @@ MIN_HALF = 0.5
 """Half the least extent of a plan: a camera that stood still is a point with room around it."""
 
 
-def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> str:
+def plan_svg(segments: Sequence[Array], autopilot: Array | None, unit: str) -> str:
     """The way from above, north up and east right; positions (N, 3) north, east, down."""
-    everything = [*stretches, *([autopilot] if autopilot is not None else [])]
+    everything = [*segments, *([autopilot] if autopilot is not None else [])]
     with _style("plan"):
         low, high = _bounds(everything)
         middle, half = (low + high) / 2, np.maximum(0.53 * (high - low), MIN_HALF)
@@ -63,9 +63,9 @@ def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> 
         axes = figure.add_subplot()
         if autopilot is not None:
             axes.plot(*_thin(autopilot)[:, 1::-1].T, **AUTOPILOT)
-        _draw_stretches(axes, [stretch[:, 1::-1] for stretch in stretches])
-        if stretches:
-            first, last = stretches[0][0], stretches[-1][-1]
+        _draw_segments(axes, [segment[:, 1::-1] for segment in segments])
+        if segments:
+            first, last = segments[0][0], segments[-1][-1]
             axes.plot(first[1], first[0], "o", ms=8, mfc="none", mec=PATH, label="start")
             axes.plot(last[1], last[0], "s", ms=6, color=PATH, label="end")
         metric = unit == "m"
@@ -79,7 +79,7 @@ def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> 
 
 
 def height_svg(
-    stretches: Sequence[tuple[Array, Array]],
+    segments: Sequence[tuple[Array, Array]],
     autopilot: tuple[Array, Array] | None,
     unit: str,
     duration_s: float,
@@ -92,7 +92,7 @@ def height_svg(
             t_s, position = autopilot
             line = _thin(np.stack([t_s, -position[:, 2]], 1))
             axes.plot(*line.T, **AUTOPILOT)
-        _draw_stretches(axes, [np.stack([t, -p[:, 2]], 1) for t, p in stretches])
+        _draw_segments(axes, [np.stack([t, -p[:, 2]], 1) for t, p in segments])
         axes.set_ylabel("height [m]" if unit == "m" else f"-z [{unit}]")
         low, high = axes.get_ylim()
         if unit == "m" and high - low < MIN_HEIGHT_M:  # else centimetres look like mountains
@@ -113,7 +113,9 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
         found = np.where(known, [float(track.n_inliers) for track in tracks], np.nan)
         axes.plot(*_thin(np.stack([t_s, found], 1)).T, color=PATH, lw=1.2, label="map points found")
         for state, colour in (
-            (TrackState.INITIALISING, IDLE), (TrackState.COASTING, OTHER), (TrackState.LOST, BAD),
+            (TrackState.INITIALISING, IDLE),
+            (TrackState.DEAD_RECKONING, OTHER),
+            (TrackState.LOST, BAD),
         ):  # fmt: skip
             here = np.array([track.state is state for track in tracks])
             axes.fill_between(
@@ -158,7 +160,7 @@ def _style(name: str) -> AbstractContextManager[None]:
     return matplotlib.rc_context(style)
 
 
-def _draw_stretches(axes: Axes, lines: Sequence[Array]) -> None:
+def _draw_segments(axes: Axes, lines: Sequence[Array]) -> None:
     for n, line in enumerate(lines):
         axes.plot(*_thin(line).T, color=PATH, lw=1.8, label="camera" if n == 0 else "_")
 

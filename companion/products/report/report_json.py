@@ -42,7 +42,7 @@ def report(
                 "moved": _finite(r.moved),
                 "scale": _finite(r.scale),
             }
-            for r in result.reunions
+            for r in result.loop_closures
         ],
         "depth_maps": result.n_depth_maps,
         "points": len(cloud),

@@ -39,13 +39,13 @@ def report_page(
         lstrip_blocks=True,
     )
     environment.filters.update(distance=distance, thousands=thousands, number=number)
-    stretches = path_stretches(poses)
+    segments = path_segments(poses)
     page = environment.get_template("report.html.j2").render(
         n=numbers,
         when=when(result.first_t_ns),
-        plots=_plots(result, facts, stretches, numbers["duration_s"]),
+        plots=_plots(result, facts, segments, numbers["duration_s"]),
         autopilot=_autopilot_name(result),
-        views=[_view(view) for view in cloud_views(cloud, [p for _, p in stretches])],
+        views=[_view(view) for view in cloud_views(cloud, [p for _, p in segments])],
         depths=_depths(result),
         stages={**numbers["stages"], **kernel_stages(result)},
         config=json.dumps(numbers["config"], indent=2, ensure_ascii=False),
@@ -58,7 +58,7 @@ def kernel_stages(result: FlightResult) -> dict[str, dict[str, float]]:
     return {f"{name} (kernel)": times for name, times in result.kernel_times().items()}
 
 
-def path_stretches(poses: Sequence[WorldPose]) -> list[tuple[Array, Array]]:
+def path_segments(poses: Sequence[WorldPose]) -> list[tuple[Array, Array]]:
     """Parts of the path without gaps: t_ns (N,) and positions (N, 3) in the world.
 
     A gap is five times the usual step, and half a second at least.
@@ -106,7 +106,7 @@ def thousands(value: int) -> str:
 def _plots(
     result: FlightResult,
     facts: RunFacts,
-    stretches: Sequence[tuple[Array, Array]],
+    segments: Sequence[tuple[Array, Array]],
     duration_s: float,
 ) -> dict[str, Markup | None]:
     """The plots that there is something for; they are markup of our own making."""
@@ -114,14 +114,14 @@ def _plots(
     found = result.autopilot_path()
     autopilot = None
     placed = result.georeference is not None and result.georeference.has_origin
-    if found is not None and (placed or not stretches):
+    if found is not None and (placed or not segments):
         _, t_ns, position = found
         during = (t_ns >= first) & (t_ns <= (result.last_t_ns or first))
         if during.any():
             autopilot = ((t_ns[during] - first) * 1e-9, position[during])
     unit = "m" if autopilot is not None else result.unit
-    flown = [((t_ns - first) * 1e-9, position) for t_ns, position in stretches]
-    some_path = bool(stretches) or autopilot is not None
+    flown = [((t_ns - first) * 1e-9, position) for t_ns, position in segments]
+    some_path = bool(segments) or autopilot is not None
     stages = {**facts.stage_times, **kernel_stages(result)}
     drawn = {
         "plan": plots.plan_svg([p for _, p in flown], autopilot[1] if autopilot else None, unit)

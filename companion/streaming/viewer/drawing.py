@@ -50,7 +50,7 @@ IMAGE_PLANE_UNITS = 0.15
 WIDTH = 640
 """Of pictures, at most; a link that is thin brings smaller ones, which are enlarged."""
 STATE_LEVEL = {
-    Shown.WAITING: 0.0, Shown.LOST: 0.0, Shown.INITIALISING: 1.0, Shown.COASTING: 2.0,
+    Shown.WAITING: 0.0, Shown.LOST: 0.0, Shown.INITIALISING: 1.0, Shown.DEAD_RECKONING: 2.0,
     Shown.TRACKING: 3.0,
 }  # fmt: skip
 PLOTTED = {

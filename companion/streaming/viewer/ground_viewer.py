@@ -37,8 +37,8 @@ def show(link: GroundLink, screen: Screen, colours: Colours, stop: threading.Eve
             )
             recording.connect_grpc(screen.address, default_blueprint=layout(live=True))
             drawing = Drawing(recording, live=True, colours=colours)
-        if screen.gate is not None and not isinstance(item, (PoseItem, StatusItem)):
-            screen.gate.wait_for_room(stop)
+        if screen.proxy is not None and not isinstance(item, (PoseItem, StatusItem)):
+            screen.proxy.wait_for_browsers(stop)
         if drawing is not None:
             drawing.draw(item)
     if recording is not None:

@@ -11,13 +11,13 @@ from companion.streaming.scene_encoder import Watched
 
 
 class Inbox:
-    """Messages on their way from one thread to another, `room_bytes` of them at most.
+    """Messages on their way from one thread to another, `capacity_bytes` of them at most.
 
     A message that is larger than the room is let in when nothing else is there.
     """
 
-    def __init__(self, room_bytes: int) -> None:
-        self._room = room_bytes
+    def __init__(self, capacity_bytes: int) -> None:
+        self._capacity_bytes = capacity_bytes
         self._held: deque[tuple[Watched, int]] = deque()
         self._bytes = 0
         self._closed = False
@@ -30,14 +30,14 @@ class Inbox:
         """Put in a message; wait for room. Does nothing once the inbox is closed."""
         size = size_bytes(message)
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._fits(size, self._room))
+            self._changed.wait_for(lambda: self._closed or self._fits(size, self._capacity_bytes))
             if not self._closed:
                 self._append(message, size)
 
     def offer(self, message: Watched) -> bool:
         """Put in a message if there is room now; images leave half the room to what is small."""
         size = size_bytes(message)
-        room = self._room // 2 if isinstance(message, Frame) else self._room
+        room = self._capacity_bytes // 2 if isinstance(message, Frame) else self._capacity_bytes
         with self._changed:
             if self._closed or not self._fits(size, room):
                 return False

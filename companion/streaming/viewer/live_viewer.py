@@ -28,7 +28,7 @@ from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.reduced import SHOWN, reduced
 from companion.timing.clock import monotonic_s
 
-ROOM_BYTES = 32 << 20
+CAPACITY_BYTES = 32 << 20
 PATIENCE_S = 3.0
 START_S = 30.0
 READY = b"ready"
@@ -58,7 +58,7 @@ class LiveViewer:
         self.page = ""
         """What to open in a browser; "" for a window."""
         self._config, self._width = config, min(config.image_width, camera.width)
-        self._inbox = Inbox(ROOM_BYTES)
+        self._inbox = Inbox(CAPACITY_BYTES)
         self._budget: SetBudget | None = None
         """To be told to the exporter."""
         self._frame_ns = -(2**63)

@@ -10,7 +10,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from companion.errors import InputError
-from companion.streaming.viewer.web_gate import LOOPBACK, WebGate, free_ports
+from companion.streaming.viewer.web_proxy import LOOPBACK, WebProxy, free_ports
 from companion.timing.clock import monotonic_s, wait_s
 
 WEB_PORT = 9090
@@ -38,7 +38,7 @@ class Screen:
         """Whether it ends with the flight: a page does, a window stays."""
         self.page = ""
         """What to open in a browser."""
-        self.gate: WebGate | None = None
+        self.proxy: WebProxy | None = None
         """Through which browsers come; None where none do."""
         if where == "web":
             self._serve(bind)
@@ -66,9 +66,9 @@ class Screen:
         )  # fmt: skip
         self.is_ours = True
         self.address = f"rerun+http://{LOOPBACK}:{inner_grpc}/proxy"
-        doors = {(bind, GRPC_PORT): inner_grpc, (bind, WEB_PORT): inner_web}
+        listeners = {(bind, GRPC_PORT): inner_grpc, (bind, WEB_PORT): inner_web}
         try:
-            self.gate = WebGate(doors, watched=GRPC_PORT)
+            self.proxy = WebProxy(listeners, watched=GRPC_PORT)
         except OSError as error:
             self.process.kill()
             self.process.wait()
@@ -82,8 +82,8 @@ class Screen:
 
     def close(self) -> None:
         """End what is to end with the flight."""
-        if self.gate is not None:
-            self.gate.close()
+        if self.proxy is not None:
+            self.proxy.close()
         if self.process is not None and self.is_ours:
             self.process.terminate()
             self.process.wait()

@@ -16,7 +16,7 @@ from companion.config import RouterConfig
 from drivers.mavlink.wire.link_url import client_endpoint
 from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
 from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
-from drivers.mavlink.wire.tcp_listener import TcpDoor
+from drivers.mavlink.wire.tcp_listener import TcpListener
 from drivers.mavlink.wire.tcp_wire import TcpConnection
 from drivers.mavlink.wire.udp_wire import UdpWire
 from drivers.mavlink.wire.wire import Wire, run_together
@@ -112,7 +112,7 @@ class Router:
         self._accepts = accepts
         self._queue_bytes = config.queue_kb * 1000
         self._clients: list[RouterClient] = []
-        self._doors: list[TcpDoor[RouterClient]] = []
+        self._listeners: list[TcpListener[RouterClient]] = []
         self._autopilots: dict[int, int] = {}
         self._recent: dict[bytes, tuple[RouterClient | None, int]] = {}
         self._budget = RateLimit(1.0, 1.0)
@@ -122,7 +122,7 @@ class Router:
         for url in config.clients:
             endpoint = client_endpoint(url)
             if endpoint.kind == "tcpin":
-                self._doors.append(TcpDoor(endpoint, self._connection, self._leave))
+                self._listeners.append(TcpListener(endpoint, self._connection, self._leave))
                 continue
             queue, limit = PacketQueue(self._queue_bytes), self._read_limit()
             self._join(UdpWire(endpoint, queue, limit, listens=endpoint.kind == "udpin"))
@@ -131,7 +131,7 @@ class Router:
         """Serve the clients until cancelled."""
         fixed = [client.wire.run(client) for client in self._clients]
         try:
-            await run_together(*fixed, *(door.run() for door in self._doors))
+            await run_together(*fixed, *(door.run() for door in self._listeners))
         finally:
             if self._pump_later is not None:
                 self._pump_later.cancel()
@@ -148,14 +148,14 @@ class Router:
         return departed
 
     @property
-    def n_turned_away(self) -> int:
+    def n_rejected(self) -> int:
         """Connections for which there was no room."""
-        return sum(door.n_turned_away for door in self._doors)
+        return sum(door.n_rejected for door in self._listeners)
 
     @property
     def trouble(self) -> str:
         """Why a place for clients is not open, for people; "" when all are."""
-        places = [door.trouble for door in self._doors]
+        places = [door.trouble for door in self._listeners]
         places += [client.wire.trouble for client in self._clients if not client.wire.connected]
         return "; ".join(place for place in places if place)
 

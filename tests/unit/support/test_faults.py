@@ -74,7 +74,7 @@ def test_silent_telemetry_leaves_three_seconds_out() -> None:
 def test_a_blinded_camera_sees_nothing_for_two_seconds() -> None:
     blind = [f for f in filmed("blind for 2 s") if (f.grey > 250).all()]
     assert len(blind) == 20
-    assert fault("blind for 2 s").blind_ns(SPAN) == (blind[0].t_ns, blind[-1].t_ns + 100_000_000)
+    assert fault("blind for 2 s").dropout_ns(SPAN) == (blind[0].t_ns, blind[-1].t_ns + 100_000_000)
 
 
 def test_dropped_frames_are_the_same_each_time() -> None:

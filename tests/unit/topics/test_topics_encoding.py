@@ -78,7 +78,7 @@ def test_a_cloud_says_where_it_lies_in_the_world() -> None:
 
 
 def test_map_and_depth_are_as_they_were() -> None:
-    update = replace(flown.update(), unit_of={2: 1.5}, n_retired=1)
+    update = replace(flown.update(), scale_of={2: 1.5}, n_retired=1)
     back = map_of_envelope(unpack(map_envelope("f", update).pack()))
     assert list(back.map_from_camera) == list(update.map_from_camera) and back.n_retired == 1
     assert back.georeference is not None and back.georeference.method == "GPS positions"

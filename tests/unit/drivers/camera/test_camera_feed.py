@@ -95,7 +95,7 @@ def running(source: ToldSource | None = None, **keys: float | str) -> Iterator[R
 @pytest.fixture(autouse=True)
 def faster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_feed, "RETRY_S", 0.05)
-    monkeypatch.setattr(camera_feed, "AMISS_S", 0.4)
+    monkeypatch.setattr(camera_feed, "INVALID_S", 0.4)
     monkeypatch.setattr(camera_feed, "FROZEN_S", 0.2)
 
 
@@ -202,7 +202,7 @@ def test_a_drivers_own_bug_is_told_with_its_place(
     assert camera_feed.GONE not in run.told() and camera_feed.MISSING not in run.told()
     printed = capfd.readouterr().err
     assert printed.count("Traceback") == 1
-    assert ("_amiss" if where == "picture" else "in a_drivers_bug") in printed
+    assert ("_why_invalid" if where == "picture" else "in a_drivers_bug") in printed
     assert "secret" not in printed and (where == "picture" or "camera.url" in printed)
     assert all(line.startswith("companion: ") for line in printed.splitlines())
 

@@ -152,7 +152,7 @@ def test_video_after_a_hole_waits_for_a_picture_that_stands_alone(tmp_path: Path
     flight = opened(folder)
     whole = {f.seq: f.rgb for f in frames_of(flight)}
     places = flight.recording.pictures
-    assert [p.seq for p in places if p.alone] == [5, 35, 65]
+    assert [p.seq for p in places if p.intra] == [5, 35, 65]
     chunk = flight.recording.found.chunks[places[10].chunk]
     assert places[0].chunk < places[10].chunk < places[25].chunk
     data = bytearray(path.read_bytes())

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 
 from companion.timing.clock import monotonic_s, wait_s
 
-ROOM_BYTES = 65536
+CAPACITY_BYTES = 65536
 NOT_SENT_BYTES = 16384
-BEHIND_S = 0.3
+LAG_S = 0.3
 """A browser for which something has waited for so long does not keep up."""
 LONGEST_WAIT_S = 2.0
 """A browser that takes nothing at all holds the others up no longer than this at a time."""
@@ -27,7 +27,7 @@ LOOPBACK = "127.0.0.1"
 
 
 @dataclass(eq=False)
-class _Way:
+class _Direction:
     """One direction of a connection."""
 
     source: socket.socket
@@ -39,36 +39,38 @@ class _Way:
     ended: bool = False
 
 
-class WebGate:
-    """Connections to `doors`, (address, port) each, go on to a port of this machine.
+class WebProxy:
+    """Connections to `listeners`, (address, port) each, go on to a port of this machine.
 
     `watched` is the port of the doors at which lag counts. OSError where a door cannot be opened.
     """
 
-    def __init__(self, doors: Mapping[tuple[str, int], int], watched: int) -> None:
+    def __init__(self, listeners: Mapping[tuple[str, int], int], watched: int) -> None:
         self._selector = selectors.DefaultSelector()
-        self._ways: dict[socket.socket, tuple[_Way, _Way]] = {}
+        self._directions: dict[socket.socket, tuple[_Direction, _Direction]] = {}
         self._stop = threading.Event()
-        for (host, port), inner in doors.items():
+        for (host, port), inner in listeners.items():
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            door = socket.create_server((host, port), family=family)
-            door.setblocking(False)
-            self._selector.register(door, selectors.EVENT_READ, (inner, port == watched))
+            listener = socket.create_server((host, port), family=family)
+            listener.setblocking(False)
+            self._selector.register(listener, selectors.EVENT_READ, (inner, port == watched))
         self._thread = threading.Thread(target=self._work, name="web gate", daemon=True)
         self._thread.start()
 
-    def wait_for_room(self, stop: threading.Event) -> None:
+    def wait_for_browsers(self, stop: threading.Event) -> None:
         """Wait until no browser lags, or has for too long."""
         until_s = monotonic_s() + LONGEST_WAIT_S
-        while self.is_behind and monotonic_s() < until_s and not stop.is_set():
+        while self.is_lagging and monotonic_s() < until_s and not stop.is_set():
             wait_s(stop, LOOK_S)
 
     @property
-    def is_behind(self) -> bool:
+    def is_lagging(self) -> bool:
         """Whether a browser does not take what it is sent."""
         now_s = monotonic_s()
-        since = [way.since_s for pair in list(self._ways.values()) for way in pair]
-        return any(s is not None and now_s - s > BEHIND_S for s in since)
+        since = [
+            direction.since_s for pair in list(self._directions.values()) for direction in pair
+        ]
+        return any(s is not None and now_s - s > LAG_S for s in since)
 
     def close(self) -> None:
         """Close the doors."""
@@ -81,16 +83,16 @@ class WebGate:
                 assert isinstance(key.fileobj, socket.socket)
                 if isinstance(key.data, tuple):
                     self._open(key.fileobj, *key.data)
-                elif key.fileobj in self._ways:
+                elif key.fileobj in self._directions:
                     self._pass(key.fileobj, events)
         for opened in list(self._selector.get_map().values()):
             assert isinstance(opened.fileobj, socket.socket)
             opened.fileobj.close()
         self._selector.close()
 
-    def _open(self, door: socket.socket, inner: int, is_watched: bool) -> None:
+    def _open(self, listener: socket.socket, inner: int, is_watched: bool) -> None:
         try:
-            browser, _ = door.accept()
+            browser, _ = listener.accept()
         except OSError:  # it is gone already
             return
         try:
@@ -102,45 +104,49 @@ class WebGate:
         for each in (browser, server):
             each.setblocking(False)
             each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        out, back = _Way(server, browser, is_watched), _Way(browser, server, False)
+        out, back = _Direction(server, browser, is_watched), _Direction(browser, server, False)
         for each in (browser, server):
-            self._ways[each] = (out, back)
+            self._directions[each] = (out, back)
             self._selector.register(each, selectors.EVENT_READ)
 
     def _pass(self, ready: socket.socket, events: int) -> None:
-        ways = self._ways[ready]
+        directions = self._directions[ready]
         try:
-            for way in ways:
-                has_room = len(way.held) < ROOM_BYTES
-                if way.source is ready and events & selectors.EVENT_READ and has_room:
-                    data = way.source.recv(ROOM_BYTES)
-                    way.ended |= not data
-                    way.held += data
-                if way.held and select.select([], [way.sink], [], 0)[1]:
+            for direction in directions:
+                has_room = len(direction.held) < CAPACITY_BYTES
+                if direction.source is ready and events & selectors.EVENT_READ and has_room:
+                    data = direction.source.recv(CAPACITY_BYTES)
+                    direction.ended |= not data
+                    direction.held += data
+                if direction.held and select.select([], [direction.sink], [], 0)[1]:
                     # else the kernel would take, and keep, far more than the network does
-                    del way.held[: way.sink.send(way.held)]
-                if not way.held:
-                    way.since_s = None
-                elif way.since_s is None and way.is_watched:
-                    way.since_s = monotonic_s()
-            if any(way.ended and not way.held for way in ways):
+                    del direction.held[: direction.sink.send(direction.held)]
+                if not direction.held:
+                    direction.since_s = None
+                elif direction.since_s is None and direction.is_watched:
+                    direction.since_s = monotonic_s()
+            if any(direction.ended and not direction.held for direction in directions):
                 raise ConnectionResetError
-            for each in (ways[0].source, ways[0].sink):
-                self._watch(each, ways)
+            for each in (directions[0].source, directions[0].sink):
+                self._watch(each, directions)
         except BlockingIOError:
             pass
         except OSError:
-            for each in (ways[0].source, ways[0].sink):
+            for each in (directions[0].source, directions[0].sink):
                 self._forget(each)
-                del self._ways[each]
+                del self._directions[each]
                 each.close()
 
-    def _watch(self, each: socket.socket, ways: tuple[_Way, _Way]) -> None:
+    def _watch(self, each: socket.socket, directions: tuple[_Direction, _Direction]) -> None:
         wanted = 0
-        for way in ways:
-            if way.source is each and len(way.held) < ROOM_BYTES and not way.ended:
+        for direction in directions:
+            if (
+                direction.source is each
+                and len(direction.held) < CAPACITY_BYTES
+                and not direction.ended
+            ):
                 wanted |= selectors.EVENT_READ
-            if way.sink is each and way.held:
+            if direction.sink is each and direction.held:
                 wanted |= selectors.EVENT_WRITE
         self._forget(each)
         if wanted:
