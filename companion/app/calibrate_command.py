@@ -1,6 +1,6 @@
-"""`companion calibrate`: from a board held before a camera to the camera's calibration file.
+"""`companion calibrate`: a camera's calibration file from views of a calibration board.
 
-A calibration that may not be flown with is refused with the reason, and nothing is written.
+A calibration that is not fit for flight is refused with the reason, and nothing is written.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ N_UNFOUND_KEPT = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationReport:
-    """What a calibration came to, and where it was written."""
+    """Result of a calibration, and where it was written."""
 
     name: str
     calibration: Calibration
@@ -65,7 +65,7 @@ class CalibrationReport:
     picture: Path
 
     def __str__(self) -> str:
-        """Some lines for the terminal."""
+        """Text for the terminal."""
         made = self.calibration
         fx, fy, cx, cy = (
             f"{key} {value:.2f} ± {sigma:.2f}"
@@ -93,8 +93,9 @@ def calibrate(
 ) -> CalibrationReport:
     """Calibrate from a video, a folder of images, or a live camera, into `out`.
 
-    InputError when the board is not there, or the result may not be used; then no file is touched.
-    A KeyboardInterrupt out of `progress` ends a live camera's views; what there is must do.
+    InputError without a board, or when the result is not fit for use; then no file is touched. A
+    KeyboardInterrupt raised by `progress` ends the views of a live camera; those taken must
+    suffice.
     """
     chart = parse_chart(board)
     if model not in ("auto", *MODELS):
@@ -125,7 +126,7 @@ def calibrate(
 
 
 def print_board(board: str, path: Path) -> str:
-    """Write the board as a page to print, .pdf or .png; returns the paper that it is for."""
+    """Write the board as a page to print, .pdf or .png; return the paper size."""
     form = path.suffix.lower().lstrip(".")
     if form not in ("pdf", "png"):
         raise InputError(f"--print-board {path}: wanted a name that ends in .pdf or .png")
@@ -139,7 +140,7 @@ def print_board(board: str, path: Path) -> str:
 
 @dataclass(slots=True)
 class _Gathered:
-    """What was found so far."""
+    """Views found so far."""
 
     chart: Chart
     views: list[View] = field(default_factory=list)
@@ -152,7 +153,7 @@ class _Gathered:
     unfound: list[Bytes] = field(default_factory=list)
 
     def look(self, number: int, grey: Bytes, *, only_new: bool) -> str:
-        """Look for the board in a picture; "" when it gave a view, else why it gave none."""
+        """Search an image for the board; "" when it gives a view, else the reason."""
         height, width = grey.shape
         if self.n_searched and self.size != (width, height):
             raise InputError(
@@ -180,7 +181,7 @@ class _Gathered:
         return ""
 
     def covered(self) -> Coverage:
-        """Where the board was."""
+        """Coverage of the image by the views so far."""
         return coverage(self.views, self.lit.mask(*self.size))
 
     def _is_new(self, view: View) -> bool:
@@ -218,7 +219,7 @@ def _search(frames: FrameSource, gathered: _Gathered, progress: Progress) -> Non
 
 
 def _sharpest(frames: FrameSource, stretch: int) -> Iterator[tuple[int, Bytes, int]]:
-    """Number and grey picture of the sharpest of each stretch, and how many were decoded so far."""
+    """Number and grey image of the sharpest of each interval, and how many are decoded so far."""
     best: tuple[float, int, Bytes] | None = None
     for number, rgb in frames.pictures(0, frames.n_frames - 1):
         if rgb is not None:
@@ -232,7 +233,7 @@ def _sharpest(frames: FrameSource, stretch: int) -> Iterator[tuple[int, Bytes, i
 
 
 def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Progress) -> None:
-    """Views of a live camera, until they are enough or its user stops."""
+    """Views of a live camera, until there are enough or the user stops."""
     progress.start(0)
     try:
         source.open()
@@ -267,7 +268,7 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
 
 
 def _judged(gathered: _Gathered, called: str, model: str) -> Calibration:
-    """The calibration, when it may be used."""
+    """The calibration, if it is fit for use."""
     refused = f"{called}: not calibrated: "
     n, found = gathered.n_searched, gathered.n_found
     if found < MIN_FOUND * n:  # perhaps by chance, on a board that is another one

@@ -1,4 +1,4 @@
-"""companion flights repair: recordings that nobody ended get their ends."""
+"""companion flights repair: adds the missing end to recordings that were cut short."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ STEP_BYTES, REST_S = 4 * MB, 0.1
 def repair_flights(
     paths: Sequence[Path], progress: Progress, gently: bool = False
 ) -> Iterator[tuple[str, bool]]:
-    """A line for each recording that was cut short, and whether it is whole now.
+    """One line for each recording that was cut short, and whether it is whole now.
 
-    What is whole, or still being recorded, is passed over, and so is what is no recording at all.
+    Passes over whole recordings, those being written, and files that are no recordings.
     """
     found = [path for path in paths if _is_unfinished(path)]
     progress.start(max(1, sum(path.stat().st_size for path in found) // MB))

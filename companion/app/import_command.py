@@ -1,4 +1,4 @@
-"""companion import: a flight of any format that can be read, as a flight folder or recording."""
+"""companion import: any readable flight as a flight folder or recording."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def import_flight(
 ) -> int:
     """Read a flight and write it as a folder or, as FILE.mcap, a recording; return its frames.
 
-    `notify` hears what was amiss. InputError where it cannot be read, or not be written.
+    `notify` takes remarks about the source. InputError where it cannot be read or written.
     """
     if out.suffix not in WRITERS:
         raise InputError(f"{out}: wanted is the name of a folder, or of a file ending in .mcap")

@@ -1,4 +1,4 @@
-"""A logged flight through the very stages that fly: from folder to map, recording and report."""
+"""Replay of a recorded flight through the stages of the daemon: map, recording, report."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def replay(
 ) -> FlightResult:
     """Replay a flight into the folder `out`; InputError when it cannot begin.
 
-    `notify` hears how the telemetry was read, which OpenCL devices were refused, and where a viewer
-    shows it.
+    `notify` takes remarks: how the telemetry was read, OpenCL devices refused, address of the
+    viewer.
 
-    What was done so far is written also when it is interrupted or fails on the way. Where only the
-    dense map failed, all frames are tracked and written with the cloud so far; StageError then.
+    Results so far are written also when it is interrupted or fails on the way. Where only the dense
+    map fails, all frames are tracked and written with the cloud so far; then StageError.
     """
     flight = open_flight(flight_path, config.camera, config.telemetry)
     start_ns, stop_ns = _span(flight, start_s, stop_s)

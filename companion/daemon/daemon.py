@@ -1,8 +1,8 @@
-"""The long-running program: camera, autopilot and stages joined, from power on to power off.
+"""The daemon: joins camera, autopilot and stages, from power on to power off.
 
-The event loop does I/O only. The camera has a thread, every heavy stage a process; what they give
-comes in by `call_soon_threadsafe`. Nothing that comes loose in flight ends it: it is named, waited
-for, and taken up again.
+The event loop does I/O only. The camera has a thread, every heavy stage a process; their output
+comes in by `call_soon_threadsafe`. No failure in flight ends it: the part is reported and
+restarted.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ END_S = 2.6
 
 
 class Daemon:
-    """Everything that runs; `run` gives the exit status. To be made within the event loop."""
+    """All parts of the daemon; `run` gives the exit status. Create it within the event loop."""
 
     def __init__(self, load: Callable[[], Config]) -> None:
         self._load = load
@@ -164,7 +164,7 @@ class Daemon:
             )  # fmt: skip
 
     async def run(self) -> int:
-        """Run until told to stop or unable to go on; the exit status."""
+        """Run until stopped or unable to continue; the exit status."""
         loop, config = self._loop, self._config
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, self._stop.set)
@@ -229,7 +229,7 @@ class Daemon:
     # -- what comes in --------------------------------------------------------------------------
 
     def _on_frame(self, frame: Frame) -> None:
-        """A frame, in the camera's thread."""
+        """Take a frame; in the camera's thread."""
         self._watch.frame_came()
         if self._camera is None:
             self._soon(self._camera_known)
@@ -237,7 +237,7 @@ class Daemon:
         self._flights.frame(frame)
 
     def _on_warned(self, warning: Warned) -> None:
-        """Something to be told, in any thread."""
+        """Take a warning; in any thread."""
         if self._journal.warn(warning):
             text = of_warning(warning.what, warning.detail, warning.good)
             if text is not None:
@@ -245,7 +245,7 @@ class Daemon:
         self._soon(self._flights.take, warning)
 
     def _on_telemetry(self, sample: Telemetry) -> None:
-        """A sample, in the event loop."""
+        """Take a sample; in the event loop."""
         self._flights.take(sample)
         if isinstance(sample, AttitudeSample):
             if self._sender is not None:
@@ -254,7 +254,7 @@ class Daemon:
             self._set_armed(sample.armed)
 
     def _listener(self, flight: LiveFlight) -> Listener:
-        """What a flight gives comes in here, but only as long as it is the one that flies."""
+        """Callbacks for the output of a flight, active while that flight is the current one."""
 
         def current(take: Callable[[Any], None]) -> Callable[[Any], None]:
             def later(message: Any) -> None:
@@ -343,7 +343,7 @@ class Daemon:
             self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
 
     def _unusable(self, why: str) -> None:
-        """On the ground somebody is there to read it; in the air the pose goes on without."""
+        """On the ground exit with the error; in the air the pose goes on without the stage."""
         if not self._armed:
             self._give_up(why, BAD_INPUT)
 
@@ -391,7 +391,7 @@ class Daemon:
                 self._give_up(gone)
 
     def _reload(self) -> None:
-        """SIGHUP: take over what can be changed while running, and say what cannot."""
+        """SIGHUP: apply what can change while running, and report what cannot."""
         if self._is_ready:
             self._service.reloading()
         try:
@@ -424,16 +424,16 @@ class Daemon:
 
     @property
     def config(self) -> Config:
-        """What counts now."""
+        """Configuration in force."""
         return self._config
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are; as they last were where nothing is heard."""
+        """Whether the motors are armed; the last known state where nothing is heard."""
         return self._arming.armed
 
     def take_over(self, config: Config) -> None:
-        """Go on with another configuration: at once where that can be, else with the next map."""
+        """Continue with another configuration: at once where possible, else with the next map."""
         old, self._config = self._config, config
         if self._arming.holds:
             for name in list(self._arming.waiting):
@@ -464,11 +464,11 @@ class Daemon:
     # -- what holds until the motors are disarmed, see Arming ------------------------------------
 
     def _hold(self) -> None:
-        """What counts now shall count if this ends in the air and is begun again."""
+        """Keep the settings in force for a restart in the air."""
         self._arming.hold(self._config, self._by_ground, monotonic_s())
 
     def _let_go(self) -> None:
-        """The motors are disarmed: the configuration has its say again."""
+        """Disarmed: apply the changes that were held."""
         waiting = {
             name: value
             for name, value in self._arming.let_go().items()
@@ -497,7 +497,7 @@ class Daemon:
         self._journal.say(text, WARNING)
 
     def _autopilot_boot_s(self) -> float | None:
-        """When the autopilot was started, CLOCK_MONOTONIC; None while its clock is not known."""
+        """Boot time of the autopilot, CLOCK_MONOTONIC; None while its clock is unknown."""
         report = self._link.clock_filter.report() if self._link is not None else None
         return None if report is None else report.offset_s - self._clock.epoch_ns * 1e-9
 
@@ -505,12 +505,12 @@ class Daemon:
         return self._link is not None and self._link.alive
 
     def prepare(self) -> None:
-        """Have a flight at hand beside the one that goes on."""
+        """Start the processes of a standby flight."""
         if self._camera is not None:
             self._flights.prepare(self._config, self._camera)
 
     def begin_flight(self) -> None:
-        """Begin one with a map of its own, where one is due."""
+        """Begin a flight with a map of its own, where one is due."""
         self._begin_if_due(take_up=False)
 
     def _give_up(self, why: str, status: int = FAULT) -> None:
@@ -527,7 +527,7 @@ class Daemon:
         self._on_warned(Warned(self._clock.now_ns(), text))
 
     def _soon(self, call: Callable[..., object], *arguments: Any) -> None:
-        """Have something done in the event loop; from any thread, nothing once it has ended."""
+        """Call in the event loop; from any thread, ignored once the loop has ended."""
         try:
             self._loop.call_soon_threadsafe(call, *arguments)
         except RuntimeError:

@@ -1,6 +1,6 @@
-"""What the daemon knows of itself, put together; and what follows from it while it runs.
+"""Health of the daemon, and the reactions to it.
 
-The governor's levels go to the flight from here, and a pose loop that hangs is noticed here.
+The governor's load levels go to the flight from here, and a hanging pose loop is detected here.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ IN_WORDS = {
 
 
 class HealthWatch:
-    """Counts what goes by, and says how all is. To be used in the event loop."""
+    """Counts messages and computes health. To be used in the event loop."""
 
     def __init__(
         self,
@@ -93,11 +93,11 @@ class HealthWatch:
 
     @property
     def too_hot(self) -> bool:
-        """Whether work is left out because of the temperature."""
+        """Whether the load level is reduced because of the temperature."""
         return "hot" in self._governor.degraded
 
     def reconfigure(self, config: Config) -> None:
-        """Take over what has changed."""
+        """Apply a changed configuration."""
         if config.daemon == self._config:
             return
         if config.daemon.hot_c != self._config.hot_c:
@@ -107,18 +107,18 @@ class HealthWatch:
         self._lines = StatusLines(config.daemon.status_every_s)
 
     def restart(self) -> None:
-        """Another flight begins."""
+        """Begin another flight."""
         self._odometry, self._scale, self._n_dropped = None, "", 0
         self._odometry_ns = self._clock.now_ns()
         self._governed_ns = 0
 
     def frame_came(self) -> None:
-        """A frame; from the camera's thread."""
+        """Count a frame; from the camera's thread."""
         now_ns = self._clock.now_ns()
         self._last_frame_ns = now_ns
 
     def take_odometry(self, odometry: Odometry) -> None:
-        """The odometry of a frame."""
+        """Count the odometry of a frame."""
         now_ns = self._clock.now_ns()
         if odometry.state is not TrackState.TRACKING:
             self._settled_ns = now_ns + SETTLE_NS
@@ -127,7 +127,7 @@ class HealthWatch:
         self._recent.add(now_ns, (now_ns - odometry.t_ns) * 1e-6)
 
     def take_mapped(self, message: Track | MapUpdate | PointChunk) -> None:
-        """What the map has become."""
+        """Take the depth latency from points, and the source of the scale from the map."""
         if isinstance(message, PointChunk):
             self._depth.done(self._clock.now_ns(), message.t_ns)
         elif isinstance(message, MapUpdate):
@@ -136,7 +136,7 @@ class HealthWatch:
 
     @property
     def up(self) -> bool:
-        """Whether the stages are ready for frames, and the way to the autopilot is open."""
+        """Whether the stages are ready for frames, and the link is open."""
         link_open = self._link is None or self._link.health.state != "missing"
         return link_open and self._flights.stages_up
 
@@ -164,7 +164,7 @@ class HealthWatch:
         return now_ns - self._odometry_ns < (BUSY_STUCK_NS if works else STUCK_NS)
 
     def kill_stuck(self) -> None:
-        """End a localisation that hangs, so that another takes its place."""
+        """End a localisation that hangs, so that it is restarted."""
         flight, now_ns = self._flights.current, self._clock.now_ns()
         if flight is not None:
             self._odometry_ns = now_ns
@@ -172,13 +172,13 @@ class HealthWatch:
             flight.kill_localisation()
 
     def end_stalled(self) -> None:
-        """End whatever other stage hangs."""
+        """End any other stage that hangs."""
         for flight in (self._flights.current, self._flights.standby):
             if flight is not None:
                 flight.end_stalled()
 
     async def govern(self) -> None:
-        """Read the load and leave out work where there is too much; ends by cancellation."""
+        """Read the load and set load levels; ends by cancellation."""
         loop = asyncio.get_running_loop()
         while True:
             flight = self._flights.current
@@ -218,15 +218,15 @@ class HealthWatch:
             )
 
     def line_due(self) -> str | None:
-        """The status line, if it is due now."""
+        """Status line for the journal, if due."""
         return self._lines.step(self.health())
 
     def document(self) -> dict[str, Any]:
-        """What `companion status` shows."""
+        """Status document of `companion status`."""
         return {"version": __version__, **self.health().to_json()}
 
     def health(self) -> Health:
-        """How all is now."""
+        """Health now."""
         now_ns, flight = self._clock.now_ns(), self._flights.current
         odometry = self._odometry if flight is not None else None
         sources = [self._feed.health] + ([self._link.health] if self._link is not None else [])

@@ -1,4 +1,4 @@
-"""What goes wrong on the autopilot's wire and at the router's places, which no message tells."""
+"""Warnings about the autopilot's wire and the router's clients that no message reports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NO_MAVLINK = "a client of the router sends damaged data"
 
 
 class LinkWatch:
-    """Looks at a port's counters once a second, and warns of those that rise."""
+    """Checks a port's counters once a second, and warns of those that rise."""
 
     def __init__(self, port: MavlinkPort, warn: Callable[[Warned], None]) -> None:
         self._port, self._warn = port, warn
@@ -31,7 +31,7 @@ class LinkWatch:
         self._named_ns: dict[tuple[str, str], int] = {}
 
     def step(self, now_ns: int) -> None:
-        """Look, if it is time."""
+        """Check the counters, if it is time."""
         if now_ns - self._looked_ns < LOOK_NS:
             return
         self._looked_ns = now_ns

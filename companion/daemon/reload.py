@@ -1,4 +1,4 @@
-"""What of a configuration can be changed while the daemon runs."""
+"""Configuration keys that can change while the daemon runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FIXED_KEYS = frozenset({
 
 
 def reloaded(running: Config, read: Config) -> tuple[Config, list[str]]:
-    """The configuration to go on with, and the changed keys that need a restart."""
+    """Configuration in force after a reload, and the changed keys that need a restart."""
     old, new = dump(running), dump(read)
     cannot = [
         f"{section}.{key}"

@@ -1,6 +1,6 @@
-"""Notices what does not come: missing frames, an image that stands still, telemetry that stops.
+"""Gap detection: missing frames, a frozen image, telemetry that stops.
 
-It changes nothing in the flow of messages; it adds a `Warned` where something is amiss.
+Messages pass unchanged; a `Warned` is added at a gap.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SAMPLE_STEP = 8
 
 
 class IntervalMonitor:
-    """How often something comes: its usual interval and its last time."""
+    """Median interval and last time of a periodic input."""
 
     def __init__(self, min_gap_s: float) -> None:
         self._min_gap_s = min_gap_s
@@ -33,7 +33,7 @@ class IntervalMonitor:
         self._last_ns: int | None = None
 
     def silence_s(self, t_ns: int) -> float | None:
-        """How long nothing has come at this time if that is a gap, else None."""
+        """Seconds since the last arrival if that is a gap, else None."""
         if self._last_ns is None or len(self._intervals_s) < MIN_INTERVALS:
             return None
         silence_s = (t_ns - self._last_ns) * 1e-9
@@ -42,14 +42,14 @@ class IntervalMonitor:
         return silence_s if silence_s > limit_s else None
 
     def arrived(self, t_ns: int) -> None:
-        """It came."""
+        """Note an arrival."""
         if self._last_ns is not None:
             self._intervals_s.append((t_ns - self._last_ns) * 1e-9)
         self._last_ns = t_ns
 
 
 class GapMonitor:
-    """Hears every message, in order of time, and says what is amiss."""
+    """Takes every message in order of time, and warns of gaps."""
 
     def __init__(self) -> None:
         self._frames = IntervalMonitor(MIN_FRAME_GAP_S)
@@ -104,7 +104,7 @@ class GapMonitor:
 
 
 def with_gap_warnings(messages: Iterable[Message]) -> Iterator[Message]:
-    """The same messages, and before the one that shows a gap a `Warned`."""
+    """The same messages, with a `Warned` before the one that reveals a gap."""
     watch = GapMonitor()
     for message in messages:
         yield from watch.step(message)

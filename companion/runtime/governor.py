@@ -1,9 +1,9 @@
-"""What is left out when the computer is too busy or too hot: always in the same order.
+"""Load governor: load levels for a computer that is too busy or too hot, in a fixed order.
 
-First the viewer, then the dense map, then features. The pose itself is never touched: the last
-level gives it less to do for each frame, not fewer frames. One step at a time, each given time to
-work before the next; a step back is taken when all has been easy for a while, and later each time
-that it turns out to have been too early.
+First the viewer is reduced, then the dense map, then features. The pose has priority: the last
+level gives it less work per frame, not fewer frames. One level at a time, each with time to take
+effect before the next. With hysteresis: a level is lowered after some time with headroom, and later
+each time that this turns out to have been too early.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FORGET_S = 300.0
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """What may be done at one level. `dense_share` of keyframes get a depth map."""
+    """Work allowed at one level. `dense_share` of keyframes get a depth map."""
 
     number: int
     left_out: str
@@ -61,9 +61,9 @@ LEVELS = (
 
 @dataclass(frozen=True, slots=True)
 class LoadSample:
-    """How hard it is going; None where that is not known. All of about the last second.
+    """Measured load of about the last second; None where unknown.
 
-    A longer time would have a step judged by what was before it.
+    A longer window would judge a level by the time before it.
     """
 
     cpu_share: float | None = None
@@ -74,7 +74,7 @@ class LoadSample:
 
 
 class Governor:
-    """Decides the level; to be asked about once a second."""
+    """Chooses the level; to be called about once a second."""
 
     def __init__(self, hot_c: float, max_pose_latency_ms: float = MAX_POSE_LATENCY_MS) -> None:
         self._hot_c = hot_c
@@ -90,11 +90,11 @@ class Governor:
 
     @property
     def degraded(self) -> str:
-        """What is left out and why; "" where nothing is."""
+        """Work left out, and the reason; "" at level 0."""
         return f"{self.level.left_out}, {self.why}" if self.level.number else ""
 
     def step(self, t_ns: int, sample: LoadSample) -> bool:
-        """Take what was measured at this time; whether the level has changed."""
+        """Take a measurement; whether the level has changed."""
         why, settle_s = self._overload(sample)
         if why:
             self._headroom_since_ns = None
@@ -139,7 +139,7 @@ class Governor:
             self.why = ""
 
     def _overload(self, sample: LoadSample) -> tuple[str, float]:
-        """What is too much, in words, and how long a step must be given to help; "" for nothing."""
+        """Reason of an overload, and seconds for a level to take effect; "" for none."""
         latency_ms, limit_ms = sample.pose_latency_p95_ms, self._max_latency_ms
         if latency_ms is not None and latency_ms > limit_ms:
             severe = latency_ms > SEVERE_LATENCY_SHARE * limit_ms

@@ -1,4 +1,4 @@
-"""What of the messages for a stage gives way, and how much of them may wait."""
+"""Drop policies of messages that wait for a stage, and the size of its queues."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FRAMES_SHARE = 0.6
 
 
 def drop_policy_of(message: Any, latest_only: bool) -> DropPolicy:
-    """`latest_only` is for who wants the latest frame and no other."""
+    """Drop policy of a message; `latest_only` for a stage that wants the newest frame only."""
     if isinstance(message, FrameHandle):
         return DropPolicy.LATEST_WINS if latest_only else DropPolicy.LOSSLESS
     if isinstance(message, Frame | DepthMap):

@@ -1,4 +1,4 @@
-"""A queue of messages of bounded size: where room is short they go by kind, and are counted."""
+"""Message queue of bounded size: on overflow messages are dropped by kind, and counted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class DropPolicy(IntEnum):
-    """What becomes of a message that waits. Where room is short the lowest kind goes first."""
+    """Treatment of a waiting message on overflow: the lowest kind is dropped first."""
 
     LATEST_WINS = 0
     """It gives way to the next of its kind, whether room is short or not."""
@@ -27,9 +27,9 @@ class DropPolicy(IntEnum):
 
 
 class Mailbox(Generic[T]):
-    """Messages in order, `capacity_bytes` of them at most; may be used from any thread.
+    """Queue of messages, at most `capacity_bytes` of them; may be used from any thread.
 
-    A message that is larger than the room is let in when nothing else is there that could go.
+    A message larger than that is let in when nothing else is there that could be dropped.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Mailbox(Generic[T]):
             self._changed.notify()
 
     def get(self) -> T | None:
-        """The oldest message; waits for one. None once it is closed and empty."""
+        """Oldest message; waits for one. None once it is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or any(self._waiting.values()))
             heads = [held[0] for held in self._waiting.values() if held]
@@ -84,13 +84,13 @@ class Mailbox(Generic[T]):
             return oldest[2]
 
     def close(self) -> None:
-        """No more comes; what is there can still be taken out."""
+        """End input; waiting messages can still be taken out."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def _drop_lowest(self) -> bool:
-        """Give up a message, but not the one that came last; whether there was one to give up."""
+        """Drop a message, but not the newest; whether there was one to drop."""
         for policy in (DropPolicy.PICTURE, DropPolicy.MAP, DropPolicy.LOSSLESS):
             if self._waiting[policy] and self._waiting[policy][0][0] < self._n_put - 1:
                 self._drop(policy)

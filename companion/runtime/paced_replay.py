@@ -1,7 +1,7 @@
-"""A recorded flight in its own time, with the drops of a live one.
+"""Replay in real time, with the frame drops of a live flight.
 
-A frame that comes while the last is still being worked on takes the place of any other that waits:
-the latest wins and the rest are counted. Telemetry is never dropped.
+A frame that comes while the last is being processed replaces any other that waits: the newest wins,
+the rest are counted. Telemetry is never dropped.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CAPACITY_BYTES = 256 << 20
 
 
 class PacedFeed:
-    """Plays messages at the times they carry; iterate over it in the working thread."""
+    """Plays messages at the times of their stamps; iterate over it in the working thread."""
 
     def __init__(self, messages: Iterable[Message], speed: float = 1.0) -> None:
         self._messages = messages
@@ -33,7 +33,7 @@ class PacedFeed:
 
     @property
     def n_dropped(self) -> int:
-        """Frames passed over."""
+        """Frames dropped."""
         return self._waiting.n_dropped
 
     def __iter__(self) -> Iterator[Message]:

@@ -44,7 +44,7 @@ SWITCH_S = 5e-4
 
 
 def main() -> int:
-    """Serve one stage until told to finish, or until the daemon is gone."""
+    """Run one stage until told to finish, or until the daemon is gone."""
     kind, nice, pipe_fd, ring_fd = sys.argv[1], *map(int, sys.argv[2:5])
     os.nice(min(nice, LOWEST_NICE))
     if kind == "localisation":
@@ -86,7 +86,7 @@ def _serve(
 
 
 class _Loop:
-    """Takes one message after the other, and tells how that goes, also of a step that hangs."""
+    """Processes one message after the other, and reports progress, also of a step that hangs."""
 
     def __init__(self, ring: FrameRing, work: Work) -> None:
         self._ring, self._work = ring, work
@@ -99,7 +99,7 @@ class _Loop:
         self._busy_since_s: float | None = None
 
     def read(self, pipe: Connection[Any, Any]) -> None:
-        """Put what comes into the inbox, frames copied, until the daemon is gone."""
+        """Put incoming messages into the inbox, frames copied, until the daemon is gone."""
         ring, work = self._ring, self._work
         try:
             while True:
@@ -118,7 +118,7 @@ class _Loop:
             self._inbox.put(Finish(hurry=True))
 
     def report(self, send: Callable[[Any], None]) -> None:
-        """Tell every now and then how it goes, as long as the process lives."""
+        """Report progress periodically, as long as the process lives."""
         while True:
             wait_s(threading.Event(), REPORT_EVERY_S)
             inbox, work = self._inbox, self._work
@@ -153,9 +153,9 @@ class _Loop:
 
 
 def _take_real_time() -> None:
-    """The pose before all else, where the service's LimitRTPRIO allows it and a core is left over.
+    """Real-time priority for the pose, if the service's LimitRTPRIO and a spare core allow it.
 
-    Only what takes a frame to its pose: threads that this one starts have the usual policy again.
+    Only for the thread from frame to pose: threads started by it get the usual policy again.
     """
     if resource.getrlimit(resource.RLIMIT_RTPRIO)[0] == 0 or len(os.sched_getaffinity(0)) < 2:
         return

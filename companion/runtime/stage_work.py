@@ -1,4 +1,4 @@
-"""A stage as its process sees it, and which module does it."""
+"""Interface of a stage in its process, and the look-up of its module."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.timing.clock import StageTimes
 
 
 class Work(ABC):
-    """What all stages have; `step` and `finish` are theirs."""
+    """Base class of stages; `step` and `finish` are theirs."""
 
     latest_only = False
     """Whether it wants the latest frame only, and that without its colours."""
@@ -26,11 +26,11 @@ class Work(ABC):
 
     @property
     def n_rejected(self) -> int:
-        """Messages taken and then given up."""
+        """Messages taken and then dropped."""
         return 0
 
     def begin(self, tell: Callable[[Any], None]) -> None:  # noqa: B027 - most have nothing to do
-        """Before the first message; `tell` takes what the daemon is to know at once."""
+        """Called before the first message; `tell` sends a message to the daemon at once."""
 
     @abstractmethod
     def step(self, message: Any) -> Iterable[Message | Snapshot]:
@@ -38,14 +38,14 @@ class Work(ABC):
 
     @abstractmethod
     def finish(self, finish: Finish) -> Iterable[Message | Snapshot]:
-        """Give what is left."""
+        """Give the last results."""
 
 
 class WorkModule(Protocol):
-    """A module that makes a stage. Its import loads all that the stage needs."""
+    """Module of a stage. Importing it loads all that the stage needs."""
 
     def work(self, setup: Setup) -> Work:
-        """The stage that a setup asks for."""
+        """The stage for a setup."""
 
 
 def module_of(kind: str) -> WorkModule:

@@ -1,7 +1,7 @@
 """`companion install` and `companion uninstall`: a service of this computer, or of one user.
 
-Everything that can be refused is refused before the first step; steps that are done already are
-left out, so that it can be run again after an update.
+All checks come before the first step; steps already done are skipped, so that it can be run again
+after an update.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Notify = Callable[[str], None]
 def install(
     config: Path | None, notify: Notify, *, user: bool, venv: Path | None, now: bool, dry_run: bool
 ) -> None:
-    """Set the service up; InputError before anything is done, InstallError with all undone."""
+    """Set the service up; InputError before any change, InstallError with all changes undone."""
     places = user_places() if user else SYSTEM
     _check_can_act(user, dry_run)
     settings = load_config(config or (places.config if places.config.exists() else None))
@@ -69,7 +69,7 @@ def install(
 
 
 def uninstall(notify: Notify, *, user: bool, purge: bool, dry_run: bool) -> None:
-    """Take the service away; flights and configuration stay unless purged."""
+    """Remove the service; flights and configuration stay unless purged."""
     places = user_places() if user else SYSTEM
     _check_can_act(user, dry_run)
     steps = [*_stopped(places), _disabled(places), removed(places.unit)]
@@ -179,7 +179,7 @@ def _configuration(places: Places, given: Path | None) -> list[Step]:
 
 
 def _have_opencl_device(environment: Path, notify: Notify) -> None:
-    """Install a driver where no device works; without one the service maps nothing, and flies."""
+    """Install a driver where no device works; without one the service makes no dense map."""
     source = clone()
     if source is None:
         return
@@ -190,7 +190,7 @@ def _have_opencl_device(environment: Path, notify: Notify) -> None:
 
 
 def _rules_read() -> list[Step]:
-    """None where udev does not run, as in an image: it reads them as it starts."""
+    """Step that reloads udev rules; None where udev does not run, as in an image."""
 
     def do() -> None:
         command("udevadm", "control", "--reload")

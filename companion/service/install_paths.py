@@ -1,4 +1,4 @@
-"""Where a service's files lie: of the computer, or of one user."""
+"""Paths of a service's files: of the computer, or of one user."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OWN_ENVIRONMENT = Path("/opt/companion")
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """`rules` is None where no rules for devices can be set."""
+    """Paths; `rules` is None where no udev rules can be set."""
 
     unit: Path
     config: Path
@@ -46,7 +46,7 @@ SYSTEM = Places(
 
 
 def user_places(environment: Mapping[str, str] = os.environ) -> Places:
-    """Those of the user whose environment this is; InputError where it states no home."""
+    """Paths for the user of this environment; InputError where it states no home."""
     home = environment.get("HOME", "")
     if not home:
         raise InputError("$HOME is not set; --user wants to know whose service it is to be")

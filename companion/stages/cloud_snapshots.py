@@ -30,7 +30,7 @@ class CloudSnapshots:
         self._refused: list[Snapshot] = []
 
     def begin(self, asked: TakeSnapshot) -> None:
-        """Begin one; refused while another is under way."""
+        """Begin a snapshot; refused while another is under way."""
         if self._gathering is not None:
             self._refused.append(Snapshot(asked.number, why_not=BUSY))
             return
@@ -38,7 +38,7 @@ class CloudSnapshots:
         self._gathering = self._result.gather_cloud(self._voxel_m)
 
     def step(self) -> list[Snapshot]:
-        """Go on for a moment; what there is to tell."""
+        """Work for a moment; progress to report."""
         out, self._refused = self._refused, []
         if self._gathering is None or self._asked is None:
             return out

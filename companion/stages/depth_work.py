@@ -1,4 +1,4 @@
-"""What the camera sees, as a process."""
+"""Stage `depth`: dense depth and cloud."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _Depth(Work):
         self._stage: DepthStage | None = None
 
     def begin(self, tell: Callable[[Any], None]) -> None:
-        """Find the device, which may take long."""
+        """Choose the device, which may take long."""
         self._tell = tell
         setup = self._setup
         self._devices = choose_devices(
@@ -63,9 +63,9 @@ class _Depth(Work):
 
     @contextmanager
     def _watched(self, device: ListedDevice) -> Iterator[None]:
-        """SIGALRM ends the process where the driver does not come back.
+        """Watchdog: SIGALRM ends the process where the driver does not return.
 
-        The kernel sends it, so that it does not matter what the driver holds meanwhile.
+        The kernel sends it, whatever the driver holds.
         """
         self._used = device.identity
         patience_s = PATIENCE_S if self._used in self._proven else FIRST_PATIENCE_S
@@ -79,5 +79,5 @@ class _Depth(Work):
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return _Depth(setup)

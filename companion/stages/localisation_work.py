@@ -1,4 +1,4 @@
-"""Where the camera is, as a process: always with the latest frame."""
+"""Stage `localisation`: the camera's pose, always from the newest frame."""
 
 from __future__ import annotations
 
@@ -87,5 +87,5 @@ class _Localisation(Work):
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return _Localisation(setup)

@@ -38,5 +38,5 @@ class _Recorder(Work):
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return _Recorder(setup)

@@ -53,5 +53,5 @@ class _Results(Work):
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return _Results(setup)

@@ -1,6 +1,6 @@
-"""What nodes elsewhere and other programs are told of a flight, as a process: topics over Zenoh.
+"""Stage `topics`: publishes the flight over Zenoh to other nodes and programs.
 
-The flight's other stages neither wait for this one nor miss it.
+The flight's other stages neither wait for this one nor need it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ TAKEN, NOT_TAKEN = "a node elsewhere makes the depth", "no node elsewhere makes 
 
 
 class Topics(Work):
-    """Gathers what nodes fetch, and publishes; InputError where Zenoh cannot be had."""
+    """Builds bundles for depth nodes, and publishes topics; InputError where Zenoh is unusable."""
 
     def __init__(self, setup: Setup) -> None:
         super().__init__()
@@ -82,11 +82,11 @@ class Topics(Work):
 
     @property
     def n_rejected(self) -> int:
-        """Frames that the budget had no room for, and bundles that nobody came for in time."""
+        """Frames beyond the budget, and bundles that nobody fetched in time."""
         return self._gatherer.n_dropped + self._backlog.n_evicted
 
     def step(self, message: Any) -> Iterable[Message]:
-        """Take one message; says when somebody begins or ceases to fetch."""
+        """Take one message; warns when a node begins or ceases to fetch."""
         if isinstance(message, (Frame, Track, KeyframeAdded, MapUpdate)):
             if isinstance(message, MapUpdate):
                 self._update = message
@@ -103,7 +103,7 @@ class Topics(Work):
         return self._changes(message.t_ns) if isinstance(message, Frame) else []
 
     def finish(self, finish: Finish) -> Iterable[Message]:
-        """Leave, if not in a hurry once the last is fetched by who has fetched so far."""
+        """Disconnect; if not in a hurry after the last bundle has been fetched."""
         self._take_bundle(self._gatherer.last())
         until_s = monotonic_s() + (0.0 if finish.hurry else LINGER_S)
         while self._fetches() and self._backlog.fetched < self._backlog.newest:
@@ -125,7 +125,7 @@ class Topics(Work):
             self._publish("map", partial(map_envelope, self._flight, update))
 
     def _publish(self, topic: str, envelope: Callable[[], Envelope]) -> None:
-        """Send what somebody has subscribed to; else it is not even made."""
+        """Publish if there are subscribers; else the message is not even encoded."""
         if self.bus.has_subscribers(topic):
             self.bus.publish(topic, envelope().pack())
 
@@ -134,7 +134,7 @@ class Topics(Work):
         return map_envelope(self._flight, update).pack() if update is not None else None
 
     def _depth_input(self, asked: bytes) -> bytes | None:
-        """Called in a thread of the bus; what cannot be read gets no answer."""
+        """Answer a query, in a thread of the bus; malformed queries get no answer."""
         try:
             request = unpack(asked)
             run, after = request.text("run"), request.integer("after", -1)
@@ -159,5 +159,5 @@ class Topics(Work):
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return Topics(setup)

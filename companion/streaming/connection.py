@@ -1,4 +1,4 @@
-"""The drone's end of a viewer's connection: a socket that never waits."""
+"""On-board end of a viewer's TCP connection: a non-blocking socket."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ MOST_READ = 4096
 
 
 class Connection:
-    """Reads what a viewer says; sends what its session has for it. Raises OSError when it is gone.
+    """Reads from a viewer; sends what its session has for it. OSError when it is gone.
 
-    StreamError is raised for a peer that is no viewer.
+    StreamError for a peer that is no viewer.
     """
 
     def __init__(self, opened: socket.socket, peer: str, now_s: float) -> None:
@@ -46,7 +46,7 @@ class Connection:
             opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"bbr")
 
     def read(self, now_s: float) -> bool:
-        """Take in what has come; whether the viewer has said who it is just now."""
+        """Read what has come; whether the viewer has just identified itself."""
         data = self.socket.recv(MOST_READ)
         if not data:
             raise ConnectionResetError("the viewer has closed the connection")
@@ -68,7 +68,7 @@ class Connection:
         return is_new
 
     def send(self, now_s: float, budget_bytes: int) -> int:
-        """Send a piece of what there is, if there is room; how many bytes went."""
+        """Send a piece if there is one and the socket has capacity; number of bytes sent."""
         if self.session is None or not self.is_writable():
             return 0
         if not self._left:
@@ -85,7 +85,7 @@ class Connection:
         return bool(select.select([], [self.socket], [], 0)[1])
 
     def wire_bytes(self, n_given: int) -> int:
-        """Bytes on the wire, headers and repeats included, beyond those counted so far.
+        """Bytes on the wire, with headers and retransmissions, since the last call.
 
         `n_given` is what was given to the kernel, which may not have sent it yet.
         """
@@ -100,5 +100,5 @@ class Connection:
         return more
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the socket."""
         self.socket.close()

@@ -1,4 +1,4 @@
-"""The drone's end of datagrams to viewers: who hears them, and whether they get through."""
+"""On-board end of datagrams to viewers: their addresses, and whether datagrams get through."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class _Peer:
 
 
 class Datagrams:
-    """The UDP side of a port at which viewers connect by TCP."""
+    """UDP side of a port at which viewers connect by TCP."""
 
     def __init__(self, listener: socket.socket) -> None:
         self.socket = socket.socket(listener.family, socket.SOCK_DGRAM)
@@ -35,9 +35,9 @@ class Datagrams:
         self._peers: dict[bytes, _Peer] = {}
 
     def receive(self, now_s: float, peers: dict[bytes, str]) -> None:
-        """Take in what viewers say; `peers` are the addresses from which viewers are connected.
+        """Receive from viewers; `peers` are the addresses from which viewers are connected.
 
-        Whoever is not among them is sent nothing.
+        Anybody else is sent nothing.
         """
         with contextlib.suppress(OSError):
             while True:
@@ -53,7 +53,7 @@ class Datagrams:
         self._peers = {viewer: peer for viewer, peer in self._peers.items() if viewer in peers}
 
     def get_through(self, viewer: bytes, now_s: float) -> bool:
-        """Whether datagrams get through to a viewer."""
+        """Whether datagrams reach a viewer."""
         peer = self._peers.get(viewer)
         return (
             peer is not None
@@ -62,11 +62,11 @@ class Datagrams:
         )
 
     def has_peer(self, viewer: bytes) -> bool:
-        """Whether it is known where to send them."""
+        """Whether a viewer's address is known."""
         return viewer in self._peers
 
     def send(self, viewer: bytes, data: bytes) -> int:
-        """Send one; how many bytes that takes. Nothing where the network has no room now."""
+        """Send one; its size in bytes. Nothing where the network has no capacity now."""
         try:
             self.socket.sendto(data, self._peers[viewer].address)
         except OSError:

@@ -1,7 +1,7 @@
-"""The process of an exporter: messages come in by its standard input, and go to viewers by TCP.
+"""Process of an exporter: messages come in on its standard input, and go to viewers by TCP.
 
-The first thing that it is told is an ExportSetup. It says in lines of JSON where it listens, and
-each second how it is. When its input ends it gives viewers a moment to take the last of it.
+The first message is an ExportSetup. It reports in lines of JSON where it listens, and each second
+its health. When its input ends it gives viewers a moment to receive the rest.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NICE = 10
 
 @dataclass(frozen=True, slots=True)
 class ExportSetup:
-    """What it needs to know. `listen` is "" where only viewers of this machine are wanted."""
+    """Setup of the process. `listen` is "" where only viewers of this machine are wanted."""
 
     flight: FlightItem
     stream: StreamConfig
@@ -47,7 +47,7 @@ class ExportSetup:
 
 @dataclass(frozen=True, slots=True)
 class SetBudget:
-    """All viewers together get no more from now on; 0 for no limit."""
+    """Limit the rate of all viewers together; 0 for no limit."""
 
     kbit_s: float
 
@@ -111,7 +111,7 @@ def _give(exporter: Exporter, items: list[Item]) -> None:
 
 
 def _report(exporter: Exporter, listen: str, ended: threading.Event) -> None:
-    """Open the door when it can be opened: the flight before may have it for a while."""
+    """Listen when the port is free (the flight before may still have it), and report health."""
     is_open = not listen
     while not ended.is_set():
         said: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Serves what a store has to viewers that connect. In a process of its own; see export_process."""
+"""Server of a store's items to viewers. In a process of its own; see export_process."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class Exporter:
         """By viewers that are forgotten."""
 
     def take(self, item: Item, parts: Sequence[Part]) -> None:
-        """Keep and send an item, whose parts are made already."""
+        """Keep and send an item with its encoded parts."""
         with self._lock:
             self._store.put(item, parts)
         self._wake_up()
 
     def listen(self, listener: socket.socket) -> None:
-        """Take viewers that connect there; to be called before `run`."""
+        """Accept viewers at a socket; to be called before `run`."""
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
         with contextlib.suppress(OSError):  # somebody has that port: poses go with all else
@@ -63,7 +63,7 @@ class Exporter:
             self._selector.register(datagrams.socket, selectors.EVENT_READ)
 
     def set_budget(self, kbit_s: float) -> None:
-        """What all viewers together get from now on; 0 for no limit. From any thread."""
+        """Limit the rate of all viewers together; 0 for no limit. From any thread."""
         self._budget.set_rate(kbit_s)
         self._wake_up()
 
@@ -73,14 +73,14 @@ class Exporter:
         self._wake_up()
 
     def is_drained(self, n_least: int = 0) -> bool:
-        """Whether all viewers that are connected, so many at least, have taken all there is."""
+        """Whether all connected viewers, at least `n_least`, have received everything."""
         with self._lock:
             sessions = [c.session for c in self._connections]
             done = [session is not None and session.is_complete for session in sessions]
         return all(done) and len(done) >= n_least
 
     def report(self) -> dict[str, float]:
-        """How many viewers there are, what they get, and what they were not given."""
+        """Number of viewers, their rate, and data that was skipped."""
         with self._lock:
             sessions = [c.session for c in self._connections if c.session is not None]
             skipped = sum(s.n_skipped.total() for s in self._sessions.values())
@@ -148,7 +148,7 @@ class Exporter:
         self._selector.register(opened, selectors.EVENT_READ)
 
     def _begin_session(self, connection: Connection) -> None:
-        """A viewer that is known goes on where it was; its connection before is no more."""
+        """Resume the session of a known viewer, and close its former connection."""
         assert connection.viewer is not None
         for other in list(self._connections):
             if other is not connection and other.viewer == connection.viewer:
@@ -170,7 +170,7 @@ class Exporter:
             self._store.unsubscribe(gone)
 
     def _step(self) -> bool:
-        """Send what can be sent; whether more may be to send soon."""
+        """Send what can be sent; whether there may be more soon."""
         now_s = monotonic_s()
         n_viewers = sum(c.session is not None for c in self._connections)
         self._connections.append(self._connections.pop(0)) if self._connections else None
@@ -202,7 +202,7 @@ class Exporter:
         self._budget.charge(connection.wire_bytes(self._given[connection]))
 
     def _send_pose(self, session: Session, viewer: bytes | None, now_s: float) -> None:
-        """The newest pose by datagram, where that may get through."""
+        """Send the newest pose by datagram, where that may get through."""
         datagrams = next((d for d in self._datagrams if viewer and d.has_peer(viewer)), None)
         session.datagrams_work = bool(datagrams and viewer and datagrams.get_through(viewer, now_s))
         if datagrams is None or viewer is None or not self._budget.available_bytes(now_s):

@@ -1,7 +1,6 @@
-"""The ground's end of a viewer's connection: items as they come, whatever the link does.
+"""Ground end of a viewer's connection: items as they come, across lost connections.
 
-What is acknowledged is what whoever takes the items has taken, so that a screen that is slow makes
-the drone send less.
+Items are acknowledged when the consumer has taken them, so that a slow screen slows the sender.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ HELLO_EVERY_S = 1.0
 
 
 class GroundLink:
-    """`items` gives them until `stop` is set; `notify` hears in words what becomes of the link.
+    """`items` gives them until `stop` is set; `notify` takes the state of the link in words.
 
     Without `again` the end of the first connection is the end.
     """
@@ -54,9 +53,9 @@ class GroundLink:
         self._pose_ns = -(2**63)
 
     def items(self, stop: threading.Event) -> Iterator[Item]:
-        """What the drone sends; an item is acknowledged when the next one is asked for.
+        """Items of the drone; one is acknowledged when the next one is asked for.
 
-        StreamError for a drone that speaks otherwise.
+        StreamError for a drone of another protocol.
         """
         is_away = False
         while not stop.is_set():
@@ -88,7 +87,7 @@ class GroundLink:
         return opened
 
     def _datagrams(self) -> socket.socket:
-        """What brings poses beside the connection, where it can."""
+        """Socket for poses by datagram, where possible."""
         found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_DGRAM)[0]
         opened = socket.socket(found[0], socket.SOCK_DGRAM)
         opened.setblocking(False)
@@ -96,7 +95,7 @@ class GroundLink:
         return opened
 
     def _poses(self, datagrams: socket.socket) -> Iterator[PoseItem]:
-        """Poses that have come beside the connection, and are the newest."""
+        """Poses that have come by datagram and are the newest."""
         with suppress(OSError):  # nothing more, or nobody there
             while True:
                 data = datagrams.recv(256)

@@ -1,7 +1,7 @@
-"""The newest of everything there is to see, ready for the wire. Bounded, whatever the flight.
+"""Newest items of a flight, encoded for the wire, in bounded memory.
 
-What is kept is what a viewer that comes now must be given. The points are nearly all of it; when
-they are more than there is room for, the finest of the oldest go first, counted.
+It holds what a viewer that connects now must be given. Points are nearly all of it; beyond the
+capacity the finest of the oldest are evicted, counted.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ MOST_PIECES = 20_000
 
 
 class StoreListener(Protocol):
-    """Who hears of what is new."""
+    """Notified of new items."""
 
     def changed(self, kind: Kind, key: Hashable) -> None:
-        """There is a new one of a kind."""
+        """There is a new item of a kind."""
 
 
 class ItemStore:
-    """Takes items, and tells its followers. To be used by one thread at a time."""
+    """Takes items, and notifies its listeners. To be used by one thread at a time."""
 
     def __init__(self, available_bytes: int) -> None:
         self._capacity_bytes = available_bytes
@@ -40,31 +40,31 @@ class ItemStore:
         """What there was no room for, by what it was."""
         self._listeners: list[StoreListener] = []
 
-    def subscribe(self, follower: StoreListener) -> None:
-        """Have somebody told of all there is, oldest first, and from now on of all that is new."""
-        self._listeners.append(follower)
+    def subscribe(self, listener: StoreListener) -> None:
+        """Notify a listener of all items, oldest first, and of new ones from now on."""
+        self._listeners.append(listener)
         for kind, held in self._held.items():
             for key in held:
-                follower.changed(kind, key)
+                listener.changed(kind, key)
         if self.image is not None:
-            follower.changed(Kind.PICTURE, NEWEST)
+            listener.changed(Kind.PICTURE, NEWEST)
         if self.status is not None:
-            follower.changed(Kind.STATUS, NEWEST)
+            listener.changed(Kind.STATUS, NEWEST)
 
-    def unsubscribe(self, follower: StoreListener) -> None:
-        """Somebody is told nothing any more."""
-        self._listeners.remove(follower)
+    def unsubscribe(self, listener: StoreListener) -> None:
+        """Notify a listener no more."""
+        self._listeners.remove(listener)
 
     def get(self, kind: Kind, key: Hashable) -> bytes | None:
-        """What there is now; None where it was given up."""
+        """Payload of an item; None where it was evicted."""
         return self._held[kind].get(key)
 
     def take(self, item: Item) -> None:
-        """Keep an item in the place of an older one of the same thing."""
+        """Keep an item; replaces an older one with the same key."""
         self.put(item, parts_of(item))
 
     def put(self, item: Item, parts: Iterable[Part]) -> None:
-        """The same, with the item's parts made already: to make them takes time."""
+        """The same, with the parts encoded already: encoding takes time."""
         if isinstance(item, ImageItem):
             self.image = item
             self._tell(Kind.PICTURE, NEWEST)
@@ -100,5 +100,5 @@ class ItemStore:
         self.n_evicted[kind.name.lower()] += 1
 
     def _tell(self, kind: Kind, key: Hashable) -> None:
-        for follower in self._listeners:
-            follower.changed(kind, key)
+        for listener in self._listeners:
+            listener.changed(kind, key)

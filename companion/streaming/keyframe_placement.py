@@ -1,4 +1,4 @@
-"""Where keyframes, and what hangs on them, lie; what of that has moved. Asks no clock, no I/O."""
+"""Poses of keyframes and the data attached to them, as the map moves. No clock, no I/O."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ MOVED_UNITS = 1e-4
 
 
 class KeyframePlacement:
-    """Follows a map, and gives places of what has moved.
+    """Follows a map, and gives the poses of moved keyframes.
 
-    A keyframe's place has the scale by which the map has been stretched about it since its points
-    were measured, so that points which were sent once lie where they would be measured now.
+    A keyframe's place has the local scale correction of the map since its points were measured, so
+    that points sent once lie where they would be measured now.
     """
 
     def __init__(self) -> None:
@@ -34,14 +34,14 @@ class KeyframePlacement:
         self._local_scale: dict[int, float] = {}
 
     def added(self, keyframe: KeyframeAdded) -> list[PlacesItem]:
-        """A keyframe, before the map tells of it."""
+        """Take a new keyframe, before the map has it."""
         pose = keyframe.map_from_camera
         keyframe_id = keyframe.keyframe_id
         self._mapped[keyframe_id] = Similarity(1.0, pose.rotation, pose.translation)
         return self._changes_of(keyframe.t_ns, {keyframe_id: self._mapped[keyframe_id]})
 
     def measured(self, chunk: PointChunk) -> list[PlacesItem]:
-        """Points, which may be of a map before the newest."""
+        """Take points, which may be of a map before the newest."""
         self._spans[chunk.keyframe_id] = chunk.spans
         if self._update is None or chunk.keyframe_id not in self._mapped:
             return []
@@ -49,7 +49,7 @@ class KeyframePlacement:
         return self._changes_of(chunk.t_ns, {chunk.keyframe_id: self._mapped[chunk.keyframe_id]})
 
     def mapped(self, update: MapUpdate) -> list[PlacesItem]:
-        """The map as it now stands."""
+        """Take a new map."""
         self._update = update
         places: dict[int, Similarity | None] = {}
         changed: set[int] = set()
@@ -78,7 +78,7 @@ class KeyframePlacement:
     def _changes_of(
         self, t_ns: int, places: Mapping[int, Similarity | None], world: Similarity | None = None
     ) -> list[PlacesItem]:
-        """What there is to tell of places in the map."""
+        """Places that have changed since they were last sent."""
         moved: dict[int, Similarity | None] = {}
         for keyframe_id, place in places.items():
             if place is None:
@@ -98,7 +98,7 @@ class KeyframePlacement:
 
 
 def _about(keyframe_ids: Iterable[int]) -> set[int]:
-    """These and all whose spans may end at one of them."""
+    """These keyframes and all whose spans may end at one of them."""
     reach = range(-SPANS_REACH, SPANS_REACH + 1)
     return {keyframe_id + k for keyframe_id in keyframe_ids for k in reach}
 

@@ -1,4 +1,4 @@
-"""Messages to items: what of a flight is to be seen. Asks no clock and does no I/O."""
+"""Scene encoder: messages to items for viewers. No clock, no I/O."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ IN_WORDS = {
 
 @dataclass(slots=True)
 class _Piece:
-    """The piece of a path that grows."""
+    """Piece of a path that still grows."""
 
     number: int = 0
     keyframe_id: int = -1
@@ -76,7 +76,7 @@ class _Piece:
 
 
 class SceneEncoder:
-    """A flight as it is told. `path_step_ns` thins the camera's path."""
+    """Encodes one flight. `path_step_ns` thins the camera's path."""
 
     def __init__(self, flight: FlightItem, path_step_ns: int = 0) -> None:
         self.flight = replace(flight, origin=None)
@@ -98,11 +98,11 @@ class SceneEncoder:
 
     @property
     def camera(self) -> Camera:
-        """Whose flight it is."""
+        """Camera of the flight."""
         return self.flight.camera
 
     def take(self, message: Watched) -> list[Item]:
-        """What a message shows."""
+        """Items that show a message."""
         if isinstance(message, GeoOrigin):
             self._origin = message
             return self._origin_if_known()
@@ -142,7 +142,7 @@ class SceneEncoder:
         return out + self._status(message)
 
     def close(self) -> list[Item]:
-        """What still waits."""
+        """Items that are still held back."""
         out: list[Item] = list(self._images.values())
         self._images.clear()
         for piece in (self._path, self._autopilot_path):
@@ -201,7 +201,7 @@ class SceneEncoder:
         )
 
     def _measure_speed(self, t_ns: int, world: Array) -> None:
-        """Where nothing else tells the speed it is that of the last while."""
+        """Estimate the speed from recent poses, where no other source gives it."""
         before = self._speed_from
         if before is None or t_ns - before[0] > 5 * SPEED_OVER_NS:
             self._speed_from = (t_ns, world)
@@ -213,7 +213,7 @@ class SceneEncoder:
     # -- paths -----------------------------------------------------------------------------------
 
     def _extend(self, track: Track) -> list[Item]:
-        """Add a position to the path, in the frame of the keyframe that it is known by."""
+        """Add a position to the path, in the frame of its keyframe."""
         keyframe_id, relative = track.keyframe_id, track.keyframe_from_camera
         if keyframe_id is None or relative is None or track.map_from_camera is None:
             return []
@@ -232,7 +232,7 @@ class SceneEncoder:
         return out + (self._items_of(piece, track.t_ns) if piece.n_waiting >= PIECE_STEP else [])
 
     def _keyframe_pose(self, track: Track, pose: Pose, relative: Pose) -> Similarity:
-        """Where the tracker has its keyframe, of which the map may not have told yet."""
+        """Pose of the tracker's keyframe, which the map may not have yet."""
         units = self._update.scale_of if self._update is not None else {}
         scale = units.get(track.keyframe_id or 0, 1.0)
         rotation = pose.rotation @ relative.rotation.T
@@ -284,7 +284,7 @@ class SceneEncoder:
         return out
 
     def _origin_if_known(self) -> list[Item]:
-        """Where the world lies on the earth, once the map is known to lie in that world."""
+        """Geodetic origin, once the map is known to be georeferenced."""
         found = self._update.georeference if self._update is not None else None
         if found is None or not found.has_origin or self._origin is self.flight.origin:
             return []
@@ -294,7 +294,7 @@ class SceneEncoder:
     # -- status ----------------------------------------------------------------------------------
 
     def _status(self, message: Watched) -> list[Item]:
-        """How all is, about once a second of the flight."""
+        """Status item, about once a second of the flight."""
         if isinstance(message, GeoOrigin):
             return []
         since = message.t_ns - self._status_ns

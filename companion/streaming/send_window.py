@@ -1,10 +1,10 @@
-"""How much may be on its way to a viewer: as much as the link carries without a queue growing.
+"""Congestion window to a viewer: as many bytes in flight as the link carries without queueing.
 
-A window of unacknowledged bytes. It grows while it is what limits the sender and the standing delay
-(the least round trip of late) stays near the least there was; it shrinks when the standing delay
-shows a queue. Losses, which TCP repairs, delay some acknowledgements but not all, and so do not
-shrink it. After Arun and Balakrishnan, Copa (NSDI 2018), whose standing delay this is, and LEDBAT
-(RFC 6817), whose target it has.
+A window of unacknowledged bytes. It grows while it limits the sender and the standing delay (the
+least recent round trip) stays near the base round trip; it shrinks when the standing delay shows a
+queue. Losses, which TCP repairs, delay some acknowledgements but not all, and so do not shrink it.
+After Arun and Balakrishnan, Copa (NSDI 2018), for the standing delay, and LEDBAT (RFC 6817), for
+the target.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RATE_OVER_S = 1.0
 
 
 class SendWindow:
-    """Counts what is sent and acknowledged; times are seconds of one monotonic clock."""
+    """Counts bytes sent and acknowledged; times are seconds of one monotonic clock."""
 
     def __init__(self) -> None:
         self.size_bytes = float(LEAST_BYTES)
@@ -51,11 +51,11 @@ class SendWindow:
 
     @property
     def in_flight_bytes(self) -> int:
-        """Sent and not yet acknowledged."""
+        """Bytes sent and not yet acknowledged."""
         return self.sent_bytes - self.acknowledged_bytes
 
     def available_bytes(self) -> int:
-        """So much more may be sent now."""
+        """Bytes that may be sent now."""
         drains = self._drains_from is not None
         room = (LEAST_BYTES if drains else int(self.size_bytes)) - self.in_flight_bytes
         if room < LEAST_USED and not drains:
@@ -63,12 +63,12 @@ class SendWindow:
         return max(0, room)
 
     def sent(self, now_s: float, n_bytes: int) -> None:
-        """So much went out."""
+        """Count bytes sent."""
         self.sent_bytes += n_bytes
         self._in_flight.append((self.sent_bytes, now_s))
 
     def acknowledged(self, now_s: float, total_bytes: int) -> None:
-        """So much in all has been taken by the viewer."""
+        """Take the total of bytes acknowledged by the viewer."""
         if not self.acknowledged_bytes < total_bytes <= self.sent_bytes:
             return
         n_new, self.acknowledged_bytes = total_bytes - self.acknowledged_bytes, total_bytes
@@ -86,12 +86,12 @@ class SendWindow:
         self._adjust(now_s, self.round_trip_s, n_new)
 
     def oldest_age_s(self, now_s: float) -> float:
-        """How long the oldest that is on its way has been."""
+        """Age of the oldest bytes in flight, seconds."""
         return now_s - self._in_flight[0][1] if self._in_flight else 0.0
 
     @property
     def rate_bytes_s(self) -> float:
-        """What has got through of late; 0 before anything has."""
+        """Recent goodput; 0 before any acknowledgement."""
         if len(self._delivered) < 2:
             return 0.0
         (t0, n0), (t1, n1) = self._delivered[0], self._delivered[-1]
@@ -99,7 +99,7 @@ class SendWindow:
 
     @property
     def capacity_bytes_s(self) -> float:
-        """What the link would carry, by window and round trip; 0 while not known."""
+        """Capacity of the link, by window and round trip; 0 while unknown."""
         if self.round_trip_s is None or not self._base:
             return 0.0
         return self.size_bytes / max(min(r for _, r in self._base) + QUEUE_S / 2, 1e-3)
@@ -120,7 +120,7 @@ class SendWindow:
             self.size_bytes = min(MOST_BYTES, self.size_bytes + gain * n_new)
 
     def _base_s(self, now_s: float, round_trip_s: float) -> float:
-        """The least round trip, in two halves of which the older is forgotten."""
+        """Base round trip: the least of two windows of time, of which the older expires."""
         if not self._base or now_s - self._base[-1][0] > FORGET_S:
             if self._base and self._base[-1][1] > self._base[0][1] + BASE_RISE_S:
                 self._drains_from = self.sent_bytes
@@ -131,7 +131,7 @@ class SendWindow:
 
 
 class TokenBucket:
-    """A bucket of bytes that fills at a rate, 0 for no limit; it may be overdrawn by one piece."""
+    """Token bucket: fills at a rate, 0 for no limit; may be overdrawn by one piece."""
 
     def __init__(self, kbit_s: float) -> None:
         self.bytes_s = kbit_s * 125.0
@@ -139,11 +139,11 @@ class TokenBucket:
         self._t_s: float | None = None
 
     def set_rate(self, kbit_s: float) -> None:
-        """Fill at another rate from now on."""
+        """Change the rate."""
         self.bytes_s = kbit_s * 125.0
 
     def available_bytes(self, now_s: float) -> int:
-        """So much may be sent now."""
+        """Bytes that may be sent now."""
         if self.bytes_s <= 0:
             return MOST_BYTES
         if self._t_s is not None:
@@ -153,5 +153,5 @@ class TokenBucket:
         return max(0, int(self._held))
 
     def charge(self, n_bytes: int) -> None:
-        """So much was sent."""
+        """Count bytes sent."""
         self._held -= n_bytes

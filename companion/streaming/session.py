@@ -1,9 +1,9 @@
-"""What one viewer is given next.
+"""Scheduler of the items that one viewer is sent.
 
 Pose and state come first, then the map from coarse to fine, then pictures; of anything that the
 link has no time for only the newest waits.
 
-Nothing here can wait or grow: what waits are names of things that the store has.
+Nothing here waits or grows: the queues hold keys of items in the store.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Session:
         store.subscribe(self)
 
     def changed(self, kind: Kind, key: Hashable) -> None:
-        """There is a new one of a kind."""
+        """There is a new item of a kind."""
         waiting = self._waiting[kind]
         if kind is Kind.POSE:
             self.n_skipped["poses"] += self._pose_is_new and self.is_connected
@@ -88,7 +88,7 @@ class Session:
         waiting[key] = None
 
     def reconnected(self) -> None:
-        """Another connection: what was not acknowledged by the one before is sent again."""
+        """A new connection: unacknowledged items of the one before are sent again."""
         for _, kind, keys in self._in_flight:
             self._queue_again(kind, keys)
         for kind, partial in self._partial.items():
@@ -100,29 +100,29 @@ class Session:
         self.changed(Kind.FLIGHT, NEWEST)
 
     def acknowledged(self, now_s: float, total_bytes: int) -> None:
-        """The viewer has taken so much in all of this connection."""
+        """Take the total of bytes acknowledged on this connection."""
         self.window.acknowledged(now_s, total_bytes)
         while self._in_flight and self._in_flight[0][0] <= self.window.acknowledged_bytes:
             self._in_flight.popleft()
 
     @property
     def rate_bytes_s(self) -> float:
-        """What the link is taken to carry for this viewer."""
+        """Estimated rate of the link for this viewer."""
         rate = self.window.capacity_bytes_s or ASSUMED_BYTES_S
         return min(rate, self.limit_bytes_s) if self.limit_bytes_s > 0 else rate
 
     @property
     def n_waiting(self) -> int:
-        """How many things of the map it has not been given."""
+        """Number of map items not yet sent."""
         return sum(len(self._waiting[kind]) for kind in ORDER[3:-2])
 
     @property
     def is_complete(self) -> bool:
-        """Whether it has taken all there is."""
+        """Whether everything has been received."""
         return not self._in_flight and not self._partial and not any(self._waiting.values())
 
     def next_datagram(self, now_s: float) -> bytes | None:
-        """The newest pose, if it is time for it and it has not been sent."""
+        """The newest pose, if due and not sent yet."""
         every_s = self._pose_every_s() if self.datagrams_work else 1.0 / POSES_BESIDE_HZ
         if not self._pose_is_new or now_s - self._datagram_s < every_s:
             return None
@@ -131,7 +131,7 @@ class Session:
         return bytes([Kind.POSE]) + payload if payload is not None else None
 
     def next_piece(self, now_s: float, most_bytes: int) -> bytes | None:
-        """A piece of what comes next, framed; None if there is nothing now, or no room for it."""
+        """Next piece to send, framed; None if there is none now, or no capacity."""
         rate = self.rate_bytes_s
         most = int(min(max(rate * PIECE_S, LEAST_PIECE), MOST_PIECE, most_bytes - HEAD_BYTES))
         if most < min(LEAST_PIECE, MOST_PIECE) // 4:
@@ -161,7 +161,7 @@ class Session:
         return framed
 
     def _next_kind(self, now_s: float, rate: float) -> Kind | None:
-        """The first kind in order of which a piece can go now."""
+        """First kind in order of priority of which a piece can go now."""
         for kind in ORDER:
             if kind is Kind.COARSE and self._credit > 0:
                 for picture in PICTURES:
@@ -177,7 +177,7 @@ class Session:
         return None
 
     def _can_send(self, kind: Kind, now_s: float, rate: float, share: float) -> bool:
-        """Whether something of a kind is going, or can begin to."""
+        """Whether an item of a kind is partly sent, or one can begin."""
         if kind in self._partial:
             return True
         if now_s - self._sent_s[kind] < self._every_s(kind, rate):

@@ -1,7 +1,7 @@
-"""Bundles that wait to be fetched, whoever comes and whenever: the oldest go when room is short.
+"""Bundles that wait to be fetched; the oldest are evicted when capacity is short.
 
-Whoever fetches says what they have; nothing here knows them, so that they may vanish, come back,
-and begin anew.
+Stateless for clients: each states what it has, so that clients may vanish, come back, and begin
+anew.
 """
 
 from __future__ import annotations
@@ -58,10 +58,11 @@ class Backlog:
                 self.n_evicted += oldest.number > self.fetched
 
     def after(self, run: str, number: int, now_s: float, whole: bool = False) -> bytes:
-        """What follows bundle `number` of a run, as bytes: a bundle, or `wait` where none may go.
+        """Bytes of the bundle after bundle `number` of a run, or `wait` where none may go.
 
         Where bundles between are gone, or with `whole`, the whole map comes first, in a bundle that
-        has the number before. Another run's number counts for nothing: then the oldest follows.
+        has the number before. The number of another run counts for nothing: then the oldest
+        follows.
         """
         with self._lock:
             self.fetched_s = now_s

@@ -1,9 +1,8 @@
-"""Frames, tracks, keyframes and the map, gathered into bundles: only what depth can use.
+"""Builds bundles of frames, tracks, keyframes and map changes: only data that depth can use.
 
-Of the frames between two keyframes those are taken that lie far enough apart to tell depth, and
-no more than the budget allows: a keyframe that could not have enough of them gets none, so that
-the next one has all that it needs. Until a keyframe tells which frames are wanted they wait as
-JPEG.
+Of the frames between two keyframes those are taken that have enough baseline for depth, and no more
+than the budget allows: a keyframe that could not have enough of them gets none, so that the next
+one has all that it needs. Until the next keyframe tells which frames are needed they wait as JPEG.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ GREY_SHARE = 0.9
 
 
 class Gatherer:
-    """Gives a bundle whenever the map was told; `budget_bytes_s` of 0 is no limit."""
+    """Gives a bundle at each map update; `budget_bytes_s` of 0 is no limit."""
 
     def __init__(self, run: str, budget_bytes_s: float, jpeg_quality: int) -> None:
         self._run, self._budget_bytes_s, self._quality = run, budget_bytes_s, jpeg_quality
@@ -64,7 +63,7 @@ class Gatherer:
         return None
 
     def last(self) -> Bundle:
-        """What is left when the flight is over."""
+        """Last bundle of the flight."""
         return self._bundle(None, over=True)
 
     def _wait(self, frame: Frame) -> None:
@@ -97,7 +96,7 @@ class Gatherer:
         return bundle
 
     def _pictures(self) -> list[Picture]:
-        """Frames up to the newest keyframe; older ones are decided on and wait no more."""
+        """Frames up to the newest keyframe; older ones are taken or dropped."""
         newest = max(keyframe.seq for keyframe in self._keyframes)
         owners = {k.seq: k.keyframe_id for k in self._keyframes if k.seq in self._frames}
         self.keyframe_jpegs = {i: self._frames[seq][1] for seq, i in owners.items()}
@@ -117,7 +116,7 @@ class Gatherer:
         return out
 
     def _spread(self, seqs: Sequence[int], keyframes: set[int]) -> list[int]:
-        """Frames of which each shows something else than the one before; keyframes always."""
+        """Frames with enough baseline between them; keyframes always."""
         depths = np.concatenate([k.points_camera[:, 2] for k in self._keyframes])
         step = LEAST_STEP * float(np.median(depths)) if len(depths) else 0.0
         out = []
@@ -137,7 +136,7 @@ class Gatherer:
         return out
 
     def _affordable(self, seqs: list[int], keyframes: set[int]) -> list[int]:
-        """Those that the budget has room for, evenly spread."""
+        """Frames within the budget, evenly spread."""
         others = [seq for seq in seqs if seq not in keyframes]
         room = MOST_PICTURES - len(keyframes)
         if self._budget_bytes_s and others:

@@ -1,4 +1,4 @@
-"""What goes wrong in flight, put into a recorded one: known faults for a bench to measure.
+"""Known faults injected into a recorded flight for benchmarks.
 
 Each fault changes telemetry (a sorted list), images, or both, and nothing else.
 """
@@ -42,20 +42,20 @@ VELOCITY_SCALE, VELOCITY_TURN_RAD = 1.1, np.radians(8.0)
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """When a flight begins and ends."""
+    """Begin and end of a flight."""
 
     start_ns: int
     stop_ns: int
 
     @property
     def fault_ns(self) -> int:
-        """When the short faults come."""
+        """Time at which short faults begin."""
         return self.start_ns + int(AT_SHARE * (self.stop_ns - self.start_ns))
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that goes wrong; `blind` says in which part of the flight nothing can be seen."""
+    """One fault; the images show nothing for `dropout_s` seconds from the middle of the flight."""
 
     name: str
     telemetry: Callable[[Samples, Span], Samples] = lambda samples, span: samples
@@ -63,7 +63,7 @@ class Fault:
     dropout_s: float = 0.0
 
     def dropout_ns(self, span: Span) -> tuple[int, int] | None:
-        """From when to when nothing can be seen."""
+        """Begin and end of the image dropout; None without one."""
         if not self.dropout_s:
             return None
         return span.fault_ns, span.fault_ns + int(self.dropout_s * 1e9)
@@ -74,7 +74,7 @@ def _without_attitude(samples: Samples, span: Span) -> Samples:
 
 
 def _offset_attitude(samples: Samples, span: Span) -> Samples:
-    """The autopilot sits askew on the body."""
+    """Autopilot mounted at an angle to the body."""
     turn = turn_by(OFFSET_RAD * OFFSET_AXIS / np.linalg.norm(OFFSET_AXIS))
 
     def askew(sample: AttitudeSample) -> AttitudeSample:
@@ -98,7 +98,7 @@ def _silent(samples: Samples, span: Span) -> Samples:
 
 
 def _wrong_velocity(samples: Samples, span: Span) -> Samples:
-    """The autopilot's compass is off, and its velocity too large."""
+    """Compass offset, and velocity too large."""
     turn = VELOCITY_SCALE * turn_by(np.array([0.0, 0.0, VELOCITY_TURN_RAD]))
 
     def wrong(sample: PositionSample) -> PositionSample:
@@ -111,7 +111,7 @@ def _wrong_velocity(samples: Samples, span: Span) -> Samples:
 def _edited(
     edit: Callable[[Bytes, int], Bytes],
 ) -> Callable[[Pictures, Span], Iterator[Frame | Warned]]:
-    """Change images by a function of the grey image and the time since the start, ns."""
+    """Fault that edits images: a function of the grey image and the time since the start, ns."""
 
     def edited(pictures: Pictures, span: Span) -> Iterator[Frame | Warned]:
         for frame in pictures:
@@ -152,14 +152,14 @@ def _exposed(grey: Bytes, since_ns: int) -> Bytes:
 
 
 def _low_contrast(grey: Bytes, since_ns: int) -> Bytes:
-    """Hardly any contrast, and the camera's own noise on it."""
+    """Hardly any contrast, and the noise of the camera on it."""
     rng = np.random.default_rng(since_ns)
     noise = rng.normal(scale=LOW_CONTRAST_NOISE, size=grey.shape)
     return np.asarray(np.clip(128 + LOW_CONTRAST_GAIN * (grey - 128.0) + noise, 0, 255), np.uint8)
 
 
 def _blurred(grey: Bytes, since_ns: int) -> Bytes:
-    """Smeared along a direction that turns, for half a second in every two."""
+    """Motion blur along a direction that turns, for half a second in every two."""
     if (since_ns * 1e-9) % 2.0 > 0.5:
         return grey
     angle = since_ns * 1e-9

@@ -1,4 +1,4 @@
-"""The commands for a flight that is under way: the daemon, and who looks at it."""
+"""Commands for a flight in progress: the daemon, its status, the viewer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The part of the command line that sets the program up as a service of this computer."""
+"""Commands that install the program as a service, and remove it."""
 
 from __future__ import annotations
 

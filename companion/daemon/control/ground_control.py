@@ -1,6 +1,6 @@
-"""What a ground station may have the companion do, and when not; docs/control.md tells it to users.
+"""Ground commands and parameters: what is allowed, and when; users' guide in docs/control.md.
 
-Everything here runs in the event loop. How MAVLink asks and is answered the drivers know.
+Everything here runs in the event loop. The MAVLink protocol is in the drivers.
 """
 
 from __future__ import annotations
@@ -68,28 +68,28 @@ NOT_LOOSER = "while armed it can be made stricter only", REFUSED_ARMED
 
 
 class Controlled(Protocol):
-    """The daemon, as far as the ground has a say."""
+    """The daemon, as the ground controls it."""
 
     @property
     def config(self) -> Config:
-        """What counts now."""
+        """Configuration in force."""
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are; as they last were where nothing is heard."""
+        """Whether the motors are armed; the last known state where nothing is heard."""
 
     def take_over(self, config: Config) -> None:
-        """Go on with another configuration."""
+        """Continue with another configuration."""
 
     def prepare(self) -> None:
-        """Have a flight at hand beside the one that goes on."""
+        """Start the processes of a standby flight."""
 
     def begin_flight(self) -> None:
-        """Begin one, where one is due."""
+        """Begin a flight, where one is due."""
 
 
 class GroundControl:
-    """Commands and parameters of our component; `changed` is by key what the ground has set."""
+    """Commands and parameters of our component; `changed` are values set by the ground, by key."""
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class GroundControl:
         link.on_request = self._requests.take
 
     async def run(self) -> None:
-        """Answer, and carry out what takes long; until cancelled."""
+        """Answer requests and execute long commands, until cancelled."""
         answering = asyncio.ensure_future(self._requests.run())
         try:
             while not answering.done():
@@ -141,15 +141,15 @@ class GroundControl:
 
     @property
     def names(self) -> Sequence[str]:
-        """Of all parameters, in the order of their numbers."""
+        """Names of all parameters, by index."""
         return tuple(PARAMETERS)
 
     def value(self, name: str) -> float:
-        """As it counts now."""
+        """Value in force."""
         return number_of(self._daemon.config, PARAMETERS[name])
 
     def set(self, name: str, value: float) -> int:
-        """Set one, if it may be now; SET or a MAV_PARAM_ERROR."""
+        """Set one, if allowed now; SET or a MAV_PARAM_ERROR."""
         parameter, config = PARAMETERS[name], self._daemon.config
         try:
             wanted = value_of(config, parameter, value)
@@ -175,7 +175,7 @@ class GroundControl:
     def _forbidden(
         self, parameter: FlightParameter, wanted: Any
     ) -> tuple[str, PilotMessage] | None:
-        """Why it must not be so now; None if it may."""
+        """Reason why it is refused now; None if allowed."""
         self._changes.refill(self._clock.now_ns())
         if self._changes.left < 1.0:
             return TOO_OFTEN
@@ -202,7 +202,7 @@ class GroundControl:
         return self._kept
 
     def close(self, seconds: float = 0.0) -> None:
-        """Keep what is still to be kept; waits for the disk at most so long."""
+        """Write settings still to be kept; waits for the disk at most this long."""
         if self._kept is not None:
             self._kept.close(seconds)
 
@@ -244,7 +244,7 @@ class GroundControl:
         return Done(result)
 
     def _tell(self, told: PilotText, text: str, good: bool) -> None:
-        """Answer the pilot, unless that comes too often, and say it at length in the journal."""
+        """Answer the pilot, rate-limited, and write the details to the journal."""
         self._texts.refill(self._clock.now_ns())
         in_time = self._texts.left >= 1.0
         if in_time:

@@ -1,8 +1,8 @@
-"""What may change, while the motors are armed, of what decides which poses the autopilot gets.
+"""Changes allowed while armed to settings that decide which poses the autopilot gets.
 
-Limits become tighter, feedback is switched off; anything else waits for disarming. That holds
-however a change comes: by parameter, by command, with a configuration that is read again, or with
-one that is read by a daemon that starts in the air.
+Limits may become tighter, feedback may be switched off; anything else waits for disarming. That
+holds for a parameter, a command, a reloaded configuration, and the configuration read by a daemon
+that starts in the air.
 """
 
 from __future__ import annotations
@@ -63,13 +63,13 @@ WHILE_ARMED: Mapping[str, MayChange] = {
 
 
 def value_of_key(config: Config, name: str) -> Any:
-    """The value of `section.key`."""
+    """Value of `section.key`."""
     section, key = name.split(".")
     return getattr(getattr(config, section), key)
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
-    """The configuration with other values for keys `section.key`; they are taken as they are."""
+    """The configuration with other values for keys `section.key`, not validated."""
     for name, value in values.items():
         section, key = name.split(".")
         part = dataclasses.replace(getattr(config, section), **{key: value})
@@ -78,12 +78,12 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
 
 def may_change(name: str, now: Any, wanted: Any) -> bool:
-    """Whether a key may have another value while armed; keys that have no say in it always may."""
+    """Whether a key may change to a value while armed; always for keys without influence."""
     return WHILE_ARMED.get(name, _freely)(now, wanted)
 
 
 def tightened(running: Config, wanted: Config) -> tuple[Config, dict[str, Any]]:
-    """The configuration to go on with while armed, and by key what has to wait for disarming."""
+    """The configuration in force while armed, and by key the changes that wait for disarming."""
     waiting = {
         name: value_of_key(wanted, name)
         for name in WHILE_ARMED

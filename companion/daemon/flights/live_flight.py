@@ -1,4 +1,4 @@
-"""One live flight: its stages, each in a process, joined from the first frame to the report.
+"""One live flight: its stages, each in a process, from the first frame to the report.
 
     frames, telemetry -> localisation -> depth -> results, viewer
     all input, poses, warnings -> recorder
@@ -78,7 +78,7 @@ NOT_FINISHED = "a stage did not give its last results in time"
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """Who hears of a flight; all are called from its threads and must not block."""
+    """Callbacks for the output of a flight; called from its threads, must not block."""
 
     odometry: Callable[[Odometry], None]
     mapped: Callable[[Track | MapUpdate | PointChunk], None]
@@ -90,7 +90,7 @@ class Listener:
 
 
 class LiveFlight:
-    """Processes that wait for a flight to begin, then the flight."""
+    """Processes of one flight: on standby before `begin`, then flying."""
 
     def __init__(
         self,
@@ -133,12 +133,12 @@ class LiveFlight:
 
     @property
     def ready(self) -> bool:
-        """Whether frames are worked on as they come."""
+        """Whether frames are processed as they come."""
         return self.folder is not None and self.stages["localisation"].progress is not None
 
     @property
     def stages_up(self) -> bool:
-        """Whether every stage that can be has begun its work, or has tried and will again."""
+        """Whether every stage that can run is up, or has failed to start and is retried."""
         return all(
             stage.progress is not None or self.n_restarted.get(kind, 0)
             for kind, stage in list(self.stages.items())
@@ -146,7 +146,7 @@ class LiveFlight:
         )
 
     def begin(self, folder: Path, keep: KeepMap | None = None) -> None:
-        """The flight begins, and leaves its results there; its map is kept as said in `keep`."""
+        """Begin the flight, with its results in `folder`; `keep` says where its map is kept."""
         self.folder, self._began_s = folder, monotonic_s()
         if keep is not None:
             self.stages["localisation"].offer(keep)
@@ -157,7 +157,7 @@ class LiveFlight:
             self._viewing = Viewing(self._config, self.camera, folder.name, self._warn)
 
     def frame(self, frame: Frame) -> None:
-        """Take a frame of the camera's size."""
+        """Take a frame of the camera's size; never waits."""
         if self.folder is None or self._over.is_set():
             return
         self.n_frames += 1
@@ -168,7 +168,7 @@ class LiveFlight:
         self._show(frame)
 
     def take(self, message: Telemetry | Warned) -> None:
-        """Take telemetry, or a warning for the log."""
+        """Take telemetry, or a warning for the log; never waits."""
         if self.folder is None or self._over.is_set():
             return
         if not isinstance(message, Warned):
@@ -177,12 +177,12 @@ class LiveFlight:
         self._to_results(message)
 
     def record(self, message: Message | LinkBytes | HealthNote) -> None:
-        """Have something in the recording; nobody else hears of it."""
+        """Send a message to the recorder only."""
         if "recorder" in self.stages and self.folder is not None and not self._over.is_set():
             self.stages["recorder"].offer(message)
 
     def publish_health(self, health: Health, origin: GeoOrigin | None) -> None:
-        """Have viewers and recording told how all is, once a second, and where the world lies."""
+        """Send health to viewers and results once a second, and a changed world's origin."""
         if self.folder is None or self._over.is_set():
             return
         if health.t_ns - self._health_ns < HEALTH_EVERY_NS:
@@ -195,11 +195,11 @@ class LiveFlight:
 
     @property
     def viewing(self) -> Viewing | None:
-        """Who looks on; None if nobody may."""
+        """The viewers' exporter; None if nobody may view."""
         return self._viewing
 
     def set_load_levels(self, features: float, dense: float, viewer: bool) -> None:
-        """Leave out some of the work, or take it up again; see companion.runtime.governor."""
+        """Set the share of work of the stages; see companion.runtime.governor."""
         if self._viewing is not None:
             self._viewing.pictures = viewer
         self.stages["localisation"].offer(SetLoadLevel(features))
@@ -213,7 +213,7 @@ class LiveFlight:
         return self._dense
 
     def set_dense(self, dense: bool) -> None:
-        """Make the dense map from now on, or leave it; what there is of it stays."""
+        """Start or stop dense mapping; the dense map so far stays."""
         with self._lock:
             if dense == self._dense or self._over.is_set():
                 return
@@ -227,23 +227,23 @@ class LiveFlight:
         self._bring_up_to_date("depth")
 
     def set_budget(self, kbit_s: float) -> None:
-        """All viewers together get no more from now on; 0 for no limit."""
+        """Limit the rate of all viewers together; 0 for no limit."""
         if self._viewing is not None:
             self._viewing.set_budget(kbit_s)
 
     def take_snapshot(self, number: int, origin: GeoOrigin | None) -> None:
-        """Have the cloud written as it is now; the listener hears how far that is."""
+        """Write the cloud as it is now; progress goes to the listener."""
         self.stages["results"].offer(TakeSnapshot(number, origin))
 
     @property
     def has_origin(self) -> bool:
-        """Whether the map lies in the autopilot's own world."""
+        """Whether the map is georeferenced to the autopilot's origin."""
         found = self._last_map.georeference if self._last_map is not None else None
         return found is not None and found.has_origin
 
     @property
     def duration_s(self) -> float:
-        """Since it began."""
+        """Seconds since it began."""
         return monotonic_s() - self._began_s
 
     def kill_localisation(self) -> None:
@@ -251,9 +251,9 @@ class LiveFlight:
         self.stages["localisation"].interrupt()
 
     def end_stalled(self) -> None:
-        """End stages that hang, so that others take their place; localisation only as it starts.
+        """End stages that hang, so that they are restarted; localisation only as it starts.
 
-        Whether a localisation that has begun hangs is known by its poses, and sooner.
+        A running localisation that hangs is detected by its poses, and sooner.
         """
         now_s = monotonic_s()
         for kind, stage in list(self.stages.items()):
@@ -264,11 +264,11 @@ class LiveFlight:
                 stage.interrupt(STALLED.format(stalled_s))
 
     def hurry(self) -> None:
-        """Whatever `finish` is at, it has little time left."""
+        """Have `finish` end within three seconds."""
         self._hurry_s = monotonic_s()
 
     def finish(self, facts: Callable[[LiveFlight], RunFacts]) -> None:
-        """Give all results and end; after `hurry` within three seconds. Waits for it."""
+        """Write all results and end; within three seconds after `hurry`. Blocks."""
         with self._lock:
             self._over.set()
         if self.folder is not None:
@@ -329,7 +329,7 @@ class LiveFlight:
         self.stages[kind].begin(Setup(self._config, self.camera, folder, failed))
 
     def _ended(self, kind: str, why: str) -> None:
-        """A stage's process is gone; called from its own thread."""
+        """Handle the end of a stage's process; called from its own thread."""
         if not why:
             return
         with self._lock:
@@ -359,7 +359,7 @@ class LiveFlight:
         self._bring_up_to_date(kind)
 
     def _blame_driver(self, gone: StageProcess, why: str) -> None:
-        """A device whose driver has ended a stage is not used again in this flight.
+        """Exclude a device whose driver has ended a stage from the rest of the flight.
 
         A stage may have been too slow to answer for other reasons; that counts the second time.
         """
@@ -372,14 +372,14 @@ class LiveFlight:
         self._failed_devices[driver.identity] = f"{driver.named}: {why}"
 
     def _bring_up_to_date(self, kind: str) -> None:
-        """A stage begins in mid-flight: it has to know what the others do."""
+        """Give a stage that starts in flight the load level and the newest map."""
         if kind == "depth":
             self.stages[kind].offer(SetLoadLevel(self._dense_share))
         if self._last_map is not None:
             self.stages[kind].offer(self._last_map)
 
     def _deliver(self, message: Message | Snapshot) -> None:
-        """What a stage gives goes to whom it is for; called from the stages' threads."""
+        """Route the output of a stage; called from the stages' threads."""
         if "topics" in self.stages and isinstance(message, PUBLISHED):
             self.stages["topics"].offer(message)
         if isinstance(message, Snapshot):
@@ -417,7 +417,7 @@ class LiveFlight:
         self._listener.warned(warning)
 
     def dropped(self) -> dict[str, int]:
-        """Frames that stages passed over, by stage, and messages that the viewer did."""
+        """Frames dropped by each stage, and messages dropped by the viewer."""
         counts: dict[str, Any] = {f"{k} frames": s.n_dropped for k, s in self.stages.items()}
         if self._viewing is not None:
             counts["viewer messages"] = self._viewing.n_dropped

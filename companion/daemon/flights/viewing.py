@@ -1,6 +1,6 @@
-"""The viewers of a flight: its exporter, and what shows it on board if anything is to.
+"""The viewers of a flight: its exporter, and the viewer on board if one is configured.
 
-Whoever calls `take` never waits, and nothing that becomes of a viewer matters to the flight.
+`take` never waits, and no failure of a viewer affects the flight.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ CLOSED = "viewers cannot connect"
 
 
 class Viewing:
-    """Exports to `stream.listen` and keeps `daemon.viewer` shown until `close`.
+    """Exports to `stream.listen` and keeps `daemon.viewer` open until `close`.
 
-    `warn` takes what, a detail, and whether it is good.
+    `warn` takes a warning, its detail, and whether it is good news.
     """
 
     def __init__(
@@ -59,16 +59,16 @@ class Viewing:
 
     @property
     def n_dropped(self) -> int:
-        """Messages that there was no room for."""
+        """Messages dropped for lack of capacity."""
         return self._n_dropped + self._viewer.n_dropped
 
     @property
     def pid(self) -> int:
-        """Of the exporter."""
+        """Process id of the exporter."""
         return self._viewer.pid
 
     def health(self) -> StageHealth:
-        """How the exporter is; what it gave up for want of room on links counts as dropped."""
+        """Health of the exporter; data that it skipped on thin links counts as dropped."""
         report = self._viewer.report
         n_viewers = int(report.get("viewers", 0))
         plural = "" if n_viewers == 1 else "s"
@@ -91,12 +91,12 @@ class Viewing:
             self._viewer.take(message)
 
     def set_budget(self, kbit_s: float) -> None:
-        """All viewers together get no more from now on; 0 for no limit."""
+        """Limit the rate of all viewers together; 0 for no limit."""
         self._stream = replace(self._stream, budget_kbit_s=kbit_s)
         self._viewer.set_budget(kbit_s)
 
     def close(self, hurry: bool) -> None:
-        """The flight is over; what viewers have not got by then they never will."""
+        """End at the end of the flight; data that viewers lack by then is lost."""
         self._patience_s = HURRIED_S if hurry else PATIENCE_S
         self._over.set()
         self._thread.join(4 * self._patience_s + 1.0)
@@ -125,7 +125,7 @@ class Viewing:
         self._close_viewer(self._patience_s)
 
     def _show(self) -> float:
-        """Show it, for the first time or again; how long to wait after that."""
+        """Open the viewer, for the first time or again; seconds until the next attempt."""
         if self._told == "" and self._was_shown:
             self._tell(GONE, self._where)
             if self._where == "native":
@@ -155,7 +155,7 @@ class Viewing:
         self._viewer.n_dropped = 0
 
     def _tell(self, what: str, detail: str) -> None:
-        """Say it, but not again as long as nothing else is to be said."""
+        """Warn, unless the same was the last warning."""
         if what != self._told:
             self._told = what
             self._warn(what, detail, False)

@@ -1,7 +1,7 @@
-"""A node on another machine: it fetches what a drone has tracked, and makes depth and cloud of it.
+"""Depth node on another machine: fetches keyframe bundles from a drone, makes depth and cloud.
 
-It asks for one bundle after the other, as fast as it can work on them. Whatever becomes of the
-link, of the drone or of itself, it goes on with the bundle after the last that counted.
+It asks for one bundle after the other, as fast as it can process them. After any failure of the
+link, of the drone or of itself it continues after the last bundle that counted.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def run_depth_node(config: Config, is_stopped: Callable[[], bool]) -> int:
 
 
 class DepthNode:
-    """See above."""
+    """Fetches bundles and runs the depth stage on them."""
 
     def __init__(self, config: Config, is_stopped: Callable[[], bool]) -> None:
         self._config, self._is_stopped = config, is_stopped
@@ -66,7 +66,7 @@ class DepthNode:
         self._journal.say(f"depth and cloud of {config.distributed.vehicle} at {where}")
 
     def run(self) -> None:
-        """Fetch and work until stopped."""
+        """Fetch and process until stopped."""
         while not self._is_stopped():
             if self._flight is None:
                 worked = self._look()
@@ -78,12 +78,12 @@ class DepthNode:
         self._journal.say("stopping")
 
     def close(self) -> None:
-        """Write what there is, and leave."""
+        """Write the results so far, and disconnect."""
         self._end_flight(hurry=True)
         self._bus.close()
 
     def _look(self) -> bool:
-        """Find out what flies; whether there is a flight to work on."""
+        """Find the current flight; whether there is one to work on."""
         answer = self._bus.ask("flight", b"", ASK_S)
         self._heard(answer is not None)
         if answer is None:
@@ -119,7 +119,7 @@ class DepthNode:
         self._after = self._flight.kept.resume_after(run)
 
     def _fetch(self, flight: RemoteFlight) -> bool:
-        """Ask for the next bundle and work on it; whether there was one."""
+        """Ask for the next bundle and process it; whether there was one."""
         wanted = {"run": self._run, "after": self._after, "whole": self._needs_whole}
         answer = self._bus.ask("depth_input", Envelope("wanted", wanted, {}).pack(), ASK_S)
         self._heard(answer is not None)

@@ -1,4 +1,4 @@
-"""A flight whose depth and cloud are made here, while it is flown and tracked elsewhere."""
+"""Dense mapping of a flight that is flown and tracked on another machine."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_NUMBERS = 200
 class RemoteFlight:
     """Bundles in; depth maps and points to files, viewers and topics.
 
-    A folder in which there is a cloud of the same flight already is gone on with.
+    A folder that has a cloud of the same flight is continued.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class RemoteFlight:
         return self._result.n_depth_maps
 
     def take(self, bundle: Bundle) -> None:
-        """Work on a bundle. StreamError for pictures that are none; the rest of it counts."""
+        """Process a bundle. StreamError for undecodable images; the rest of it counts."""
         for keyframe in bundle.keyframes:
             self._numbers[keyframe.keyframe_id] = (bundle.run, bundle.number)
         while len(self._numbers) > MOST_NUMBERS:
@@ -95,9 +95,9 @@ class RemoteFlight:
             self._step(self._update)
 
     def close(self, hurry: bool) -> None:
-        """Make what is still open, and write all results; the page not in a hurry.
+        """Complete open depth maps, and write all results; the page only without `hurry`.
 
-        Where no map has come, nothing is known of where points lie: what is there stays.
+        Where no map has come, nothing is known of the points' places: earlier results stay.
         """
         for out in self._depth.flush():
             self._give(out)
@@ -153,6 +153,6 @@ class RemoteFlight:
 
 
 def _free(folder: Path) -> Path:
-    """A recording that does not exist yet."""
+    """Path of a recording that does not exist yet."""
     names = ["flight.rrd", *(f"flight-{n}.rrd" for n in range(2, 1000))]
     return next(folder / name for name in names if not (folder / name).exists())

@@ -1,4 +1,4 @@
-"""How two runs of one flight differ: poses, cloud, times, in numbers."""
+"""Differences between two runs of one flight: poses, cloud, times."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ COUNTS = ("frames", "tracked", "segments", "keyframes", "depth_maps", "points", 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseDifference:
-    """Of the frames that both runs placed, by their times: `distance_m`, `rotation_deg` (N,).
+    """Frames localised in both runs, by time: `distance_m` (N,), `rotation_deg` (N,).
 
-    Both in the world as each run has it; `aligned_rms_m` is what is left after the best similarity,
-    whose scale is `scale`.
+    Both in the world of each run; `aligned_rms_m` is the ATE after the best similarity, whose scale
+    is `scale`.
     """
 
     n_only_a: int
@@ -55,7 +55,7 @@ class CloudDifference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Of run B with run A; `same_files` says of each result whether its bytes are the same."""
+    """Run B compared to run A; `same_files` says for each result whether its bytes are equal."""
 
     same_files: Mapping[str, bool]
     poses: PoseDifference
@@ -70,12 +70,12 @@ class Comparison:
 
     @property
     def identical(self) -> bool:
-        """Whether poses and cloud are the same to the last bit."""
+        """Whether poses and cloud are equal to the last bit."""
         return all(self.same_files.values())
 
 
 def compare_runs(a: FinishedRun, b: FinishedRun) -> Comparison:
-    """Compare two finished runs; InputError where no frame of one is in the other."""
+    """Compare two finished runs; InputError where they have no frame in common."""
     times = [{pose.t_ns for pose in run.poses} for run in (a, b)]
     if all(times) and times[0].isdisjoint(times[1]):
         raise InputError(
@@ -99,7 +99,7 @@ def compare_runs(a: FinishedRun, b: FinishedRun) -> Comparison:
 
 
 def numbers(found: Comparison) -> dict[str, Any]:
-    """The comparison for programs; null for what there is nothing of."""
+    """The comparison as JSON; null for missing values."""
     poses, cloud = found.poses, found.cloud
     return {
         "identical": found.identical,

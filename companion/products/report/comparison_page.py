@@ -1,4 +1,4 @@
-"""The comparison of two runs as one page that needs no other file."""
+"""HTML page of a comparison, self-contained."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_POINTS = 3000
 
 
 def comparison_page(found: Comparison, name_a: str, name_b: str) -> bytes:
-    """HTML with all styles and plots in it."""
+    """HTML with all styles and plots embedded."""
     environment = Environment(
         loader=PackageLoader("companion.products.report", ""),
         autoescape=True,
@@ -43,7 +43,7 @@ def comparison_page(found: Comparison, name_a: str, name_b: str) -> bytes:
 
 
 def shown(value: Any) -> str:
-    """A number as short as it says enough; a dash for none."""
+    """A number with few digits; a dash for none."""
     if value is None:
         return "-"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""The report's plots, as SVG that takes its colours and type from the page."""
+"""Plots of the report, as SVG that takes colours and type from the page."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ MIN_HALF = 0.5
 
 
 def plan_svg(segments: Sequence[Array], autopilot: Array | None, unit: str) -> str:
-    """The way from above, north up and east right; positions (N, 3) north, east, down."""
+    """Plan view of the path, north up and east right; positions (N, 3) north, east, down."""
     everything = [*segments, *([autopilot] if autopilot is not None else [])]
     with _style("plan"):
         low, high = _bounds(everything)
@@ -104,7 +104,7 @@ def height_svg(
 
 
 def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
-    """Map points found in each frame, over bands where the place was not known."""
+    """Map points found in each frame, over bands where the pose was unknown."""
     with _style("tracking"):
         figure = Figure(figsize=(11.6, 2.6), layout="constrained")
         axes = figure.add_subplot()
@@ -132,7 +132,7 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
 
 
 def stages_svg(stage_times: Mapping[str, Mapping[str, float]]) -> str:
-    """Milliseconds for one call of each stage: bars to the median, lines to the 95th percentile."""
+    """Milliseconds per call of each stage: bars to the median, lines to the 95th percentile."""
     with _style("stages"):
         names = sorted(stage_times, key=lambda name: -stage_times[name]["total_s"])
         figure = Figure(figsize=(6.4, 0.32 * len(names) + 0.9), layout="constrained")
@@ -155,7 +155,7 @@ def stages_svg(stage_times: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _style(name: str) -> AbstractContextManager[None]:
-    """The report's style; the plot's name keeps its element ids apart from those of others."""
+    """Style of the report; the plot's name keeps its element ids unique."""
     style: Any = {**STYLE, "svg.hashsalt": name}
     return matplotlib.rc_context(style)
 
@@ -166,7 +166,7 @@ def _draw_segments(axes: Axes, lines: Sequence[Array]) -> None:
 
 
 def _thin(line: Array) -> Array:
-    """At most `MAX_POINTS` of a line's points, its ends among them."""
+    """At most `MAX_POINTS` points of a line, its ends included."""
     if len(line) <= MAX_POINTS:
         return line
     thinned: Array = line[np.linspace(0, len(line) - 1, MAX_POINTS).round().astype(int)]
@@ -179,7 +179,7 @@ def _bounds(parts: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def _edges(t_s: Array) -> Array:
-    """Time of each frame, and where the last one ends."""
+    """Time of each frame, and the end of the last one."""
     step = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.05
     return np.append(t_s, t_s[-1] + step)
 
@@ -197,7 +197,7 @@ def _legend(axes: Axes) -> None:
 
 
 def _svg(figure: Figure) -> str:
-    """The figure as an element to put into a page, the same bytes each time."""
+    """The figure as an element to embed in a page, the same bytes each time."""
     figure.patch.set_alpha(0)
     for axes in figure.axes:
         axes.patch.set_alpha(0)

@@ -1,4 +1,4 @@
-"""The report as one page that needs no other file."""
+"""HTML page of the report, self-contained."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def report_page(
     cloud: Cloud,
     numbers: dict[str, Any],
 ) -> bytes:
-    """HTML with all styles and pictures in it; `numbers` are those of report.json."""
+    """HTML with all styles and pictures embedded; `numbers` are those of report.json."""
     environment = Environment(
         loader=PackageLoader("companion.products.report", ""),
         autoescape=True,
@@ -54,14 +54,14 @@ def report_page(
 
 
 def kernel_stages(result: FlightResult) -> dict[str, dict[str, float]]:
-    """Times of the kernels, named so that they can stand among the stages."""
+    """Times of the kernels, named for the table of stages."""
     return {f"{name} (kernel)": times for name, times in result.kernel_times().items()}
 
 
 def path_segments(poses: Sequence[WorldPose]) -> list[tuple[Array, Array]]:
     """Parts of the path without gaps: t_ns (N,) and positions (N, 3) in the world.
 
-    A gap is five times the usual step, and half a second at least.
+    A gap is longer than five times the median step, and half a second at least.
     """
     if not poses:
         return []
@@ -91,7 +91,7 @@ def distance(value: float, unit: str = "m") -> str:
 
 
 def number(value: float) -> str:
-    """A number as short as it can be read."""
+    """A number with as few digits as it can be read by."""
     if value == 0:
         return "0"
     digits = int(np.clip(2 - np.floor(np.log10(abs(value))), 0, 3))
@@ -109,7 +109,7 @@ def _plots(
     segments: Sequence[tuple[Array, Array]],
     duration_s: float,
 ) -> dict[str, Markup | None]:
-    """The plots that there is something for; they are markup of our own making."""
+    """The plots that have data; they are markup of our own making."""
     first = result.first_t_ns or 0
     found = result.autopilot_path()
     autopilot = None

@@ -1,4 +1,4 @@
-"""Items to entities: what is drawn where. Called from one thread.
+"""Items to Rerun entities. To be called from one thread.
 
 world                       local NED in metres (z down)
   autopilot/<n>             the autopilot's own path, in pieces
@@ -73,8 +73,8 @@ NOWHERE = Similarity(1e-6, np.eye(3), np.zeros(3))
 class Drawing:
     """Draws items in one recording.
 
-    Live, what makes up the map is drawn for all times, so that a viewer never holds more than one
-    of it; in a file all has its time.
+    Live, map entities are static, so that a viewer never holds more than one version; in a file all
+    have their time.
     """
 
     def __init__(self, recording: rr.RecordingStream, *, live: bool, colours: Colours) -> None:
@@ -91,7 +91,7 @@ class Drawing:
         self.go_on_in(recording)
 
     def go_on_in(self, recording: rr.RecordingStream) -> None:
-        """Draw in another recording from now on: what is drawn later needs the places known now."""
+        """Draw in another recording from now on; repeats the places that later entities need."""
         self._rec = recording
         recording.log("world", rr.ViewCoordinates.FRD, static=True)
         for plot, name in SERIES.items():
@@ -170,7 +170,7 @@ class Drawing:
         self._rec.log("world/camera/image/found", found)
 
     def _pinhole(self, width: int) -> None:
-        """The lens of pictures that are so wide."""
+        """Pinhole of pictures of this width."""
         self._width = width
         assert self._flight is not None
         camera = self._flight.camera
@@ -215,7 +215,7 @@ class Drawing:
                 self._path_on_earth(keyframe_id)
 
     def _points(self, item: PointsItem) -> None:
-        """Points of one level; when both are there they become one, which is cheaper to show."""
+        """Points of one level; both levels are merged into one entity, which is cheaper to show."""
         points, rgb, confidence = item.points_camera, item.rgb, item.confidence
         if item.level == FINE:
             coarse = self._coarse.pop(item.keyframe_id, None)

@@ -1,4 +1,4 @@
-"""A flight that goes to files, written by a thread of their own."""
+"""Viewer file of a flight, written by a thread of its own."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ CAPACITY_BYTES = 64 << 20
 
 
 class FileViewer:
-    """Everything, into a .rrd file: the caller waits when the file cannot keep up.
+    """All messages into a .rrd file: the caller waits when the file cannot keep up.
 
-    No more than `rrd_mb` of it is kept, the newest, in several files. What goes wrong in the thread
-    is raised when the file is closed, and not before. `indexed` is not for long flights, see
-    RrdFiles.
+    At most `rrd_mb` of the newest are kept, in several files. An error of the thread is raised when
+    the file is closed, and not before. `indexed` is not for long flights, see RrdFiles.
     """
 
     def __init__(

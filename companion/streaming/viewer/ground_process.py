@@ -1,4 +1,4 @@
-"""The process that shows a flight on the machine where it runs: WHERE PORT COLOURS BIND."""
+"""Process of the viewer on the machine of the flight: WHERE PORT COLOURS BIND."""
 
 from __future__ import annotations
 

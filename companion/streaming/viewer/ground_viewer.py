@@ -1,7 +1,7 @@
-"""What comes over the link is drawn on a screen. A screen that is slow slows the link, and no more.
+"""Draws items of a link on a screen. A slow screen slows the link, and nothing else.
 
-A call into Rerun whose peer hangs does not return. It is this process that hangs then, on the
-ground; the drone sees that nothing is taken any more, and sends nothing.
+A call into Rerun whose peer hangs does not return. Then this process hangs, on the ground; the
+drone gets no acknowledgements any more, and sends nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FLUSH_S = 2.0
 
 
 def show(link: GroundLink, screen: Screen, colours: Colours, stop: threading.Event) -> None:
-    """Draw all that a link gives, each flight in a recording of its own."""
+    """Draw the items of a link, each flight in a recording of its own."""
     recording: rr.RecordingStream | None = None
     drawing: Drawing | None = None
     flight_id = None

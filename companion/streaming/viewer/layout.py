@@ -1,4 +1,4 @@
-"""The layout that is good without a click."""
+"""Default layout of the viewer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a flight is looked at: a window, a page in a browser, or a viewer that runs already."""
+"""Screens: a window, a page in a browser, or a running viewer."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ SERVER_MEMORY = "256MB"
 
 
 class Screen:
-    """A viewer that listens at `address`, and its process where that is ours to end.
+    """A viewer that listens at `address`, and its process where we have started it.
 
-    `where` is web, native, or a rerun+http address; `bind` is where the web's two ports are
-    opened. Raises InputError where there is no such viewer.
+    `where` is web, native, or a rerun+http address; `bind` is the address of the two web ports.
+    Raises InputError where there is no such viewer.
     """
 
     def __init__(self, where: str, bind: str = LOOPBACK) -> None:
@@ -81,7 +81,7 @@ class Screen:
         return self.process is not None and self.process.poll() is not None
 
     def close(self) -> None:
-        """End what is to end with the flight."""
+        """End what was started for this flight."""
         if self.proxy is not None:
             self.proxy.close()
         if self.process is not None and self.is_ours:
@@ -90,13 +90,13 @@ class Screen:
 
 
 def page_of(host: str) -> str:
-    """The address, for a browser, of a page that shows what is served there."""
+    """Address, for a browser, of the page that shows this server."""
     shown = f"rerun%2Bhttp://{host}:{GRPC_PORT}/proxy"
     return f"http://{host}:{WEB_PORT}/?url={shown}&theme=dark"
 
 
 def listens(host: str, port: int) -> bool:
-    """Whether something accepts connections there."""
+    """Whether a server accepts connections there."""
     try:
         with socket.create_connection((host, port), timeout=3.0):
             return True
@@ -127,7 +127,7 @@ def _start(port: int, *arguments: str, detached: bool = False) -> subprocess.Pop
 
 
 def _executable() -> Path:
-    """The viewer that came with the library, wherever the shell looks for programs."""
+    """Viewer shipped with the library, whatever PATH says."""
     spec = importlib.util.find_spec("rerun_cli")
     for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
         program = Path(folder) / "rerun"

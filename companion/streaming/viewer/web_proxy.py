@@ -1,7 +1,7 @@
-"""The door through which browsers see a page and what is drawn on it; it knows when they lag.
+"""Flow-controlled proxy between browsers and Rerun's server; detects browsers that lag.
 
-Rerun's server sends all it is given, and keeps what a thin link has no room for. Behind this door
-it gets no more than the browsers take: whoever draws waits while the door has to.
+Rerun's server sends all it is given, and buffers without limit what a thin link cannot carry.
+Behind this proxy it is given no more than the browsers take: whoever draws waits for them.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class _Direction:
 
 
 class WebProxy:
-    """Connections to `listeners`, (address, port) each, go on to a port of this machine.
+    """Forwards connections to `listeners`, (address, port) each, to a port of this machine.
 
-    `watched` is the port of the doors at which lag counts. OSError where a door cannot be opened.
+    `watched` is the port on which lag counts. OSError where a port cannot be opened.
     """
 
     def __init__(self, listeners: Mapping[tuple[str, int], int], watched: int) -> None:
@@ -58,7 +58,7 @@ class WebProxy:
         self._thread.start()
 
     def wait_for_browsers(self, stop: threading.Event) -> None:
-        """Wait until no browser lags, or has for too long."""
+        """Wait until no browser lags, or one has for too long."""
         until_s = monotonic_s() + LONGEST_WAIT_S
         while self.is_lagging and monotonic_s() < until_s and not stop.is_set():
             wait_s(stop, LOOK_S)
@@ -73,7 +73,7 @@ class WebProxy:
         return any(s is not None and now_s - s > LAG_S for s in since)
 
     def close(self) -> None:
-        """Close the doors."""
+        """Close the ports."""
         self._stop.set()
         self._thread.join()
 
@@ -158,7 +158,7 @@ class WebProxy:
 
 
 def free_ports(n: int) -> list[int]:
-    """Ports of this machine on which nobody listens now."""
+    """Ports of this machine that are free now."""
     with contextlib.ExitStack() as stack:
         found = [stack.enter_context(socket.socket()) for _ in range(n)]
         for each in found:
