@@ -1,4 +1,4 @@
-"""The thread that keeps a camera open and hands on what may be believed of its pictures."""
+"""Camera supervisor: a thread that keeps a camera open and passes on valid frames."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ REPEAT_WARNING_S = 10.0
 
 @dataclass(slots=True)
 class _Opening:
-    """What is known of the camera since it was opened, CLOCK_MONOTONIC in seconds."""
+    """State since the camera was opened, CLOCK_MONOTONIC in seconds."""
 
     since_s: float
     picture_s: float | None = None
@@ -62,11 +62,10 @@ class _Opening:
 
 
 class CameraFeed:
-    """Opens a source, and opens it anew whenever it has gone, for as long as it is to run.
+    """Opens a source, and reopens it whenever it is lost, until stopped.
 
-    `deliver` and `warn` are called in its thread and must not block. A picture that repeats the one
-    before, has another size than the first of all, or a stamp that cannot be true, goes no further
-    and is counted.
+    `deliver` and `warn` are called in its thread and must not block. An image that repeats the one
+    before, has another size than the first of all, or an impossible stamp, is dropped and counted.
     """
 
     def __init__(
@@ -101,11 +100,11 @@ class CameraFeed:
 
     @property
     def health(self) -> SourceHealth:
-        """As it stands now; may be asked from any thread."""
+        """Health now; from any thread."""
         return self._meter.health(self._clock.now_ns())
 
     def start(self) -> None:
-        """Begin to open the camera."""
+        """Start the thread, which opens the camera."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -156,7 +155,7 @@ class CameraFeed:
             self._set_fault(error)
 
     def _read_on(self) -> None:
-        """Hand on pictures until the camera has gone, or should be opened anew."""
+        """Deliver images until the camera is lost, or should be reopened."""
         opening = _Opening(time.monotonic())
         while not self._stop.is_set():
             try:
@@ -202,7 +201,7 @@ class CameraFeed:
         return True
 
     def _take(self, picture: Picture) -> str:
-        """Hand a picture on, or say what is amiss with it."""
+        """Deliver an image, or return the reason why it is invalid."""
         now_ns = time.monotonic_ns()
         invalid = self._why_invalid(picture, now_ns)
         if invalid:
@@ -252,13 +251,13 @@ class CameraFeed:
         return str(error)
 
     def _set_fault(self, error: Exception) -> None:
-        """A bug: where it lies goes to the journal whole, what it is to whoever asks."""
+        """Report a bug: its traceback to the journal, its kind to health."""
         self._faults.tell(error, self._secrets)
         name = type(error).__name__
         self._set("driver fault", DRIVER_FAULT, f"{self._source.name}: {name}, see the journal")
 
     def _set(self, state: SourceState, what: str, detail: str) -> None:
-        """Note what is amiss, and tell of it where that is new."""
+        """Set the state of the source, and warn if it is new."""
         self._meter.state, self._meter.detail = state, detail
         if what not in self._warned_s:
             self._warned_s[what] = time.monotonic()

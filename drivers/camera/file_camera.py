@@ -1,4 +1,4 @@
-"""A recorded flight, a folder of images or a video as a camera: played in the time it was taken."""
+"""A recorded flight, a folder of images or a video as a camera, in real time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PREFETCHED = 3
 
 
 class FileCamera:
-    """Each picture comes when it is due; those whose successor is due already are left out."""
+    """Gives each image when it is due; skips those whose successor is due already."""
 
     live = False
     start_s = 5.0
@@ -44,7 +44,7 @@ class FileCamera:
         self._waiting: tuple[int, Bytes] | None = None
 
     def open(self) -> None:
-        """Find the pictures and their times, and begin to decode; see `CameraSource`."""
+        """Find the images and their times, and start to decode; see `CameraSource`."""
         self.close()
         try:
             self._source = _frames(self._path)
@@ -73,7 +73,7 @@ class FileCamera:
         return Picture(due_ns, grey, rgb)
 
     def close(self) -> None:
-        """End the decoding."""
+        """Stop decoding."""
         prefetch, self._prefetch = self._prefetch, None
         if prefetch is not None:
             prefetch.close()
@@ -87,7 +87,7 @@ class FileCamera:
         self._pictures = iter(self._prefetch)
 
     def _next(self) -> tuple[int, Bytes]:
-        """The next picture that is not too late, and when it is due by the monotonic clock."""
+        """Next image that is not too late, and when it is due by CLOCK_MONOTONIC."""
         if self._prefetch is None:
             raise SourceError(f"{self.name}: not open")
         while True:

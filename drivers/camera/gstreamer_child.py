@@ -1,4 +1,4 @@
-"""Runs a GStreamer pipeline for `drivers.camera.gstreamer_camera`, in the system's own Python.
+"""Process of a GStreamer pipeline for `drivers.camera.gstreamer_camera`, in the system's Python.
 
 It needs nothing but the standard library and PyGObject, which a virtual environment does not have,
 and a camera's plugin that crashes or hangs takes only this process with it. Python 3.8 will do.
@@ -30,21 +30,21 @@ POLL_NS = 100_000_000
 
 
 class Answers:
-    """Where answers go. Not standard output: plugins print there."""
+    """Output stream of the answers. Not standard output: plugins print there."""
 
     def __init__(self) -> None:
         self._fd = os.dup(1)
         os.dup2(2, 1)
 
     def send(self, kind: bytes, data: bytes = b"", width=0, height=0, stride=0, t_ns=0) -> None:  # type: ignore[no-untyped-def]
-        """One answer."""
+        """Send one answer."""
         left = memoryview(HEADER.pack(kind, width, height, stride, t_ns, len(data)) + data)
         while left:
             left = left[os.write(self._fd, left) :]
 
 
 def main() -> None:
-    """Serve one pipeline."""
+    """Run one pipeline."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one that asks
     answers = Answers()
     try:

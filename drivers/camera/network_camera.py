@@ -1,4 +1,4 @@
-"""RTSP and other network video by PyAV (FFmpeg): what is newest, decoded as it arrives."""
+"""RTSP and other network video by PyAV (FFmpeg): the newest image, decoded as it arrives."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class _Newest:
 
 
 class NetworkCamera:
-    """A video stream; what it cannot decode in time is left out, never queued."""
+    """Video stream; images that it cannot decode in time are dropped, never queued."""
 
     live = True
     start_s = 8.0
@@ -70,7 +70,7 @@ class NetworkCamera:
         self._receiver = receiver
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The newest picture that has been decoded; see `CameraSource`."""
+        """Newest decoded image; see `CameraSource`."""
         receiver = self._receiver
         if receiver is None:
             raise SourceError(f"{self.name}: not open")
@@ -83,14 +83,14 @@ class NetworkCamera:
         return Picture(newest.monotonic_ns, *_arrays(newest.frame))
 
     def close(self) -> None:
-        """Disconnect; a connection that hangs is left to its own time limit."""
+        """Disconnect; a connection that hangs is left to its own timeout."""
         receiver, self._receiver = self._receiver, None
         if receiver is not None:
             receiver.end()
 
 
 class _Receiver:
-    """Receives and decodes in a thread of its own: each picture builds on the one before."""
+    """Receives and decodes in a thread of its own: each image depends on the one before."""
 
     def __init__(self, config: CameraConfig, name: str) -> None:
         self.opened = threading.Event()
@@ -107,14 +107,14 @@ class _Receiver:
         self.thread = threading.Thread(target=self._run, name="network camera", daemon=True)
 
     def take(self, timeout_s: float) -> _Newest | None:
-        """The newest picture, once only."""
+        """Newest image, once only."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest or self.error, timeout_s)
             newest, self._newest = self._newest, None
             return newest
 
     def take_n_dropped(self) -> int:
-        """Pictures left out since this was last asked."""
+        """Images dropped since the last call."""
         with self._changed:
             n, self._n_dropped = self._n_dropped, 0
             return n
@@ -200,7 +200,7 @@ class _Receiver:
 
 
 def without_secrets(url: str) -> str:
-    """An address without user, password and query, fit to be printed."""
+    """Address without user, password and query, fit to be printed."""
     try:
         parts = urlsplit(url)
         host = parts.hostname or ""

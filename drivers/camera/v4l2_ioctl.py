@@ -1,4 +1,4 @@
-"""Video4Linux as the kernel speaks it: structures, numbers and requests for capture.
+"""Video4Linux capture interface of the kernel: structures, constants and requests.
 
 Names are those of linux/videodev2.h, without their prefix; layouts are those of 64-bit Linux,
 which are the same on x86-64 and aarch64.
@@ -314,7 +314,7 @@ _READ = 2
 
 
 def _request(direction: int, number: int, about: Any) -> int:
-    """Number of an ioctl as the kernel makes it: way, size of what is handed over, "V", number."""
+    """Number of an ioctl: direction, size of the argument, "V", number."""
     return direction << 30 | ctypes.sizeof(about) << 16 | ord("V") << 8 | number
 
 
@@ -339,9 +339,9 @@ ENUM_FRAMEINTERVALS = _request(_READ | _WRITTEN, 75, Frmivalenum)
 
 
 def ask(fd: int, request: int, about: Any) -> None:
-    """Hand `about` to the driver, which answers in it; OSError where it refuses.
+    """Pass `about` to the driver, which answers in it; OSError where it refuses.
 
-    A request that a signal interrupted is made again, after the signal's handler ran.
+    A request interrupted by a signal is repeated after the signal's handler.
     """
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Any flight as a flight folder: what was read of it, so that it is read again as it was."""
+"""Writes any flight as a flight folder, which reads back equal."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _write(flight: Flight, folder: Path, on_progress: Callable[[int], None]) -> 
 
 
 def camera_json(camera: Camera) -> dict[str, object]:
-    """A camera as `read_calibration` takes it."""
+    """A camera in the format of `read_calibration`."""
     said: dict[str, object] = {
         "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
         "cx": camera.cx, "cy": camera.cy, "distortion_model": camera.distortion.value,

@@ -1,4 +1,4 @@
-"""A folder of photographs with their places in EXIF, as mapping cameras take them, as a flight."""
+"""Geotagged still images (EXIF) of mapping cameras as a flight."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SUSPECT_SHARE = 0.9
 
 
 def is_geotagged(path: Path) -> bool:
-    """Whether a folder holds photographs, without a video, and one of the first has a place."""
+    """Whether a folder holds stills, without a video, and one of the first is geotagged."""
     if any(p.suffix.lower() in VIDEO_SUFFIXES for p in path.iterdir()):
         return False
     files = _files(path)
@@ -42,7 +42,7 @@ def is_geotagged(path: Path) -> bool:
 
 
 def open_geotagged(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """Photographs in order of time; FlightError where they do not tell it."""
+    """Stills in order of time; FlightError without times."""
     files = _files(path)
     found = [photo for photo in map(read_photo, files) if photo is not None]
     timed = [photo for photo in found if photo.local_ns is not None or photo.utc_ns is not None]
@@ -92,7 +92,7 @@ def _in_order(photos: Sequence[Photo]) -> tuple[list[Photo], list[int]]:
 
 
 def _zone_ns(photos: Sequence[Photo]) -> int:
-    """The camera's clock before that of satellites, as whole quarters of an hour."""
+    """Camera clock minus satellite time, in whole quarters of an hour."""
     apart = [p.local_ns - p.utc_ns for p in photos if p.local_ns is not None and p.utc_ns]
     return round(float(np.median(apart)) / ZONE_NS) * ZONE_NS if apart else 0
 
@@ -149,7 +149,7 @@ def _places(photos: Sequence[Photo], times_ns: Sequence[int]) -> tuple[LogConten
 def _heights(
     placed: Sequence[tuple[int, Photo]], start_ns: int
 ) -> tuple[list[float], list[Warned]]:
-    """Heights by barometer where there is one; where they cannot be believed, one for all."""
+    """Barometric heights if given; one height for all where they are implausible."""
     if not placed:
         return [], []
     relative = [photo.relative_altitude_m for _, photo in placed]
@@ -175,9 +175,9 @@ def _heights(
 
 
 def _steady_climb(t_s: Array, height_m: Array) -> float | None:
-    """How far heights drift from begin to end, if that explains most of them; None if it does not.
+    """Drift of heights from begin to end, if that explains most of them; else None.
 
-    Photographs for maps are taken level; a receiver that has just been switched on drifts.
+    Mapping flights are level; a receiver that has just been switched on drifts.
     """
     if len(t_s) < 10 or np.ptp(height_m) < SUSPECT_CLIMB_M:
         return None

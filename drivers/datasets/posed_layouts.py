@@ -1,4 +1,4 @@
-"""The layouts of folders with posed images, and which of them a folder is."""
+"""Layouts of folders with posed images, and their detection."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ POSE_GAP_S = 0.5
 
 
 def open_posed_images(path: Path) -> PosedImages:
-    """A folder of any known layout; FlightError where it is none, or not whole."""
+    """Folder of any known layout; FlightError for any other, or an incomplete one."""
     if not path.is_dir():
         raise FlightError(f"{path}: there is no such folder")
     sequences = sorted(path.glob("*input_sequence*.txt"))
@@ -179,7 +179,7 @@ def _tum_poses(path: Path) -> tuple[Array, list[Pose]]:
 
 
 def _rows(path: Path, n_words: int) -> Iterator[list[str]]:
-    """Lines of a table, split, without comments; FlightError where one is short or none is."""
+    """Rows of a table, split, without comments; FlightError for a short row or none."""
     try:
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
