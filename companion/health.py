@@ -1,4 +1,4 @@
-"""How the daemon is: what each source and stage does, and what comes of it.
+"""Health of the daemon: meters of sources and stages, and their report.
 
 Meters count while the work goes on, in whatever thread does it; they ask no clock, every time is
 handed in. What they report is frozen: `SourceHealth`, `StageHealth`, and all of it as `Health`.
@@ -46,7 +46,7 @@ class SourceHealth:
 
 @dataclass(frozen=True, slots=True)
 class StageHealth:
-    """A piece of the pipeline. Latency counts from exposure to result; None where nothing came."""
+    """A stage. Latency is from exposure to result; None without results."""
 
     name: str
     alive: bool = True
@@ -64,10 +64,10 @@ class StageHealth:
 
 @dataclass(frozen=True, slots=True)
 class FeedbackHealth:
-    """The pose that the autopilot is given, or why it is not.
+    """Poses sent to the autopilot, or why none are.
 
-    `why_not` is one of a few constant phrases, by which a change is noticed; numbers belong in
-    `detail`. Latency counts from exposure to sending.
+    `why_not` is one of a few constant phrases, by which a change is detected; numbers belong in
+    `detail`. Latency is from exposure to sending.
     """
 
     mode: str = "off"
@@ -93,7 +93,7 @@ class ProcessLoad:
 
 @dataclass(frozen=True, slots=True)
 class ComputerLoad:
-    """The computer that this runs on. Shares are 0 to 1; None is what it does not tell."""
+    """Load of this computer. Shares are 0 to 1; unknown values are None."""
 
     uptime_s: float = 0.0
     cpu_share: float | None = None
@@ -114,12 +114,12 @@ class ComputerLoad:
 
     @property
     def temperature_c(self) -> float | None:
-        """The hottest sensor."""
+        """Highest temperature."""
         return max(self.temperatures_c.values(), default=None)
 
     @property
     def memory_share(self) -> float | None:
-        """Share of the memory that is in use."""
+        """Share of memory in use."""
         if self.memory_used_mib is None or not self.memory_total_mib:
             return None
         return self.memory_used_mib / self.memory_total_mib
@@ -127,7 +127,7 @@ class ComputerLoad:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """All of it, at one time. `tracker` is in plain words; `quality` 1 to 100, -1 while lost."""
+    """Health at one time. `tracker` is in plain words; `quality` 1 to 100, -1 while lost."""
 
     t_ns: int
     uptime_s: float = 0.0

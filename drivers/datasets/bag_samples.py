@@ -88,7 +88,7 @@ def fix_samples(message: Any) -> Iterator[GeodeticFix]:
 
 
 def pressure_samples(message: Any) -> Iterator[Telemetry]:
-    """Barometric height of a FluidPressure, pascals."""
+    """Barometric height of a FluidPressure of the air (pascals)."""
     if message.fluid_pressure > LEAST_PRESSURE_PA:
         yield HeightSample(0, height_from_pressure(float(message.fluid_pressure)))
 

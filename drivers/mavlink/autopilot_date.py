@@ -1,4 +1,4 @@
-"""The date as the autopilot has it, mostly from its GPS: SYSTEM_TIME."""
+"""Date by the autopilot's SYSTEM_TIME, mostly from its GPS."""
 
 from __future__ import annotations
 

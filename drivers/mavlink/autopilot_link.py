@@ -1,8 +1,8 @@
-"""The autopilot: found on a port, kept in step with, asked for what is wanted, and listened to.
+"""Link to the autopilot: discovery, clock synchronisation, message rates, samples.
 
-Which vehicle it is its HEARTBEAT tells; from then on we are a component of that system. What it
-measures goes out as samples on the flight's clock. Whatever goes wrong on the link is named once
-and taken up again when it is over.
+Its HEARTBEAT identifies the vehicle; from then on we are a component of that system. Its
+measurements are passed on as samples on the flight's clock. Every failure of the link is reported
+once and handled when it is over.
 """
 
 from __future__ import annotations
@@ -107,24 +107,24 @@ class AutopilotLink:
 
     @property
     def n_reboots(self) -> int:
-        """Times that the autopilot began anew while we listened."""
+        """Reboots of the autopilot seen."""
         return self._n_reboots
 
     @property
     def rates_hz(self) -> dict[str, float]:
-        """Messages that make samples, by name: how often they really came in the last seconds."""
+        """Measured rates of messages that make samples, by name, over the last seconds."""
         now_ns = self._clock.now_ns()
         found = {name: round(meter.hz(now_ns), 1) for name, meter in sorted(self._rates.items())}
         return {name: rate_hz for name, rate_hz in found.items() if rate_hz}
 
     @property
     def origin(self) -> GeoOrigin | None:
-        """Where the positions handed on are counted from; None while no place is known."""
+        """Origin of the positions passed on; None while unknown."""
         return self.samples.positions.home
 
     @property
     def health(self) -> SourceHealth:
-        """As it stands now."""
+        """Health now."""
         self._meter.n_dropped = sum(self.samples.n_dropped.values())
         self._meter.detail = self._detail()
         if self.alive:
@@ -136,7 +136,7 @@ class AutopilotLink:
         return self._meter.health(self._clock.now_ns())
 
     def listen(self, message_id: int, take: Take) -> Callable[[], None]:
-        """Have every message of a kind that the autopilot sends; what is returned ends that."""
+        """Call back with every message of a type from the autopilot; call the result to stop."""
         self._takers[message_id].append(take)
 
         def end() -> None:
@@ -152,14 +152,14 @@ class AutopilotLink:
         self.port.send(message)
 
     def heartbeat(self) -> Any:
-        """Our HEARTBEAT as it is now."""
+        """Our HEARTBEAT now."""
         return mavlink.MAVLink_heartbeat_message(
             mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
             self.system_status, 3,
         )  # fmt: skip
 
     def say(self, text: PilotText) -> bool:
-        """Tell the pilot, by STATUSTEXT. False for what comes too soon: not told."""
+        """Send a STATUSTEXT to the pilot. False where the rate limit held it back."""
         said = self._text_limit.passed(text, self._clock.now_ns())
         for each in said:
             self.send(status_text(each))
@@ -168,7 +168,7 @@ class AutopilotLink:
     async def command(
         self, command: int, *params: float, timeout_s: float = ANSWER_S, tries: int = TRIES
     ) -> int:
-        """Send a COMMAND_LONG until it is answered: a MAV_RESULT, or NO_ANSWER (-1)."""
+        """Send a COMMAND_LONG until acknowledged: a MAV_RESULT, or NO_ANSWER (-1)."""
         values = [*params, *[0.0] * (7 - len(params))]
         system = self._target()
 
@@ -183,7 +183,7 @@ class AutopilotLink:
         self, command: int, place: GeoOrigin, *params: float, timeout_s: float = ANSWER_S,
         tries: int = TRIES,
     ) -> int:  # fmt: skip
-        """Send a COMMAND_INT about a place on Earth, altitude above mean sea level; likewise."""
+        """Send a COMMAND_INT for a geodetic position, altitude above mean sea level; likewise."""
         values = [*params, *[0.0] * (4 - len(params))]
         system = self._target()
 
@@ -197,7 +197,7 @@ class AutopilotLink:
         return await self._commands.ask(command, make, timeout_s, tries)
 
     async def request_message(self, message_id: int, timeout_s: float = ANSWER_S) -> Any | None:
-        """A message of the autopilot that it does not send by itself; None if it does not come."""
+        """Request a message that is not streamed; None if it does not come."""
         came: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def take(message: Any, _receive_ns: int) -> None:
@@ -305,7 +305,7 @@ class AutopilotLink:
     # -- what is done in turn --------------------------------------------------------------------
 
     async def _say_heartbeats(self) -> None:
-        """Once a second, and at once where nobody has heard us under this name on this wire."""
+        """Send once a second, and at once under a new name or on a new wire."""
         said_as: tuple[int, int] | None = None
         due_ns = 0
         while True:
@@ -364,7 +364,7 @@ class AutopilotLink:
             await asyncio.sleep(WATCH_S)
 
     async def _ask_for_origin(self) -> None:
-        """A local frame's zero is told once, and we may not have been there."""
+        """Request the origin: it is sent once, possibly before we listened."""
         while True:
             await asyncio.sleep(ORIGIN_S if self.alive else WATCH_S)
             if self.alive and self.samples.positions.origin is None:

@@ -1,4 +1,4 @@
-"""Commands to the autopilot: sent again until they are answered, one of a kind at a time."""
+"""Command protocol, client side: retransmitted until acknowledged, one of a kind at a time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MakeCommand = Callable[[int], Any]
 
 
 class Commands:
-    """What was asked and not answered yet."""
+    """Commands not acknowledged yet."""
 
     def __init__(self, send: Callable[[Any], None]) -> None:
         self._send = send
@@ -29,7 +29,7 @@ class Commands:
         self._answers: dict[int, asyncio.Queue[int]] = {}
 
     async def ask(self, command: int, make: MakeCommand, timeout_s: float, tries: int) -> int:
-        """The MAV_RESULT of a command, or NO_ANSWER."""
+        """MAV_RESULT of a command, or NO_ANSWER."""
         async with self._turns.setdefault(command, asyncio.Lock()):
             answers: asyncio.Queue[int] = asyncio.Queue(maxsize=8)
             self._answers[command] = answers

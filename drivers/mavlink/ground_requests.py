@@ -1,7 +1,7 @@
-"""Requests to our component from whoever may speak on the link or through the router.
+"""Requests to our component over the link or through the router.
 
-Who that is the link's signing and the router decide; what is here has passed them. Requests beyond
-a rate are not listened to, and answers go out at a rate that leaves the link to the poses.
+Signing and the router decide who may send them; these have passed. Requests beyond a rate are
+ignored, and answers go out at a rate that leaves the link to the poses.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ EVERYBODY = (0, 0)
 
 
 class GroundRequests:
-    """Takes what is addressed to us, or to all; to be used in the event loop."""
+    """Handles messages addressed to us, or broadcast; to be used in the event loop."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class GroundRequests:
         self._told_ns: int | None = None
 
     def take(self, message: Any, now_ns: int) -> None:
-        """Take any message; most are none of ours."""
+        """Take any message; most are not for us."""
         kind = message.get_msgId()
         if kind not in KINDS:
             return
@@ -77,7 +77,7 @@ class GroundRequests:
             self._port.send(answer)
 
     async def run(self) -> None:
-        """Say what waits to be said, until cancelled."""
+        """Send answers that wait, until cancelled."""
         while True:
             await asyncio.sleep(TICK_S)
             for answer in self._commands.step(self._clock.now_ns()):

@@ -1,6 +1,6 @@
-"""An origin for an autopilot that has none: without one ArduPilot does not use a pose.
+"""Sets an origin on an autopilot that has none: without one ArduPilot does not use a pose.
 
-One that has an origin, from its own GPS or from anybody else, keeps it.
+An autopilot that has an origin, from its own GPS or from anybody else, keeps it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NOWHERE_DEG = 1e-7
 
 
 class OriginKeeper:
-    """Sees to it that the autopilot has an origin; the link itself asks for the one it has."""
+    """Ensures that the autopilot has an origin; the link itself requests the present one."""
 
     def __init__(
         self, config: FeedbackConfig, link: AutopilotLink, say: Callable[[str], None],
@@ -37,7 +37,7 @@ class OriginKeeper:
         )
 
     async def run(self) -> None:
-        """Look, and set where need be; ends by cancellation."""
+        """Check, and set where needed; ends by cancellation."""
         n_without = 0
         while True:
             await asyncio.sleep(LOOK_EVERY_S)
@@ -52,7 +52,7 @@ class OriginKeeper:
                 await asyncio.sleep(AGAIN_AFTER_S)
 
     async def _set(self) -> None:
-        """By the command, and by the message that older firmware knows."""
+        """Set it by the command, and by the message that older firmware has."""
         place = self._link.origin or self._place
         if place.latitude_deg == 0 and place.longitude_deg == 0:
             place = GeoOrigin(NOWHERE_DEG, NOWHERE_DEG, place.altitude_m)

@@ -1,8 +1,8 @@
-"""A recording as a flight folder: pictures, their times, camera and telemetry, for other programs.
+"""Exports a recording as a flight folder: images, their times, camera and telemetry.
 
-Pictures are not encoded again: JPEG and PNG become files as they are, a video a video. What was
-recorded raw becomes PNG. Telemetry is what came over the link; where none of that was recorded, as
-of an import, it is the samples.
+Images are not encoded again: JPEG and PNG become files as they are, a video a video. Raw images
+become PNG. Telemetry is the link's packets; where none were recorded, as of an import, it is the
+samples.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ NAMES = {"jpeg": "jpg", "png": "png"}
 
 
 def export(recording: Recording, out: Path, on_progress: Callable[[int], None]) -> None:
-    """Write one that has pictures as the folder `out`; `on_progress` hears of pictures done.
+    """Write a recording with images as the folder `out`; `on_progress` takes the images done.
 
-    FlightError where it cannot be written, or holds anything already.
+    FlightError where it cannot be written, or is not empty.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FlightError(f"{out}: is there already; give a folder that is not, or empty")
@@ -63,7 +63,7 @@ def export(recording: Recording, out: Path, on_progress: Callable[[int], None]) 
 
 
 def tlog(recording: Recording) -> bytes:
-    """All packets of the link, both ways, as ground stations write them."""
+    """All packets of the link, in both directions, in the format of ground stations."""
     streams = {RECEIVED: MavlinkStream(), SENT: MavlinkStream()}
     out = []
     for number in range(len(recording.found.chunks)):
@@ -100,7 +100,7 @@ def _images(recording: Recording, folder: Path, on_progress: Callable[[int], Non
 def _video(
     recording: Recording, path: Path, on_progress: Callable[[int], None]
 ) -> list[PicturePlace]:
-    """Put the pictures of a video, from the first that stands alone, into an MP4 file."""
+    """Remux the images of a video, from the first intra picture on, into an MP4 file."""
     places = recording.pictures
     places = places[next((k for k, p in enumerate(places) if p.intra), len(places)) :]
     stream = b"".join(CompressedVideo.FromString(recording.picture_data(p)[1]).data for p in places)

@@ -1,4 +1,4 @@
-"""Any flight as a recording: the frames and samples that were read, without loss."""
+"""Imports any flight as a recording: its frames and samples, without loss."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RATE_HZ = 30.0
 
 
 def write_recording(flight: Flight, out: Path, on_progress: Callable[[int], None]) -> int:
-    """Write a flight as the recording `out`, which must not be there; return how many frames.
+    """Write a flight as the recording `out`, which must not exist; return the number of frames.
 
     `on_progress` takes the number of frames done. FlightError where it cannot be written; then
     nothing is left.

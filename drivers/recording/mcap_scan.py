@@ -1,7 +1,7 @@
-"""Reads MCAP as it really is: cut short, or with bytes that are not what was written.
+"""Scan of an MCAP file that may be cut short or damaged.
 
-Records are believed as far as they fit into the file and into each other, chunks by their checksum;
-where that fails the next whole chunk is looked for. Nothing is read into memory but one chunk.
+Records are accepted as far as they fit into the file and into each other, chunks by their checksum;
+after damage the next whole chunk is searched. Only one chunk at a time is in memory.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ NOTES = frozenset(
 
 @dataclass(slots=True)
 class Scan:
-    """What there is in a file."""
+    """Content of a file."""
 
     profile: str = ""
     whole: bool = False
@@ -71,7 +71,7 @@ class Scan:
 
 
 def summary(file: McapFile) -> Scan | None:
-    """What the file's own end says of it, quickly; None where that is not to be believed."""
+    """Content by the file's own index, quickly; None where that is invalid."""
     found = Scan()
     begin = file.end_of_data()
     if begin is None:
@@ -89,9 +89,9 @@ def summary(file: McapFile) -> Scan | None:
 
 
 def scan(file: McapFile, on_progress: Callable[[int], None] | None = None) -> Scan:
-    """Go through all of it; `on_progress` hears how many bytes are done.
+    """Scan the whole file; `on_progress` takes the bytes done.
 
-    Chunks whose checksum is wrong are left out and counted.
+    Chunks with a wrong checksum are left out and counted.
     """
     found = Scan(good_end=len(MAGIC), n_bytes=file.size)
     at, in_data, lost = len(MAGIC), True, False
@@ -127,7 +127,7 @@ def scan(file: McapFile, on_progress: Callable[[int], None] | None = None) -> Sc
 
 
 def _take_record(file: McapFile, found: Scan, opcode: int, at: int, end: int) -> bool:
-    """Take what a record says; whether it can be believed."""
+    """Take a record; whether it is valid."""
     begin, contents = at + RECORD.size, found.contents
     try:
         if opcode == Opcode.CHUNK:
@@ -193,7 +193,7 @@ def _take_chunk(file: McapFile, found: Scan, at: int) -> None:
 
 
 def _next_chunk(file: McapFile, at: int) -> int | None:
-    """Where the next chunk begins that is whole."""
+    """Offset of the next whole chunk."""
     while at < file.size:
         window = file.bytes_at(at, at + WINDOW)
         for match in CHUNK_BEGIN.finditer(window):

@@ -1,4 +1,4 @@
-"""Pictures on their way into a recording and out of it."""
+"""Encoding and decoding of a recording's images."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _IDR_OR_SPS = re.compile(rb"\x00\x00\x01(?:[\x25\x45\x65\x05]|[\x27\x47\x67\x07]
 
 
 class EncodedPicture(NamedTuple):
-    """One message of the picture of a frame; unless `intra` it needs the picture before it."""
+    """One message with the image of a frame; unless `intra` it needs the image before it."""
 
     topic: str
     seq: int
@@ -45,25 +45,25 @@ class EncodedPicture(NamedTuple):
 
 
 class PictureEncoder(Protocol):
-    """Pictures to messages; one for each flight."""
+    """Encoder of images to messages; one for each flight."""
 
     name: str
     """For people."""
 
     def encode(self, frame: Frame) -> list[EncodedPicture]:
-        """Take a frame; what is ready, of this one or of one before it."""
+        """Encode a frame; finished messages, of this frame or of earlier ones."""
 
     def request_intra(self) -> None:
-        """Something was lost: the next picture is to need none before it."""
+        """Make the next image independent of those before it, after a loss."""
 
     def finish(self) -> list[EncodedPicture]:
-        """No more frames come; what is left."""
+        """Finish; messages that are left."""
 
 
 def picture_encoder(config: RecorderConfig, width: int, height: int, rate_hz: float) -> (
     PictureEncoder
 ):  # fmt: skip
-    """What is configured; ConfigError where an encoder that is asked for does not work."""
+    """The configured encoder; ConfigError where it does not work."""
     if config.codec == "h264":
         return H264(config, width, height, rate_hz)
     if config.codec == "mjpeg":
@@ -74,7 +74,7 @@ def picture_encoder(config: RecorderConfig, width: int, height: int, rate_hz: fl
 
 
 class Stills:
-    """Each picture by itself: as JPEG, or without loss as PNG, grey ones beside if need be."""
+    """Each image by itself: as JPEG, or lossless as PNG, with a separate grey image if needed."""
 
     def __init__(self, form: str, parameters: list[int]) -> None:
         self.name = form
@@ -98,7 +98,7 @@ class Stills:
 
 
 class Raw:
-    """Pictures as they are; the chunk's compression makes them a little smaller."""
+    """Uncompressed images; the chunk's compression makes them a little smaller."""
 
     name = "raw"
 
@@ -115,7 +115,7 @@ class Raw:
 
 
 class H264:
-    """A video whose pictures come out one by one, as they go in: no picture waits for a later."""
+    """Video without reordering: each image comes out as it goes in."""
 
     def __init__(self, config: RecorderConfig, width: int, height: int, rate_hz: float) -> None:
         self._config, self._size, self._rate_hz = config, (width, height), rate_hz
@@ -153,7 +153,7 @@ class H264:
             return []
 
     def _opened(self, name: str) -> Any:
-        """An encoder that has shown that it works."""
+        """An encoder that has been tested."""
         width, height = self._size
         blank = np.zeros((height, width, 3), np.uint8)
         with av.logging.Capture():
@@ -206,12 +206,12 @@ class H264:
 
 
 def is_intra(h264: bytes | memoryview) -> bool:
-    """Whether a picture of H.264 in its byte stream can be decoded without those before it."""
+    """Whether an image of an H.264 byte stream can be decoded without those before it."""
     return _IDR_OR_SPS.search(bytes(h264[:256])) is not None
 
 
 def still(topic: str, data: bytes | memoryview) -> Bytes | None:
-    """RGB (or grey, of the grey topic) of a picture that stands alone; None if it is damaged."""
+    """RGB (or grey, of the grey topic) of an independent image; None if it is damaged."""
     try:
         if topic == IMAGE:
             image = CompressedImage.FromString(bytes(data))
@@ -232,7 +232,7 @@ def still(topic: str, data: bytes | memoryview) -> Bytes | None:
 
 
 class VideoDecoder:
-    """Pictures of a video one by one; to be begun with one that stands alone."""
+    """Decoder of a video, image by image; starts with an intra picture."""
 
     def __init__(self) -> None:
         self._codec: Any = av.CodecContext.create("h264", "r")
@@ -242,7 +242,7 @@ class VideoDecoder:
     def pictures(
         self, messages: Iterable[tuple[int, bytes, bool]]
     ) -> Iterator[tuple[int, Bytes | None]]:
-        """Number and RGB of each; None where one cannot be decoded, or needs one that could not.
+        """Number and RGB of each; None where it, or one that it needs, cannot be decoded.
 
         Each message is a number, the bytes, and whether something before it is missing.
         """
@@ -283,12 +283,12 @@ def _video(data: bytes) -> bytes | None:
 
 
 def grey_of(rgb: Bytes) -> Bytes:
-    """Grey of a colour picture, as all recorded flights have it."""
+    """Grey of a colour image, as in all recorded flights."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _lossless_grey(frame: Frame) -> list[EncodedPicture]:
-    """The grey picture, where it is not what the colours give (of a camera that gives Y, say)."""
+    """The grey image, where it differs from that of the colours (of a camera that gives Y, say)."""
     if np.array_equal(frame.grey, grey_of(frame.rgb)):
         return []
     return [_raw(GREY, frame, frame.grey, "mono8")]

@@ -1,4 +1,4 @@
-"""Writes all that a flight took in and gave out, as it comes: flight.mcap, and flight.tlog."""
+"""Recorder: writes the input and output of a flight as they come: flight.mcap, and flight.tlog."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ MOST_ROUND_TRIP_NS = 2_000_000_000
 
 
 class Recorder:
-    """The recording of one flight, in a folder that is there. Used from one thread.
+    """Recording of one flight, in an existing folder. Used from one thread.
 
     StageError where it cannot be begun. Nothing waits for the disk but `close`.
     """
@@ -111,16 +111,16 @@ class Recorder:
 
     @property
     def n_dropped(self) -> Counter[str]:
-        """What there was no room for, by what it is."""
+        """Number of dropped messages, by kind."""
         return self._disk.n_dropped
 
     @property
     def slowest_s(self) -> float:
-        """What the disk took at most, from a chunk's beginning until it was safe."""
+        """Longest time to write and sync a chunk."""
         return self._disk.slowest_s
 
     def take(self, message: Message | LinkBytes | HealthNote) -> None:
-        """Record a message; of messages of the map only the points, and those if configured."""
+        """Record a message; of the map only the points, and those if configured."""
         self._newest_ns = max(self._newest_ns, message.t_ns)
         if isinstance(message, LinkBytes):
             self._link(message)
@@ -143,13 +143,13 @@ class Recorder:
             self._cloud(message)
 
     def warnings(self) -> list[Warned]:
-        """What has gone wrong since this was last asked."""
+        """Warnings since the last call."""
         with self._lock:
             out, self._warnings = self._warnings, []
         return out
 
     def close(self) -> None:
-        """Make the files whole."""
+        """Complete the files."""
         self._put_pictures(self._encoder.finish())
         self._disk.close()
 

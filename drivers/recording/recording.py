@@ -1,4 +1,4 @@
-"""An open recording: where its pictures lie, its samples, and what of it is missing."""
+"""An open recording: index of its images, its samples, and its gaps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CUT, DAMAGE = "the recording was cut short", "the recording is damaged"
 
 
 class PicturePlace(NamedTuple):
-    """Where a picture lies: which chunk, and which message in it."""
+    """Place of an image: its chunk, and the message in it."""
 
     seq: int
     t_ns: int
@@ -29,9 +29,9 @@ class PicturePlace(NamedTuple):
 
 
 class Recording:
-    """An open recording and what is in it; FlightError where it is none.
+    """An open recording and its content; FlightError if invalid.
 
-    `on_progress` hears, chunk by chunk, how many bytes have been read.
+    `on_progress` takes, chunk by chunk, the bytes read.
     """
 
     def __init__(self, path: Path, on_progress: Callable[[int], None] = lambda _: None) -> None:
@@ -64,7 +64,7 @@ class Recording:
 
     @property
     def warnings(self) -> tuple[Warned, ...]:
-        """What of it is missing."""
+        """Warnings about missing data."""
         t_ns = self.pictures[0].t_ns if self.pictures else 0
         out = []
         n_cut, found = n_cut_bytes(self.found), self.found
@@ -79,7 +79,7 @@ class Recording:
         return tuple(out)
 
     def messages(self, number: int) -> list[McapMessage]:
-        """All messages of a chunk; none of one that is damaged."""
+        """All messages of a chunk; none of a damaged one."""
         if self._held[0] != number:
             self._held = -1, []
             try:
@@ -90,12 +90,12 @@ class Recording:
         return self._held[1]
 
     def picture_data(self, place: PicturePlace) -> tuple[str, bytes]:
-        """Topic and bytes of a picture."""
+        """Topic and bytes of an image."""
         message = self.messages(place.chunk)[place.message]
         return message.channel.topic, bytes(message.data)
 
     def grey(self, t_ns: int) -> Bytes | None:
-        """The grey picture recorded beside the one of this time, if there is one."""
+        """Grey image recorded with the one of this time, if any."""
         place = self.greys.get(t_ns)
         if place is None:
             return None
@@ -131,12 +131,12 @@ class Recording:
                 self.health = document
 
     def lost_before(self, number: int) -> bool:
-        """Whether something is missing just before a chunk."""
+        """Whether data is missing just before a chunk."""
         return self.found.chunks[number].after_loss or number - 1 in self._bad
 
 
 def _once_in_order(pictures: list[PicturePlace]) -> list[PicturePlace]:
-    """Pictures whose number and time are both larger than those of the one before."""
+    """Images whose number and time are both larger than those of the one before."""
     out: list[PicturePlace] = []
     for place in sorted(pictures, key=lambda each: each.seq):
         if not out or (place.seq > out[-1].seq and place.t_ns > out[-1].t_ns):

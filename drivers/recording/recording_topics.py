@@ -1,7 +1,7 @@
-"""What a recording holds, by topic, and the schema of each; docs/recording.md says it for people.
+"""Topics of a recording, and their schemas; for users in docs/recording.md.
 
-Pictures, poses, clouds and events are in Foxglove's schemas, as protobuf; bytes of the link in our
-own, as protobuf; all else as JSON with a JSON schema.
+Images, poses, clouds and events have Foxglove's schemas, as protobuf; link bytes our own, as
+protobuf; all else is JSON with a JSON schema.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ MavlinkBytes: Any = message_factory.GetMessageClass(
 
 @dataclass(frozen=True, slots=True)
 class _Json:
-    """A JSON object: its name, what it says, and its numbers, lists of numbers and words."""
+    """JSON object: its name, description, and properties."""
 
     name: str
     says: str
@@ -147,7 +147,7 @@ TOPICS: dict[str, Any] = {
 
 
 def open_channels(writer: McapWriter) -> dict[str, int]:
-    """Have a channel for each topic; their numbers."""
+    """Add a channel for each topic; their ids."""
     schemas: dict[str, int] = {}
     channels = {}
     for topic, kind in TOPICS.items():
@@ -174,7 +174,7 @@ def _json_schema(kind: _Json) -> bytes:
 
 
 def _descriptors(kind: Any) -> bytes:
-    """The message's file and all that it imports, those first that others need."""
+    """The message's file and all its imports, dependencies first."""
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
     def take(file: Any) -> None:

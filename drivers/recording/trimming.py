@@ -1,4 +1,4 @@
-"""A part of a recording as a recording of its own."""
+"""Time span of a recording as a recording of its own."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ CHUNK_BYTES = 4 << 20
 def trim(
     recording: Recording, start_ns: int, stop_ns: int, out: Path, on_progress: Callable[[int], None]
 ) -> int:
-    """Write start_ns <= time < stop_ns to a new file; how many pictures that are.
+    """Write start_ns <= time < stop_ns to a new file; the number of images in it.
 
-    A video begins with the last picture before that needs no other. What held when the part began
-    (LASTING) is said at its begin. FlightError where nothing is left, or the file cannot be written
-    or is there already. `on_progress` hears of bytes read.
+    A video begins with the last intra picture before the span. State that holds at its begin
+    (LASTING) is repeated there. FlightError where nothing is left, or the file exists or cannot be
+    written. `on_progress` takes the bytes read.
     """
     first_ns = max(
         (p.t_ns for p in recording.pictures if p.intra and p.t_ns <= start_ns), default=start_ns

@@ -1,4 +1,4 @@
-"""Whether the computer's clock is the time of day, or what it happened to have when it started."""
+"""Whether the computer's clock is synchronised."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 
 
 def clock_is_set() -> bool:
-    """Whether the clock is kept in step with the network's; False too where nobody can tell.
+    """Whether the clock is synchronised by the network; False too where unknown.
 
-    Within a service that may not touch the clock the kernel is not to be asked (ProtectClock=).
+    In a service that may not set the clock the kernel does not tell (ProtectClock=).
     """
     if SYNCHRONISED.exists():
         return True

@@ -1,7 +1,7 @@
-"""Where a bug of a driver lies: its traceback in the journal, once for each place.
+"""Tracebacks of drivers' bugs in the journal, once per place.
 
-For loops that have to go on whatever is wrong in what they call. Failures that are to be expected
-are named where they happen and never come here.
+For loops that must continue whatever is wrong in what they call. Expected failures are handled
+where they happen and never come here.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class FaultTraces:
         self._told: set[tuple[str, str, int]] = set()
 
     def tell(self, error: BaseException, secrets: Mapping[str, str] | None = None) -> bool:
-        """Write the traceback, unless it was of this kind at this place before; whether it was new.
+        """Write the traceback, unless this exception came from here before; whether it was new.
 
         `secrets` is what may not be printed, and what to print instead.
         """

@@ -1,4 +1,4 @@
-"""The serial ports of this machine on which an autopilot may be."""
+"""Serial ports of this machine that may have an autopilot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ JETSON = "ttyTHS*"
 
 @dataclass(frozen=True, slots=True)
 class SerialDevice:
-    """A port; `stable_path` stays the same when it is plugged in anew, "" where there is none."""
+    """A port; `stable_path` survives replugging, "" without one."""
 
     path: str
     stable_path: str = ""
@@ -30,7 +30,7 @@ class SerialDevice:
 
 
 def serial_devices() -> list[SerialDevice]:
-    """All ports that have hardware behind them."""
+    """All ports with hardware behind them."""
     links = {os.path.realpath(link): str(link) for link in sorted(BY_ID.glob("*"))}
     consoles = {f"/dev/{console.port}": console.what for console in login_consoles()}
     found = [

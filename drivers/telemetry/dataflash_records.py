@@ -1,7 +1,7 @@
-"""The records of an ArduPilot DataFlash log (.BIN): self-described by FMT records at its head.
+"""Records of an ArduPilot DataFlash log (.BIN): self-described by FMT records at its head.
 
-pymavlink's DFFormat serves as codec; the file is walked here, so that damage costs the records that
-it hit and no more (pymavlink's own index ends at the first kind that it does not know).
+pymavlink's DFFormat decodes; the file is parsed here, so that damage costs only the records that it
+hits (pymavlink's own index ends at the first unknown kind).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PADDING = 528
 
 @dataclass(slots=True)
 class DataflashRecords:
-    """Iterates over records of the kinds named; `n_damaged` bytes were passed over so far."""
+    """Iterates over records of the kinds named; `n_damaged` bytes were skipped so far."""
 
     log: bytes
     kinds: Collection[str]

@@ -26,7 +26,7 @@ TEXT = frozenset("cFGU")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpmfStream:
-    """The samples of one stream in one payload: rows (N, fields), in the units that it states."""
+    """Samples of one stream in one payload: rows (N, fields), in the units that it states."""
 
     key: str
     rows: Array
@@ -37,7 +37,7 @@ class GpmfStream:
 
 
 class GpmfError(ValueError):
-    """A payload is not what the format allows."""
+    """Payload that violates the format."""
 
 
 def read_streams(payload: bytes) -> list[GpmfStream]:

@@ -1,9 +1,9 @@
 """Positions of a live autopilot about one origin, as they come.
 
-It is what `TelemetryCollector.finish` does for a log, without knowing what comes later: the origin
-is where the autopilot's local frame has its zero, if it says so or if positions in both frames
-tell, and otherwise the first place there is. Once known it stays; after a reboot, which gives the
-autopilot another zero, local positions are moved to the old one.
+The live counterpart of `TelemetryCollector.finish`, without knowledge of later samples: the origin
+is that of the autopilot's local frame, if stated or if positions in both frames give it, and
+otherwise the first geodetic position. Once known it stays; after a reboot, which gives the
+autopilot another origin, local positions are moved to the old one.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ class LivePositions:
         self._first_fix_ns: int | None = None
 
     def restart(self) -> None:
-        """The autopilot has begun anew."""
+        """The autopilot has rebooted."""
         self.origin = self._local = self._first_fix_ns = None
 
     def set_origin(self, origin: GeoOrigin) -> None:
-        """The autopilot states where its local frame has its zero."""
+        """Take the origin of its local frame, as stated by the autopilot."""
         if self.origin is not None and _distance_m(self.origin, origin) < SAME_M:
             return
         self._set_origin(origin)
 
     def local(self, sample: PositionSample, remote_ns: int) -> PositionSample | None:
-        """A local position; None while it is not known how its frame lies to the one before."""
+        """A local position; None while the offset of its frame to the one before is unknown."""
         self._local = remote_ns, sample.position_ned_m, sample.velocity_ned_m_s
         if self.home is None or self.home is self.origin:
             return sample
@@ -54,7 +54,7 @@ class LivePositions:
         return dataclasses.replace(sample, position_ned_m=sample.position_ned_m + moved)
 
     def fix(self, fix: GeodeticFix, remote_ns: int) -> PositionSample | None:
-        """A place on Earth; None while there is no origin to count it from."""
+        """A geodetic position; None while there is no origin."""
         if self._first_fix_ns is None:
             self._first_fix_ns = remote_ns
         waited = remote_ns - self._first_fix_ns >= WAIT_NS
@@ -82,7 +82,7 @@ class LivePositions:
             self.home = origin
 
     def _local_at(self, remote_ns: int) -> Array | None:
-        """The newest local position, brought to a time near it."""
+        """Newest local position, extrapolated to a time near it."""
         if self._local is None or abs(remote_ns - self._local[0]) > PAIR_NS:
             return None
         at_ns, position, velocity = self._local

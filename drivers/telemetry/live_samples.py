@@ -1,8 +1,8 @@
-"""Messages of a live autopilot to samples on the flight's clock: what a log's reader does, at once.
+"""Messages of a live autopilot as samples on the flight's clock: live counterpart of log readers.
 
-Of several messages that state one quantity one kind is taken, as from a log: of attitudes the more
-frequent, of the others the first that there is. Stamps that are not of the running clock, or not
-later than the one before, are dropped and counted.
+Of several messages for one quantity one type is taken, as from a log: of attitudes the more
+frequent, of the others the first available. Stamps that are not of the present boot, or not later
+than the one before, are dropped and counted.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ AHEAD, UNUSABLE = "telemetry from the future", "telemetry that is not usable"
 
 
 class LiveSamples:
-    """Stamps, places and passes on what the vehicle's autopilot measures."""
+    """Stamps, georeferences and passes on the measurements of the vehicle's autopilot."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class LiveSamples:
             )
 
     def _begin(self) -> None:
-        """Another clock runs: the autopilot has begun anew."""
+        """The autopilot has rebooted: its clock is another."""
         self._segment = self._clock.n_segments
         self._latest = {quantity: (-1, t_ns) for quantity, (_, t_ns) in self._latest.items()}
         self._stamps.clear()
@@ -158,14 +158,14 @@ class LiveSamples:
         self._name(what, now_ns, detail)
 
     def _name(self, what: str, now_ns: int, detail: str) -> None:
-        """Say it, but not for every message of a stream."""
+        """Warn, rate-limited."""
         if now_ns - self._named_ns.get(what, -NAME_AGAIN_NS) >= NAME_AGAIN_NS:
             self._named_ns[what] = now_ns
             self._warn(Warned(now_ns, what, detail))
 
 
 class _Choice:
-    """Which of several messages that state the same is taken."""
+    """Selection among messages for the same quantity."""
 
     def __init__(self, ids: tuple[int, ...], frequent: bool) -> None:
         self._ids, self._frequent = ids, frequent
@@ -175,7 +175,7 @@ class _Choice:
         self._chosen: int | None = None
 
     def takes(self, kind: int, now_ns: int) -> bool:
-        """Count a message; whether it is to be taken, as it is if it states something else."""
+        """Count a message; whether to use it, as always for another quantity."""
         if kind not in self._ids:
             return True
         if now_ns - self._since_ns >= CHOOSE_NS:

@@ -1,4 +1,4 @@
-"""Telemetry as a table, `telemetry.csv`: on the flight's clock, about one origin, nothing rounded.
+"""Telemetry table `telemetry.csv`: on the flight's clock, about one origin, nothing rounded.
 
 A line is `unix_ns,kind,values`; what a sample does not have is empty. Comments before hold the
 origin, how the clocks were put together, and what was amiss where the samples come from.
@@ -46,7 +46,7 @@ MAX_BYTES = 4_000_000_000
 
 
 def telemetry_csv(log: TelemetryLog, warnings: Sequence[Warned] = ()) -> Iterator[str]:
-    """The lines of the table; `warnings` is said in it beside the log's own warnings."""
+    """Lines of the table; `warnings` are added to the log's own."""
     if log.origin is not None:
         yield "# origin," + ",".join(map(repr, dataclasses.astuple(log.origin))) + "\n"
     if log.clock is not None:
@@ -62,7 +62,7 @@ def telemetry_csv(log: TelemetryLog, warnings: Sequence[Warned] = ()) -> Iterato
 
 
 def read_telemetry_csv(path: Path) -> LogContent:
-    """Read such a table; FlightError where it is none. Lines that are damaged are counted."""
+    """Read such a table; FlightError for any other. Damaged lines are counted."""
     collected = TelemetryCollector(path.name)
     clock: ClockReport | None = None
     warnings: list[Warned] = []
@@ -148,7 +148,7 @@ def _origin(words: list[str]) -> GeoOrigin | None:
 
 
 def _warning(line: str) -> list[Warned]:
-    """The warning of such a line; none of another."""
+    """Warning of such a line; none of another."""
     name, _, rest = line.partition(",")
     t_ns, _, said = rest.partition(",")
     if name != WARNING or not (t_ns.isascii() and t_ns.isdigit() and len(t_ns) < 20):

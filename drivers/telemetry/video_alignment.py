@@ -1,6 +1,6 @@
-"""A log put on the time of a video by the turns that both saw, where no clock does it.
+"""Time alignment of a log and a video by rotation, where no clock gives it.
 
-What the camera saw is told by its own gyro, where the video has that, else by the pictures.
+The camera's rotation comes from its own gyroscope, where the video has that, else from the images.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ def read_unaligned(
     paths: Sequence[Path], pictures: Pictures, config: TelemetryConfig, camera: Camera,
     frames: Frames,
 ) -> TelemetryLog:  # fmt: skip
-    """The log of a video whose times are its own; of several the one whose turns agree best.
+    """Log of a video with times of its own; of several the one whose rotation correlates best.
 
-    As `telemetry.align` says. FlightError where no log agrees so well that it must be the one.
+    As `telemetry.align` says. FlightError where no log correlates well enough.
     """
     if not paths or config.align == "never" or config.offset_s:
         return read_telemetry(paths, pictures, config)
@@ -108,7 +108,7 @@ def _mount(camera: Camera) -> Array | None:
 
 
 def _from_gyro(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotation | None:
-    """By the camera's gyro; None where the video has nothing of it."""
+    """Rotation by the camera's gyroscope; None where the video has no such data."""
     turns = gyro_rotation(blocks_of(pictures.path)) if pictures.path.is_file() else None
     if turns is None:
         return None
@@ -119,7 +119,7 @@ def _from_gyro(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotation 
 
 
 def _from_images(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotation:
-    """By the pictures."""
+    """Rotation by the images."""
     meter = RotationMeter(camera)
     times_s: list[float] = []
     angles: list[Array] = []
@@ -138,7 +138,7 @@ def _from_images(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotatio
 
 
 def _from_log(samples: Sequence[Telemetry], start_ns: int) -> TurnRecord | None:
-    """The turns of the kind of sample that there is most of; times after `start_ns`."""
+    """Rotation by the most frequent kind of sample; times after `start_ns`."""
     rates = [(s.t_ns, s.gyro_rad_s) for s in samples if isinstance(s, ImuSample)]
     attitudes = [s for s in samples if isinstance(s, AttitudeSample)]
     if max(len(rates), len(attitudes)) < LEAST_SAMPLES:

@@ -1,7 +1,7 @@
-"""Shares the autopilot's link with other programs: ground stations, loggers, another companion.
+"""MAVLink router: shares the autopilot's link with ground stations, loggers, companions.
 
-What the autopilot says goes to all clients, and so does what we say; what a client says goes to the
-autopilot, and to us where it is addressed to us. Clients do not hear each other.
+Packets of the autopilot and ours go to all clients; a client's packets go to the autopilot, and to
+us where addressed to us. Clients do not get each other's.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ TIMESYNC = 111
 
 @dataclass(frozen=True, slots=True)
 class ClientCounts:
-    """How one client is doing."""
+    """Counters of one client."""
 
     name: str
     connected: bool
@@ -53,7 +53,7 @@ class ClientCounts:
 
 
 class RouterClient:
-    """One client: its wire, what it sent, and what of that still waits for the link."""
+    """One client: its wire, its counters, and its packets that wait for the link."""
 
     def __init__(self, router: Router, wire: Wire) -> None:
         self.wire = wire
@@ -84,7 +84,7 @@ class RouterClient:
         return n_known
 
     def counts(self) -> ClientCounts:
-        """So far."""
+        """Counters so far."""
         return ClientCounts(
             self.wire.name, self.wire.connected, self.n_received, self.wire.n_dropped,
             self.inbox.n_dropped, self.stream.n_bad_bytes, self.n_refused,
@@ -92,10 +92,10 @@ class RouterClient:
 
 
 class Router:
-    """All clients of a link. ConfigError if one of them names nothing that can be opened.
+    """All clients of a link. ConfigError for an invalid URL of a client.
 
-    Clients share what we leave of the link, each in its turn, so that none of them can keep us or
-    another from the autopilot.
+    Clients share the part of the link's rate that we leave, in turn, so that none of them can keep
+    us or another from the autopilot.
     """
 
     def __init__(
@@ -138,41 +138,41 @@ class Router:
                 self._pump_later = None
 
     def counts(self) -> list[ClientCounts]:
-        """Of the clients that there are now."""
+        """Counters of the present clients."""
         return [client.counts() for client in self._clients]
 
     def take_departed(self) -> list[ClientCounts]:
-        """Of the newest of those that have left since the last call: each is told once."""
+        """Counters of the newest clients that have left since the last call."""
         departed = list(self._departed)
         self._departed.clear()
         return departed
 
     @property
     def n_rejected(self) -> int:
-        """Connections for which there was no room."""
+        """Connections rejected for lack of capacity."""
         return sum(door.n_rejected for door in self._listeners)
 
     @property
     def trouble(self) -> str:
-        """Why a place for clients is not open, for people; "" when all are."""
+        """Reason why a listener is not open, for people; "" when all are."""
         places = [door.trouble for door in self._listeners]
         places += [client.wire.trouble for client in self._clients if not client.wire.connected]
         return "; ".join(place for place in places if place)
 
     def from_link(self, packets: list[Packet], monotonic_ns: int) -> None:
-        """Pass on what came from the autopilot's side."""
+        """Forward a packet of the autopilot's side."""
         for packet in packets:
             if packet.component == AUTOPILOT and packet.known:
                 self._autopilots[packet.system] = monotonic_ns
             self._to_clients(packet.raw, monotonic_ns)
 
     def from_us(self, raw: bytes) -> None:
-        """Pass on what we have sent to the autopilot."""
+        """Forward a packet that we have sent to the autopilot."""
         self._budget.take(OWN_SHARE * len(raw))
         self._to_clients(raw, time.monotonic_ns())
 
     def from_client(self, client: RouterClient, packet: Packet, monotonic_ns: int) -> None:
-        """Pass on what a client sent."""
+        """Forward a packet of a client."""
         if (
             self._goes_in_circles(client, packet, monotonic_ns)
             or _answers_timesync(packet)
@@ -268,7 +268,7 @@ class Router:
 
 
 def _answers_timesync(packet: Packet) -> bool:
-    """Whether an autopilot would set its idea of our clock by this.
+    """Whether an autopilot would set its estimate of our clock by this.
 
     It asks all at once and takes any answer for ours, whose time is in the poses that it gets.
     """

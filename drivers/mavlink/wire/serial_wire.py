@@ -1,4 +1,4 @@
-"""MAVLink over a serial line, which may be unplugged and come back."""
+"""MAVLink over a serial line, which may be unplugged and replugged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VMIN = 6
 
 
 class SerialWire(Wire):
-    """A serial line, opened by its path and by nobody else at the same time."""
+    """Serial line, opened by its path, exclusively."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         super().__init__(str(endpoint), 0.0, PacketQueue(LEAST_QUEUE_BYTES))

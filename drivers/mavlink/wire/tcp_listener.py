@@ -1,4 +1,4 @@
-"""Where TCP clients of the router come in."""
+"""TCP listener of the router."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BACKLOG = 32
 
 
 class ClientEnd(WireEnd, Protocol):
-    """What the router has at our end of a connection."""
+    """The router's end of a connection."""
 
     n_received: int
 
@@ -29,10 +29,10 @@ AnyClient = TypeVar("AnyClient", bound=ClientEnd)
 
 
 class TcpListener(Generic[AnyClient]):
-    """Listens at an endpoint; `admit` gives a connection its wire and end, `leave` takes them back.
+    """Listens at an endpoint; `admit` makes wire and end of a connection, `leave` removes them.
 
-    When all places are taken, the oldest connection that has never sent a packet makes room for a
-    new one; if all have, the new one is turned away.
+    When all connections are in use, the oldest that has never sent a packet is closed for a new
+    one; if all have, the new one is rejected.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class TcpListener(Generic[AnyClient]):
         self._clients: dict[asyncio.Task[None], tuple[TcpConnection, AnyClient]] = {}
 
     async def run(self) -> None:
-        """Let clients in until cancelled."""
+        """Accept clients until cancelled."""
         retry_s = FIRST_RETRY_S
         try:
             while True:
