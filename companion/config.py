@@ -188,7 +188,7 @@ class DaemonConfig:
     flight: Annotated[str, OneOf(("armed", "always"))] = "armed"
     """A flight lasts from arming to disarming, or as long as the daemon runs."""
     missing_device_s: Annotated[float, Range(0, 3600)] = 60.0
-    """A camera or autopilot missing for this long ends the daemon with status 1, except while armed;
+    """Time after which a missing camera or autopilot ends the daemon with status 1, unless armed;
     0: never."""
     socket: str = "auto"
     """Unix socket of `companion status`; "auto" lies in $RUNTIME_DIRECTORY or $XDG_RUNTIME_DIR."""

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 WINDOW_S = 5.0
-"""Rates and latencies are those of the last so many seconds."""
+"""Window of rates and latencies."""
 MAX_EVENTS = 2048
-"""More events than this in a window are not kept; rates are then of a shorter time."""
+"""Most events in a window; beyond it rates are of a shorter time."""
 MIN_BETWEEN_LINES_S = 1.0
-"""Changes are told at once, but no more often than this, whatever flaps."""
+"""Least interval of lines about changes."""
 
 SourceState = Literal[
     "missing", "opening", "running", "silent", "frozen", "ended", "driver fault"
@@ -59,7 +59,7 @@ class StageHealth:
     detail: str = ""
     latency_p99_ms: float | None = None
     waiting_mb: float = 0.0
-    """Of messages that it has yet to take."""
+    """Messages that wait for the stage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,16 +100,16 @@ class ComputerLoad:
     core_shares: tuple[float, ...] = ()
     gpu_share: float | None = None
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
-    """By the name of the sensor."""
+    """By name of the sensor."""
     fans_rpm: tuple[int, ...] = ()
     memory_used_mib: float | None = None
     memory_total_mib: float | None = None
     disk_kind: str = ""
-    """hdd, ssd, emmc or sd: what the flights are written to; "" where that is not known."""
+    """hdd, ssd, emmc or sd: the disk of the flights; "" where unknown."""
     disk_used_mib: float | None = None
     disk_total_mib: float | None = None
     disk_free_mib: float | None = None
-    """What we may still write, which is less than total minus used."""
+    """Space available to us, which is less than total minus used."""
     processes: tuple[ProcessLoad, ...] = ()
 
     @property
@@ -136,21 +136,21 @@ class Health:
     tracker: str = "waiting for the camera"
     quality: int = -1
     scale: str = ""
-    """Where the metric scale comes from, in words; "" while there is none."""
+    """Source of the metric scale, in words; "" without one."""
     pose_latency_p95_ms: float | None = None
     feedback: FeedbackHealth = field(default_factory=FeedbackHealth)
     flight: str = ""
-    """Name of the flight that goes on; "" between flights."""
+    """Name of the current flight; "" between flights."""
     load: ComputerLoad = field(default_factory=ComputerLoad)
     degradation: int = 0
-    """0 is everything; see companion.runtime.governor."""
+    """Load level, 0 is everything; see companion.runtime.governor."""
     degraded: str = ""
-    """What is left out and why, in words."""
+    """Work left out and the reason, in words."""
     loop_delay_p99_ms: float | None = None
     n_warnings: Mapping[str, int] = field(default_factory=dict)
-    """How often each thing was warned of since the start."""
+    """Number of warnings since the start, by kind."""
     set_by_ground: Mapping[str, Any] = field(default_factory=dict)
-    """Keys of the configuration that were set over MAVLink, and to what."""
+    """Keys of the configuration set over MAVLink, and their values."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain types only; what is not a finite number is null."""

@@ -104,7 +104,7 @@ class TrackState(Enum):
     INITIALISING = "initialising"
     TRACKING = "tracking"
     DEAD_RECKONING = "coasting"
-    """Nothing is recognised; the pose is carried on by the autopilot's attitude and velocity."""
+    """No map points found; the pose is propagated by the autopilot's attitude and velocity."""
     LOST = "lost"
 
 
@@ -209,7 +209,7 @@ class Georeference:
 
 
 SPANS_REACH = 6
-"""Keyframes before one, and after it, that tell how its surroundings are stretched."""
+"""Number of keyframes before and after one whose distances give its local scale correction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from drivers.telemetry.telemetry_log import Pictures, TelemetryLog
 
 PREFETCHED = 4
 ENDS_EARLY = "the video ends early"
-"""What a flight with fewer frames than its list of times warns of."""
+"""Warning about fewer frames than the list of times has."""
 
 
 class TruePose(NamedTuple):
@@ -47,9 +47,9 @@ class Flight:
         self.path = path
         self.camera = camera
         self.warnings = tuple(warnings)
-        """What was found amiss on opening."""
+        """Warnings on opening."""
         self.source = source
-        """Where its pictures lie."""
+        """Source of its images."""
         self._numbers = numbers
         self._times_ns = times_ns
         self._read_log = read_log

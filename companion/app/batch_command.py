@@ -28,7 +28,7 @@ from companion.products.report.batch_page import batch_page
 
 DONE, INDEX, THUMBNAIL = "batch.json", "index.html", "thumbnail.jpg"
 MOST_FILES = 1000
-"""Of a flight's folder that are looked at for changes; a flight of images has its list besides."""
+"""Files of a flight's folder checked for changes; a flight of images has its list besides."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

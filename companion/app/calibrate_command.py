@@ -35,20 +35,20 @@ from drivers.camera.camera_source import CameraSource, EndOfPictures
 from drivers.images.frame_source import FrameSource, Video, find_frames
 
 MAX_SEARCHED = 400
-"""Pictures of a recording in which the board is looked for, the sharpest of each stretch."""
+"""Images of a recording that are searched for the board, the sharpest of each interval."""
 MAX_VIEWS = 40
-"""Views that a lens is fitted to; more of them make it slower and hardly better."""
+"""Views for the lens fit; more make it slower and hardly better."""
 MAX_LIVE_VIEWS = 80
 LIVE_NOVELTY, LIVE_GAIN = 0.05, 0.005
-"""Views of a live camera are kept when they are so unlike those before, or cover so much more."""
+"""Least novelty, or gain of coverage, of a view of a live camera."""
 LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
-"""A lens is fitted to the views of a live camera from so many on, and again after so many more."""
+"""Views of a live camera before the first lens fit, and between two fits."""
 READ_S = 0.25
-"""A live camera is waited for so long before Ctrl-C is looked for."""
+"""Longest read of a live camera, so that Ctrl-C is noticed."""
 MIN_FOUND = 0.05
-"""Of the pictures must show the board, else it is asked whether they show another."""
+"""Least share of images with the board; below it other boards are tried."""
 N_UNFOUND_KEPT = 12
-"""Pictures without the board that are kept, to tell what else is on them."""
+"""Images without the board that are kept, to detect another board on them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class CalibrationReport:
     name: str
     calibration: Calibration
     n_pictures: int
-    """In which the board was looked for."""
+    """Images searched for the board."""
     n_found: int
     n_blurred: int
     toml: Path

@@ -31,9 +31,9 @@ from drivers.datasets.posed_layouts import open_posed_images
 
 MAX_TURN_RAD = np.radians(35.0)
 RANGE_FRAMES = 60
-"""Images over which points are followed to find the range of depths."""
+"""Images over which points are tracked to find the depth range."""
 MAX_FRAMES = 400
-"""Images around one reference that are taken at most."""
+"""Most images around one reference."""
 
 
 @dataclass(frozen=True, slots=True)

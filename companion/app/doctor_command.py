@@ -27,9 +27,9 @@ from drivers.system.login_console import login_console_on
 from drivers.system.status_socket import ask_status, found_socket_path
 
 PATIENCE_S, SEARCH_PATIENCE_S = 10.0, 25.0
-"""The second where the baud rate is to be found out."""
+"""The second where the baud rate must be detected."""
 ROUNDS = 3
-"""A parameter that is set may bring others to light."""
+"""A parameter that is set may reveal others."""
 ANY_ADDRESS = ("0.0.0.0", "::")
 GOOD, IN_THE_WAY = 0, 1
 
@@ -47,7 +47,7 @@ class Examination:
     n_examined: int
     written: list[dict[str, Any]] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
-    """What the autopilot did not take, in words."""
+    """Parameters that the autopilot refused, in words."""
 
     @property
     def in_the_way(self) -> list[Finding]:

@@ -13,7 +13,7 @@ from drivers.recording.repair import in_place, unfinished
 
 MB = 1 << 20
 STEP_BYTES, REST_S = 4 * MB, 0.1
-"""Gently: so much is read between two rests."""
+"""Bytes read between two pauses with --gently."""
 
 
 def repair_flights(

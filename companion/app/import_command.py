@@ -17,7 +17,7 @@ WRITERS: dict[str, Callable[[Flight, Path, Callable[[int], None]], int]] = {
     "": write_flight_folder,
     ".mcap": write_recording,
 }
-"""By how the name ends."""
+"""By suffix of the output."""
 
 
 def import_flight(

@@ -29,7 +29,7 @@ from drivers.open_flight import open_flight
 from drivers.telemetry.telemetry_log import TelemetryLog
 
 LEAD_NS = 10_000_000_000
-"""Telemetry from so long before the first frame is used."""
+"""Telemetry used from before the first frame."""
 
 
 def replay(

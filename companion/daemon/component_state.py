@@ -5,7 +5,7 @@ from __future__ import annotations
 from companion.health import Health
 
 BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, POWEROFF = 1, 2, 3, 4, 5, 7
-"""Of MAV_STATE."""
+"""MAV_STATE values."""
 NO_CAMERA = ("missing", "opening", "silent", "frozen", "ended", "driver fault")
 
 

@@ -72,18 +72,18 @@ from drivers.system.service_manager import ServiceManager
 from drivers.system.status_socket import StatusSocket, own_socket_path
 
 NOT_THERE = ("missing", "driver fault")
-"""States of sources that are tried again."""
+"""States of sources that are retried."""
 WATCH_S = 0.2
 START_S = 180.0
-"""Stages have so long to come up once nothing is missing any more; the first time they compile."""
+"""Time for stages to start once no device is missing; the first time they compile."""
 FAULT, BAD_INPUT = 1, 2
 """Exit statuses."""
 NO_PROGRESS = "frames come and no pose, whatever is tried: left to the service manager's watchdog"
 STANDBY_RETRY_S = 1.0
 WRITE_S = 0.2
-"""What counts while armed may take so long to be written down at the end."""
+"""Time to write the armed settings at the end."""
 END_S = 2.6
-"""A stop takes little longer, whatever hangs."""
+"""Longest stop, whatever hangs."""
 
 
 class Daemon:
@@ -105,7 +105,7 @@ class Daemon:
         self._config = config = resumed.config
         kept |= resumed.by_ground
         self._stays_off = resumed.by_ground.get("feedback.mode") == "off"
-        """Whether the pilot is still to be told so, once there is one to hear it."""
+        """Whether the pilot is still to be told so, once the link is up."""
         if before is not None:
             self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
         self._stop = asyncio.Event()

@@ -34,17 +34,17 @@ from drivers.system.system_load import SystemLoad
 
 GOVERN_NS = 1_000_000_000
 STUCK_NS = 3_000_000_000
-"""Frames come but no track does: the pose loop hangs,"""
+"""Time with frames but no track after which the pose loop counts as hanging,"""
 BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
-"""unless it works: then the computer has too much else to do, and it is given longer."""
+"""unless it uses the processor: then the computer is overloaded, and it gets more time."""
 START_S = 120.0
-"""A localisation that is not ready by then never will be; the first of all compiles its loops."""
+"""Longest start of localisation; the first of all compiles its loops."""
 PATIENCE_NS = 20_000_000_000
-"""Frames come, localisation was started again, and still no track: nothing here will help."""
+"""Time with frames but no track, after a restart of localisation, before the daemon gives up."""
 NO_SIGN_S = 10.0
-"""A stage that has been at one step for so long is not well; when it is ended: see live.flight."""
+"""A stage in one step for longer is reported as down; it is restarted later, see live_flight."""
 SETTLE_NS = 3_000_000_000
-"""Beginning a map takes long, and tells nothing of what comes after."""
+"""Time after the begin of a map that is ignored: initialisation is slow."""
 STUCK = "localisation hangs and is ended"
 IN_WORDS = {
     TrackState.INITIALISING: "initialising",
@@ -87,7 +87,7 @@ class HealthWatch:
         self._scale = ""
         self._recent = LatencyMeter(1.0)
         self.set_by_ground: Mapping[str, Any] = {}
-        """Keys of the configuration, and what they were set to in flight."""
+        """Keys of the configuration, and the values set by the ground."""
         self._pose = StageMeter("localisation")
         self._depth = StageMeter("depth")
 

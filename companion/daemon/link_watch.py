@@ -11,7 +11,7 @@ from drivers.mavlink.wire.router import ClientCounts
 LOOK_NS = 1_000_000_000
 NAME_AGAIN_NS = 10_000_000_000
 FEW = 3
-"""So many in a second are nothing: a port that is just opened begins within a packet."""
+"""Errors per second that are ignored: a port just opened begins within a packet."""
 
 DAMAGED = "damaged data on the autopilot's link"
 REFUSED = "a client of the router is refused"

@@ -12,7 +12,7 @@ FIXED_SECTIONS = frozenset({"camera", "mount", "link", "router", "distributed"})
 FIXED_KEYS = frozenset({
     "daemon.socket", "daemon.prometheus_port", "feedback.mode", "feedback.obstacle_distance",
 })  # fmt: skip
-"""These are taken at the start. All else counts at once or from the next flight on."""
+"""Keys read at the start only. All others take effect at once or with the next flight."""
 
 
 def reloaded(running: Config, read: Config) -> tuple[Config, list[str]]:

@@ -38,7 +38,7 @@ class VehicleReports:
         self._link, self._clock, self._watch = link, clock, watch
         self._obstacles = obstacles
         self.computer_hz = COMPUTER_HZ
-        """How often the computer's state is sent, 5 a second at most; 0: not."""
+        """Rate of the computer's status, at most 5 Hz; 0: none."""
         self._camera_from_body = Pose.identity()
         self.restart(None)
 

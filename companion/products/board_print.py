@@ -18,7 +18,7 @@ PAPERS_MM = {
 LEAST_MARGIN_MM = 4.0
 INCH_MM = 25.4
 DOTS_PER_INCH, MOST_DOTS = 300, 8000
-"""Of a PNG; a large board is drawn coarser, so that the page fits into memory."""
+"""Resolution of a PNG; lower for a large board, so that the page fits into memory."""
 
 
 def board_page(chart: Chart, form: str) -> tuple[bytes, str]:

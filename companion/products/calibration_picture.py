@@ -28,7 +28,7 @@ STYLE: Any = {
     "figure.facecolor": CARD,
 }  # fmt: skip
 LONGEST_ARROW = 0.05
-"""Of the picture's width: how long a large residual is drawn."""
+"""Longest arrow of a residual, as a share of the picture's width."""
 
 
 def calibration_png(calibration: Calibration, name: str, board: str) -> bytes:

@@ -26,7 +26,7 @@ class _Stored:
     t_ns: int
     spans: Mapping[int, float]
     begin: int
-    """in the file"""
+    """Offset in the file."""
     n: int
 
 

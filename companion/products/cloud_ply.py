@@ -19,7 +19,7 @@ VERTEX = np.dtype(
     ]
 )  # fmt: skip
 AT_ONCE = 100_000
-"""Vertices that are in memory as they are written."""
+"""Vertices in memory while writing."""
 KINDS = {"f": "float", "u": "uchar"}
 
 

@@ -12,7 +12,7 @@ from companion.messages import DepthMap, PixelState
 from companion.products.atomic_file import write_atomically
 
 COPIES = {"upload": "upload_ms", "read-back": "read_back_ms", "copy": "copy_ms"}
-"""What is no kernel, by the names that the engine has for it."""
+"""Transfers, by the engine's names for them."""
 
 
 @dataclass(frozen=True, slots=True)

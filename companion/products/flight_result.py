@@ -38,7 +38,7 @@ from companion.timing.clock import StageTimes
 
 POSITION_STEP_NS = 100_000_000
 VOXEL_PER_DEPTH = 0.01
-"""Side of a voxel over the median depth, while there is no metre."""
+"""Voxel size over the median depth, without a metric scale."""
 GIVEN_UP = "points were given up, as the disk does not take them"
 
 
@@ -101,7 +101,7 @@ class FlightResult:
         self._median_depths: dict[int, float] = {}
         self._kernel_times = StageTimes()
         self._positions: dict[PositionSource, tuple[array[int], array[float]]] = {}
-        """times, and the coordinates of one place after the other"""
+        """Times, and coordinates one after the other."""
         self._pictures = DepthPictures()
 
     def take(self, message: Message) -> None:

@@ -14,7 +14,7 @@ from companion.products.cloud import Cloud, no_cloud
 from companion.products.voxel_cloud import Tile, VoxelCloud, tiles_of
 
 AT_ONCE = 2_000_000
-"""Points, before they are thinned, of the tiles that are worked on together."""
+"""Points, before voxel filtering, of the tiles of one round."""
 GROWTH = 1.125
 
 

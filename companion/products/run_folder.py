@@ -20,7 +20,7 @@ from companion.products.flight_result import WorldPose
 FORMER_NAMES = ("x", "y", "z", "red", "green", "blue", "confidence")
 MAX_HEAD = 4096
 FORMER_VERTEX = np.dtype([(name, VERTEX[name]) for name in FORMER_NAMES])
-"""As runs of earlier versions wrote it, without normals and standard deviations."""
+"""Vertex of earlier versions, without normals and standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

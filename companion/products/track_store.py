@@ -19,7 +19,7 @@ ROW = np.dtype(
     ]
 )  # fmt: skip
 BLOCK = 4096
-"""Rows that are made room for at once."""
+"""Rows allocated at once."""
 
 
 class TrackStore:

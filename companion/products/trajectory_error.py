@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from companion.geometry.transforms import Array, Similarity, quaternion_from_rotation
 
 MAX_TIME_DIFFERENCE_NS = 4_000_000
-"""Poses belong to the same frame when their times are no further apart."""
+"""Largest time difference of poses of the same frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

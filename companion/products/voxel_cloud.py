@@ -13,9 +13,9 @@ from companion.messages import Floats
 from companion.products.cloud import Cloud, joined, no_cloud
 
 TILE_VOXELS = 256
-"""Side of a tile, north and east: each is thinned by itself."""
+"""Side of a tile, north and east, in voxels; each tile is filtered by itself."""
 LEAST_WAITING = 20_000
-"""Points that wait in a tile before it is thinned, or half as many as it has."""
+"""Points that wait in a tile before it is filtered, or half as many as it has."""
 
 
 Tile = tuple[int, int]

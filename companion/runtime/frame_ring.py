@@ -54,7 +54,7 @@ class FrameRing:
         self.frame_bytes = frame_bytes = 4 * self._pixels
         self.n_slots = int(np.clip(CAPACITY_BYTES // frame_bytes, LEAST_SLOTS, MOST_SLOTS))
         self._begin = 8 * self.n_slots
-        """of the first slot, behind all serials"""
+        """Offset of the first slot, behind all serials."""
         size = self.n_slots * (frame_bytes + 8)
         self.fd = os.memfd_create("companion-frames") if fd is None else fd
         if fd is None:

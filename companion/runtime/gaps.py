@@ -13,14 +13,14 @@ import numpy as np
 from companion.messages import AttitudeSample, Bytes, Frame, Message, PositionSample, Warned
 
 GAP_IN_INTERVALS = 5
-"""A silence is a gap from so many usual intervals on."""
+"""Silence of this many median intervals is a gap."""
 MIN_INTERVALS = 3
-"""With fewer nothing is usual yet."""
+"""Intervals needed for a median."""
 MIN_FRAME_GAP_S = 0.3
 MIN_TELEMETRY_GAP_S = 2.0
 STILL_S = 0.5
 STILL_GREY = 0.3
-"""Images that differ by less than this, in grey levels, are the same one, encoded again."""
+"""Largest mean difference of equal images that were encoded again, grey levels."""
 SAMPLE_STEP = 8
 
 

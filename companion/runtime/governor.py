@@ -16,18 +16,18 @@ HEADROOM_LATENCY_SHARE = 0.75
 NEARLY_LATE_SHARE = 0.9
 SEVERE_LATENCY_SHARE = 2.0
 FULL_CPU_SHARE = 0.97
-"""A full processor is no harm by itself (the dense map takes what is left over), but makes a pose
-that is nearly late a late one."""
+"""A full processor is harmless by itself (the dense map takes the rest), but makes a pose that is
+nearly late a late one."""
 FULL_MEMORY_SHARE = 0.92
 HEADROOM_MEMORY_SHARE = 0.85
 MAX_DROPPED_HZ = 1.0
-"""Frames that the pose had no time for."""
+"""Frames dropped by localisation."""
 COOLER_C = 5.0
-"""So much below the limit is cool again."""
+"""Temperature below the limit at which it counts as cool again."""
 SEVERE_C = 7.0
-"""So much above the limit is about where processors slow themselves down."""
+"""Temperature above the limit at which processors throttle themselves."""
 OVERLOADED_S = 1.0
-"""So long on end: a second in which a map begins or a viewer joins is no reason."""
+"""Least duration of an overload: one second of initialisation or a joining viewer is ignored."""
 SETTLE_S = 2.0
 SETTLE_HEAT_S = 15.0
 SETTLE_SEVERE_S = 1.0
@@ -81,7 +81,7 @@ class Governor:
         self._max_latency_ms = max_pose_latency_ms
         self.level = LEVELS[0]
         self.why = ""
-        """What led to the present level, in words."""
+        """Reason of the present level, in words."""
         self._raised_ns: int | None = None
         self._lowered_ns: int | None = None
         self._headroom_since_ns: int | None = None

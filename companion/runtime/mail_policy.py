@@ -10,11 +10,11 @@ from companion.runtime.mailbox import DropPolicy
 from companion.runtime.stage_protocol import Finish, SetLoadLevel, Setup, TakeSnapshot
 
 OUT_BYTES = 32 << 20
-"""Before a stage, in the daemon, where frames are a few bytes: six depth maps of 640x480."""
+"""Queue before a stage, in the daemon, where frames are handles: six depth maps of 640x480."""
 IN_BYTES = 64 << 20
-"""In a stage's process, where frames have been copied: fifty of 640x480."""
+"""Queue in a stage's process, where frames are copies: fifty of 640x480."""
 FRAMES_SHARE = 0.6
-"""Of that room, for frames: what else comes needs some, too."""
+"""Share of that capacity for frames; the rest is for other messages."""
 
 
 def drop_policy_of(message: Any, latest_only: bool) -> DropPolicy:

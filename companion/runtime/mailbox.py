@@ -15,15 +15,15 @@ class DropPolicy(IntEnum):
     """Treatment of a waiting message on overflow: the lowest kind is dropped first."""
 
     LATEST_WINS = 0
-    """It gives way to the next of its kind, whether room is short or not."""
+    """Replaced by the next of its kind, even without overflow."""
     PICTURE = 1
-    """Large, and one of many: the oldest goes."""
+    """Large, and one of many: the oldest is dropped first."""
     MAP = 2
-    """Part of the map: the oldest goes when there is no picture left."""
+    """Part of the map: the oldest is dropped when no PICTURE is left."""
     LOSSLESS = 3
-    """Small: the oldest goes when there is nothing else left."""
+    """Small: the oldest is dropped when nothing else is left."""
     ALWAYS = 4
-    """What a stage is told to do: it stays."""
+    """Control message: never dropped."""
 
 
 class Mailbox(Generic[T]):
@@ -48,11 +48,11 @@ class Mailbox(Generic[T]):
         self._closed = False
         self._changed = threading.Condition()
         self.n_bytes = 0
-        """Of what waits."""
+        """Size of the waiting messages."""
         self.n_dropped = 0
-        """Frames that gave way to a newer one."""
+        """Frames replaced by a newer one."""
         self.n_overflowed = 0
-        """Other messages given up for want of room."""
+        """Other messages dropped on overflow."""
 
     def __len__(self) -> int:
         with self._changed:

@@ -15,7 +15,7 @@ from companion.runtime.message_size import size_bytes
 from companion.timing.clock import monotonic_s, wait_s
 
 CAPACITY_BYTES = 256 << 20
-"""Of telemetry that waits: more than that of an hour."""
+"""Waiting telemetry: more than an hour's."""
 
 
 class PacedFeed:

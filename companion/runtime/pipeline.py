@@ -32,7 +32,7 @@ from companion.messages import (
 from companion.runtime.message_size import size_bytes
 
 DEPTH_QUEUE, DEPTH_QUEUE_BYTES = 64, 128 << 20
-"""Messages that wait for depth, and bytes of them: of large pictures there is room for fewer."""
+"""Capacity of the queue to depth, in messages and bytes."""
 DEPTH_FAILED = "the dense map ends here: the depth stage has failed"
 
 
@@ -68,7 +68,7 @@ class StageThread:
         self._n_bytes = 0
         self._taken = threading.Condition()
         self.fault: BaseException | None = None
-        """What the stage raised; None while it works."""
+        """Exception of the stage; None while it works."""
         self.n_dropped = 0
         self._thread = threading.Thread(target=self._work, name="depth", daemon=True)
         self._thread.start()

@@ -38,9 +38,9 @@ from companion.timing.clock import monotonic_s, wait_s  # noqa: E402
 
 REPORT_EVERY_S = 1.0
 LOWEST_NICE = 19
-"""What is nicer still runs only where nothing else wants the processor."""
+"""Lowest priority: runs only where nothing else wants the processor."""
 SWITCH_S = 5e-4
-"""What works beside the tracker gives it the interpreter so soon."""
+"""Switch interval of the interpreter, so that background threads yield to the tracker."""
 
 
 def main() -> int:
@@ -95,7 +95,7 @@ class _Loop:
         )
         self._n_done = 0
         self._n_overwritten = 0
-        """Frames for which it was too late, or that there was no room for."""
+        """Frames overwritten in the ring or dropped on overflow."""
         self._busy_since_s: float | None = None
 
     def read(self, pipe: Connection[Any, Any]) -> None:

@@ -27,7 +27,7 @@ CHILD = "companion.runtime.stage_child"
 BY_DRIVER = (
     signal.SIGABRT, signal.SIGALRM, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV,
 )  # fmt: skip
-"""What ends a process from within; SIGALRM where a driver does not come back."""
+"""Signals of a driver's crash; SIGALRM where a driver does not return."""
 
 
 class StageProcess:
@@ -55,12 +55,12 @@ class StageProcess:
         self._interrupted: str | None = None
         self._begun_s: float | None = None
         self._busy_since_s: float | None = None
-        """As it last said."""
+        """By its last report."""
         self._offered_s: float | None = None
-        """When it was first offered something since it last said that it waits."""
+        """Time of the first message since it last reported that it waits."""
         self._deliver, self._ended = deliver, ended
         self.asked_to_end = False
-        """Whether it was told to end, one way or the other."""
+        """Whether it was asked to finish or killed."""
         self._driver = DriverAtWork()
         self._outbox: Mailbox[Any] = Mailbox(
             lambda message: drop_policy_of(message, not every_frame), size_bytes, OUT_BYTES

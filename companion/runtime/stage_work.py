@@ -16,7 +16,7 @@ class Work(ABC):
     """Base class of stages; `step` and `finish` are theirs."""
 
     latest_only = False
-    """Whether it wants the latest frame only, and that without its colours."""
+    """Whether it wants the newest frame only, without colours."""
     outlives_daemon = False
     """Whether it finishes by itself when the daemon is gone; else it ends at once."""
     device = ""

@@ -15,7 +15,7 @@ from companion.service.shipped import clone
 from companion.service.steps import Step, command
 
 HIDDEN = (Path("/home"), Path("/root"), Path("/run/user"))
-"""What ProtectHome= of the unit hides."""
+"""Folders hidden by ProtectHome= of the unit."""
 MARK = "made-by-companion-install"
 PYTHON = Path("/usr/bin/python3")
 OLDEST, FIRST_TOO_NEW = (3, 10), (3, 14)

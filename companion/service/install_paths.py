@@ -11,7 +11,7 @@ from companion.errors import InputError
 
 ACCOUNT = "companion"
 GROUPS = ("video", "dialout", "render")
-"""Of cameras, serial ports and GPUs."""
+"""Groups of cameras, serial ports and GPUs."""
 UNIT = "companion.service"
 RULES = "99-companion.rules"
 PACKAGED_UNITS = (Path("/usr/lib/systemd/system", UNIT), Path("/lib/systemd/system", UNIT))
@@ -26,12 +26,12 @@ class Places:
     config: Path
     rules: Path | None
     working: Path
-    """Its working directory, where what it is told in relative paths lies."""
+    """Working directory, which relative paths refer to."""
     kept: tuple[Path, ...]
-    """What only --purge takes away: configuration, flights, caches, logs."""
+    """Removed by --purge only: configuration, flights, caches, logs."""
     systemctl: tuple[str, ...]
     manager: Path
-    """There only while the service manager runs."""
+    """Exists only while the service manager runs."""
 
 
 SYSTEM = Places(

@@ -12,7 +12,7 @@ from pathlib import Path
 from companion.errors import InstallError
 
 PATIENCE_S = 900.0
-"""A command may take so long: an environment is filled over a slow network."""
+"""Timeout of a command: an environment is filled over a slow network."""
 
 
 def nothing() -> None:

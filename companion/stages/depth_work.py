@@ -19,7 +19,7 @@ FIRST_PATIENCE_S = 120.0
 """Drivers may compile kernels when they first run: on a small processor that takes most of a
 minute."""
 PATIENCE_S = 30.0
-"""A depth map takes 0.1 to 2 s, on a processor that has ten times as much else to do 20 s."""
+"""A depth map takes 0.1 to 2 s, on an overloaded processor 20 s."""
 
 
 class _Depth(Work):

@@ -29,7 +29,7 @@ from companion.timing.clock import since_boot_ns
 from drivers.system.computer_boot import computer_boot
 
 MOST_READ_BYTES = 64_000_000
-"""Nothing that was written here is larger by far."""
+"""Larger than any checkpoint."""
 
 
 class Kept(NamedTuple):
@@ -54,7 +54,7 @@ class MapKeeper:
         self._closed = False
         self._changed = threading.Condition()
         self.fault = ""
-        """Why nothing can be kept; "" while it can."""
+        """Reason why nothing can be written; "" without one."""
         self._thread = threading.Thread(target=self._work, name="map keeper", daemon=True)
         self._thread.start()
 

@@ -43,10 +43,10 @@ from drivers.system.zenoh_bus import LAST, URGENT, USUAL, ZenohBus
 TOPICS = {"pose": URGENT, "keyframe": USUAL, "map": USUAL, "depth": LAST, "cloud": LAST}
 BYTES_S_PER_KBIT_S = 125.0
 NEW_SHARE = 0.75
-"""Of the budget for what is new; the rest is for making up what was missed."""
+"""Share of the budget for new bundles; the rest is for catching up."""
 GONE_S = 5.0
 LINGER_S = 10.0
-"""After a flight so long for who still fetches it."""
+"""Time after a flight for nodes that still fetch it."""
 STEP_S = 0.1
 MALFORMED = "questions came over the network that cannot be read"
 TAKEN, NOT_TAKEN = "a node elsewhere makes the depth", "no node elsewhere makes depth any more"

@@ -12,13 +12,13 @@ from companion.streaming.framing import ACKNOWLEDGED, HELLO, HELLO_BYTES, VIEWER
 from companion.streaming.session import Session
 
 NOT_SENT_BYTES = 4096
-"""The kernel takes no more than this beyond what the network takes from it."""
+"""TCP_NOTSENT_LOWAT: the kernel buffers no more than this beyond what is in flight."""
 GIVE_UP_MS = 20_000
-"""A viewer that the network does not reach for so long connects anew."""
+"""TCP_USER_TIMEOUT: a viewer unreachable for this long reconnects."""
 HEADERS_BYTES = 66
-"""Of a packet: Ethernet, IP and TCP with time stamps."""
+"""Headers of a packet: Ethernet, IP and TCP with time stamps."""
 TCP_INFO_BYTES, SEGMENTS_AT, SENT_AT = 232, 136, 200
-"""Where struct tcp_info (linux/tcp.h) has tcpi_segs_out and tcpi_bytes_sent."""
+"""Size of struct tcp_info (linux/tcp.h), and offsets of tcpi_segs_out and tcpi_bytes_sent."""
 MOST_READ = 4096
 
 
@@ -32,7 +32,7 @@ class Connection:
         self.socket, self.peer = opened, peer
         self.since_s = now_s
         self.viewer: bytes | None = None
-        """Its name; None until it has said it."""
+        """Name of the viewer; None before its HELLO."""
         self.session: Session | None = None
         self._read = bytearray()
         self._left = b""

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from companion.streaming.framing import read_hello
 
 HEADERS_BYTES = 42
-"""Of a datagram: Ethernet, IP and UDP."""
+"""Headers of a datagram: Ethernet, IP and UDP."""
 UNREACHABLE_AFTER_S = 3.0
-"""A viewer that has got none for so long is taken to get none."""
+"""A viewer that has received none for this long counts as unreachable by datagram."""
 
 
 @dataclass(slots=True)

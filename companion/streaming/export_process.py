@@ -25,13 +25,13 @@ from companion.streaming.scene_encoder import SceneEncoder
 from companion.timing.clock import monotonic_s, wait_s
 
 OWN = "127.0.0.1:0"
-"""Where viewers of this machine find it, on a port of their own."""
+"""Address for viewers of this machine, on a port of their own."""
 PATH_STEP_NS = 200_000_000
 REPORT_EVERY_S = 1.0
 BIND_AGAIN_S = 1.0
 DRAIN_S = 2.5
 NICE = 10
-"""The pose comes first."""
+"""The pose has priority."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class ExportSetup:
     stream: StreamConfig
     listen: str
     n_own: int = 0
-    """Viewers of this machine that are sure to come."""
+    """Viewers of this machine that are expected."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from companion.timing.clock import monotonic_s
 TICK_S, IDLE_S = 0.005, 0.05
 HELLO_WITHIN_S = 5.0
 MOST_REMEMBERED = 8
-"""Viewers of which it is known what they have; those that came longest ago are forgotten."""
+"""Sessions kept of disconnected viewers; the oldest are forgotten."""
 PIECES_AT_ONCE = 16
 
 
@@ -45,7 +45,7 @@ class Exporter:
         self._stopping = threading.Event()
         self.n_refused = 0
         self._n_skipped_before = 0
-        """By viewers that are forgotten."""
+        """Skipped items of forgotten sessions."""
 
     def take(self, item: Item, parts: Sequence[Part]) -> None:
         """Keep and send an item with its encoded parts."""

@@ -13,7 +13,7 @@ SIZES = ((640, 60), (480, 50), (320, 45), (240, 40), (160, 35))
 """Width and JPEG quality, best first."""
 GUESS_BYTES = (40_000, 20_000, 9_000, 5_000, 2_500)
 PER_SECOND = 2.0
-"""A size is used that lets so many through in a second."""
+"""Least rate of pictures; the largest size is used that reaches it."""
 MOST_FOUND = 300
 
 

@@ -26,11 +26,9 @@ from companion.timing.clock import monotonic_s, wait_s
 
 PORT = 9870
 CONNECT_S = 1.0
-"""An attempt is given up after so long, and another made: after an outage the first that can get
-through shall do so soon."""
+"""Timeout of an attempt to connect, so that a later one can succeed soon after an outage."""
 SILENT_S = 3.0
-"""The drone says something twice a second; after so long without, the connection is taken to be
-dead."""
+"""The drone sends twice a second; a connection silent for this long counts as dead."""
 ACKNOWLEDGE_EVERY_S, ACKNOWLEDGE_EVERY_BYTES = 0.04, 8192
 RECEIVE_BYTES = 65536
 HELLO_EVERY_S = 1.0

@@ -82,10 +82,10 @@ SHOWN = list(Shown)
 LEVELS = [WHOLE, COARSE, FINE]
 MOST_JSON_BYTES = 65536
 NOWHERE_UNITS = 1e-6
-"""The scale of a keyframe that lies nowhere now."""
+"""Scale that marks a keyframe without a known pose."""
 WORLD = -1
 LENS = ("width", "height", "fx", "fy", "cx", "cy")
-"""Of a camera, what a viewer needs."""
+"""Camera fields that a viewer needs."""
 
 
 def encode(item: Item) -> bytes:

@@ -37,7 +37,7 @@ class ItemStore:
         self.flight: FlightItem | None = None
         self.status: StatusItem | None = None
         self.n_evicted: Counter[str] = Counter()
-        """What there was no room for, by what it was."""
+        """Evicted items, by kind."""
         self._listeners: list[StoreListener] = []
 
     def subscribe(self, listener: StoreListener) -> None:

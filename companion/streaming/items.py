@@ -40,7 +40,7 @@ class FlightItem:
     name: str
     camera: Camera
     origin: GeoOrigin | None = None
-    """Where the world's zero is, as far as known."""
+    """Geodetic origin of the world, as far as known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ from companion.messages import SPANS_REACH, KeyframeAdded, MapUpdate, PointChunk
 from companion.streaming.items import PlacesItem
 
 MOVED_UNITS = 1e-4
-"""Of a keyframe that moves less, or grows by a smaller part, nothing is told."""
+"""Least movement, or relative change of scale, of a keyframe that is sent."""
 
 
 class KeyframePlacement:
@@ -27,9 +27,9 @@ class KeyframePlacement:
         """world_from_map, once known."""
         self._update: MapUpdate | None = None
         self._mapped: dict[int, Similarity] = {}
-        """places as the map has them"""
+        """Places in the newest map."""
         self._sent: dict[int, Similarity] = {}
-        """and with their stretch, as they were told last"""
+        """Places with their local scale correction, as last sent."""
         self._spans: dict[int, Mapping[int, float]] = {}
         self._local_scale: dict[int, float] = {}
 

@@ -25,10 +25,10 @@ from companion.streaming.items import (
 from companion.streaming.point_codec import coarse_of
 
 COARSE_CELLS = 60
-"""The coarse level has one point for each cube of so small a part of the median distance."""
+"""Voxel size of the coarse level over the median distance."""
 COARSE_MOST = 1500
 NEWEST = 0
-"""The key of what there is one of."""
+"""Key of items of which there is only one."""
 
 
 class Part(NamedTuple):

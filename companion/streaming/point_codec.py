@@ -18,7 +18,7 @@ from companion.messages import Bytes, Floats
 
 STEPS_PER_DEPTH = 1024
 MOST_BITS = 20
-"""Of a coordinate; what is wider gets a larger step."""
+"""Bits of a coordinate; a wider range gets a larger step."""
 HEAD = struct.Struct("<Iffff")
 N_MOST = 2_000_000
 LEVELS_OF_CONFIDENCE = 7

@@ -46,17 +46,17 @@ from companion.streaming.keyframe_placement import KeyframePlacement
 from companion.streaming.status_facts import StatusFacts
 
 Watched = Message | Health | GeoOrigin
-"""What may be told."""
+"""Messages that can be shown."""
 STATUS_EVERY_NS = 1_000_000_000
 SPEED_OVER_NS = 400_000_000
 PIECE = 50
 """Positions in a piece of a path: only the last piece grows, so that long flights cost no more."""
 PIECE_STEP = 5
-"""A piece is told anew when it has grown by so many."""
+"""A piece is sent again when it has grown by this many."""
 AUTOPILOT_STEP_NS = 200_000_000
 SPARSE_EVERY = 5
 MOST_IMAGES_HELD = 4
-"""Frames that wait for the points that will be found in them."""
+"""Frames that wait for their track."""
 IN_WORDS = {
     TrackState.INITIALISING: Shown.INITIALISING,
     TrackState.TRACKING: Shown.TRACKING,

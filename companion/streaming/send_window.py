@@ -14,17 +14,17 @@ from collections import deque
 LEAST_BYTES = 6_000
 MOST_BYTES = 4 << 20
 LEAST_USED = 1_000
-"""Less room than this is none: a piece would be too small."""
+"""Less than this is not used: a piece would be too small."""
 QUEUE_S = 0.05
-"""Delay beyond the least that counts as a queue."""
+"""Delay above the base round trip that counts as a queue."""
 STANDING_S = 0.1
-"""The standing delay is over so long, or two round trips where that is longer: what repairs a loss
-delays all that follows it by one."""
+"""Window of the standing delay, or two round trips if that is longer: a retransmission delays all
+that follows by one."""
 FORGET_S = 20.0
-"""The least round trip is that of the last so long, or twice so long."""
+"""Time window of the base round trip."""
 BASE_RISE_S = 0.005
-"""By so much more than before it the least may have our own queue in it, on a link that is always
-full. Then no more than LEAST_BYTES is on its way for a round trip, which measures it anew."""
+"""A rise of the base round trip by more may include our own queue, on a link that is always full.
+Then at most LEAST_BYTES are in flight for a round trip, to measure it anew."""
 SHRINK = 0.8
 RATE_OVER_S = 1.0
 
@@ -43,11 +43,11 @@ class SendWindow:
         self._standing: deque[tuple[float, float]] = deque()
         self._delivered: deque[tuple[float, int]] = deque()
         self._limited_at = -1
-        """What was sent up to here left no room; so acknowledged, it says that more would do."""
+        """Bytes sent when the window was last full; their acknowledgement shows that it limits."""
         self._shrunk_s = -1e9
         self._has_seen_queue = False
         self._drains_from: int | None = None
-        """While the least is measured anew: what was sent before that."""
+        """Bytes sent before the base round trip began to be measured anew; None otherwise."""
 
     @property
     def in_flight_bytes(self) -> int:

@@ -25,19 +25,19 @@ ORDER = (
 )  # fmt: skip
 PICTURES = (Kind.PICTURE, Kind.DEPTH)
 PICTURE_SHARE = 0.15
-"""Of what is sent, pictures have so much while the map is not there yet; then all that is left."""
+"""Share of the rate for pictures until the map is complete; then they get the rest."""
 MOST_CREDIT_BYTES = 20_000
 POSE_SHARE, POSE_BYTES = 0.15, 120
 MOST_POSES_HZ, LEAST_POSES_HZ = 30.0, 2.0
 POSES_BESIDE_HZ = 2.0
-"""Poses over the connection where datagrams bring them as well."""
+"""Rate of poses on the connection where datagrams get through."""
 STATUS_EVERY_S, ALIVE_EVERY_S = 1.0, 0.5
 PICTURES_HZ = 15.0
 PLACES_AT_ONCE = 40
 PIECE_S = 0.02
 LEAST_PIECE, MOST_PIECE = 1000, 16_000
 ASSUMED_BYTES_S = 30_000.0
-"""The rate before any is known."""
+"""Initial rate."""
 Keys = list[Hashable]
 
 
@@ -63,15 +63,15 @@ class Session:
         self._pictures = AdaptiveJpeg()
         self._credit = 0.0
         self.is_connected = True
-        """Whether there is somebody for whom what it is not given counts as skipped."""
+        """Whether skipped items are counted."""
         self._pose_is_new = False
         self._datagram_s = -1e9
         self.datagrams_work = False
-        """Whether poses get through beside the connection."""
+        """Whether poses get through by datagram."""
         self.limit_bytes_s = 0.0
-        """What the budget allows this viewer; 0 for no limit."""
+        """Rate limit of this viewer; 0 for none."""
         self.n_skipped: Counter[str] = Counter()
-        """Poses and pictures that gave way to newer ones."""
+        """Poses and pictures replaced by newer ones."""
         self.n_sent: Counter[str] = Counter()
         """Bytes, by kind."""
         store.subscribe(self)

@@ -14,7 +14,7 @@ from companion.streaming.items import Shown
 
 RATE_OVER_NS = 2_000_000_000
 RECENT_NS = 30_000_000_000
-"""A warning is on the panel for so long."""
+"""Time for which a warning is shown."""
 MOST_WARNINGS = 3
 
 

@@ -17,7 +17,7 @@ from companion.topics.envelope import Envelope
 from companion.topics.keyframe_bundle import Bundle, MapChange
 
 SAVED_S = 2.0
-"""Of a budget that was not used, so much is kept."""
+"""Seconds of unused budget that are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +37,12 @@ class Backlog:
         self._lock = threading.Lock()
         self._allowed_bytes, self._allowed_s = 0.0, 0.0
         self.n_evicted = 0
-        """Bundles that had to go before anybody had fetched them."""
+        """Bundles evicted before anybody had fetched them."""
         self.fetched = -1
-        """The newest that was fetched."""
+        """Newest bundle fetched."""
         self.newest = -1
         self.fetched_s = float("-inf")
-        """When somebody last asked."""
+        """Time of the last query."""
 
     def put(self, bundle: Bundle, update: MapUpdate | None) -> None:
         """Add a bundle; `update` is the whole map after it."""

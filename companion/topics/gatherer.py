@@ -20,13 +20,13 @@ MOST_WAITING, MOST_WAITING_BYTES = 240, 24 << 20
 MOST_PICTURES = 48
 MOST_TRACKS = 1000
 LEAST_STEP = 0.01
-"""Of the median depth: frames that lie nearer to each other tell the same."""
+"""Least baseline of frames over the median depth."""
 LEAST_FRAMES = 4
-"""Beside its own that a keyframe needs to get depth."""
+"""Frames beside its own that a keyframe needs to get depth."""
 SAVED_NS = 3_000_000_000
-"""Budget that was not used is kept for so long."""
+"""Time for which unused budget is kept."""
 GREY_SHARE = 0.9
-"""Of the bytes of a picture in colour, what it takes in grey."""
+"""Size of a grey picture over that of the same in colour."""
 
 
 class Gatherer:
@@ -35,7 +35,7 @@ class Gatherer:
     def __init__(self, run: str, budget_bytes_s: float, jpeg_quality: int) -> None:
         self._run, self._budget_bytes_s, self._quality = run, budget_bytes_s, jpeg_quality
         self.n_dropped = 0
-        """Frames that depth could have used, but for the budget or the room to wait in."""
+        """Frames useful for depth, dropped for the budget or for capacity."""
         self._frames: OrderedDict[int, tuple[int, bytes]] = OrderedDict()
         self._frame_bytes = 0
         self._tracks: list[Track] = []
@@ -46,7 +46,7 @@ class Gatherer:
         self._budget_left_bytes, self._budget_at_ns = SAVED_NS * 1e-9 * budget_bytes_s, 0
         self._last_place: tuple[float, ...] | None = None
         self.keyframe_jpegs: dict[int, bytes] = {}
-        """Pictures of the keyframes of the last bundle, by number of keyframe."""
+        """Pictures of the keyframes of the last bundle, by keyframe id."""
 
     def take(self, message: Frame | Track | KeyframeAdded | MapUpdate) -> Bundle | None:
         """Take one message, in the order in which localisation gives it."""

@@ -10,7 +10,7 @@ from companion.messages import Bytes
 
 MARKER, START, FIRST_FRAME, LAST_FRAME = 0xFF, 0xD8, 0xC0, 0xCF
 NO_FRAMES = frozenset({0xC4, 0xC8, 0xCC})
-"""Tables, among the markers of frames."""
+"""Markers of tables, in the range of frame markers."""
 
 
 def jpeg_of(image: Bytes, quality: int) -> bytes:

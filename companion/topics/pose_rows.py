@@ -18,9 +18,9 @@ from companion.geometry.transforms import (
 )
 
 POSE_NUMBERS = 7
-"""x y z, then the quaternion w x y z; all nan where there is no pose."""
+"""x y z, then the quaternion w x y z; all nan without a pose."""
 PLACE_NUMBERS = 8
-"""The scale before these."""
+"""A scale, then a pose."""
 FURTHEST = 1e7
 LEAST_NORM = 1e-3
 LEAST_SCALE, MOST_SCALE = 1e-9, 1e9

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 MAX_DRIFT = 200e-6
-"""Two clocks of computers do not run apart faster than this."""
+"""Largest drift between two computers' clocks."""
 MAX_LATE_NS = 1_000_000_000
 SETTLED_FALL_NS, SETTLED_AFTER = 5_000_000, 5
-"""So many arrivals that are not much earlier than was known show that no backlog comes any more."""
+"""Number of arrivals not much earlier than the estimate that show the end of a backlog."""
 STEPPED_AFTER_NS = 3_000_000_000
-"""What is later than that for so long is not late: the sender's stamps were set back."""
+"""Lateness that lasts longer is a step of the sender's clock."""
 
 
 class ArrivalClock:

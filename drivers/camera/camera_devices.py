@@ -28,7 +28,7 @@ class CameraFormat:
     width: int
     height: int
     rates_hz: tuple[float, ...] = ()
-    """Fastest first; nothing where the driver does not tell."""
+    """Fastest first; empty where the driver does not list them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class CameraControl:
     step: int
     default: int
     choices: dict[int, str] = field(default_factory=dict)
-    """What the values of a menu mean."""
+    """Names of a menu's values."""
 
 
 @dataclass(frozen=True, slots=True)

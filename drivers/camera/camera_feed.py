@@ -29,23 +29,23 @@ ENDED = "the camera's pictures have ended"
 DRIVER_FAULT = "the camera's driver has a fault"
 
 EXPECTED = (CompanionError, OSError)
-"""What a camera or its connection may do at any time; anything else is a bug of its driver."""
+"""Expected failures of a camera or its connection; any other exception is a bug of its driver."""
 RETRY_S = 0.5
-"""Between two attempts to open a camera that is not there."""
+"""Interval of attempts to open a missing camera."""
 READ_S = 0.1
-"""A read waits for so long at most, so that stopping does not."""
+"""Timeout of a read, so that stopping does not block."""
 STOP_S = 2.0
-"""A thread that has not ended by then never will."""
+"""Timeout of the thread's end."""
 FROZEN_S = 1.0
-"""Pictures that have been the same for so long come from a frozen camera."""
+"""Duration of equal images that means a frozen camera."""
 MIN_CONTRAST = 12
-"""Pictures with less than this between dark and bright, as under a lens cap, may well be equal."""
+"""Least contrast of images that are compared; darker ones, as under a lens cap, may be equal."""
 INVALID_S = 1.5
-"""A camera that has been frozen, or of the wrong size, for so long is opened anew,"""
+"""A camera with invalid images for this long is reopened,"""
 BETWEEN_CURES_S = 5.0
 """but not more often than this."""
 MAX_AHEAD_NS, MAX_BEHIND_NS = 50_000_000, 10_000_000_000
-"""How far a stamp may lie from now."""
+"""Largest difference of a stamp from now."""
 REPEAT_WARNING_S = 10.0
 
 
@@ -55,9 +55,9 @@ class _Opening:
 
     since_s: float
     picture_s: float | None = None
-    """When the last picture of any kind came."""
+    """Arrival of the last image, valid or not."""
     invalid_s: float | None = None
-    """Since when none came that could be handed on, and what is wrong with them."""
+    """Time since when all images have been invalid, and the reason."""
     invalid: str = ""
 
 
@@ -77,9 +77,9 @@ class CameraFeed:
         warn: Callable[[Warned], None],
     ) -> None:
         self.fault: CompanionError | None = None
-        """Why the configured camera can never be opened; the thread has then ended."""
+        """Reason why the configured camera can never be opened; the thread has then ended."""
         self.size: tuple[int, int] | None = None
-        """Width and height of the first picture, which all others must have."""
+        """Width and height of the first image, which all others must have."""
         self._source = source
         self._clock = clock
         self._rate_hz = config.rate_hz

@@ -36,15 +36,15 @@ class CameraSource(Protocol):
     name: str
     """For people: a path, a URL without its password."""
     live: bool
-    """Whether opening it anew can help where it gives nothing, or one picture for ever."""
+    """Whether reopening can help where it gives nothing, or the same image for ever."""
     start_s: float
-    """The first picture may take so long after opening."""
+    """Longest time from opening to the first image."""
     silent_s: float
-    """No picture for so long, once there were some, means that it is silent."""
+    """Time without an image, after the first, that means that it is silent."""
     n_dropped: int
-    """Pictures that came, and were damaged or too late to be handed on."""
+    """Images dropped as damaged or too late."""
     remarks: list[str]
-    """What it does otherwise than asked; the reader takes them out."""
+    """Deviations from the request; the reader takes them out."""
 
     def open(self) -> None:
         """Open. SourceError: not there now. ConfigError: impossible as configured.

@@ -25,7 +25,7 @@ CHILD = Path(__file__).with_name("gstreamer_child.py")
 SYSTEM_PYTHON = "/usr/bin/python3"
 OPEN_S = 5.0
 END_S = 1.0
-"""A pipeline that has not ended by itself in this time is killed."""
+"""Time after which a pipeline that has not ended is killed."""
 PIPE_BYTES = 1 << 20
 INSTALL = (
     "apt install python3-gi gir1.2-gstreamer-1.0 gstreamer1.0-plugins-base "

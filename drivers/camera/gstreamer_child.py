@@ -17,10 +17,10 @@ import sys
 import traceback
 
 HEADER = struct.Struct("<4sIIIqI")
-"""What it is, width, height, bytes in a row, CLOCK_MONOTONIC in ns or 0, bytes that follow."""
+"""Kind, width, height, bytes per row, CLOCK_MONOTONIC in ns or 0, number of bytes that follow."""
 OPENED, NEVER, GONE, ENDED, FAULT = b"open", b"nevr", b"gone", b"ends", b"bugs"
-"""Running; cannot be, for the reason that follows; has failed, likewise; no more pictures; a bug
-of this program, whose traceback follows."""
+"""Running; impossible, for the reason that follows; failed, likewise; no more images; a bug of this
+program, whose traceback follows."""
 CODES = {"NV12": b"NV12", "YUY2": b"YUYV", "GRAY8": b"GREY"}
 APPSINK = (
     " ! videoconvert ! video/x-raw,format=(string){" + ",".join(CODES) + "}"

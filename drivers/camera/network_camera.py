@@ -20,15 +20,15 @@ from drivers.camera.arrival_clock import ArrivalClock
 from drivers.camera.camera_source import EndOfPictures, Picture
 
 OPEN_S = 4.0
-"""To connect and learn what the stream is."""
+"""Timeout to connect and to analyse the stream."""
 READ_S = 2.0
-"""Without a packet for so long the connection counts as lost."""
+"""Time without a packet after which the connection counts as lost."""
 MAX_WAIT_FOR_ORDER_US = 100_000
-"""UDP packets that overtake each other are put in order within this time."""
+"""Reordering window of UDP packets."""
 NO_STAMPS = 0x80
 """AVFMT_NOTIMESTAMPS: the stream has none (JPEG over HTTP), and FFmpeg makes them up."""
 BRIGHTNESS_FIRST = frozenset({"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "nv12", "gray"})
-"""Pixel formats whose first plane is the grey picture."""
+"""Pixel formats whose first plane is the grey image."""
 
 
 @dataclass(slots=True)
@@ -42,7 +42,7 @@ class NetworkCamera:
 
     live = True
     start_s = 8.0
-    """Until a picture that needs no other before it: some cameras send one every few seconds."""
+    """Time to the first intra picture: some cameras send one every few seconds."""
     silent_s = 2.0
 
     def __init__(self, config: CameraConfig) -> None:
@@ -95,7 +95,7 @@ class _Receiver:
     def __init__(self, config: CameraConfig, name: str) -> None:
         self.opened = threading.Event()
         self.error: Exception | None = None
-        """SourceError or ConfigError, or else a bug, with the place where it lies."""
+        """SourceError or ConfigError, or else a bug, with its place."""
         self._config = config
         self._name = name
         self._ended = threading.Event()
@@ -103,7 +103,7 @@ class _Receiver:
         self._newest: _Newest | None = None
         self._n_dropped = 0
         self._heard_s = 0.0
-        """When the last packet came; RTSP reports a time that ran out as damaged data."""
+        """Arrival of the last packet; RTSP reports a timeout as damaged data."""
         self.thread = threading.Thread(target=self._run, name="network camera", daemon=True)
 
     def take(self, timeout_s: float) -> _Newest | None:

@@ -33,7 +33,7 @@ DEFAULT_HFOV_DEG = 75.0
 BODY_FROM_CAMERA = Pose(
     np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)
 )
-"""It looks straight down, and forward is up in its pictures."""
+"""Looks straight down; forward is up in the image."""
 
 
 def pattern_optics(config: CameraConfig) -> Camera:

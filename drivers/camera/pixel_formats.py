@@ -105,4 +105,4 @@ _RAW: dict[str, tuple[int, int, Callable[[Bytes, int, int], Arrays]]] = {
 }
 
 CODES = (*_RAW, "MJPG")
-"""What can be read, the cheapest colours first; a camera without colours gives GREY."""
+"""Supported formats, the cheapest to convert first; a camera without colours gives GREY."""

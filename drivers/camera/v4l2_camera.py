@@ -20,7 +20,7 @@ from drivers.camera.v4l2_node import CaptureNode, FilledBuffer, PictureFormat
 
 N_BUFFERS = 4
 MAX_AGE_NS = 2_000_000_000
-"""A stamp further than this from now is not of the clock that the driver says."""
+"""A stamp further from now is not of the clock that the driver states."""
 MAX_RATE_SHORTFALL = 0.9
 GONE = (errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EIO, errno.EPIPE, errno.EPROTO)
 
@@ -33,7 +33,7 @@ class _Stream:
     buffers: list[mmap.mmap]
     exposure_ns: int
     sequence: int | None = None
-    """Number that the driver gave to the last picture."""
+    """Sequence number of the last image."""
     stamped_by_us: bool = False
 
 

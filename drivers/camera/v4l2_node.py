@@ -13,11 +13,11 @@ from typing import Any
 from drivers.camera import v4l2_ioctl as v4l2
 
 MAX_ENTRIES = 1024
-"""A driver that lists more of anything than this does not come to an end."""
+"""Limit of a driver's list, which may never end."""
 END_OF_LIST = (errno.EINVAL, errno.ENOTTY, errno.ENODATA)
-"""Past the last entry; no such list; none for this input."""
+"""Errors at the end of a list: past the last entry, no such list, none for this input."""
 MAX_DENOMINATOR = 1001
-"""Rates such as 30000/1001 are met exactly."""
+"""Denominator that represents rates such as 30000/1001 exactly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class FilledBuffer:
     end: int
     stamp_ns: int
     flags: int
-    """BUF_FLAG_…: whether it is damaged, of which clock its stamp is, and of which moment."""
+    """BUF_FLAG_…: damage, clock of the stamp, and its moment."""
     sequence: int
 
 

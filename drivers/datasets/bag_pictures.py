@@ -35,7 +35,7 @@ ENCODINGS: dict[str, tuple[str, int, Convert]] = {
     "bayer_gbrg8": ("u1", 1, lambda i: cv2.cvtColor(i, cv2.COLOR_BayerGR2RGB)),
     "bayer_grbg8": ("u1", 1, lambda i: cv2.cvtColor(i, cv2.COLOR_BayerGB2RGB)),
 }
-"""Type of a number, numbers a pixel, and how to RGB."""
+"""Data type, channels, and conversion to RGB."""
 
 
 def rgb_of(message: Any) -> Bytes | None:

@@ -30,9 +30,9 @@ DAMAGE = (
     struct.error, zlib.error, ArithmeticError, AssertionError, AttributeError, EOFError,
     LookupError, MemoryError, OSError, RecursionError, RuntimeError, TypeError, ValueError,
 )  # fmt: skip
-"""What the readers below raise on files that are not as they should be."""
+"""Exceptions of the readers on damaged files."""
 STAMP_AT = 4
-"""Where a message with a header has its seconds and nanoseconds, in ROS 1 as in ROS 2."""
+"""Offset of a header's seconds and nanoseconds, in ROS 1 as in ROS 2."""
 
 
 class BagMessage(NamedTuple):

@@ -26,7 +26,7 @@ from drivers.telemetry.telemetry_log import GeodeticFix, LogContent, TelemetryCo
 SUFFIXES = frozenset({".jpg", ".jpeg", ".tif", ".tiff"})
 LEAST = 3
 ZONE_NS = 900_000_000_000
-"""Zones of time are whole quarters of an hour apart."""
+"""Time zones are whole quarters of an hour apart."""
 SECOND_NS = 1_000_000_000
 SUSPECT_CLIMB_M = 20.0
 SUSPECT_SHARE = 0.9

@@ -21,7 +21,7 @@ from drivers.images.text_table import ns_of_seconds, numbers_of, read_rows
 from drivers.telemetry.telemetry_log import no_telemetry
 
 CAMERAS = ("image_2", "image_0", "image_3", "image_1")
-"""Folders of images: colour is preferred, then the left one."""
+"""Folders of images, in order of preference: colour, then left."""
 
 
 def is_kitti(path: Path) -> bool:

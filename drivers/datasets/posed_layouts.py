@@ -23,7 +23,7 @@ from drivers.images.calibration_file import read_calibration
 from drivers.images.frame_source import IMAGE_SUFFIXES
 
 REMODE_FOCAL_PX = (481.2, 480.0)
-"""Of the test set's camera, whose images are 640 x 480."""
+"""Camera of the test set, whose images are 640 x 480."""
 TUM_CAMERAS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -32,7 +32,7 @@ TUM_CAMERAS = {
 TUM_CAMERA = (525.0, 525.0, 319.5, 239.5, (0.0, 0.0, 0.0, 0.0, 0.0))
 TUM_TIME_DIFFERENCE_S = 0.02
 POSE_GAP_S = 0.5
-"""Poses of a flight further apart than this say nothing of what is between them."""
+"""Longest interval over which poses are interpolated."""
 
 
 def open_posed_images(path: Path) -> PosedImages:

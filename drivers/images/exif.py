@@ -17,7 +17,7 @@ DAMAGE = (
     UnidentifiedImageError, OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError,
     ArithmeticError, AttributeError, EOFError, MemoryError, RuntimeError, struct.error,
 )  # fmt: skip
-"""What Pillow raises on files that are not as they should be."""
+"""Exceptions of Pillow on damaged files."""
 FILM_DIAGONAL_MM = 43.2666
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 XMP_NUMBER = re.compile(

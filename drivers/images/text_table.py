@@ -13,7 +13,7 @@ from companion.geometry.transforms import Pose, rotation_from_quaternion
 
 MAX_BYTES = 200_000_000
 MAX_S = 9e9
-"""Unix seconds that fit in nanoseconds of 64 bits."""
+"""Largest Unix seconds whose nanoseconds fit in 64 bits."""
 
 
 def read_rows(path: Path, n_words: int) -> list[list[str]]:

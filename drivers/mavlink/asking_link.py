@@ -30,7 +30,7 @@ COMPONENT = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 HEARTBEAT_S = 1.0
 OPEN_S = 2.0
-"""What cannot be opened for so long is not waited for."""
+"""Longest wait for a port to open."""
 LOOK_S = 0.02
 
 

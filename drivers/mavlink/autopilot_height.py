@@ -18,10 +18,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drivers.mavlink.autopilot_link import AutopilotLink
 
 MAX_AGE_NS = 500_000_000
-"""A height is carried on by its rate of change for so long: both messages come at 10 Hz, and a
+"""Longest extrapolation of a height by its rate of change: both messages come at 10 Hz, and a
 multicopter that accelerates by 2 m/s2 is 0.25 m elsewhere after this."""
 LANDED_AGE_NS = 2_000_000_000
-"""EXTENDED_SYS_STATE holds for so long; autopilots that send it do so each second."""
+"""Validity of EXTENDED_SYS_STATE; autopilots that send it do so each second."""
 MOST_AWAY_M = 1e5
 
 
@@ -41,9 +41,9 @@ class AutopilotHeight:
         self._local: _Height | None = None
         self._below_home: _Height | None = None
         self.home_down_m: float | None = None
-        """Where home is along the local frame's down axis; None until that is known."""
+        """Position of home on the local frame's down axis; None while unknown."""
         self._landed_ns: int | None = None
-        """When the autopilot last said that it stands on the ground."""
+        """Time of the last report that it is on the ground."""
         link.listen(mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, self._take_local)
         link.listen(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, self._take_global)
         link.listen(mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, self._take_state)

@@ -34,13 +34,13 @@ from drivers.telemetry.live_samples import LiveSamples
 from drivers.telemetry.mavlink_samples import SAMPLE_OF
 
 FIRST_SYSTEM = 1
-"""Whose component we say we are until the vehicle is heard: on UDP it may answer only then."""
+"""System id that we use until the vehicle is heard: on UDP it may send only then."""
 HEARTBEAT_NS, HEARTBEAT_TICK_S = 1_000_000_000, 0.05
 WATCH_S, ORIGIN_S = 0.1, 5.0
 ANSWER_S, REQUEST_S = 1.0, 0.4
 MAX_ROUND_TRIP_NS = 2_000_000_000
 MAX_QUESTIONS = 64
-"""TIMESYNC without an answer that are remembered."""
+"""TIMESYNC requests without an answer that are remembered."""
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 REFUSALS = (
     mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
@@ -66,7 +66,7 @@ class AutopilotLink:
         self.vehicle: Vehicle | None = None
         """None until its first HEARTBEAT; kept while it is silent."""
         self.alive = False
-        """Whether the autopilot has said something lately."""
+        """Whether the autopilot has been heard recently."""
         self.clock_filter = ClockFilter()
         self.samples = LiveSamples(self.clock_filter, deliver, warn)
         self._meter = SourceMeter("autopilot")
@@ -75,9 +75,9 @@ class AutopilotLink:
         self._commands = Commands(self.send)
         self._text_limit = TextLimit()
         self.system_status: int = mavlink.MAV_STATE_BOOT
-        """What our HEARTBEAT states: a MAV_STATE."""
+        """MAV_STATE of our HEARTBEAT."""
         self.on_request: Take | None = None
-        """Takes what anybody sends, for who answers what is asked of us."""
+        """Handler of all messages, for requests to our component."""
         self._takers: defaultdict[int, list[Take]] = defaultdict(list)
         self._heard_ns = 0
         self._armed: bool | None = None

@@ -22,9 +22,9 @@ FAILED: int = mavlink.MAV_RESULT_FAILED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 IN_PROGRESS: int = mavlink.MAV_RESULT_IN_PROGRESS
 REPEAT_NS = 30_000_000_000
-"""A command whose `confirmation` counts up is the one before for so long."""
+"""Time within which a command whose `confirmation` counts up is a retransmission."""
 SAME_INT_NS = 5_000_000_000
-"""COMMAND_INT does not count its repeats: the same within so long is one."""
+"""COMMAND_INT does not count its repeats: an equal one within this time is a retransmission."""
 PROGRESS_NS = 500_000_000
 MOST_JOB_NS = 120_000_000_000
 MOST_REMEMBERED = 64
@@ -46,11 +46,11 @@ class Job:
 
     percent: int = 0
     result: int | None = None
-    """A MAV_RESULT once it is over."""
+    """A MAV_RESULT when it is finished."""
 
 
 Handler = Callable[[Sequence[float]], Done | Job]
-"""Carries out a command with its seven parameters; those not given are NaN or 0."""
+"""Executes a command with its seven parameters; those not given are NaN or 0."""
 
 
 @dataclass(frozen=True, slots=True)

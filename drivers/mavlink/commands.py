@@ -11,13 +11,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drivers.system.within import within
 
 NO_ANSWER = -1
-"""In the place of a MAV_RESULT: it did not answer, however often it was asked."""
+"""Result of a command that was never acknowledged."""
 TRIES = 3
 MOST_PATIENCE_S = 30.0
-"""An answer "in progress" is waited on for so long."""
+"""Longest wait after an acknowledgement "in progress"."""
 
 MakeCommand = Callable[[int], Any]
-"""A message for the so-manieth try, counted from 0."""
+"""Makes the message of a try, counted from 0."""
 
 
 class Commands:

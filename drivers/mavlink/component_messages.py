@@ -23,7 +23,7 @@ CAPABILITIES = (
 MAVLINK_2, MAVLINK_1 = 200, 100
 """Versions of the protocol, times a hundred."""
 OFFICIAL = 255
-"""The lowest byte of a version that is a release."""
+"""Lowest byte of a release's version."""
 NOT_SENT, NOT_OURS = -1, 0
 """Intervals of MESSAGE_INTERVAL."""
 

@@ -20,7 +20,7 @@ from drivers.mavlink.request_limit import RequestLimit
 from drivers.mavlink.wire.message_port import MavlinkPort
 
 TICK_S = 0.025
-"""A parameter goes out in each: 1.5 kB/s."""
+"""Interval of parameter messages: 1.5 kB/s."""
 TELL_NS = 10_000_000_000
 TOO_MANY = "more is asked of the companion over MAVLink than it answers"
 COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)

@@ -10,13 +10,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import LinkConfig
 
 CHECK_NS = 3_000_000_000
-"""So long a rate is counted before it is judged."""
+"""Window in which a rate is measured."""
 SHORT = 0.5
-"""A rate of less than this share of what was asked for falls short."""
+"""Share of the requested rate below which it counts as missing."""
 FIRST_AGAIN_NS, MOST_AGAIN_NS = 3_000_000_000, 60_000_000_000
-"""Between asking and asking again, doubling."""
+"""Backoff of repeated requests, doubling."""
 GPS_HZ, TIME_HZ = 5.0, 1.0
-"""More than receivers give, and often enough to tell GPS time from boot time."""
+"""More than receivers give, and enough to map GPS time to boot time."""
 NEVER_NS = 2**62
 
 
@@ -27,7 +27,7 @@ class Wanted:
     ids: tuple[int, ...]
     rate_hz: float
     always: bool = True
-    """Whether there is always something to send; a position or a range may not be known."""
+    """Whether it is always sent; a position or a range may be unknown."""
 
 
 def wanted(config: LinkConfig) -> list[Wanted]:
@@ -65,7 +65,7 @@ class _Stream:
     due_ns: int = 0
     again_ns: int = FIRST_AGAIN_NS
     begun_ns: int | None = None
-    """When counting began; None while it has not been asked for."""
+    """Begin of the measurement; None before the first request."""
     n: int = 0
 
     @property
@@ -80,7 +80,7 @@ class MessageRates:
         self._streams = [_Stream(want) for want in wants]
         self.n_asked = 0
         self.missing: list[int] = []
-        """Messages that this autopilot has said it does not have."""
+        """Messages that this autopilot has reported as unsupported."""
 
     def restart(self) -> None:
         """Request everything anew: the autopilot has rebooted."""

@@ -25,7 +25,7 @@ from drivers.mavlink.component_messages import (
 LAST_MESSAGE = 2**24 - 1
 DEFAULT_RATE = 0
 MOST_HZ = 5.0
-"""What is sent at a rate of choice is sent no more often."""
+"""Highest rate of a message with an adjustable rate."""
 HEARTBEAT: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 COMPUTER_STATUS: int = mavlink.MAVLINK_MSG_ID_ONBOARD_COMPUTER_STATUS
 OBSTACLES: int = mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE

@@ -16,12 +16,12 @@ from drivers.mavlink.autopilot_link import AutopilotLink
 
 LOOK_EVERY_S = 0.5
 PATIENCE = 12
-"""Looks in a row at an autopilot without an origin, whose own GPS may still find one."""
+"""Consecutive checks without an origin before one is set: its own GPS may still find one."""
 AGAIN_AFTER_S = 10.0
-"""After it was given one, and still has none."""
+"""Time after which an origin that was not accepted is set again."""
 DO_SET_GLOBAL_ORIGIN = 611
 NOWHERE_DEG = 1e-7
-"""Autopilots take a place of all zeros for none at all."""
+"""Autopilots take a position of all zeros for none."""
 
 
 class OriginKeeper:

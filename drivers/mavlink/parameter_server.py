@@ -20,7 +20,7 @@ OUT_OF_RANGE: int = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
 NOT_NOW: int = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
 LONGEST_NAME = 16
 MOST_ERRORS = 16
-"""What waits to be said of requests that failed; all else that waits is one of each name."""
+"""Limit of waiting errors; of values only one waits for each name."""
 
 
 class Table(Protocol):

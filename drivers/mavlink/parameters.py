@@ -23,14 +23,13 @@ from drivers.system.within import within
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAVLINK_2 = 0xFD
 WINDOW = 10
-"""Requests under way at once; ArduPilot queues no more than 20, of everybody's."""
+"""Requests in flight at once; ArduPilot queues no more than 20, of all senders."""
 ANSWER_S, LEAST_ANSWER_S = 0.5, 0.1
 SLACK = 4
-"""What is not there is not answered for: it is waited for as long as the slowest answer, so many
-times over."""
+"""A missing parameter is not answered: the timeout is the slowest answer, times this."""
 TRIES = 3
 QUIET_S = 1.0
-"""A list that has paused for so long has ended, or has lost its end."""
+"""Pause that ends a list, whether complete or not."""
 MOST_ANSWERS_S, MOST_LIST_S = 3.0, 180.0
 MOST_KNOWN = 10_000
 NO_INDEX = 65535

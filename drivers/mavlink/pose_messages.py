@@ -21,7 +21,7 @@ from companion.geometry.transforms import Array, quaternion_from_rotation
 
 N_COVARIANCE = 21
 ROW_STARTS = (0, 6, 11, 15, 18, 20)
-"""Places of the diagonal of a 6 x 6 matrix in its upper triangle, row by row."""
+"""Indices of the diagonal of a 6 x 6 matrix in its upper triangle, row by row."""
 UNKNOWN = [math.nan] * N_COVARIANCE
 
 

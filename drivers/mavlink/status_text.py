@@ -14,7 +14,7 @@ from drivers.mavlink.wire.send_queue import RateLimit
 
 TEXTS_PER_S, TEXTS_AT_ONCE = 1.0, 12
 WARNINGS_ONLY = 4
-"""The last so many of those at once are for warnings."""
+"""Part of the burst that is reserved for warnings."""
 MOST_KEPT_BACK = 100
 
 

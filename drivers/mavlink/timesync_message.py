@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 _LAYOUT = struct.Struct("<qqBB")
 _MAVLINK_2 = 0xFD
 _PAYLOAD = 10
-"""Where the payload begins in a packet of MAVLink 2."""
+"""Offset of the payload in a MAVLink 2 packet."""
 
 
 class TimesyncMessage(mavlink.MAVLink_timesync_message):  # type: ignore[misc]

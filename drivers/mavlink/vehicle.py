@@ -38,7 +38,7 @@ class Vehicle:
     firmware: Firmware
     armed: bool
     mode: str
-    """In words; the number where no word is known for it."""
+    """In words; the number of an unknown mode."""
 
     def __str__(self) -> str:
         names = {"ardupilot": "ArduPilot", "px4": "PX4", "other": "autopilot"}

@@ -25,13 +25,13 @@ from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
 
 CHUNK_BYTES = 4 << 20
-"""A chunk is written before its time when it has grown to this."""
+"""Size at which a chunk is written early."""
 PICTURES_SHARE = 0.8
-"""Of the buffer, so that there is room for what is small and matters more."""
+"""Share of the buffer for images, so that small messages always fit."""
 LOOK_S = 2.0
-"""The room on the disk is looked at so often."""
+"""Interval of checks of the free space."""
 RESERVE_BYTES = 1 << 20
-"""For the end of the file: a disk may fill up between two looks."""
+"""Space reserved for the end of the file: a disk may fill up between two checks."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 FULL, PRUNED = "the disk is full: the flight is no longer recorded", "an old flight was deleted"
@@ -68,9 +68,9 @@ class DiskWriter:
         self._looked_s = -LOOK_S
         self._told: set[str] = set()
         self.n_dropped: Counter[str] = Counter()
-        """Messages turned away, by what they are."""
+        """Dropped messages, by kind."""
         self.slowest_s = 0.0
-        """What the disk took for one chunk at most."""
+        """Longest time to write a chunk."""
         self._reserve = _reserved(flight)
         self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
         self._thread.start()

@@ -29,7 +29,7 @@ class FlightDate:
     began_unix_s: float
     correction_s: float
     by: str
-    """Who told it."""
+    """Source of the date."""
 
 
 def write_date(flight: Path, date: FlightDate) -> None:

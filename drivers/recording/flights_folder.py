@@ -19,11 +19,11 @@ from drivers.recording.growing_file import is_growing
 
 RECORDING, TLOG = "flight.mcap", "flight.tlog"
 KEEP = "keep"
-"""A file of this name in a flight's folder keeps it from being deleted."""
+"""A file of this name in a flight's folder protects it from deletion."""
 COUNTER = ".last-number"
-"""Has the number of the newest flight, which may have been deleted or taken elsewhere since."""
+"""Holds the number of the newest flight, which may have been deleted or moved since."""
 STAMPED = re.compile(r"(?:(\d{5,})-)?(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-\d+)?")
-"""What the daemon calls a flight; nothing else is ever deleted."""
+"""Names of flights by the daemon; nothing else is ever deleted."""
 STAMP = "%Y-%m-%dT%H-%M-%SZ"
 PROGRAM_UNIX_S = 1767225600.0
 """2026-01-01: no flight was recorded before; an earlier date is of a clock that was not set."""
@@ -38,8 +38,8 @@ class FlightPlace(NamedTuple):
     growing: bool
     """Whether it is still being recorded."""
     not_before_s: float | None = None
-    """Unix time before which it cannot have begun, by its name and those before it in order; None
-    where no clock was ever right."""
+    """Lower bound of its begin, Unix time, by its name and those before it in order; None where no
+    clock was ever right."""
 
 
 def flights_in(folder: Path) -> list[FlightPlace]:

@@ -21,7 +21,7 @@ from drivers.recording.recording_topics import CALIBRATION, EVENTS, HEALTH, PROF
 
 CHUNK_BYTES = 4_000_000
 RATE_HZ = 30.0
-"""Told to the encoder, which for still pictures does not matter."""
+"""Frame rate given to the encoder; irrelevant for still images."""
 
 
 def write_recording(flight: Flight, out: Path, on_progress: Callable[[int], None]) -> int:

@@ -26,7 +26,7 @@ MOST_IN_CHUNK = 256 << 20
 FOOTER_SIZE = 9 + 20 + len(MAGIC)
 OPCODES = frozenset(map(int, Opcode))
 DAMAGED = (struct.error, ValueError, McapError, RuntimeError, zstandard.ZstdError)
-"""What the libraries, and what is here, raise on bytes that are not what they should be."""
+"""Exceptions of the libraries, and of this module, on damaged data."""
 
 
 class McapMessage(NamedTuple):
@@ -51,7 +51,7 @@ class ChunkPlace(NamedTuple):
     compression: str
     data_at: int
     after_loss: bool = False
-    """Whether something that lay before it could not be read."""
+    """Whether data before it could not be read."""
 
 
 class McapFile:

@@ -37,7 +37,7 @@ from drivers.recording.mcap_file import (
 from drivers.recording.mcap_writer import MAGIC, Contents
 
 MOST_OF_SMALL = 64 << 20
-"""Bytes of an attachment or another record that is read whole."""
+"""Size limit of an attachment or another record that is read whole."""
 WINDOW = 1 << 20
 # opcode, length below 4 GB, times, size, checksum, then one of the two compressions
 CHUNK_BEGIN = re.compile(rb"\x06.{4}\x00{4}.{28}(?:\x04\x00{3}zstd|\x00{4})", re.DOTALL)
@@ -53,21 +53,21 @@ class Scan:
 
     profile: str = ""
     whole: bool = False
-    """Whether it ends as it should."""
+    """Whether it has a valid end."""
     contents: Contents = field(default_factory=Contents)
     chunks: list[ChunkPlace] = field(default_factory=list)
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     n_lost_bytes: int = 0
-    """Bytes of data that could not be read."""
+    """Bytes of unreadable data."""
     n_lost_places: int = 0
-    """Places between whole chunks where they lay."""
+    """Number of gaps between whole chunks."""
     n_cut_bytes: int = 0
-    """Those of them after the last whole record, where the file was cut."""
+    """Unreadable bytes after the last whole record, where the file was cut."""
     good_end: int = 0
-    """Where the data end that can be read."""
+    """End of the readable data."""
     n_bytes: int = 0
-    """Of the file, as it was scanned."""
+    """Size of the file when scanned."""
 
 
 def summary(file: McapFile) -> Scan | None:

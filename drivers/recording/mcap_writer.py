@@ -38,7 +38,7 @@ from mcap.records import (
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "companion"
 LEVEL = 1
-"""Of zstd: pictures do not grow smaller, and the rest does at the lowest."""
+"""Level of zstd: the lowest, as images do not compress any further."""
 
 
 @dataclass(slots=True)
@@ -77,7 +77,7 @@ class McapWriter:
         self._sequences: Counter[int] = Counter()
         self._waiting: list[Message] = []
         self.n_waiting_bytes = 0
-        """Of messages that no chunk has yet."""
+        """Size of messages that are in no chunk yet."""
         self._compressor = zstandard.ZstdCompressor(level=LEVEL, write_content_size=True)
         self._put(MAGIC + _bytes_of(Header(profile, LIBRARY)))
 

@@ -25,13 +25,13 @@ from drivers.recording.recording_topics import GREY, IMAGE, RAW, VIDEO
 FRAME_ID = "camera"
 PNG_LEVEL = 1
 MOST_INSIDE = 64
-"""Pictures that an encoder may hold."""
+"""Most images held by an encoder."""
 SOFTWARE = "libx264"
 HARDWARE = ("h264_v4l2m2m", "h264_nvenc")
-"""What of FFmpeg's encoders is tried before the processor has to do it."""
+"""FFmpeg encoders in hardware, tried first."""
 OPTIONS = {SOFTWARE: {"preset": "ultrafast", "tune": "zerolatency"}}
 _IDR_OR_SPS = re.compile(rb"\x00\x00\x01(?:[\x25\x45\x65\x05]|[\x27\x47\x67\x07])")
-"""An IDR slice or a sequence parameter set in H.264's byte stream (ITU-T H.264, annex B)."""
+"""IDR slice or sequence parameter set in an H.264 byte stream (ITU-T H.264, annex B)."""
 
 
 class EncodedPicture(NamedTuple):
@@ -120,7 +120,7 @@ class H264:
     def __init__(self, config: RecorderConfig, width: int, height: int, rate_hz: float) -> None:
         self._config, self._size, self._rate_hz = config, (width, height), rate_hz
         self._inside: dict[int, tuple[int, int]] = {}
-        """By presentation stamp: number and time of the frames in the encoder."""
+        """Number and time of the frames in the encoder, by presentation stamp."""
         self._number = 0
         self._intra_requested = False
         wanted = config.h264_encoder

@@ -35,7 +35,7 @@ from companion.messages import (
 from drivers.recording.recording_topics import MavlinkBytes
 
 WORLD, MAP = "local_ned", "map"
-"""Frames of what Foxglove shows."""
+"""Coordinate frames for Foxglove."""
 _SAMPLES: dict[str, type[Any]] = {
     "/telemetry/attitude": AttitudeSample,
     "/telemetry/imu": ImuSample,

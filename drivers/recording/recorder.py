@@ -62,7 +62,7 @@ from drivers.recording.recording_topics import (
 
 CAMERA_JSON, CONFIG_TOML = "camera.json", "config.toml"
 NOTES = "companion"
-"""Metadata: versions and what else is known at the beginning."""
+"""Metadata: versions and other facts known at the beginning."""
 TELEMETRY = (
     AttitudeSample, ImuSample, PositionSample, RangeSample, HeightSample, ArmedSample,
 )  # fmt: skip
@@ -88,7 +88,7 @@ class Recorder:
         self._camera: Camera | None = camera
         self._skips_until_intra = False
         self.n_frames = 0
-        """Pictures taken in, written or not."""
+        """Images received, written or not."""
         self._encoder = picture_encoder(
             self._config, camera.width, camera.height, config.camera.rate_hz
         )

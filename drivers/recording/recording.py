@@ -38,15 +38,15 @@ class Recording:
         self.path = path
         self.file, self.found = opened(path)
         self.pictures: list[PicturePlace] = []
-        """In order of their times, each number once."""
+        """In order of time, each number once."""
         self.greys: dict[int, tuple[int, int]] = {}
-        """By the time of the picture: chunk and message of a grey one beside it."""
+        """Chunk and message of a separate grey image, by the time of the image."""
         self.samples: list[Telemetry] = []
         self.health: dict[str, Any] = {}
-        """The newest document."""
+        """Newest health document."""
         self.n_bad_messages = 0
         self.counts: dict[str, int] = {}
-        """Messages that can be read, by topic."""
+        """Number of readable messages, by topic."""
         self._bad: set[int] = set()
         self._held: tuple[int, list[McapMessage]] = (-1, [])
         if self.found.profile not in ("", PROFILE):

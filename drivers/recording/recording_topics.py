@@ -23,7 +23,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from drivers.recording.mcap_writer import McapWriter
 
 PROFILE = "companion"
-"""What the header of a recording says; a number after it would tell a later layout."""
+"""Profile in the header of a recording; a number after it would mark a later layout."""
 
 IMAGE, VIDEO, RAW, GREY = "/camera/image", "/camera/video", "/camera/raw", "/camera/grey"
 CALIBRATION = "/camera/calibration"
@@ -32,10 +32,10 @@ TIMESYNC = "/mavlink/timesync"
 POSE, ODOMETRY, CLOUD = "/pose", "/odometry", "/cloud"
 EVENTS, HEALTH = "/events", "/health"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
-"""One of them has the pictures of a flight."""
+"""Topics of images, of which a flight has one."""
 ARMED = "/telemetry/armed"
 LASTING = frozenset({CALIBRATION, HEALTH, ARMED})
-"""What is said there holds until it is said otherwise, which may be never."""
+"""Topics whose messages hold until the next one, which may never come."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 
@@ -143,7 +143,7 @@ TOPICS: dict[str, Any] = {
         {"health": OBJECT, "clock": OBJECT, "origin": OBJECT, "warnings": OBJECTS},
     ),
 }  # fmt: skip
-"""In the order of their channels."""
+"""In order of their channels."""
 
 
 def open_channels(writer: McapWriter) -> dict[str, int]:

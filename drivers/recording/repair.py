@@ -13,7 +13,7 @@ from drivers.recording.mcap_scan import Scan, scan, summary
 from drivers.recording.mcap_writer import ending, note_record
 
 NOTE = "repaired"
-"""Metadata that a repair leaves: how many bytes were cut off."""
+"""Metadata of a repair: the number of bytes cut off."""
 
 
 def repair(path: Path, found: Scan) -> bool:

@@ -13,7 +13,7 @@ from drivers.recording.recording import Recording
 from drivers.recording.recording_topics import GREY, LASTING, PICTURES, PROFILE, open_channels
 
 LEAD_NS = 10_000_000_000
-"""Of what is no picture so much from before the first is kept, as a replay uses it."""
+"""Messages other than images are kept from this long before the first, as a replay uses them."""
 CHUNK_BYTES = 4 << 20
 
 

@@ -6,11 +6,11 @@ import ctypes
 from pathlib import Path
 
 TIMEX_BYTES = 512
-"""More than struct timex has anywhere (adjtimex(2))."""
+"""Larger than struct timex anywhere (adjtimex(2))."""
 TIME_ERROR = 5
-"""What adjtimex answers for a clock that nobody keeps in step."""
+"""Result of adjtimex for an unsynchronised clock."""
 SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
-"""Made by systemd-timesyncd when it has set the clock (systemd-timesyncd.service(8))."""
+"""Written by systemd-timesyncd when it has set the clock (systemd-timesyncd.service(8))."""
 
 
 def clock_is_set() -> bool:

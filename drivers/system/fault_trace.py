@@ -13,9 +13,9 @@ import traceback
 from collections.abc import Mapping
 
 PRIORITY = "<3>"
-"""Before each line that systemd reads: an error (sd-daemon(3))."""
+"""Prefix of lines for systemd: an error (sd-daemon(3))."""
 MOST_PLACES = 64
-"""A driver that fails in more places than this fills no disk with them."""
+"""Limit of places, so that a driver cannot fill the disk with tracebacks."""
 
 
 class FaultTraces:

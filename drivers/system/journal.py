@@ -13,7 +13,7 @@ from companion.messages import Warned
 ERROR, WARNING, INFO = 3, 4, 6
 MAX_SAME_IN_A_ROW = 5
 EVERY = 100
-"""A thing that is warned of again and again is told of each so many times only."""
+"""Of a repeated warning only every so many are written."""
 
 
 class Journal:

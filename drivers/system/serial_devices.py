@@ -12,7 +12,7 @@ from drivers.system.login_console import login_consoles
 
 BY_ID = Path("/dev/serial/by-id")
 JETSON = "ttyTHS*"
-"""Ports of a Jetson's own, which pyserial does not list."""
+"""Serial ports of a Jetson, which pyserial does not list."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class SerialDevice:
     """Vendor and product in hexadecimal."""
     serial_number: str = ""
     problem: str = ""
-    """What else uses it, and how that is ended."""
+    """Other user of the port, and the remedy."""
 
 
 def serial_devices() -> list[SerialDevice]:

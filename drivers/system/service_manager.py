@@ -19,11 +19,11 @@ class ServiceManager:
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self.watchdog_s = _watchdog_s(environment)
-        """It must hear `alive` at least this often (half of what it allows); None: it need not."""
+        """Interval for `alive` (half of the watchdog's); None without a watchdog."""
         self.n_lost = 0
-        """Notices that could not be handed over."""
+        """Notifications that could not be sent."""
         self.problem = ""
-        """Why nothing can be sent although it should, in words."""
+        """Reason why nothing can be sent although it should, in words."""
         self._address = ""
         self._socket: socket.socket | None = None
         address = environment.get("NOTIFY_SOCKET", "")

@@ -18,7 +18,7 @@ MAX_REQUEST = 8192
 TIMEOUT_S = 2.0
 
 Answer = Callable[[asyncio.StreamReader], Awaitable[bytes]]
-"""Reads what it needs of a question, and says what to send."""
+"""Reads the request as far as needed, and returns the answer."""
 
 
 class ShortAnswers:

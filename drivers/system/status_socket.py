@@ -23,9 +23,9 @@ from drivers.system.short_answers import ShortAnswers
 
 NAME = "status.sock"
 SERVICE_FOLDER = Path("/run/companion")
-"""What systemd makes for the service: its RuntimeDirectory."""
+"""RuntimeDirectory of the service."""
 MAX_PATH = 107
-"""Longer names do not fit a unix socket's address."""
+"""Length limit of a unix socket's address."""
 MAX_DOCUMENT = 4 << 20
 
 

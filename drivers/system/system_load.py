@@ -17,7 +17,7 @@ from companion.health import ComputerLoad, ProcessLoad
 
 MIB = 1 << 20
 NOT_A_TEMPERATURE = ("pmic-die",)
-"""Jetsons report a constant there."""
+"""Constant that Jetsons report."""
 PLAUSIBLE_C = (-60.0, 150.0)
 GPU_LOADS = (  # per mille, of Jetsons by age
     "devices/platform/gpu.0/load",

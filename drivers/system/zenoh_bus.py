@@ -17,7 +17,7 @@ from companion.errors import InputError
 LOOPBACK = "tcp/127.0.0.1:7447"
 MOST_MESSAGE_BYTES = 64 << 20
 LISTEN_MS = 15_000
-"""A port that the process before still holds is waited for."""
+"""Timeout for a port that the process before still holds."""
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/\S+:\d{1,5}(#\S*|\?\S*)?")
 PRIORITIES = ("INTERACTIVE_HIGH", "DATA", "BACKGROUND")

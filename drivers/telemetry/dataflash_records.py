@@ -16,7 +16,7 @@ from pymavlink.DFReader import FORMAT_TO_STRUCT, DFFormat
 HEAD = b"\xa3\x95"
 FMT, FMT_LENGTH = 0x80, 89
 PADDING = 528
-"""So many bytes at the end of a log may be what was in memory before: no damage."""
+"""Bytes at the end of a log that may be old memory: no damage."""
 
 
 @dataclass(slots=True)

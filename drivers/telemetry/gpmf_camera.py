@@ -18,7 +18,7 @@ from drivers.telemetry.telemetry_log import GeodeticFix, TelemetryCollector
 
 FIX_3D = 3.0
 METRES_PER_DILUTION = 3.0
-"""A usual receiver's error for a dilution of one."""
+"""Typical error of a receiver at dilution 1."""
 MAX_DILUTION = 10.0
 HEIGHTS = Warned(0, "heights of the camera's receiver", "may be above the ellipsoid, not the sea")
 

@@ -18,9 +18,9 @@ from companion.geometry.transforms import Array
 from drivers.telemetry.gpmf_records import GpmfError, read_streams
 
 STEP_S = 0.02
-"""Of the turns that are given."""
+"""Sampling interval of the result."""
 LONGEST_STEP_S = 0.1
-"""Longer ones are gaps, over which nobody knows how it turned."""
+"""Longer intervals are gaps, over which the rotation is unknown."""
 LEAST = 100
 CAMERA_FROM_GOPRO = np.array([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
 NAMED = re.compile(r"\(([xyzXYZ]),([xyzXYZ]),([xyzXYZ])\)")

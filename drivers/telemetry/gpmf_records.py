@@ -31,9 +31,9 @@ class GpmfStream:
     key: str
     rows: Array
     name: str = ""
-    """What the stream calls itself."""
+    """Name in the stream."""
     orientation: str = ""
-    """A letter for the axis of each field, small where it points the other way; "" if not told."""
+    """A letter for the axis of each field, lower case if it points the other way; "" if unknown."""
 
 
 class GpmfError(ValueError):

@@ -16,9 +16,9 @@ from companion.messages import PositionSample, PositionSource
 from drivers.telemetry.telemetry_log import PAIR_NS, GeodeticFix
 
 WAIT_NS = 2_000_000_000
-"""A fix without an origin waits so long for one before it becomes the origin itself."""
+"""Time that a fix waits for an origin before it becomes the origin itself."""
 SAME_M = 0.5
-"""Origins nearer than this to each other are the same, seen with different rounding."""
+"""Origins closer than this are the same, with different rounding."""
 
 
 class LivePositions:
@@ -26,9 +26,9 @@ class LivePositions:
 
     def __init__(self) -> None:
         self.home: GeoOrigin | None = None
-        """Where all positions are counted from; None while no place on Earth is known."""
+        """Origin of all positions; None while no geodetic position is known."""
         self.origin: GeoOrigin | None = None
-        """Where the autopilot's local frame has its zero just now."""
+        """Present origin of the autopilot's local frame."""
         self._local: tuple[int, Array, Array | None] | None = None
         self._first_fix_ns: int | None = None
 

@@ -24,12 +24,12 @@ from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, SAMPLE_OF, 
 from drivers.telemetry.telemetry_log import GeodeticFix, is_finite
 
 LATE_NS, AHEAD_NS = 2_000_000_000, 100_000_000
-"""A delay that is named; a stamp that is further in the future than this cannot be true."""
+"""Delay that is reported; a stamp further in the future than the second is invalid."""
 NAME_AGAIN_NS = 10_000_000_000
 CHOOSE_NS = 1_000_000_000
-"""Which of several messages is the more frequent is looked at so often."""
+"""Interval at which the more frequent of several messages is chosen."""
 ABOUT = 1.25
-"""Messages that come at rates within this ratio are about as frequent."""
+"""Ratio of rates within which messages count as equally frequent."""
 MOST_AWAY_M = 1e6
 
 OUT_OF_ORDER, WILD, LATE = "telemetry out of order", "telemetry stamped wildly", "telemetry late"
@@ -48,14 +48,14 @@ class LiveSamples:
         self._clock, self._deliver, self._warn = clock, deliver, warn
         self.positions = LivePositions()
         self.n_dropped: Counter[str] = Counter()
-        """By the reason."""
+        """By reason."""
         self.gps_fix_type = 0
-        """GPS_FIX_TYPE of the newest GPS_RAW_INT; 0 where there is no GPS."""
+        """GPS_FIX_TYPE of the newest GPS_RAW_INT; 0 without a GPS."""
         self._unix_minus_boot_ns: int | None = None
         self._segment = clock.n_segments
         self._stamps: dict[int, int] = {}
         self._latest: dict[str, tuple[int, int]] = {}
-        """By quantity: the newest stamp, and the time that it was given."""
+        """Newest stamp by quantity, and the time that it was given."""
         self._choices = (_Choice(ATTITUDE_IDS, frequent=True), _Choice(IMU_IDS, frequent=False))
         self._wild = ""
         self._named_ns: dict[str, int] = {}

@@ -27,7 +27,7 @@ GPS_RANGE_ERROR_M = 1.5
 UNKNOWN_16 = 65535
 FIX_3D = 3
 UNIX_SINCE_NS = 10**17
-"""Stamps larger than this count from 1970, smaller ones from boot."""
+"""Larger stamps count from 1970, smaller ones from boot."""
 ACCEL_AND_GYRO = 0x3F
 PRESSURE_ALTITUDE = 0x800
 
@@ -164,4 +164,4 @@ SAMPLE_OF: dict[int, Callable[[Any], Telemetry | GeodeticFix | None]] = {
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: _range,
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: _pressure,
 }
-"""What each message says; samples bear no time yet, None where a message says nothing usable."""
+"""Sample of each message type; samples have no time yet, None without a valid value."""

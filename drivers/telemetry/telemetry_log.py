@@ -30,7 +30,7 @@ from companion.messages import (
 )
 
 PAIR_NS = 100_000_000
-"""Local and global positions so near in time tell where the local origin lies."""
+"""Largest time difference of local and global positions that give the local origin."""
 MAX_PAIRS = 200
 HostTimes = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]
 
@@ -60,7 +60,7 @@ class TelemetryLog:
     warnings: tuple[Warned, ...] = ()
     rates_hz: Mapping[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-    """What the user should be told of how it was read."""
+    """Remarks for the user on how it was read."""
 
 
 def no_telemetry(pictures: Pictures) -> TelemetryLog:

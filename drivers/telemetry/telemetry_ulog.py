@@ -43,7 +43,7 @@ LATEST_NS = 4_102_444_800 * 10**9  # the year 2100
 MAX_SHORT_READS = 100
 MAX_LATENCY_US = 1_000_000
 DAMAGE = (ULogException, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error)
-"""What pyulog raises for a file that is none, or for definitions that are damaged."""
+"""Exceptions of pyulog for invalid files or damaged definitions."""
 
 Columns = Mapping[str, NDArray[Any]]
 

@@ -60,7 +60,7 @@ class _Rotation:
     by_what: str
     record: TurnRecord
     body_from_camera: Array | None
-    """Rotation (3, 3), where it is known and so are the axes."""
+    """Rotation (3, 3), if it and the axes are known."""
 
 
 def _best(

@@ -30,10 +30,10 @@ from drivers.open_flight import open_flight
 
 LEAD_NS = 10_000_000_000
 FRAME_PARTS = ("features", "tracking", "initialising")
-"""What a frame waits for; the rest is done beside it in flight."""
+"""Work that a frame waits for; the rest runs in the background in flight."""
 NEES_NS = 10_000_000_000
 STEP_NS = 500_000_000
-"""Poses of odometry further apart than this are not one step."""
+"""Longest interval between consecutive odometry poses."""
 
 
 @dataclass(frozen=True, slots=True)

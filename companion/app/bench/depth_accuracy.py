@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 RIM_PX = 20
-"""Pixels about the border that are not counted."""
+"""Border pixels that are ignored."""
 
 
 @dataclass(frozen=True, slots=True)

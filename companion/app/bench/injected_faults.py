@@ -28,7 +28,7 @@ Pictures = Iterable[Frame | Warned]
 
 DROPOUT_S, SILENT_S = 2.0, 3.0
 AT_SHARE = 0.5
-"""Where in the flight the short ones come."""
+"""Begin of short faults, as a share of the flight."""
 SHIFT_NS = 60_000_000
 OFFSET_AXIS = np.array([0.6, 0.64, 0.48])
 OFFSET_RAD = np.radians(5.0)

@@ -10,7 +10,7 @@ from pathlib import Path
 from companion.app.stopping import StopSignals
 
 Command = Callable[[argparse.Namespace, StopSignals], int]
-"""What does it: the arguments in, the exit status out."""
+"""Implementation of a command: arguments in, exit status out."""
 
 
 def configuration() -> argparse.ArgumentParser:

@@ -19,11 +19,11 @@ from companion.daemon.control.tightening import WHILE_ARMED, tightened, value_of
 from companion.errors import ConfigError
 
 FILE = ".armed.json"
-"""In the folder of flights, the one place that the daemon is sure to be able to write to."""
+"""In the folder of flights, the one place that the daemon can certainly write to."""
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-"""Another each time that the computer starts (random(4))."""
+"""Random id of each boot of the computer (random(4))."""
 ANOTHER_BOOT = "unknown"
-"""Of the computer: what is held is let go as soon as the autopilot says that it is disarmed."""
+"""Boot id unknown: held changes are applied as soon as the autopilot reports disarmed."""
 NOT_KEPT = "settings cannot be kept"
 MODE = "feedback.mode"
 
@@ -33,12 +33,12 @@ class ArmedSettings:
     """Content of the file; times are CLOCK_MONOTONIC of the boot that it names."""
 
     values: Mapping[str, Any]
-    """Of each key of `WHILE_ARMED`."""
+    """Value of each key of `WHILE_ARMED`."""
     by_ground: Mapping[str, Any]
-    """Those that the ground has set, and to what."""
+    """Values set by the ground, by key."""
     computer_boot: str
     autopilot_boot_s: float | None
-    """When the autopilot was started; None while that is not known."""
+    """Boot time of the autopilot; None while unknown."""
     written_s: float
 
 

@@ -22,11 +22,11 @@ from companion.daemon.control.armed_settings import (
 from companion.products.newest_file import NewestFile
 
 CERTAIN_S = 2.5
-"""An autopilot that says it is disarmed is believed after so long with the same clock: of another
-clock a ClockFilter is sure a second after stamps of it come."""
+"""Time with the same clock after which a report of disarmed is believed: a ClockFilter detects
+another clock a second after its first stamps."""
 SAME_BOOT_S, SAME_BOOT_SHARE = 5.0, 0.02
-"""A clock that is so far from where it was expected was started anew: what links delay, and what
-clocks may drift (companion.timing.link_clock.PRIOR_DRIFT)."""
+"""Largest deviation of the autopilot's clock within one boot: link delays, and clock drift
+(companion.timing.link_clock.PRIOR_DRIFT)."""
 
 
 class Arming:
@@ -43,7 +43,7 @@ class Arming:
         self._said: bool | None = None
         self._disarmed_s: float | None = None
         self.waiting: dict[str, Any] = {}
-        """By key: what the configuration says that counts after disarming only."""
+        """Changes that wait for disarming, by key."""
 
     @property
     def armed(self) -> bool:

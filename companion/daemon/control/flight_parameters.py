@@ -14,7 +14,7 @@ from companion.config_file import words_of
 from companion.errors import ConfigError
 
 DIGITS = 7
-"""More a float of four bytes does not hold."""
+"""Precision of a 32-bit float."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class FlightParameter:
     section: str
     key: str
     at_once: bool = False
-    """Else it counts from the next map on."""
+    """Whether it takes effect at once; else with the next map."""
 
     @property
     def full_key(self) -> str:

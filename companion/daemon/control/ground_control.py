@@ -55,16 +55,16 @@ MAPPING, NEW_MAP, SNAPSHOT, BUDGET = 31010, 31011, 31012, 31013
 """MAV_CMD_USER_1 to MAV_CMD_USER_4."""
 STEP_S = 0.05
 TEXTS_HZ, TEXTS_AT_ONCE = 0.3, 5.0
-"""What comes of requests must not keep back what a pilot has to know."""
+"""Rate limit of answers to requests, so that they cannot suppress important texts."""
 CHANGES_HZ, CHANGES_AT_ONCE = 2.0, 40.0
-"""As many as there are parameters may be set in a row; afterwards so many a second."""
+"""Rate limit of parameter changes: a burst of as many as there are parameters, then this rate."""
 NO_FLIGHT = "there is no flight"
 POSES_SENT = "the autopilot may fly on these poses; param1 = 1 does it all the same"
 NOT_ARMED = "while armed it can be switched off only", REFUSED_ARMED
 ELSEWHERE = "another machine makes the dense map", REFUSED_ELSEWHERE
 TOO_OFTEN = "it is set too often", REFUSED_OFTEN
 NOT_LOOSER = "while armed it can be made stricter only", REFUSED_ARMED
-"""Why a parameter is refused: for the journal, and for the pilot."""
+"""Reason of a refusal: for the journal, and for the pilot."""
 
 
 class Controlled(Protocol):

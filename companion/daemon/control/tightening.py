@@ -14,7 +14,7 @@ from typing import Any
 from companion.config import Config
 
 MayChange = Callable[[Any, Any], bool]
-"""Whether a value may give way to another while armed."""
+"""Whether a value may be replaced by another while armed."""
 
 
 def _to_less(now: float, wanted: float) -> bool:
@@ -59,7 +59,7 @@ WHILE_ARMED: Mapping[str, MayChange] = {
     "georeference.max_sigma_scale": _to_less,
     "tracking.min_inliers": _to_more,
 }
-"""Every key of [feedback], and those of other sections that poses are believed by."""
+"""Every key of [feedback], and those of other sections that decide which poses are sent."""
 
 
 def value_of_key(config: Config, name: str) -> Any:

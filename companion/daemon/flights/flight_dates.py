@@ -17,19 +17,19 @@ from drivers.recording.flight_date import FlightDate, named_by_date, write_date
 from drivers.recording.flights_folder import PROGRAM_UNIX_S
 
 WRONG_NS = 2_000_000_000
-"""Names have seconds; less than this between two clocks is not worth another name."""
+"""Names have seconds; a smaller clock error needs no new name."""
 LOOK_NS = 1_000_000_000
 MOST_FLIGHTS = 1000
-"""Of which the date is still awaited; more no run of a daemon has."""
+"""Most flights whose date is still unknown."""
 
 
 @dataclass(slots=True)
 class _Flight:
     began_ns: int
-    """By the flight's clock."""
+    """Flight's clock."""
     over: bool = False
     corrected_ns: int = 0
-    """What its file says that is to be added to that."""
+    """Correction in its date file."""
 
 
 class FlightDates:

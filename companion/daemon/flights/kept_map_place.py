@@ -13,7 +13,7 @@ from drivers.system.status_socket import own_socket_path
 
 NAME = "map.checkpoint"
 SHARED_MEMORY = Path("/dev/shm")
-"""A file system in memory that Linux always has (tmpfs); anyone may write there."""
+"""File system in memory that Linux always has (tmpfs), writable for all."""
 
 
 def kept_map_path(setting: str, environment: Mapping[str, str] = os.environ) -> Path:

@@ -50,28 +50,28 @@ from companion.timing.clock import FlightClock, monotonic_s
 from drivers.recording.recorded_content import HealthNote, LinkBytes
 
 NICE = {"localisation": 0, "recorder": 5, "topics": 10, "results": 10, "depth": 20}
-"""The pose comes first; the others take what is left over."""
+"""The pose has priority; the others get the remaining processor time."""
 PATIENCE_S = {
     "localisation": 120.0, "depth": 60.0, "recorder": 60.0, "results": 180.0, "topics": 15.0,
 }  # fmt: skip
 HURRIED_S = {"localisation": 0.7, "depth": 0.2, "recorder": 0.3, "results": 1.6, "topics": 0.2}
 START_S = 300.0
-"""Who has not begun its work by then never will. On a computer with far too much to do the imports
-alone take a minute and more, and the first start of all compiles loops or kernels."""
+"""Longest start of a stage. On an overloaded computer the imports alone take a minute and more, and
+the first start of all compiles loops or kernels."""
 ANSWER_S = {"depth": 120.0, "recorder": 60.0, "results": 60.0, "topics": 30.0}
-"""Who is at one step for longer hangs, and is ended and started again: depth may wait for a driver
-that compiles and has the least right to the processor, the others for a slow disk or network."""
+"""Longest step of a stage before it is restarted: depth may wait for a driver that compiles, and
+has the lowest priority; the others for a slow disk or network."""
 IN_FOLDER = ("recorder", "results")
-"""Stages that leave something in the flight's folder."""
+"""Stages that write into the flight's folder."""
 WITH_FLIGHT = (*IN_FOLDER, "topics")
-"""Stages that cannot begin before the flight does."""
+"""Stages that start with the flight."""
 PUBLISHED = (Odometry, Track, KeyframeAdded, MapUpdate, DepthMap, PointChunk)
-"""What the topics are told, beside frames."""
+"""Messages for the topics, beside frames."""
 RESTARTED = "a stage has died and is started again"
 STALLED = "it hung for {:.0f} s and was ended"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
-"""Between two starts of a stage that dies again and again."""
+"""Longest pause between two starts of a stage that dies repeatedly."""
 HEALTH_EVERY_NS = 1_000_000_000
 NOT_FINISHED = "a stage did not give its last results in time"
 
@@ -85,7 +85,7 @@ class Listener:
     warned: Callable[[Warned], None]
     localisation_died: Callable[[], None]
     unusable: Callable[[str], None]
-    """A stage has never come up, since what the user gave cannot be used."""
+    """A stage could never start because of the user's input."""
     snapshot: Callable[[Snapshot], None] = lambda _: None
 
 
@@ -103,14 +103,14 @@ class LiveFlight:
         self._began_s = monotonic_s()
         self._listener = listener(self)
         self.folder: Path | None = None
-        """Where the results go; None until it has begun."""
+        """Folder of the results; None before the begin."""
         self.n_restarted = {"depth": 0, "results": 0, "recorder": 0, "topics": 0}
         self._ring = FrameRing(camera.width, camera.height)
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._hurry_s: float | None = None
         self.keep_map = False
-        """Whether the vehicle flies on without it, and what comes next may go on with its map."""
+        """Whether the vehicle flies on without it, and the next process may continue its map."""
         self.n_frames = 0
         self._viewing: Viewing | None = None
         self._last_map: MapUpdate | None = None
@@ -121,9 +121,9 @@ class LiveFlight:
         self._failed_devices: dict[str, str] = {}
         """OpenCL devices that have ended the depth stage in this flight, by identity, and how."""
         self._interrupted_at: set[str] = set()
-        """Those that were at work when it was ended for not answering."""
+        """Devices that were at work when the stage was ended for not answering."""
         self._began_later: set[str] = set()
-        """Stages that were not wanted at first."""
+        """Stages started during the flight."""
         kinds = ["localisation", "results"]
         kinds += ["recorder"] * config.recorder.enabled + ["depth"] * self._dense
         kinds += ["topics"] * config.distributed.enabled

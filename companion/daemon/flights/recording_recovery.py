@@ -17,7 +17,7 @@ from companion.timing.clock import FlightClock
 from drivers.system.low_priority import give_way
 
 AFTER_S = 10.0
-"""From the start, or the end of a flight: there is enough to be done then."""
+"""Delay after the start, or the end of a flight, when other work has priority."""
 LOOK_S = 0.2
 CUT_SHORT = "an earlier recording was cut short"
 

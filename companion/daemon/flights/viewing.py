@@ -19,13 +19,13 @@ from companion.timing.clock import monotonic_s
 
 LOOK_S = 0.5
 AGAIN_S = 3.0
-"""Between two attempts to show it."""
+"""Pause between two attempts to open the viewer."""
 PATIENCE_S, HURRIED_S = 3.0, 0.2
-"""What a viewer may take to show the last of a flight."""
+"""Time for a viewer to show the last messages of a flight."""
 STALLED_S = 30.0
-"""An exporter that takes nothing for so long is ended, and another takes its place."""
+"""An exporter that reads nothing for this long is restarted."""
 MANY = 50
-"""So many messages given up between two looks are an exporter that hangs."""
+"""Messages dropped between two checks that mean an exporter that hangs."""
 NOWHERE = "none"
 SHOWN = "the flight can be seen"
 NO_VIEWER = "the viewer cannot be shown"
@@ -46,7 +46,7 @@ class Viewing:
         self._config, self._camera, self._name, self._warn = config, camera, name, warn
         self._stream = config.stream
         self.pictures = True
-        """Whether it is given pictures."""
+        """Whether images are sent to viewers."""
         self._n_dropped = self._n_seen = self._n_restarted = 0
         self._where = config.daemon.viewer
         self._told = ""

@@ -24,11 +24,11 @@ from drivers.system.journal import WARNING, Journal
 from drivers.system.zenoh_bus import LAST, ZenohBus
 
 ASK_S = 10.0
-"""What an answer may take over a thin link."""
+"""Timeout of an answer over a thin link."""
 AGAIN_S, NOBODY_S = 0.15, 0.5
-"""Until it asks again: where there is nothing new, and where nobody answers."""
+"""Pause before the next query: where there is nothing new, and where nobody answers."""
 MOST_IN_A_ROW = 10
-"""Answers that cannot be read, before the next bundle is asked for."""
+"""Malformed answers before the bundle is skipped."""
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,79}")
 
 
@@ -58,7 +58,7 @@ class DepthNode:
         self._needs_whole = True
         self._is_heard = False
         self._over = ""
-        """The flight that has ended."""
+        """Flight that has ended."""
         self._n_malformed = self._n_in_a_row = 0
         self._told_s = monotonic_s()
         self._never = threading.Event()

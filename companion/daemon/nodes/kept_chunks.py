@@ -16,7 +16,7 @@ from companion.topics.message_codec import cloud_envelope, cloud_of_envelope
 
 NAME = "cloud.chunks"
 STEP_BACK = 4
-"""Depth maps whose neighbours were lost with the node; they are made again."""
+"""Depth maps whose neighbours were lost with the node; they are recomputed."""
 MARGIN = 2
 """Bundles before the first of them, whose frames it uses."""
 
@@ -36,7 +36,7 @@ class KeptChunks:
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
         self.found: list[Kept] = []
-        """What was there."""
+        """Chunks found in the file."""
         end = 0
         if self._path.exists():
             end = self._read()

@@ -26,9 +26,9 @@ from companion.topics.message_codec import cloud_envelope, depth_envelope
 from drivers.system.journal import WARNING, Journal
 
 Publish = Callable[[str, Callable[[], Envelope]], None]
-"""Given a topic, and what makes an envelope of it."""
+"""Takes a topic, and a function that makes its envelope."""
 MOST_NUMBERS = 200
-"""Keyframes of which it is known with which bundle they came."""
+"""Most keyframes whose bundle number is remembered."""
 
 
 class RemoteFlight:
@@ -43,7 +43,7 @@ class RemoteFlight:
     ) -> None:  # fmt: skip
         self.flight, self.camera, self.folder = flight, camera, folder
         self.n_missed = 0
-        """Bundles that were gone before they could be fetched."""
+        """Bundles evicted before they could be fetched."""
         self._config, self._devices = config, devices
         self._publish, self._journal = publish, journal
         folder.mkdir(parents=True, exist_ok=True)

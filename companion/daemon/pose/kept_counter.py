@@ -28,7 +28,7 @@ class KeptCounter:
     boot: BootIdentity
     reset_counter: int
     home_down_m: float | None = None
-    """Where its home is in its local frame; see `drivers.mavlink.autopilot_height`."""
+    """Position of home on its local frame's down axis; see `drivers.mavlink.autopilot_height`."""
 
 
 def counter_path(flights: str, environment: Mapping[str, str] = os.environ) -> Path:

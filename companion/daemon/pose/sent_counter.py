@@ -21,8 +21,8 @@ from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.system.computer_boot import computer_boot
 
 PATIENCE_NS = 1_000_000_000
-"""The first pose of a row waits no longer for the disk. Cards that are written to by a recording
-take some tenths of a second; the counter of a reset is written while the pose is proven."""
+"""Longest wait of the first pose of a sequence for the disk. Cards in use by a recording take some
+tenths of a second; the counter of a reset is written while the pose is proven."""
 NO_CLOCK = "no autopilot clock"
 WAITING = "disk is slow"
 NOT_KEPT = "reset counter is not kept"

@@ -15,13 +15,13 @@ from companion.products.cloud import Cloud
 from companion.products.export.map_frame import MapFrame
 
 UPPER_SHARE = 0.75
-"""The surface of a cell is this quantile of its points' heights: above most, below stray ones."""
+"""Quantile of the heights in a cell taken as its surface: above most points, below outliers."""
 MAX_CELLS = 100_000_000
 N_SPACING = 2000
 CELLS_PER_SPACING = 2.0
 MIN_NEIGHBOURS = 3
 FILL_STEPS = 2
-"""Holes up to twice so many cells wide are filled from their rim."""
+"""Holes up to twice this many cells wide are filled from their border."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from companion.products.cloud import Cloud
 
 WIDTH_PX = 1100
 FINER = 2
-"""Views are drawn so much larger and then reduced, which smooths edges."""
+"""Supersampling factor of views, for smooth edges."""
 MAX_SPLAT_PX = 25
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 

@@ -16,9 +16,9 @@ from companion.products.run_folder import FinishedRun
 from companion.products.trajectory_error import align
 
 MOST_POINTS = 200_000
-"""Of a cloud that are looked up in the other; evenly spread where there are more."""
+"""Most points of a cloud looked up in the other; evenly sampled beyond it."""
 COUNTS = ("frames", "tracked", "segments", "keyframes", "depth_maps", "points", "path_length")
-"""Numbers of the reports that are set side by side."""
+"""Numbers of the reports that are compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +65,7 @@ class Comparison:
     config: Mapping[str, tuple[Any, Any]]
     """Keys that differ."""
     versions: Mapping[str, tuple[Any, Any]]
-    """Likewise."""
+    """Versions that differ."""
     unit: str
 
     @property

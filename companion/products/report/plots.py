@@ -44,11 +44,11 @@ STYLE = {
 }
 MAX_POINTS = 3000
 AUTOPILOT: Any = {"color": OTHER, "lw": 4, "alpha": 0.55, "label": "autopilot"}
-"""Broad, since the camera's way often lies right on it."""
+"""Broad line, since the camera's path often lies right on it."""
 MIN_HEIGHT_M = 4.0
 """Least range of a height plot."""
 MIN_HALF = 0.5
-"""Half the least extent of a plan: a camera that stood still is a point with room around it."""
+"""Half the least extent of a plan: a camera that stood still is a point with a margin."""
 
 
 def plan_svg(segments: Sequence[Array], autopilot: Array | None, unit: str) -> str:

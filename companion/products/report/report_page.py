@@ -20,7 +20,7 @@ from companion.products.report.cloud_views import CloudView, cloud_views
 
 N_DEPTH_PICTURES = 6
 LAST_CENTURY_NS = 946_684_800 * 10**9
-"""Times before 2000 come from a clock that was never set, and are no dates."""
+"""Times before 2000 are of a clock that was never set, and are no dates."""
 
 
 def report_page(

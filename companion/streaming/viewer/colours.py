@@ -11,7 +11,7 @@ from companion.geometry.transforms import Similarity
 from companion.messages import Bytes, Floats
 
 HEIGHT_PERIOD_M = 20.0
-"""Colours by height begin anew after so many metres, so that no range need be known."""
+"""Period of the colours by height, so that no range need be known."""
 
 
 class Colours(Enum):

@@ -48,7 +48,7 @@ from companion.streaming.viewer.status_panel import status_text
 
 IMAGE_PLANE_UNITS = 0.15
 WIDTH = 640
-"""Of pictures, at most; a link that is thin brings smaller ones, which are enlarged."""
+"""Width of pictures; smaller ones, of a thin link, are enlarged."""
 STATE_LEVEL = {
     Shown.WAITING: 0.0, Shown.LOST: 0.0, Shown.INITIALISING: 1.0, Shown.DEAD_RECKONING: 2.0,
     Shown.TRACKING: 3.0,
@@ -57,7 +57,7 @@ PLOTTED = {
     "rate_hz": ("rate", 1.0), "latency_ms": ("latency", 1.0), "link_kbit_s": ("link", 1.0),
     "cpu_share": ("cpu", 100.0), "scale_m": ("scale", 1.0),
 }  # fmt: skip
-"""Facts of the status that are plotted: as what, and in how many of its units."""
+"""Values that are plotted: name of the plot, and factor."""
 SERIES = {
     "height": "m above home", "speed": "m/s", "quality": "% sure", "rate": "poses a second",
     "latency": "ms late", "link": "kbit/s", "cpu": "% busy", "scale": "m per unit of the map",
@@ -86,7 +86,7 @@ class Drawing:
         self._strips: dict[int, dict[int, Floats]] = {}
         self._coarse: dict[int, PointsItem] = {}
         self._width = 0
-        """Of pictures as they are drawn; 0 before the first."""
+        """Width of the pictures drawn; 0 before the first."""
         self._earth_ns = -(2**63)
         self.go_on_in(recording)
 

@@ -32,11 +32,11 @@ CAPACITY_BYTES = 32 << 20
 PATIENCE_S = 3.0
 START_S = 30.0
 READY = b"ready"
-"""Said by what shows it here, and what to open in a browser if that is to be done."""
+"""Prefix of the line in which the viewer process reports its address for browsers."""
 EXPORTER, GROUND = "companion.streaming.export_process", "companion.streaming.viewer.ground_process"
 NOWHERE = "none"
 FRAME_EVERY_NS = 60_000_000
-"""Frames that come sooner after another are not for viewers."""
+"""Least interval of frames for viewers."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
@@ -52,15 +52,15 @@ class LiveViewer:
     ) -> None:  # fmt: skip
         self.n_dropped = 0
         self.report: Mapping[str, Any] = {}
-        """What the exporter last said of itself."""
+        """Last report of the exporter."""
         self.closed = ""
-        """Why nobody can connect, if so."""
+        """Reason why nobody can connect, or ""."""
         self.page = ""
-        """What to open in a browser; "" for a window."""
+        """Address for a browser; "" for a window."""
         self._config, self._width = config, min(config.image_width, camera.width)
         self._inbox = Inbox(CAPACITY_BYTES)
         self._budget: SetBudget | None = None
-        """To be told to the exporter."""
+        """Change to be sent to the exporter."""
         self._frame_ns = -(2**63)
         self._port = 0
         self._has_port = threading.Event()

@@ -13,9 +13,9 @@ import rerun as rr
 from companion.streaming.viewer.layout import layout
 
 APPLICATION = "companion-2"
-"""Viewers remember by this name the layout that they were shown: a new layout has a new number."""
+"""Viewers store a layout by this name: a new layout has a new number."""
 N_FILES = 4
-"""The files that there is room for; each is one such part of it."""
+"""Number of files that share the size limit."""
 LOOK_EVERY = 16
 
 

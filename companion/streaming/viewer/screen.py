@@ -17,11 +17,11 @@ WEB_PORT = 9090
 GRPC_PORT = 9876
 START_S = 20.0
 MEMORY = "50%"
-"""Of the ground's memory; the oldest poses and pictures go first, the map stays."""
+"""Share of the ground's memory; the oldest poses and pictures are dropped first, the map stays."""
 
 
 SERVER_MEMORY = "256MB"
-"""What is kept for browsers that come late; the map, which is drawn for all times, stays."""
+"""Buffer for browsers that join late; the static map stays."""
 
 
 class Screen:
@@ -37,9 +37,9 @@ class Screen:
         self.is_ours = False
         """Whether it ends with the flight: a page does, a window stays."""
         self.page = ""
-        """What to open in a browser."""
+        """Address for a browser."""
         self.proxy: WebProxy | None = None
-        """Through which browsers come; None where none do."""
+        """Proxy for browsers; None without any."""
         if where == "web":
             self._serve(bind)
         elif where == "native":

@@ -19,9 +19,9 @@ from companion.timing.clock import monotonic_s, wait_s
 CAPACITY_BYTES = 65536
 NOT_SENT_BYTES = 16384
 LAG_S = 0.3
-"""A browser for which something has waited for so long does not keep up."""
+"""A browser whose data has waited for this long lags."""
 LONGEST_WAIT_S = 2.0
-"""A browser that takes nothing at all holds the others up no longer than this at a time."""
+"""Longest wait for a browser that takes nothing at all."""
 LOOK_S = 0.02
 LOOPBACK = "127.0.0.1"
 
@@ -35,7 +35,7 @@ class _Direction:
     is_watched: bool
     held: bytearray = field(default_factory=bytearray)
     since_s: float | None = None
-    """Since when something has waited; None while nothing does."""
+    """Time since when data waits; None while none does."""
     ended: bool = False
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 BAUDS = (921600, 57600, 115200, 460800, 230400, 1500000, 500000, 38400, 19200, 9600)
-"""In the order in which they are tried: what companions are wired with most, first."""
+"""In order of the search: the most common first."""
 SURE_PACKETS = 2
 SILENT_NS = 1_200_000_000
-"""An autopilot that was asked for nothing still sends a heartbeat every second."""
+"""An autopilot sends at least a heartbeat every second."""
 HOPEFUL_NS = 2_500_000_000
 GARBAGE_BYTES = 560
-"""In so many there is a whole packet, wherever they begin: twice the longest."""
+"""Bytes that must contain a whole packet: twice the longest."""
 LOST_BYTES, LOST_NS = 2000, 3_000_000_000
 
 

@@ -32,7 +32,7 @@ LONGEST = 512
 PAIR_BYTES = 1 << 20
 LOOK_S = 0.1
 SILENT_NS = 5_000_000_000
-"""A serial line that spoke and has been silent for so long is opened anew."""
+"""A serial line that was heard and is silent for this long is reopened."""
 END_S = 1.5
 
 
@@ -52,7 +52,7 @@ class MavsdkWire(Wire):
             )
         check_library()
         self.n_overrun = 0
-        """Packets that came faster than the event loop took them, and were lost."""
+        """Packets lost because the event loop was too slow."""
         self._endpoint = endpoint
         self._search = BaudSearch((endpoint.baud,) if endpoint.baud else BAUDS)
         self._searching = False

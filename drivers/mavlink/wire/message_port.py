@@ -9,16 +9,16 @@ from drivers.mavlink.wire.router import ClientCounts
 from drivers.mavlink.wire.wire import Tap
 
 OnMessage = Callable[[Any, int], None]
-"""Takes a message as pymavlink has it, and the flight's time at which it came, ns."""
+"""Takes a pymavlink message, and its arrival on the flight's clock, ns."""
 
 
 class MavlinkPort(Protocol):
     """One end of a MAVLink link. Used from one event loop; nothing here blocks or raises."""
 
     name: str
-    """For people: what it is plugged into."""
+    """Endpoint, for people."""
     identity: tuple[int, int]
-    """System and component that `send` speaks as; may be set at any time, by who knows it."""
+    """System and component of sent messages; may be set at any time."""
 
     @property
     def connected(self) -> bool:

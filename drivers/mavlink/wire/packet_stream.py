@@ -19,7 +19,7 @@ SIGNATURE_SIZE = 13
 LONGEST = 280
 MARKER = re.compile(b"[\xfd\xfe]")
 STALE_NS = 100_000_000
-"""A packet does not pause for so long; what comes after the pause may be another one."""
+"""Longest pause within a packet; after it another one may begin."""
 SURE_OF_EXTRA = 2
 MOST_LEARNED = 4096
 
@@ -34,7 +34,7 @@ def _crc_step(index: int) -> int:
 
 
 LAST_BYTE_OF = {_crc_step(index): index for index in range(256)}
-"""From what the last byte of a CRC-16/MCRF4XX changed, back to that byte."""
+"""Inverse of the last step of a CRC-16/MCRF4XX: from its change to the last byte."""
 
 
 class Packet(NamedTuple):
@@ -93,9 +93,9 @@ class MavlinkStream:
 
     def __init__(self) -> None:
         self.n_bad_bytes = 0
-        """Bytes that belonged to no packet."""
+        """Bytes outside any packet."""
         self.n_breaks = 0
-        """Times that packets ceased to follow each other without a gap."""
+        """Gaps between packets."""
         self._learned: dict[int, tuple[int, int]] = {}
         self._rest = b""
         self._in_step = True

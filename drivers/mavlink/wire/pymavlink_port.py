@@ -19,7 +19,7 @@ from drivers.mavlink.wire.transport import link_wire
 from drivers.mavlink.wire.wire import Tap, Wire, run_together
 
 FIRST_SYSTEM = 1
-"""What ArduPilot and PX4 are numbered unless somebody changed it."""
+"""Default system id of ArduPilot and PX4."""
 MANY_REFUSED = 10
 
 
@@ -44,12 +44,12 @@ class PymavlinkPort:
         self.n_received = 0
         self.n_sent = 0
         self.n_lost = 0
-        """Packets that others sent and that never came, by their sequence numbers."""
+        """Packets of others that never came, by their sequence numbers."""
         self.n_unsigned = 0
-        """Packets of the link refused for want of a valid signature."""
+        """Packets of the link rejected without a valid signature."""
         self._n_unpacked = 0
         self._n_refused = 0
-        """Of `n_unsigned`, those since one was good."""
+        """Part of `n_unsigned` since the last valid one."""
         self._clock = clock
         self._stream = MavlinkStream()
         self._reader = mavlink.MAVLink(None)

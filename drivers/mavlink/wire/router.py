@@ -27,7 +27,7 @@ CLIENT_READ_SIZE = 4096
 MOST_GARBAGE = 64_000
 MOST_DEPARTED = 16
 CLIENTS_SHARE, OWN_SHARE = 0.85, 0.8
-"""Clients get what we leave of the link, and a twentieth of it at least."""
+"""Clients get the part of the link's rate that we leave, and a twentieth of it at least."""
 BURST_S, LEAST_BURST = 0.05, 600
 LOOP_NS = 1_000_000_000
 AUTOPILOT_NS = 5_000_000_000
@@ -43,13 +43,13 @@ class ClientCounts:
     connected: bool
     n_received: int
     n_dropped_out: int
-    """Packets that it was too slow for, or not there to take."""
+    """Packets to it that were dropped, as it was too slow or not connected."""
     n_dropped_in: int
-    """Packets of its own that the link had no room for."""
+    """Packets of it that were dropped for lack of capacity of the link."""
     n_bad_bytes: int
     n_refused: int
-    """Packets that came back in a circle, spoke in the autopilot's name or ours, told it another
-    time than ours, or lacked the signature."""
+    """Packets that came back in a loop, used the autopilot's or our identity, gave it another time
+    than ours, or lacked the signature."""
 
 
 class RouterClient:

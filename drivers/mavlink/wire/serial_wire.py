@@ -20,7 +20,8 @@ from drivers.mavlink.wire.wire import Wire, WireEnd
 BITS_PER_BYTE = 10
 QUEUE_S, LEAST_QUEUE_BYTES = 0.25, 2000
 KERNEL_S, LEAST_KERNEL_BYTES = 0.05, 300
-"""The kernel would take seconds of packets at a slow rate, and a late pose is worse than none."""
+"""Limit of the kernel's buffer, which would take seconds of packets at a slow rate: a late pose is
+worse than none."""
 LOOK_S = 0.1
 VMIN = 6
 

@@ -15,7 +15,7 @@ from drivers.mavlink.wire.wire import FIRST_RETRY_S, MOST_RETRY_S, WireEnd
 
 MOST_CONNECTIONS = 8
 ACCEPT_S = 0.02
-"""Between two that come in: who connects again and again costs no more than this."""
+"""Least interval of accepted connections, against clients that reconnect in a loop."""
 BACKLOG = 32
 
 
@@ -44,7 +44,7 @@ class TcpListener(Generic[AnyClient]):
         self.name = str(endpoint)
         self.trouble = ""
         self.port = 0
-        """That it listens at; 0 while it does not."""
+        """Port in use; 0 while it does not listen."""
         self.n_rejected = 0
         self._endpoint = endpoint
         self._admit = admit

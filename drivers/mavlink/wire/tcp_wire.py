@@ -17,7 +17,7 @@ from drivers.mavlink.wire.wire import Wire
 CONNECT_S = 2.0
 UNANSWERED_MS = 3000
 SEND_BUFFER = 65536
-"""Small, so that what waits is in our queue, where the oldest can be given up."""
+"""Small, so that packets wait in our queue, where the oldest can be dropped."""
 
 
 class TcpConnection(Wire):

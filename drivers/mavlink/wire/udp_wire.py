@@ -18,7 +18,7 @@ MOST_AGE_NS = 500_000_000
 STEP_NS = 1_000_000
 PEER_SILENT_NS = 1_500_000_000
 NETWORK_BYTES_PER_S = 250e3
-"""More than any autopilot is told or tells."""
+"""More than any autopilot sends or receives."""
 
 
 class KernelStamps:

@@ -28,7 +28,7 @@ async def run_together(*parts: Coroutine[Any, Any, None]) -> None:
 
 
 Tap = Callable[[bool, bytes, int], None]
-"""Takes whether bytes went out, the bytes, and when by CLOCK_MONOTONIC; must not block."""
+"""Takes whether bytes were sent, the bytes, and their time by CLOCK_MONOTONIC; must not block."""
 
 
 class WireEnd(Protocol):
@@ -56,16 +56,16 @@ class Wire(ABC):
     ) -> None:
         self.name = name
         self.bytes_per_s = bytes_per_s
-        """What it carries, as far as that is known."""
+        """Capacity, as far as known."""
         self.queue = queue
         self.connected = False
         self.trouble = ""
-        """Why it is not connected, or what is wrong with what comes; "" when nothing is."""
+        """Reason why it is not connected, or problem of its input; "" without one."""
         self.n_opened = 0
         self.n_unsent = 0
-        """Packets dropped while the wire was not there."""
+        """Packets dropped while the wire was not open."""
         self.tap: Tap | None = None
-        """Hears of all bytes as they come and go."""
+        """Called with all bytes read and written."""
         self._read_limit = read_limit
         self._fd = -1
         self._lost: asyncio.Future[str] | None = None
