@@ -208,8 +208,8 @@ def _search(frames: FrameSource, gathered: _Gathered, progress: Progress) -> Non
     """Views of a recording."""
     progress.start(frames.n_frames)
     try:
-        stretch = math.ceil(frames.n_frames / MAX_SEARCHED)
-        for number, grey, done in _sharpest(frames, stretch):
+        interval = math.ceil(frames.n_frames / MAX_SEARCHED)
+        for number, grey, done in _sharpest(frames, interval):
             gathered.look(number, grey, only_new=False)
             progress.update(done, "looking for the board", len(gathered.views))
     finally:
@@ -218,16 +218,16 @@ def _search(frames: FrameSource, gathered: _Gathered, progress: Progress) -> Non
         raise InputError(f"{frames.path}: none of its {frames.n_frames} pictures can be decoded")
 
 
-def _sharpest(frames: FrameSource, stretch: int) -> Iterator[tuple[int, Bytes, int]]:
+def _sharpest(frames: FrameSource, interval: int) -> Iterator[tuple[int, Bytes, int]]:
     """Number and grey image of the sharpest of each interval, and how many are decoded so far."""
     best: tuple[float, int, Bytes] | None = None
     for number, rgb in frames.pictures(0, frames.n_frames - 1):
         if rgb is not None:
             grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-            sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).std()) if stretch > 1 else 0.0
+            sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).std()) if interval > 1 else 0.0
             if best is None or sharpness > best[0]:
                 best = sharpness, number, grey
-        if best is not None and ((number + 1) % stretch == 0 or number + 1 == frames.n_frames):
+        if best is not None and ((number + 1) % interval == 0 or number + 1 == frames.n_frames):
             yield best[1], best[2], number + 1
             best = None
 
@@ -259,7 +259,7 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
             seen_well = problem in ("", "move the board")
             progress.update(number, wanted if seen_well else problem, len(gathered.views))
     except (KeyboardInterrupt, EndOfPictures):
-        pass  # what there is must do; if it does not, the reason is told
+        pass  # the views so far must suffice; if they do not, the reason is given
     finally:
         source.close()
         progress.finish()

@@ -9,7 +9,7 @@ from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.router import ClientCounts
 
 LOOK_NS = 1_000_000_000
-NAME_AGAIN_NS = 10_000_000_000
+WARN_AGAIN_NS = 10_000_000_000
 FEW = 3
 """Errors per second that are ignored: a port just opened begins within a packet."""
 
@@ -28,7 +28,7 @@ class LinkWatch:
         self._looked_ns = 0
         self._n_bad = 0
         self._clients: dict[str, ClientCounts] = {}
-        self._named_ns: dict[tuple[str, str], int] = {}
+        self._warned_ns: dict[tuple[str, str], int] = {}
 
     def step(self, now_ns: int) -> None:
         """Check the counters, if it is time."""
@@ -47,12 +47,12 @@ class LinkWatch:
                 self._risen(SLOW, name, now.n_dropped_out - was.n_dropped_out, "packets given up")
 
     def _risen(self, what: str, name: str, n: int, of: str) -> None:
-        last_ns = self._named_ns.get((what, name))
-        if n > FEW and (last_ns is None or self._looked_ns - last_ns >= NAME_AGAIN_NS):
+        last_ns = self._warned_ns.get((what, name))
+        if n > FEW and (last_ns is None or self._looked_ns - last_ns >= WARN_AGAIN_NS):
             # names of clients that come and go have their port in them
-            self._named_ns = {
-                key: t_ns for key, t_ns in self._named_ns.items()
-                if self._looked_ns - t_ns < NAME_AGAIN_NS
+            self._warned_ns = {
+                key: t_ns for key, t_ns in self._warned_ns.items()
+                if self._looked_ns - t_ns < WARN_AGAIN_NS
             }  # fmt: skip
-            self._named_ns[what, name] = self._looked_ns
+            self._warned_ns[what, name] = self._looked_ns
             self._warn(Warned(self._looked_ns, what, f"{name}: {n} {of} in a second"))

@@ -56,7 +56,7 @@ class ChunkStore:
             self._n_held -= len(before.rgb)
             self.n_points -= len(before.rgb)
         elif chunk.keyframe_id in self._stored:
-            # its room in the file is lost: this is rare
+            # its space in the file is lost, which is rare
             self.n_points -= self._stored.pop(chunk.keyframe_id).n
         self._held[chunk.keyframe_id] = chunk
         self._n_held += len(chunk.rgb)

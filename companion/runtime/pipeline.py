@@ -138,7 +138,7 @@ class Pipeline:
     ) -> None:
         self._localisation = localisation
         self._depth = StageThread(depth, lossless) if depth is not None else None
-        self._fault_told = False
+        self._fault_reported = False
         self._sinks = list(sinks)
         self._t_ns = 0
 
@@ -170,7 +170,7 @@ class Pipeline:
         if self._depth is not None:
             for out in self._depth.collect():
                 self._publish(out)
-            self._tell_fault()
+            self._warn_fault()
 
     def finish(self) -> None:
         """Final adjustment of the map, complete the depth maps, publish the rest."""
@@ -180,15 +180,15 @@ class Pipeline:
             if self._depth is not None:
                 for out in self._depth.close():
                     self._publish(out)
-                self._tell_fault()
+                self._warn_fault()
         for out in last:
             self._publish(out)
 
-    def _tell_fault(self) -> None:
+    def _warn_fault(self) -> None:
         """Warn once that the dense map has ended early."""
         fault = self.depth_fault
-        if fault is not None and not self._fault_told:
-            self._fault_told = True
+        if fault is not None and not self._fault_reported:
+            self._fault_reported = True
             self._publish(Warned(self._t_ns, DEPTH_FAILED, in_words(fault)))
 
     def _pass_on(self, message: Message) -> None:

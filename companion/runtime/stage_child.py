@@ -105,8 +105,8 @@ class _Loop:
             while True:
                 message = pipe.recv()
                 if isinstance(message, FrameHandle) and not work.latest_only:
-                    room = self._inbox.n_bytes + ring.frame_bytes <= FRAMES_SHARE * IN_BYTES
-                    frame = ring.get(message) if room or not len(self._inbox) else None
+                    capacity = self._inbox.n_bytes + ring.frame_bytes <= FRAMES_SHARE * IN_BYTES
+                    frame = ring.get(message) if capacity or not len(self._inbox) else None
                     if frame is None:
                         self._n_overwritten += 1
                         continue

@@ -103,7 +103,7 @@ class StageProcess:
     def stalled_s(self, now_s: float) -> float:
         """Seconds in its present step, or without reading its input, or starting.
 
-        0 where it waits for work, or was told to end. A process that is stopped or hangs in a
+        0 where it waits for work, or was asked to end. A process that is stopped or hangs in a
         driver reports nothing more, and its last report ages.
         """
         if self.asked_to_end or self._begun_s is None or self._interrupted is not None:

@@ -35,7 +35,7 @@ class _Localisation(Work):
         self._stage = LocalisationStage(setup.config, setup.camera, self.times, beside=True)
         self._keeper: MapKeeper | None = None
         self._to_take_up: Kept | None = None
-        self._told_fault = ""
+        self._reported_fault = ""
         self._kept_ns = 0
 
     def step(self, message: Any) -> Iterable[Message]:
@@ -70,9 +70,9 @@ class _Localisation(Work):
         keeper = self._keeper
         if keeper is None or keeper.busy or frame.t_ns - self._kept_ns < KEEP_EVERY_NS:
             return
-        if keeper.fault and keeper.fault != self._told_fault:
+        if keeper.fault and keeper.fault != self._reported_fault:
             yield Warned(frame.t_ns, NOT_KEPT, keeper.fault)
-        self._told_fault = keeper.fault
+        self._reported_fault = keeper.fault
         try:
             checkpoint = self._stage.checkpoint()
         except Exception as error:  # a bug in what is kept for later must not end the pose of now

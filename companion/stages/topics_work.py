@@ -66,7 +66,7 @@ class Topics(Work):
         self._backlog = Backlog(self._run, config.backlog_mb << 20, bytes_s)
         self._update: MapUpdate | None = None
         self._is_fetched = False
-        self._n_malformed, self._tell_malformed_at = 0, 1
+        self._n_malformed, self._warn_malformed_at = 0, 1
         self.about = Envelope(
             "flight",
             {"flight": self._flight, "run": self._run, "camera": camera_fields(setup.camera)},
@@ -153,8 +153,8 @@ class Topics(Work):
             self._is_fetched = fetches
             self.device = "fetched" if fetches else "nobody fetches"
             yield Warned(t_ns, TAKEN if fetches else NOT_TAKEN, good=fetches)
-        if self._n_malformed >= self._tell_malformed_at:
-            self._tell_malformed_at = 2 * self._n_malformed
+        if self._n_malformed >= self._warn_malformed_at:
+            self._warn_malformed_at = 2 * self._n_malformed
             yield Warned(t_ns, MALFORMED, f"{self._n_malformed} so far")
 
 

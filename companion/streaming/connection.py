@@ -72,8 +72,8 @@ class Connection:
         if self.session is None or not self.is_writable():
             return 0
         if not self._left:
-            room = min(self.session.window.available_bytes(), budget_bytes)
-            self._left = self.session.next_piece(now_s, room) or b""
+            capacity = min(self.session.window.available_bytes(), budget_bytes)
+            self._left = self.session.next_piece(now_s, capacity) or b""
             if not self._left:
                 return 0
         n = self.socket.send(self._left)

@@ -68,12 +68,12 @@ def main() -> int:
     own = open_listener(OWN)
     exporter.listen(own)
     _say({"own": own.getsockname()[1]})
-    ended, told = threading.Event(), threading.Event()
+    ended, finished = threading.Event(), threading.Event()
     threading.Thread(
         target=_take_in, args=(exporter, setup.flight, ended), name="messages", daemon=True
     ).start()
     threading.Thread(
-        target=_report, args=(exporter, setup.listen, told), name="report", daemon=True
+        target=_report, args=(exporter, setup.listen, finished), name="report", daemon=True
     ).start()
 
     def end() -> None:
@@ -81,7 +81,7 @@ def main() -> int:
         until_s = monotonic_s() + DRAIN_S
         while not exporter.is_drained(setup.n_own) and monotonic_s() < until_s:
             wait_s(threading.Event(), 0.02)
-        told.set()
+        finished.set()
         exporter.stop()
 
     threading.Thread(target=end, name="end", daemon=True).start()

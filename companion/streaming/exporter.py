@@ -223,7 +223,7 @@ class Exporter:
             connection.close()
 
     def _wake_up(self) -> None:
-        with contextlib.suppress(OSError):  # it has been told already, or is gone
+        with contextlib.suppress(OSError):  # already woken, or closed
             self._wake.send(b"\0")
 
 

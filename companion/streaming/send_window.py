@@ -57,10 +57,10 @@ class SendWindow:
     def available_bytes(self) -> int:
         """Bytes that may be sent now."""
         drains = self._drains_from is not None
-        room = (LEAST_BYTES if drains else int(self.size_bytes)) - self.in_flight_bytes
-        if room < LEAST_USED and not drains:
+        capacity = (LEAST_BYTES if drains else int(self.size_bytes)) - self.in_flight_bytes
+        if capacity < LEAST_USED and not drains:
             self._limited_at = self.sent_bytes
-        return max(0, room)
+        return max(0, capacity)
 
     def sent(self, now_s: float, n_bytes: int) -> None:
         """Count bytes sent."""

@@ -138,15 +138,15 @@ class Gatherer:
     def _affordable(self, seqs: list[int], keyframes: set[int]) -> list[int]:
         """Frames within the budget, evenly spread."""
         others = [seq for seq in seqs if seq not in keyframes]
-        room = MOST_PICTURES - len(keyframes)
+        capacity = MOST_PICTURES - len(keyframes)
         if self._budget_bytes_s and others:
             own_bytes = sum(len(self._frames[seq][1]) for seq in keyframes)
             each_bytes = GREY_SHARE * float(np.mean([len(self._frames[s][1]) for s in others]))
-            room = min(room, int((self._budget_left_bytes - own_bytes) / each_bytes))
-            if room < min(LEAST_FRAMES, len(others)):
+            capacity = min(capacity, int((self._budget_left_bytes - own_bytes) / each_bytes))
+            if capacity < min(LEAST_FRAMES, len(others)):
                 return []
-        if len(others) > room:
-            kept = np.unique(np.linspace(0, len(others) - 1, max(room, 0)).astype(int))
+        if len(others) > capacity:
+            kept = np.unique(np.linspace(0, len(others) - 1, max(capacity, 0)).astype(int))
             others = [others[k] for k in kept]
         return sorted([*others, *keyframes])
 

@@ -138,18 +138,18 @@ class MapChanges:
     """Changes from one state of the map to the next."""
 
     def __init__(self) -> None:
-        self._told: dict[int, tuple[object, ...]] = {}
+        self._given: dict[int, tuple[object, ...]] = {}
         self._is_first = True
 
     def since_last(self, update: MapUpdate) -> MapChange:
         """Poses that differ from those given before; the first time the whole map."""
         now = {k: _state(update, k) for k in update.map_from_camera}
         changed = {
-            k: pose for k, pose in update.map_from_camera.items() if now[k] != self._told.get(k)
+            k: pose for k, pose in update.map_from_camera.items() if now[k] != self._given.get(k)
         }
-        removed = [k for k in self._told if k not in now]
+        removed = [k for k in self._given if k not in now]
         units = {k: unit for k, unit in update.scale_of.items() if k in changed}
-        whole, self._is_first, self._told = self._is_first, False, now
+        whole, self._is_first, self._given = self._is_first, False, now
         part = replace(update, map_from_camera=changed, scale_of=units, points_map=np.zeros((0, 3)))
         return MapChange(part, removed, whole)
 

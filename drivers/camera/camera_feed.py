@@ -142,7 +142,7 @@ class CameraFeed:
         except EXPECTED as error:
             self._set("missing", MISSING, self._in_words(error))
             return False
-        if self._meter.state == "opening":  # else what was amiss may still be
+        if self._meter.state == "opening":  # else the fault may persist
             self._meter.detail = self._source.name
         return True
 

@@ -112,7 +112,7 @@ def _answer(Gst, pipeline, sample, answers) -> None:  # type: ignore[no-untyped-
     form = sample.get_caps().get_structure(0)
     width, height = form.get_int("width")[1], form.get_int("height")[1]
     code = CODES[form.get_string("format")]
-    # the default layout, which all keep to that are not told of another by an appsink
+    # the default layout, unless an appsink negotiates another
     stride = ((2 * width if code == b"YUYV" else width) + 3) // 4 * 4
     buffer = sample.get_buffer()
     t_ns = 0

@@ -63,8 +63,8 @@ def camera_of(
     """Camera by its file or `K.txt` beside it, else an assumed one, with a warning."""
     if calibration.exists():
         camera = read_calibration(calibration, source.width, source.height)
-        told = f"{calibration.name} says so itself"
-        return camera, [Warned(t_ns, "the camera is assumed", told)] if camera.assumed else []
+        detail = f"{calibration.name} says so itself"
+        return camera, [Warned(t_ns, "the camera is assumed", detail)] if camera.assumed else []
     matrix = calibration.with_name("K.txt")
     if matrix.exists():
         return read_matrix(matrix, source.width, source.height), []

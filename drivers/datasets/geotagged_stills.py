@@ -157,13 +157,13 @@ def _heights(
         first = placed[0][1]
         base_m = (first.altitude_m or 0.0) - (first.relative_altitude_m or 0.0)
         return [base_m + (height or 0.0) for height in relative], []
-    told = [photo.altitude_m for _, photo in placed]
-    known = [height for height in told if height is not None]
-    if len(known) < len(told):
+    heights = [photo.altitude_m for _, photo in placed]
+    known = [height for height in heights if height is not None]
+    if len(known) < len(heights):
         middle = float(np.median(known)) if known else 0.0
         what = "heights are missing in EXIF: the flight is taken to be level"
-        detail = f"{len(told) - len(known)} of {len(told)}; taken: {middle:.1f} m"
-        return [middle] * len(told), [Warned(start_ns, what, detail)]
+        detail = f"{len(heights) - len(known)} of {len(heights)}; taken: {middle:.1f} m"
+        return [middle] * len(heights), [Warned(start_ns, what, detail)]
     t_s = np.array([(t_ns - start_ns) * 1e-9 for t_ns, _ in placed])
     climb = _steady_climb(t_s, np.array(known))
     if climb is None:

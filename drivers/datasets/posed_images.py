@@ -1,6 +1,6 @@
 """Images with known camera poses, for measurements of the depth engine.
 
-| layout | told by | poses | truth, for scoring only |
+| layout | recognised by | poses | truth, for scoring only |
 |---|---|---|---|
 | REMODE | `first_200_frames_traj_over_table_input_sequence.txt` or another `*input_sequence*.txt` | world from camera, y up | `truth/`: distance, 0.1 mm |
 | TUM RGB-D | `rgb.txt`, `groundtruth.txt` | nearest within 20 ms | `depth.txt`: depth, 0.2 mm |

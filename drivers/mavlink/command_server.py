@@ -77,7 +77,7 @@ class _Running:
     given: _Given
     job: Job
     began_ns: int
-    told_ns: int
+    reported_ns: int
 
 
 class CommandServer:
@@ -129,8 +129,8 @@ class CommandServer:
                 del self._running[number]
                 running.given.result, running.given.t_ns = job.result, now_ns
                 out.append(_answer(running.asker, number, job.result))
-            elif now_ns - running.told_ns >= PROGRESS_NS:
-                running.told_ns = now_ns
+            elif now_ns - running.reported_ns >= PROGRESS_NS:
+                running.reported_ns = now_ns
                 out.append(_answer(running.asker, number, IN_PROGRESS, job.percent))
         return out
 

@@ -21,7 +21,7 @@ from drivers.mavlink.wire.message_port import MavlinkPort
 
 TICK_S = 0.025
 """Interval of parameter messages: 1.5 kB/s."""
-TELL_NS = 10_000_000_000
+WARN_EVERY_NS = 10_000_000_000
 TOO_MANY = "more is asked of the companion over MAVLink than it answers"
 COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
 PARAMETERS = (
@@ -47,7 +47,7 @@ class GroundRequests:
         self._port, self._clock, self._warn = port, clock, warn
         self._commands, self._parameters = commands, parameters
         self._limit = RequestLimit()
-        self._told_ns: int | None = None
+        self._warned_ns: int | None = None
 
     def take(self, message: Any, now_ns: int) -> None:
         """Take any message; most are not for us."""
@@ -61,8 +61,8 @@ class GroundRequests:
             return  # an answer, and we have asked nothing
         asker = message.get_srcSystem(), message.get_srcComponent()
         if not self._limit.allows(asker, now_ns):
-            if self._told_ns is None or now_ns - self._told_ns > TELL_NS:
-                self._told_ns = now_ns
+            if self._warned_ns is None or now_ns - self._warned_ns > WARN_EVERY_NS:
+                self._warned_ns = now_ns
                 detail = f"by component {asker[1]} of system {asker[0]}"
                 self._warn(Warned(now_ns, TOO_MANY, detail))
             return

@@ -66,7 +66,7 @@ class DiskWriter:
         self._ended = False
         self._fault: BaseException | None = None
         self._looked_s = -LOOK_S
-        self._told: set[str] = set()
+        self._warned_kinds: set[str] = set()
         self.n_dropped: Counter[str] = Counter()
         """Dropped messages, by kind."""
         self.slowest_s = 0.0
@@ -88,8 +88,8 @@ class DiskWriter:
         if self._fault is not None:
             raise self._fault
         with self._changed:
-            room = self._most * (PICTURES_SHARE if is_picture else 1.0)
-            if self._ended or self._n_waiting + len(entry.data) > room:
+            capacity = self._most * (PICTURES_SHARE if is_picture else 1.0)
+            if self._ended or self._n_waiting + len(entry.data) > capacity:
                 self.n_dropped[kind] += 1
                 too_slow = not self._ended
             else:
@@ -214,8 +214,8 @@ class DiskWriter:
             pass  # it will be repaired when it is opened
 
     def _tell_once(self, what: str, detail: str) -> None:
-        if what not in self._told:
-            self._told.add(what)
+        if what not in self._warned_kinds:
+            self._warned_kinds.add(what)
             self._warn(Warned(self._now_ns(), what, detail))
 
 

@@ -23,7 +23,7 @@ class FaultTraces:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._told: set[tuple[str, str, int]] = set()
+        self._seen_places: set[tuple[str, str, int]] = set()
 
     def tell(self, error: BaseException, secrets: Mapping[str, str] | None = None) -> bool:
         """Write the traceback, unless this exception came from here before; whether it was new.
@@ -32,9 +32,9 @@ class FaultTraces:
         """
         place = _place_of(error)
         with self._lock:
-            if place in self._told or len(self._told) >= MOST_PLACES:
+            if place in self._seen_places or len(self._seen_places) >= MOST_PLACES:
                 return False
-            self._told.add(place)
+            self._seen_places.add(place)
         text = "".join(traceback.format_exception(error))
         for secret, instead in (secrets or {}).items():
             text = text.replace(secret, instead) if secret else text

@@ -39,10 +39,10 @@ class Journal:
         with self._lock:
             self.n_warnings[warning.what] += 1
             n = self.n_warnings[warning.what]
-        told = n <= MAX_SAME_IN_A_ROW or n % EVERY == 0
-        if told:
+        written = n <= MAX_SAME_IN_A_ROW or n % EVERY == 0
+        if written:
             often = f" (for the {n}th time)" if n > MAX_SAME_IN_A_ROW else ""
             detail = f": {warning.detail}" if warning.detail else ""
             kind, priority = ("", INFO) if warning.good else ("warning: ", WARNING)
             self.say(f"{kind}{warning.what}{detail}{often}", priority)
-        return told
+        return written

@@ -25,7 +25,7 @@ from drivers.telemetry.telemetry_log import GeodeticFix, is_finite
 
 LATE_NS, AHEAD_NS = 2_000_000_000, 100_000_000
 """Delay that is reported; a stamp further in the future than the second is invalid."""
-NAME_AGAIN_NS = 10_000_000_000
+WARN_AGAIN_NS = 10_000_000_000
 CHOOSE_NS = 1_000_000_000
 """Interval at which the more frequent of several messages is chosen."""
 ABOUT = 1.25
@@ -58,7 +58,7 @@ class LiveSamples:
         """Newest stamp by quantity, and the time that it was given."""
         self._choices = (_Choice(ATTITUDE_IDS, frequent=True), _Choice(IMU_IDS, frequent=False))
         self._wild = ""
-        self._named_ns: dict[str, int] = {}
+        self._warned_ns: dict[str, int] = {}
 
     def take(self, message: Any, receive_ns: int) -> None:
         """Take any message of the autopilot."""
@@ -94,7 +94,7 @@ class LiveSamples:
         if self._segment != self._clock.n_segments:
             self._begin()
         if self._wild:
-            self._name(WILD, receive_ns, self._wild)
+            self._warn_once(WILD, receive_ns, self._wild)
             self._wild = ""
         sample = SAMPLE_OF[kind](message) if kind in SAMPLE_OF else None
         if sample is None:
@@ -121,7 +121,7 @@ class LiveSamples:
             self._drop(AHEAD, receive_ns, f"{name} by {(t_ns - receive_ns) * 1e-9:.2f} s")
             return
         if receive_ns - t_ns > LATE_NS:
-            self._name(LATE, receive_ns, f"{name} by {(receive_ns - t_ns) * 1e-9:.1f} s")
+            self._warn_once(LATE, receive_ns, f"{name} by {(receive_ns - t_ns) * 1e-9:.1f} s")
         self._latest[quantity] = remote_ns, t_ns
         sample = self._placed(content, remote_ns)
         if sample is None:
@@ -155,12 +155,12 @@ class LiveSamples:
 
     def _drop(self, what: str, now_ns: int, detail: str) -> None:
         self.n_dropped[what] += 1
-        self._name(what, now_ns, detail)
+        self._warn_once(what, now_ns, detail)
 
-    def _name(self, what: str, now_ns: int, detail: str) -> None:
+    def _warn_once(self, what: str, now_ns: int, detail: str) -> None:
         """Warn, rate-limited."""
-        if now_ns - self._named_ns.get(what, -NAME_AGAIN_NS) >= NAME_AGAIN_NS:
-            self._named_ns[what] = now_ns
+        if now_ns - self._warned_ns.get(what, -WARN_AGAIN_NS) >= WARN_AGAIN_NS:
+            self._warned_ns[what] = now_ns
             self._warn(Warned(now_ns, what, detail))
 
 

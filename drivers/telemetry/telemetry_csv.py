@@ -1,7 +1,7 @@
 """Telemetry table `telemetry.csv`: on the flight's clock, about one origin, nothing rounded.
 
 A line is `unix_ns,kind,values`; what a sample does not have is empty. Comments before hold the
-origin, how the clocks were put together, and what was amiss where the samples come from.
+origin, how the clocks were put together, and warnings about the source of the samples.
 
 | kind | values |
 |---|---|

@@ -51,9 +51,9 @@ Columns = Mapping[str, NDArray[Any]]
 def read_ulog(path: Path) -> LogContent:
     """All readable data; without absolute time where there is no UTC by GPS."""
     collected = TelemetryCollector(path.name)
-    told = io.StringIO()
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(told):  # pyulog prints what it thinks of the file
+        with contextlib.redirect_stdout(printed):  # pyulog prints what it thinks of the file
             log = ULog(_Bytes(path.read_bytes()), TOPICS, True)
     except DAMAGE as error:
         warned = Warned(0, "damaged telemetry", f"{path.name} cannot be read: {error}")

@@ -164,9 +164,9 @@ class GroundControl:
             self._tell(why_not[1](name=name), f"not set: {name}: {why_not[0]}", False)
             return NOT_NOW
         when = "" if parameter.at_once else ", from the next map on"
-        told = PARAMETER_SET if parameter.at_once else PARAMETER_NEXT_MAP
+        pilot_text = PARAMETER_SET if parameter.at_once else PARAMETER_NEXT_MAP
         self._tell(
-            told(name=name, value=_shown(wanted, brief=True)),
+            pilot_text(name=name, value=_shown(wanted, brief=True)),
             f"{parameter.full_key} = {_shown(wanted)}{when}", True,
         )  # fmt: skip
         self._take_over(parameter, wanted, changed)
@@ -239,17 +239,17 @@ class GroundControl:
         self._snapshots.start(flight, self._link.origin, job)
         return job
 
-    def _refused(self, told: PilotText, what: str, result: int) -> Done:
-        self._tell(told, what, False)
+    def _refused(self, pilot_text: PilotText, what: str, result: int) -> Done:
+        self._tell(pilot_text, what, False)
         return Done(result)
 
-    def _tell(self, told: PilotText, text: str, good: bool) -> None:
+    def _tell(self, pilot_text: PilotText, text: str, good: bool) -> None:
         """Answer the pilot, rate-limited, and write the details to the journal."""
         self._texts.refill(self._clock.now_ns())
         in_time = self._texts.left >= 1.0
         if in_time:
             self._texts.take(1.0)
-            self._link.say(told)
+            self._link.say(pilot_text)
         if in_time or good:
             self._journal.say(f"ground: {text}", INFO if good else WARNING)
 

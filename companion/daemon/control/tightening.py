@@ -52,9 +52,9 @@ WHILE_ARMED: Mapping[str, MayChange] = {
     "feedback.origin_latitude_deg": _not_at_all,
     "feedback.origin_longitude_deg": _not_at_all,
     "feedback.origin_altitude_m": _not_at_all,
-    # an autopilot that avoids obstacles counts on being told of them
+    # obstacle avoidance of the autopilot relies on these messages
     "feedback.obstacle_distance": _not_at_all,
-    # a map that is begun in the air believes its scale, and its frames, by these
+    # a map begun in the air accepts its scale, and its frames, by these
     "georeference.min_travel_m": _to_more,
     "georeference.max_sigma_scale": _to_less,
     "tracking.min_inliers": _to_more,

@@ -49,7 +49,7 @@ class Viewing:
         """Whether images are sent to viewers."""
         self._n_dropped = self._n_seen = self._n_restarted = 0
         self._where = config.daemon.viewer
-        self._told = ""
+        self._last_warning = ""
         self._was_shown = False
         self._over = threading.Event()
         self._patience_s = PATIENCE_S
@@ -126,7 +126,7 @@ class Viewing:
 
     def _show(self) -> float:
         """Open the viewer, for the first time or again; seconds until the next attempt."""
-        if self._told == "" and self._was_shown:
+        if self._last_warning == "" and self._was_shown:
             self._tell(GONE, self._where)
             if self._where == "native":
                 self._where = NOWHERE  # its window was closed by whoever looked at it
@@ -136,7 +136,7 @@ class Viewing:
         except InputError as error:
             self._tell(NO_VIEWER, str(error))
             return AGAIN_S
-        self._was_shown, self._told = True, ""
+        self._was_shown, self._last_warning = True, ""
         if self._viewer.page:
             self._warn(SHOWN, f"open {self._viewer.page}", True)
         return LOOK_S
@@ -156,6 +156,6 @@ class Viewing:
 
     def _tell(self, what: str, detail: str) -> None:
         """Warn, unless the same was the last warning."""
-        if what != self._told:
-            self._told = what
+        if what != self._last_warning:
+            self._last_warning = what
             self._warn(what, detail, False)

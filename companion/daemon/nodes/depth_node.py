@@ -60,7 +60,7 @@ class DepthNode:
         self._over = ""
         """Flight that has ended."""
         self._n_malformed = self._n_in_a_row = 0
-        self._told_s = monotonic_s()
+        self._warned_s = monotonic_s()
         self._never = threading.Event()
         where = ", ".join(config.distributed.connect) or "who joins"
         self._journal.say(f"depth and cloud of {config.distributed.vehicle} at {where}")
@@ -177,14 +177,14 @@ class DepthNode:
 
     def _malformed(self, error: StreamError) -> None:
         self._n_malformed += 1
-        if self._n_malformed & (self._n_malformed - 1) == 0:  # of many only some are told
+        if self._n_malformed & (self._n_malformed - 1) == 0:  # only some of many are reported
             self._journal.say(f"warning: malformed, {self._n_malformed} so far: {error}", WARNING)
 
     def _tell(self) -> None:
         now_s = monotonic_s()
-        if now_s - self._told_s < self._config.daemon.status_every_s:
+        if now_s - self._warned_s < self._config.daemon.status_every_s:
             return
-        self._told_s = now_s
+        self._warned_s = now_s
         if self._flight is None:
             self._journal.say("waiting for a flight")
             return

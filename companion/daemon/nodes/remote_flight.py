@@ -85,8 +85,8 @@ class RemoteFlight:
             self._result.take(frame)
             if picture.in_colour:
                 self._look(frame)
-        told: list[Message] = [*bundle.tracks, *bundle.keyframes]
-        for message in told:
+        messages: list[Message] = [*bundle.tracks, *bundle.keyframes]
+        for message in messages:
             self._step(message)
             self._show(message)
         if bundle.change is not None:

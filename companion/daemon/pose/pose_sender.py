@@ -48,7 +48,7 @@ class PoseSender:
         self._gate = PoseGate(config, counter, height.down_m, self._counter.may_begin)
         self._rate, self._latency = RateMeter(), LatencyMeter()
         self._n_sent = 0
-        self._told: str | None = None
+        self._last_text: str | None = None
 
     def restart(self) -> None:
         """Begin anew with another localisation."""
@@ -83,7 +83,7 @@ class PoseSender:
     def step(self) -> None:
         """Send a predicted pose if one is due; to be called every few milliseconds."""
         self._counter.step(self._gate)
-        if self._config.mode != "off" or self._told == "":
+        if self._config.mode != "off" or self._last_text == "":
             self._send(self._gate.due(self._clock.now_ns()))
             self._tell()
 
@@ -121,11 +121,11 @@ class PoseSender:
     def _tell(self) -> None:
         """Tell the pilot when poses begin and cease."""
         state = "" if self._gate.sending else self._gate.why_not
-        if self._gate.sending and self._told != "":
-            told = self._link.say(POSITION_ON())
-        elif not self._gate.sending and self._told == "":
-            told = self._link.say(position_lost(state))
+        if self._gate.sending and self._last_text != "":
+            sent = self._link.say(POSITION_ON())
+        elif not self._gate.sending and self._last_text == "":
+            sent = self._link.say(position_lost(state))
         else:
             return
-        if told:  # else it is tried again
-            self._told = state
+        if sent:  # else it is tried again
+            self._last_text = state

@@ -10,7 +10,7 @@ world                       local NED in metres (z down)
     sparse                  the tracker's points (hidden at first)
 depth                       depth of the newest keyframe, near is red
 earth                       the path and the camera by latitude and longitude
-status                      how all is, in words
+status                      in words
 plots/…, log
 """
 

@@ -37,9 +37,9 @@ class Inbox:
     def offer(self, message: Watched) -> bool:
         """Add a message if there is capacity now; images leave half of it to small messages."""
         size = size_bytes(message)
-        room = self._capacity_bytes // 2 if isinstance(message, Frame) else self._capacity_bytes
+        capacity = self._capacity_bytes // 2 if isinstance(message, Frame) else self._capacity_bytes
         with self._changed:
-            if self._closed or not self._fits(size, room):
+            if self._closed or not self._fits(size, capacity):
                 return False
             self._append(message, size)
             return True
@@ -61,8 +61,8 @@ class Inbox:
             self._closed = True
             self._changed.notify_all()
 
-    def _fits(self, size: int, room: int) -> bool:
-        return not self._held or self._bytes + size <= room
+    def _fits(self, size: int, capacity: int) -> bool:
+        return not self._held or self._bytes + size <= capacity
 
     def _append(self, message: Watched, size: int) -> None:
         self._held.append((message, size))

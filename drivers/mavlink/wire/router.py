@@ -131,7 +131,7 @@ class Router:
         """Serve the clients until cancelled."""
         fixed = [client.wire.run(client) for client in self._clients]
         try:
-            await run_together(*fixed, *(door.run() for door in self._listeners))
+            await run_together(*fixed, *(listener.run() for listener in self._listeners))
         finally:
             if self._pump_later is not None:
                 self._pump_later.cancel()
@@ -150,12 +150,12 @@ class Router:
     @property
     def n_rejected(self) -> int:
         """Connections rejected for lack of capacity."""
-        return sum(door.n_rejected for door in self._listeners)
+        return sum(listener.n_rejected for listener in self._listeners)
 
     @property
     def trouble(self) -> str:
         """Reason why a listener is not open, for people; "" when all are."""
-        places = [door.trouble for door in self._listeners]
+        places = [listener.trouble for listener in self._listeners]
         places += [client.wire.trouble for client in self._clients if not client.wire.connected]
         return "; ".join(place for place in places if place)
 

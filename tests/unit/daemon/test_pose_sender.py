@@ -253,7 +253,7 @@ async def test_a_copter_that_tells_no_local_position_yet_tells_its_climb(tmp_pat
 
 
 @flown
-async def test_a_disk_that_cannot_be_written_is_told_once(tmp_path: Path) -> None:
+async def test_a_disk_that_cannot_be_written_is_reported_once(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     vehicle, counters = Vehicle(tmp_path / "file" / "kept.json"), []
     for _ in range(2):

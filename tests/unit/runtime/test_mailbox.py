@@ -38,7 +38,7 @@ def test_messages_come_out_in_the_order_in_which_they_came() -> None:
     assert (len(box), box.n_bytes) == (0, 0)
 
 
-def test_the_latest_frame_wins_whether_there_is_room_or_not() -> None:
+def test_the_newest_frame_wins_with_and_without_overflow() -> None:
     box = mailbox()
     for number in range(3):
         box.put((DropPolicy.LATEST_WINS, 1, f"frame {number}"))
@@ -62,7 +62,7 @@ def test_pictures_go_first_then_the_map_then_the_rest_but_never_an_order() -> No
     assert names_in(box) == ["0", "5", "6", "7"]
 
 
-def test_what_is_larger_than_the_room_is_let_in_alone() -> None:
+def test_a_message_larger_than_the_capacity_is_let_in_alone() -> None:
     box = mailbox(10)
     box.put((DropPolicy.PICTURE, 50, "large"))
     assert box.n_overflowed == 0
@@ -71,7 +71,7 @@ def test_what_is_larger_than_the_room_is_let_in_alone() -> None:
     assert names_in(box) == ["larger"]
 
 
-def test_a_stage_that_takes_nothing_for_an_hour_holds_no_more_than_its_room() -> None:
+def test_a_stage_that_takes_nothing_for_an_hour_stays_within_its_capacity() -> None:
     box: Mailbox[object] = Mailbox(lambda m: drop_policy_of(m, True), size_bytes, 1 << 20)
     box.put(Setup(Config(), CAMERA))
     for t_ns in range(20_000):

@@ -71,7 +71,7 @@ def test_a_keyframe_that_has_left_the_map_lies_nowhere_and_may_come_back() -> No
     assert list(back.places) == [3] and back.places[3] is not None
 
 
-def test_the_origin_is_told_once_the_map_is_known_to_lie_in_its_world() -> None:
+def test_the_origin_is_sent_once_the_map_is_georeferenced() -> None:
     encoder = SceneEncoder(FlightItem("a", "a", CAMERA))
     assert told([ORIGIN, flown.update(known=False)], encoder)[0].__class__ is PlacesItem
     scaled = flown.update()
@@ -192,7 +192,7 @@ def test_the_cloud_that_viewers_have_is_the_one_that_is_written() -> None:
     assert np.linalg.norm(without[:, None] - written, axis=2).min(axis=1).max() > 0.5
 
 
-def test_a_map_that_is_stretched_sends_transforms_only() -> None:
+def test_a_local_scale_correction_sends_transforms_only() -> None:
     encoder = SceneEncoder(FlightItem("a", "a", CAMERA))
     ids = range(len(flown.update().map_from_camera))
     told([flown.update(), *(spanned_chunk(k) for k in ids)], encoder)
@@ -203,7 +203,7 @@ def test_a_map_that_is_stretched_sends_transforms_only() -> None:
     assert told([stretched(1.08)], encoder) == []
 
 
-def test_points_that_come_after_the_map_was_stretched_are_stretched_at_once() -> None:
+def test_late_points_get_the_local_scale_correction_at_once() -> None:
     encoder = SceneEncoder(FlightItem("a", "a", CAMERA))
     last = max(flown.update().map_from_camera)
     told([stretched(1.08)], encoder)

@@ -180,7 +180,7 @@ def test_the_budget_holds_headers_and_all() -> None:
         assert 40_000 < rate < 105_000  # of 100 000 bytes/s
 
 
-def test_who_is_no_viewer_is_shown_the_door_and_so_is_one_too_many() -> None:
+def test_a_peer_that_is_no_viewer_is_rejected_and_so_is_one_too_many() -> None:
     with serving(filled(1), most=1) as (exporter, port):
         with socket.create_connection(("127.0.0.1", port), timeout=5) as stranger:
             stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")

@@ -188,7 +188,7 @@ def test_after_an_outage_the_newest_comes_at_once_and_nothing_is_missing() -> No
     assert len(coarse) >= 58
 
 
-def test_what_a_connection_had_on_its_way_is_sent_by_the_next() -> None:
+def test_items_in_flight_on_a_lost_connection_are_sent_on_the_next() -> None:
     store = filled(20)
     link = ThinLink(Session(store), 62_500, 0.15)
     link.run(1.0)

@@ -90,6 +90,6 @@ def test_a_server_that_is_not_there_closes_the_connection() -> None:
             assert browser.recv(10) == b""
 
 
-def test_a_door_that_is_taken_is_an_error() -> None:
+def test_a_port_in_use_is_an_error() -> None:
     with served(b"") as inner, pytest.raises(OSError, match="in use"):
         WebProxy({(LOOPBACK, inner): 1}, watched=inner)

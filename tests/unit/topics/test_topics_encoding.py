@@ -123,7 +123,7 @@ def test_bundles_are_as_they_were() -> None:
             assert np.abs(image.grey.astype(int) - true_frame.grey).mean() < 3
 
 
-def test_a_map_is_told_by_its_changes() -> None:
+def test_a_map_is_rebuilt_from_its_changes() -> None:
     changes, mirror = MapChanges(), MapMirror()
     first = mirror.take(changes.since_last(flown.update()))
     assert len(first.map_from_camera) == len(flown.update().map_from_camera)

@@ -170,7 +170,7 @@ def a_drivers_bug(_: Picture) -> Picture:
 
 
 @pytest.mark.parametrize("where", ["open", "read", "picture", "close"])
-def test_a_drivers_own_bug_is_told_with_its_place(
+def test_a_drivers_own_bug_is_reported_with_its_place(
     where: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("JOURNAL_STREAM", raising=False)
@@ -207,7 +207,7 @@ def test_a_drivers_own_bug_is_told_with_its_place(
     assert all(line.startswith("companion: ") for line in printed.splitlines())
 
 
-def test_a_silent_camera_is_opened_anew() -> None:
+def test_a_silent_camera_is_reopened() -> None:
     with running() as run:
         run.more()
         run.source.making = lambda _: None
@@ -218,7 +218,7 @@ def test_a_silent_camera_is_opened_anew() -> None:
     assert run.told() == [camera_feed.SILENT, camera_feed.BACK]
 
 
-def test_a_frozen_camera_gives_no_frames_and_is_opened_anew() -> None:
+def test_a_frozen_camera_gives_no_frames_and_is_reopened() -> None:
     with running() as run:
         run.more()
         kept: list[Picture] = []
@@ -312,7 +312,7 @@ def test_stamps_far_from_now_are_refused_and_do_no_lasting_harm(off_s: int) -> N
     assert run.told()[0] == camera_feed.WRONG_STAMP
 
 
-def test_what_a_source_remarks_is_told() -> None:
+def test_remarks_of_a_source_are_reported() -> None:
     with running() as run:
         run.source.remarks.append("told: 15 pictures/s, 30 were asked")
         run.until(lambda: len(run.warned) == 1)

@@ -625,7 +625,7 @@ def test_nonsense_is_dropped_and_nothing_breaks() -> None:
     run(test())
 
 
-def test_arming_is_told_on_change() -> None:
+def test_arming_is_reported_on_change() -> None:
     async def test() -> None:
         async with spoken() as (heard, _port, talk):
             for n, armed in enumerate([False, True, True, False]):

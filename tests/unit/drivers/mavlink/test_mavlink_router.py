@@ -383,7 +383,7 @@ def test_a_thousand_connections_leave_nothing_behind() -> None:
     asyncio.run(play())
 
 
-def test_who_only_holds_a_place_makes_room() -> None:
+def test_an_idle_connection_is_closed_for_a_new_one() -> None:
     async def play() -> None:
         async with flown() as scene:
             clients = [await scene.tcp_client() for _ in range(MOST_CONNECTIONS)]

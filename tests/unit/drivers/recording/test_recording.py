@@ -145,7 +145,7 @@ def test_cut_short_it_is_repaired_and_says_so(tmp_path: Path) -> None:
         assert flight.n_frames >= 20
 
 
-def test_video_after_a_hole_waits_for_a_picture_that_stands_alone(tmp_path: Path) -> None:
+def test_video_after_a_gap_waits_for_an_intra_picture(tmp_path: Path) -> None:
     folder = tmp_path / "f"
     record(folder, 75, "h264", per_chunk=10)
     path = folder / "flight.mcap"

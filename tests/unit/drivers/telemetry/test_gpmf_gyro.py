@@ -47,7 +47,7 @@ def test_turns_about_the_axes_of_the_camera() -> None:
     [("Gyroscope", "ZXY", True), (HERO5, "zxY", True), ("Gyroscope", "", False),
      ("Gyroscope", "ZXX", False), ("Gyroscope", "zXY", False)],
 )  # fmt: skip
-def test_axes_that_are_told_or_not(name: str, orientation: str, known: bool) -> None:
+def test_axes_known_or_unknown(name: str, orientation: str, known: bool) -> None:
     """The last one would be left-handed."""
     rates = np.tile([0.1, 0.2, 0.3], (RATE_HZ, 1))
     turns = gyro_rotation([(0, SECOND, gyro_block(rates, name, orientation))])
