@@ -1,4 +1,4 @@
-"""What a viewer on the ground gets over bad links, beside what is asked of it. Needs root.
+"""Link table: viewers on the ground over bad links, against the requirements. Needs root.
 
     python -m tests.bench.links_table --flight FOLDER [--log FILE] [--only NAME] [--json FILE]
 

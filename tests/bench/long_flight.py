@@ -1,4 +1,4 @@
-"""Ten minutes of hovering and return passes: does a frame cost ever more, does memory grow?
+"""Ten minutes of hovering and return passes: growth of the time per frame and of memory.
 
     python -m tests.bench.long_flight FLIGHT [--minutes 10] [--hover-s 4] [--rate-hz 10] [--out DIR]
 

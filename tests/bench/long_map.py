@@ -1,4 +1,4 @@
-"""An hour of map, ten million points, to a viewer that is there and to one that comes at the end.
+"""An hour of map, ten million points, to a viewer connected throughout and to one at the end.
 
     python -m tests.bench.long_map [--keyframes N]
 

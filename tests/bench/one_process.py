@@ -1,4 +1,4 @@
-"""Two hours of one flight in one process for each stage: does a pose cost more, does memory grow?
+"""Two hours of one flight with a process per stage: growth of the pose's cost and of memory.
 
     python -m tests.bench.one_process [--flight sample/survey] [--minutes 120] [--rate-hz 10]
         [--part-s 20] [--shrink 2] [--out FOLDER] [--set SECTION.KEY=VALUE ...]

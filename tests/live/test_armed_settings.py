@@ -1,4 +1,4 @@
-"""What holds until disarming holds over a daemon that is killed in the air, and over SIGHUP."""
+"""Settings held while armed survive a daemon that is killed in the air, and SIGHUP."""
 
 from __future__ import annotations
 

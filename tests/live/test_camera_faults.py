@@ -1,4 +1,4 @@
-"""Whatever becomes of the camera in flight: no bad pose leaves, it is named, and taken up again."""
+"""Faults of the camera in flight: no bad pose is sent, a warning, and recovery."""
 
 from __future__ import annotations
 

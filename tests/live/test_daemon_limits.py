@@ -1,4 +1,4 @@
-"""What the daemon cannot do without, and what it does then; how it is told things, and how it ends.
+"""Missing prerequisites of the daemon, reload of its configuration, and its end.
 
 Each of these needs a daemon of its own, most of them not for long.
 """

@@ -1,4 +1,4 @@
-"""`companion view` opens a window in which the map is to be seen."""
+"""`companion view` opens a window that shows the map."""
 
 from __future__ import annotations
 

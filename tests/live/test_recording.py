@@ -1,4 +1,4 @@
-"""What a live flight leaves behind, however the daemon ends, and what a replay makes of it."""
+"""Recordings of live flights, however the daemon ends, and their replay."""
 
 from __future__ import annotations
 

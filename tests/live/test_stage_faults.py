@@ -1,4 +1,4 @@
-"""A stage that dies or hangs in flight takes nothing with it; nor does a viewer."""
+"""A stage that dies or hangs in flight affects no other; nor does a viewer."""
 
 from __future__ import annotations
 

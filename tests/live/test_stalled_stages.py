@@ -1,4 +1,4 @@
-"""A stage that hangs holds no more than its room, is ended, and another takes its place."""
+"""A stage that hangs stays within its queue's capacity, is ended, and is restarted."""
 
 from __future__ import annotations
 

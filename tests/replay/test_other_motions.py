@@ -1,4 +1,4 @@
-"""Ways to fly that give a single camera little to go by."""
+"""Motions that are difficult for a monocular camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A map that a process left behind is taken up by the next, where it is what the camera sees.
+"""Resumption of a map left by another process, where the camera relocalises in it.
 
 The sample flight is flown for a while; then another localisation hangs over the same ground, whose
 telemetry has no more than attitude: nothing that tells a scale.

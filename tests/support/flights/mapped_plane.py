@@ -1,4 +1,4 @@
-"""What the depth stage is told of a made-up flight with true poses: no tracker is wanted."""
+"""Input of the depth stage for a synthetic flight with true poses, without a tracker."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flights made up for a test: what a camera on a known path over known ground sees and is told."""
+"""Rendered flights: images and telemetry of a camera on a known path over known ground."""
 
 from __future__ import annotations
 

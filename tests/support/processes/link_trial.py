@@ -1,4 +1,4 @@
-"""One flight over one link: an exporter and a viewer in namespaces, and what came of it."""
+"""One flight over one link: exporter and viewer in network namespaces, and measurements."""
 
 from __future__ import annotations
 

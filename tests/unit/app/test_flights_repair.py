@@ -1,4 +1,4 @@
-"""Recordings that were cut short, ended later: by command, and by the daemon beside its work."""
+"""Repair of recordings that were cut short: by command, and by the daemon in the background."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flights of other formats as flight folders, read again as they were."""
+"""Flights of other formats as flight folders, read back equal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds until the motors are disarmed: over a crash of ours, and what is no disarming."""
+"""Changes held until disarming: over a crash of the daemon, and false disarming."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an autopilot is sent over its life and ours: heights, reset counters, and what disks do."""
+"""Poses sent over boots of the autopilot and restarts of ours: heights, reset counters, disks."""
 
 from __future__ import annotations
 

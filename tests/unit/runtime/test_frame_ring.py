@@ -1,4 +1,4 @@
-"""Frames between processes: whole, or known to be too late. Each reader is a process of its own."""
+"""Frame ring between processes: frames whole, or reported as overwritten."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each fault of the bench does what its name says, and nothing else."""
+"""Injected faults of the benchmark."""
 
 from __future__ import annotations
 

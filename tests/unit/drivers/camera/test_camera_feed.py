@@ -1,4 +1,4 @@
-"""The camera's thread against a source that does what a test tells it."""
+"""Camera supervisor with a scripted source."""
 
 from __future__ import annotations
 

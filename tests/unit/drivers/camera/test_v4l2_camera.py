@@ -1,4 +1,4 @@
-"""Video4Linux against a simulated driver: what is set, what stamps mean, what comes of faults."""
+"""Video4Linux camera with a simulated driver: settings, stamps, faults."""
 
 from __future__ import annotations
 

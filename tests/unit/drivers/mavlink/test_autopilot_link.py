@@ -1,4 +1,4 @@
-"""The autopilot's link against pretended autopilots on real wires, and against made-up messages."""
+"""The autopilot's link with simulated autopilots on real wires, and with synthetic messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Our component's parameters over MAVLink, as ground stations ask for them."""
+"""Parameter protocol of our component."""
 
 from __future__ import annotations
 

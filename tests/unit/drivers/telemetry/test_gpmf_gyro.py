@@ -1,4 +1,4 @@
-"""A GoPro's own gyro, and a log put on its video's time by it, with nothing to be seen in it."""
+"""GoPro gyroscope, and time alignment of a log by it, without any texture in the images."""
 
 from __future__ import annotations
 
