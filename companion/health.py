@@ -153,7 +153,7 @@ class Health:
     """Keys of the configuration set over MAVLink, and their values."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain types only; what is not a finite number is null."""
+        """Plain types; a number that is not finite is null."""
         document = _plain(dataclasses.asdict(self))
         document["load"]["temperature_c"] = _plain(self.load.temperature_c)
         document["load"]["memory_share"] = _plain(self.load.memory_share)
@@ -161,7 +161,7 @@ class Health:
         return dict(document)
 
     def line(self) -> str:
-        """One line for the journal: what matters in flight first."""
+        """One line for the journal, the most important first."""
         parts = [self._pose(), self._feedback()]
         parts += [_source(source) for source in self.sources]
         parts += [_stage(stage) for stage in self.stages if not stage.alive or stage.n_restarted]
@@ -172,7 +172,7 @@ class Health:
         return "; ".join(part for part in parts if part)
 
     def key(self) -> Hashable:
-        """Equal as long as nothing has changed that is worth a line at once."""
+        """Equal as long as nothing has changed that deserves a line at once."""
         return (
             self.tracker,
             bool(self.scale),
@@ -214,7 +214,7 @@ class Health:
 
 
 class StatusLines:
-    """Says when a status line is due: every so often, and at once when something has changed."""
+    """Schedule of status lines: at intervals, and at once after a change."""
 
     def __init__(self, every_s: float) -> None:
         self._every_ns = round(every_s * 1e9)
@@ -222,7 +222,7 @@ class StatusLines:
         self._last_ns: int | None = None
 
     def step(self, health: Health) -> str | None:
-        """The line that is due now, or None; to be asked several times a second."""
+        """Line that is due now, or None; to be called several times a second."""
         since_ns = None if self._last_ns is None else health.t_ns - self._last_ns
         if since_ns is not None and since_ns < self._every_ns:
             if health.key() == self._key or since_ns < MIN_BETWEEN_LINES_S * 1e9:
@@ -232,7 +232,7 @@ class StatusLines:
 
 
 class RateMeter:
-    """How often something happens, over the last few seconds."""
+    """Rate of events over the last few seconds."""
 
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_ns = round(window_s * 1e9)
@@ -240,12 +240,12 @@ class RateMeter:
         self._lock = threading.Lock()
 
     def add(self, t_ns: int) -> None:
-        """It happened."""
+        """Count an event."""
         with self._lock:
             self._times_ns.append(t_ns)
 
     def hz(self, now_ns: int) -> float:
-        """Its rate; falls to 0 within the window where nothing happens any more."""
+        """Rate; falls to 0 within the window after the last event."""
         with self._lock:
             times = [t for t in self._times_ns if now_ns - t <= self._window_ns]
             n_kept = len(self._times_ns)
@@ -255,7 +255,7 @@ class RateMeter:
 
 
 class SourceMeter:
-    """Counts what comes from a source; may be used from any thread."""
+    """Counters of a source; may be used from any thread."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -268,13 +268,13 @@ class SourceMeter:
         self._rate = RateMeter()
 
     def came(self, t_ns: int) -> None:
-        """Something came at this time, the time of receipt."""
+        """Count an input at its time of receipt."""
         self.n += 1
         self._last_ns = t_ns
         self._rate.add(t_ns)
 
     def health(self, now_ns: int) -> SourceHealth:
-        """As it stands now."""
+        """Health now."""
         last_ns = self._last_ns
         return SourceHealth(
             name=self.name,
@@ -289,7 +289,7 @@ class SourceMeter:
 
 
 class StageMeter:
-    """Counts what a stage does; may be used from any thread."""
+    """Counters of a stage; may be used from any thread."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -302,14 +302,14 @@ class StageMeter:
         self._latency = LatencyMeter()
 
     def done(self, t_ns: int, begun_ns: int | None = None) -> None:
-        """A result came out at this time; what it is of was exposed or begun at `begun_ns`."""
+        """Count a result; its input was exposed or begun at `begun_ns`."""
         self.n += 1
         self._rate.add(t_ns)
         if begun_ns is not None:
             self._latency.add(t_ns, (t_ns - begun_ns) * 1e-6)
 
     def health(self, now_ns: int) -> StageHealth:
-        """As it stands now."""
+        """Health now."""
         return StageHealth(
             name=self.name,
             alive=self.alive,
@@ -325,7 +325,7 @@ class StageMeter:
 
 
 class LatencyMeter:
-    """How long something takes, over the last few seconds; for the delay of the event loop too."""
+    """Percentiles of durations over the last few seconds; of the event loop's delay, too."""
 
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_ns = round(window_s * 1e9)
@@ -333,12 +333,12 @@ class LatencyMeter:
         self._lock = threading.Lock()
 
     def add(self, t_ns: int, ms: float) -> None:
-        """It took so long, and was over at this time."""
+        """Add a duration that ended at this time."""
         with self._lock:
             self._events.append((t_ns, ms))
 
     def percentile_ms(self, percent: float, now_ns: int) -> float | None:
-        """Of so many percent it took no longer; None where there were none."""
+        """Percentile of the durations; None without any."""
         with self._lock:
             recent = sorted(ms for t, ms in self._events if now_ns - t <= self._window_ns)
         if not recent:

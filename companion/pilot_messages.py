@@ -228,7 +228,7 @@ JOURNAL_ONLY = frozenset({
 
 
 def of_warning(what: str, detail: str = "", good: bool = False) -> PilotText | None:
-    """What the pilot is told of a `Warned`; None where that is nothing."""
+    """Text for the pilot about a `Warned`; None without one."""
     if what in JOURNAL_ONLY:
         return None
     message = OF_WARNING.get(what)

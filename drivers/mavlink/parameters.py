@@ -89,7 +89,7 @@ class Parameters:
             end()
 
     async def read(self, names: Iterable[str]) -> dict[str, Parameter]:
-        """Those of the named that the autopilot has. SourceError if it answers for none of them."""
+        """Read those of the named that exist. SourceError if the autopilot answers for none."""
         wanted = list(dict.fromkeys(names))
         self._answered.clear()
         self._unknown.clear()
