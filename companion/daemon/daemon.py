@@ -479,7 +479,7 @@ class Daemon:
         for name in waiting:
             self._by_ground.pop(name, None)
         shown = ", ".join(f"{name} = {value}" for name, value in waiting.items())
-        self._journal.say(f"disarmed: what has waited for that counts now: {shown}", WARNING)
+        self._journal.say(f"disarmed: held changes take effect: {shown}", WARNING)
         if waiting.get("feedback.mode", "off") != "off":
             self._tell_pilot(POSITION_ENABLED())
         self.take_over(with_values(self._config, waiting))

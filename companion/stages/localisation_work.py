@@ -57,7 +57,7 @@ class _Localisation(Work):
         try:
             kept = self._keeper.take()
         except CheckpointError as error:
-            print(f"companion: the map from before is of no use: {error}", file=sys.stderr)
+            print(f"companion: map checkpoint rejected: {error}", file=sys.stderr)
         else:
             self._to_take_up = kept if message.take_up else None
 
