@@ -133,7 +133,7 @@ class Beside:
     """Does the jobs in a thread of its own, in the tracker's pauses, and `spare` between them."""
 
     def __init__(self, turn: MapTurn, spare: Spare = lambda meanwhile: None) -> None:
-        self._turn, self._standby = turn, spare
+        self._turn, self._spare = turn, spare
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._finished: queue.SimpleQueue[Done] = queue.SimpleQueue()
         self._fault: BaseException | None = None
@@ -170,7 +170,7 @@ class Beside:
         try:
             while (job := self._jobs.get()) is not None:
                 self._do(job)
-                self._standby(self._meanwhile)
+                self._spare(self._meanwhile)
         except _ClosingError:
             return
         except BaseException as fault:  # handed to the tracker's thread, which raises it
