@@ -122,8 +122,8 @@ def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path, kind: st
     first, second = folder, folder / "part-2"
     if kind == "results":
         for part in (first, second):
-            assert (part / "live_flight.rrd").stat().st_size > 10_000
+            assert (part / "flight.rrd").stat().st_size > 10_000
         return
     for part in (first, second):  # the first is mended, which it was not closed for
-        with closing(Recording(part / "live_flight.mcap")) as recording:
+        with closing(Recording(part / "flight.mcap")) as recording:
             assert recording.pictures
