@@ -1,10 +1,10 @@
-"""What can be set, with its default, in one place.
+"""Configuration: all sections and keys, with defaults.
 
 Each section is a frozen dataclass; a stage takes its own section only. `config/companion.toml`
 describes every key. An unknown key or a wrong type is a ConfigError that names the nearest key.
 
-A key is a bool, int, float, str or a list of these last; `Annotated` with a `Range` or `OneOf` says
-what values it takes, which is checked where a configuration is read (`companion.config_file`).
+A key is a bool, int, float, str or a list of these last; `Annotated` with a `Range` or `OneOf`
+gives its valid values, which are checked where a configuration is read (`companion.config_file`).
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ class OneOf:
 
 @dataclass(frozen=True, slots=True)
 class CameraConfig:
-    """The camera: which one a live run opens, and what is known of it."""
+    """The camera: source of a live run, image format, calibration."""
 
     source: Annotated[str, OneOf(("v4l2", "gstreamer", "network", "file", "pattern"))] = "v4l2"
-    """What kind of camera a live run opens."""
+    """Kind of camera of a live run."""
     device: str = "auto"
-    """v4l2: a path, best of /dev/v4l/by-id; "auto" takes the only camera there is."""
+    """v4l2: a path, preferably in /dev/v4l/by-id; "auto" takes the only camera."""
     pipeline: str = ""
     """gstreamer: the pipeline up to, not including, its appsink."""
     url: str = ""
-    """network: rtsp://… or what else FFmpeg opens."""
+    """network: rtsp://… or any other URL that FFmpeg opens."""
     transport: Annotated[str, OneOf(("tcp", "udp"))] = "tcp"
-    """network: how RTSP brings its packets."""
+    """network: transport of RTSP."""
     path: str = ""
     """file: a flight folder, a folder of images, or a video, played in real time."""
     topic: str = ""
-    """The image topic of a bag that is replayed; "" takes the one with most images."""
+    """Image topic of a replayed bag; "" takes the one with most images."""
     repeat: bool = False
-    """file: begin again at the end, else the camera is silent from then on."""
+    """file: repeat at the end; else the camera is silent from then on."""
     starts_at_unix_s: Annotated[float, Range(0, 1e11)] = 0.0
-    """file: when its first picture is due; 0: when the camera is opened."""
+    """file: time of its first image; 0: when the camera is opened."""
     width: Annotated[int, Range(32, 8192)] = 640
     height: Annotated[int, Range(32, 8192)] = 480
     rate_hz: Annotated[float, Range(1, 240)] = 30.0
@@ -79,29 +79,29 @@ class CameraConfig:
     focus: Annotated[int, Range(-1, 100000)] = -1
     """v4l2: in the camera's own steps; -1 leaves it to the camera."""
     stamp_offset_ms: Annotated[float, Range(-1000, 1000)] = 0.0
-    """Added to stamps: from what the source states to the middle of the exposure."""
+    """Added to stamps: from the source's stamp to mid-exposure."""
     calibration: str = ""
     """Calibration file of a live camera, as `companion calibrate` writes it."""
     assumed_hfov_deg: Annotated[float, Range(0, 150)] = 75.0
-    """Horizontal field of view taken where there is no calibration; 0 refuses that."""
+    """Horizontal field of view assumed without a calibration; 0: refuse."""
 
 
 @dataclass(frozen=True, slots=True)
 class MountConfig:
-    """How a live camera sits on the body, where its calibration file does not say.
+    """Mounting of a live camera on the body, where its calibration file lacks it.
 
-    The angles turn a camera that looks forward, upright: first by yaw to the right, then by pitch
+    The angles rotate a camera that looks forward, upright: first by yaw to the right, then by pitch
     upwards, then by roll clockwise about its own axis.
     """
 
     known: bool = False
-    """Whether what follows is true; without it the autopilot's attitude cannot be used."""
+    """Whether the mounting is given; without it the autopilot's attitude cannot be used."""
     roll_deg: Annotated[float, Range(-180, 180)] = 0.0
     pitch_deg: Annotated[float, Range(-180, 180)] = 0.0
     """-90 looks straight down."""
     yaw_deg: Annotated[float, Range(-180, 180)] = 0.0
     x_m: Annotated[float, Range(-100, 100)] = 0.0
-    """Place of the lens from the autopilot: forward, right, down."""
+    """Position of the lens relative to the autopilot: forward, right, down."""
     y_m: Annotated[float, Range(-100, 100)] = 0.0
     z_m: Annotated[float, Range(-100, 100)] = 0.0
 
@@ -111,58 +111,58 @@ class LinkConfig:
     """The autopilot's link."""
 
     url: str = ""
-    """serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT; "" for none. A baud
-    of "auto" is found out."""
+    """serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT; "" for none. Baud
+    "auto" is detected."""
     backend: Annotated[str, OneOf(("pymavlink", "mavsdk"))] = "pymavlink"
     system_id: Annotated[int, Range(0, 255)] = 0
     """The vehicle's; 0 takes the first autopilot heard."""
     component_id: Annotated[int, Range(1, 255)] = 197
     """Ours; 197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
     attitude_hz: Annotated[float, Range(0, 400)] = 50.0
-    """Rates asked of the autopilot; 0 asks for nothing."""
+    """Rate requested from the autopilot; 0 requests none."""
     imu_hz: Annotated[float, Range(0, 1000)] = 0.0
     position_hz: Annotated[float, Range(0, 100)] = 10.0
-    """Of local, global and GPS position."""
+    """Local, global and GPS position."""
     height_hz: Annotated[float, Range(0, 100)] = 10.0
-    """Of pressure and rangefinder."""
+    """Pressure and rangefinder."""
     timesync_hz: Annotated[float, Range(0.1, 50)] = 10.0
     silent_after_s: Annotated[float, Range(0.2, 60)] = 3.0
-    """Having said nothing for so long the autopilot counts as gone."""
+    """Silence after which the autopilot counts as lost."""
     signing_key_file: str = ""
     """A file with 64 hexadecimal digits; "" for unsigned MAVLink."""
 
 
 @dataclass(frozen=True, slots=True)
 class RouterConfig:
-    """Who else talks to the autopilot over our link."""
+    """Router: other programs that share the autopilot's link."""
 
     clients: tuple[str, ...] = ()
     """udpin:HOST:PORT, udpout:HOST:PORT or tcpin:HOST:PORT each; HOST may be left out: loopback."""
     queue_kb: Annotated[int, Range(4, 65536)] = 256
-    """What waits for a slow client at most; what is older is given up."""
+    """Size of a client's queue; the oldest packets are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeedbackConfig:
-    """The pose that the autopilot is given."""
+    """Poses sent to the autopilot."""
 
     mode: Annotated[str, OneOf(("off", "odometry", "vision_position"))] = "off"
     rate_hz: Annotated[float, Range(4, 100)] = 30.0
-    """At least so many poses a second; between frames they are predicted."""
+    """Least rate of poses; between frames they are predicted."""
     max_sigma_m: Annotated[float, Range(0.01, 100)] = 1.0
     """Positions with a larger standard deviation are not sent."""
     min_quality: Annotated[int, Range(1, 100)] = 20
     """Poses of a lower quality are not sent."""
     max_gap_ms: Annotated[float, Range(30, 300)] = 200.0
-    """A pose may be predicted for so long after the frame that it comes from."""
+    """Longest prediction after the frame that a pose is from."""
     resume_after_s: Annotated[float, Range(0.1, 60)] = 1.0
-    """Belief must have held for so long before poses are sent again."""
+    """The gate must have accepted poses for this long before they are sent again."""
     max_jump_m: Annotated[float, Range(0.05, 100)] = 1.0
-    """What a pose may be away from where motion has it, before that counts as a reset."""
+    """Largest innovation of a pose against the predicted motion before it counts as a reset."""
     set_origin: bool = True
-    """Give the autopilot an origin where it has none, so that it can use a pose."""
+    """Set an origin on an autopilot that has none, so that it can use a pose."""
     origin_latitude_deg: Annotated[float, Range(-90, 90)] = 0.0
-    """That origin, where no GPS has told one."""
+    """That origin, where no GPS has given one."""
     origin_longitude_deg: Annotated[float, Range(-180, 180)] = 0.0
     origin_altitude_m: Annotated[float, Range(-500, 9000)] = 0.0
     obstacle_distance: bool = False
@@ -171,35 +171,35 @@ class FeedbackConfig:
 
 @dataclass(frozen=True, slots=True)
 class ControlConfig:
-    """What a ground station may ask and change over MAVLink; see docs/control.md."""
+    """Commands and parameters of ground stations over MAVLink; see docs/control.md."""
 
     enabled: bool = True
     keep: str = ""
-    """A TOML file that keeps what the ground has set; read at the start, after all else. "" keeps
+    """TOML file that keeps settings from the ground; read at the start, after all else. "" keeps
     nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class DaemonConfig:
-    """The long-running program."""
+    """The daemon."""
 
     flights: str = "flights"
-    """Folder under which each flight gets one of its own."""
+    """Folder of the flights' folders."""
     flight: Annotated[str, OneOf(("armed", "always"))] = "armed"
     """A flight lasts from arming to disarming, or as long as the daemon runs."""
     missing_device_s: Annotated[float, Range(0, 3600)] = 60.0
-    """A camera or autopilot missing for so long ends the daemon with status 1; 0: never. Not while
-    armed."""
+    """Time after which a missing camera or autopilot ends the daemon with status 1, unless armed;
+    0: never."""
     socket: str = "auto"
     """Unix socket of `companion status`; "auto" lies in $RUNTIME_DIRECTORY or $XDG_RUNTIME_DIR."""
     prometheus_port: Annotated[int, Range(0, 65535)] = 0
     """Loopback port of metrics; 0 for none."""
     status_every_s: Annotated[float, Range(1, 3600)] = 10.0
-    """Between two status lines in the journal."""
+    """Interval of status lines in the journal."""
     viewer: str = "none"
     """none, web, native, or the rerun+http://… of a running viewer."""
     hot_c: Annotated[float, Range(30, 120)] = 85.0
-    """A processor hotter than this has its work cut down."""
+    """Temperature of the processor above which the load level is reduced."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,35 +208,35 @@ class RecorderConfig:
 
     enabled: bool = True
     codec: Annotated[str, OneOf(("mjpeg", "h264", "png", "raw"))] = "mjpeg"
-    """Of pictures; png and raw lose nothing."""
+    """Image codec; png and raw are lossless."""
     jpeg_quality: Annotated[int, Range(30, 100)] = 90
     h264_encoder: str = "auto"
-    """FFmpeg's name of an encoder; "auto" takes one in hardware, else libx264."""
+    """Name of an FFmpeg encoder; "auto" takes one in hardware, else libx264."""
     h264_kbit_s: Annotated[int, Range(100, 100000)] = 6000
     flush_s: Annotated[float, Range(0.1, 10)] = 0.5
-    """What is older than twice this is on the disk, whatever happens."""
+    """Data older than twice this is on disk, whatever happens."""
     buffer_mb: Annotated[int, Range(4, 4096)] = 64
-    """What waits for a slow disk at most; what comes then is dropped, pictures first."""
+    """Size of the queue to a slow disk; beyond it messages are dropped, images first."""
     point_cloud: bool = False
-    """Record the dense points too, which a replay makes anew."""
+    """Record the dense points too, which a replay can recompute."""
     least_free_mb: Annotated[int, Range(0, 1000000)] = 1000
-    """With less room than this on the disk the recording makes some, or ends."""
+    """Least free disk space; below it space is made, or the recording ends."""
     when_full: Annotated[str, OneOf(("prune", "stop"))] = "prune"
     """Delete the oldest flights, or stop recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetryConfig:
-    """How the autopilot's log is put on the flight's clock."""
+    """Time alignment of the autopilot's log with the flight's clock."""
 
     log: str = ""
-    """The log to read; "" takes what lies beside the pictures."""
+    """The log to read; "" takes the one beside the images."""
     align: Annotated[str, OneOf(("auto", "never"))] = "auto"
-    """Whether a log is put on the time of a video without frames.csv by how both turned."""
+    """Whether a log is aligned with a video without frames.csv by the rotation of both."""
     offset_s: Annotated[float, Range(-1e10, 1e10)] = 0.0
     """Added to all times of the log, for a log or a video whose clock was set wrong."""
     starts_with_video: bool = False
-    """Whether a log without absolute time is taken to begin with the video; else it is not used."""
+    """Whether a log without absolute time begins with the video; else it is not used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,13 +247,13 @@ class FeaturesConfig:
     n_levels: Annotated[int, Range(1, 16)] = 8
     scale_factor: Annotated[float, Range(1.05, 2)] = 1.2
     fast_threshold: Annotated[int, Range(1, 255)] = 12
-    """Contrast that a corner has at least to begin with, in grey levels; it follows the scene."""
+    """Initial FAST threshold, grey levels; it adapts to the scene."""
     min_fast_threshold: Annotated[int, Range(1, 255)] = 4
-    """The same where the scene is dull."""
+    """Least threshold, for scenes of low contrast."""
     max_fast_threshold: Annotated[int, Range(1, 255)] = 60
-    """The same where the scene is so rich that looking at all corners would take too long."""
+    """Largest threshold, for scenes so rich that all corners would take too long."""
     cell_px: Annotated[int, Range(8, 512)] = 32
-    """Features are spread over cells of this size."""
+    """Cell size of the grid over which features are distributed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,16 +261,16 @@ class TrackingConfig:
     """Tracking and keyframes."""
 
     min_inliers: Annotated[int, Range(6, 1000)] = 20
-    """Fewer map points found than this and the frame is lost."""
+    """Least map points found; with fewer the frame is lost."""
     min_init_parallax_deg: Annotated[float, Range(0.1, 30)] = 1.0
-    """The two initial keyframes are at least this far apart, seen from the points."""
+    """Least parallax between the two initial keyframes."""
     keyframe_min_share: Annotated[float, Range(0.05, 1)] = 0.75
-    """A new keyframe comes when fewer than this share of the reference's points are seen."""
+    """A keyframe is inserted when less than this share of the reference's points is seen."""
     keyframe_parallax_deg: Annotated[float, Range(0.1, 45)] = 3.0
-    """A new keyframe comes when the view of the points has turned by this much."""
+    """A keyframe is inserted when the parallax of the points exceeds this."""
     keyframe_max_s: Annotated[float, Range(0.05, 3600)] = 3.0
     restart_after_s: Annotated[float, Range(0, 3600)] = 1.0
-    """A camera that has been lost for so long may begin a new segment of the map.
+    """A camera lost for this long may begin a new segment of the map.
 
     With the autopilot's attitude after 0.4 of it.
     """
@@ -283,12 +283,12 @@ class MappingConfig:
     window: Annotated[int, Range(2, 100)] = 10
     """Keyframes adjusted together."""
     n_fixed: Annotated[int, Range(1, 200)] = 10
-    """Older keyframes that see the same points and hold them."""
+    """Older keyframes that see the same points, held fixed."""
     iterations: Annotated[int, Range(1, 100)] = 6
     final_iterations: Annotated[int, Range(1, 100)] = 8
-    """Of the adjustment of the whole map when the flight is over."""
+    """Iterations of the full bundle adjustment at the end of the flight."""
     keyframe_spacing_deg: Annotated[float, Range(0, 45)] = 1.0
-    """One that is nearer to another, seen from its points, goes if three show the same; 0: none."""
+    """Keyframes closer than this, seen from their points, are culled if redundant; 0: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,14 +296,14 @@ class GeoreferenceConfig:
     """Scale, heading and origin from the autopilot."""
 
     min_travel_m: Annotated[float, Range(0.1, 10000)] = 3.0
-    """No scale before the autopilot has moved this far."""
+    """Least distance flown before a scale is estimated."""
     max_sigma_scale: Annotated[float, Range(0.001, 1)] = 0.1
-    """No scale while its standard deviation is larger than this share."""
+    """Largest relative standard deviation of the scale."""
 
 
 @dataclass(frozen=True, slots=True)
 class OpenclConfig:
-    """Where kernels run."""
+    """OpenCL device."""
 
     device: str = "auto"
     """"auto" (the fastest that computes right), or a part of a device's or platform's name, or
@@ -316,23 +316,23 @@ class DepthConfig:
 
     enabled: bool = True
     stride: Annotated[int, Range(1, 8)] = 2
-    """Depth is estimated for every so many pixels; images are matched at full size."""
+    """Pixel step of depth estimation; images are matched at full size."""
     reference_step: Annotated[float, Range(0, 10)] = 0.15
-    """A keyframe gets a depth map when it is this far from the last, as a share of the depth."""
+    """Least distance between keyframes with a depth map, as a share of the depth."""
     n_updates: Annotated[int, Range(3, 100)] = 7
-    """Frames that a keyframe's depth is made of, chosen by their baselines."""
+    """Frames per depth map, chosen by their baselines."""
     max_baseline: Annotated[float, Range(0.01, 1)] = 0.20
     """Longest baseline used, as a share of the median depth."""
     lag_keyframes: Annotated[int, Range(1, 20)] = 2
-    """A keyframe waits for so many later ones, whose frames and adjusted poses it uses."""
+    """Number of later keyframes to wait for, whose frames and adjusted poses are used."""
     min_zncc: Annotated[float, Range(0, 1)] = 0.5
-    """Least correlation of an image that is said to fit."""
+    """Least correlation (ZNCC) of a matching image."""
     noise_grey: Annotated[float, Range(0, 50)] = 1.0
-    """Patches whose grey levels vary less than this are blank."""
+    """Patches whose grey levels vary less than this have no texture."""
     converged_sigma: Annotated[float, Range(0.0001, 0.1)] = 0.02
     """Relative standard deviation at which a pixel has converged."""
     min_inlier_ratio: Annotated[float, Range(0, 1)] = 0.35
-    """Share of images that fit, which a converged pixel has at least; some may not see it."""
+    """Least share of matching images of a converged pixel; some may not see it."""
     regularise_iterations: Annotated[int, Range(0, 1000)] = 60
     regularise_weight: Annotated[float, Range(0.001, 1000)] = 20.0
     """Weight of the measurements against smoothness."""
@@ -343,29 +343,28 @@ class CloudConfig:
     """The fused cloud."""
 
     voxel_m: Annotated[float, Range(0.001, 100)] = 0.10
-    """One point is kept in each cube of this size; a hundredth of the median depth while there is
-    no metric scale."""
+    """Voxel size of the cloud; a hundredth of the median depth without a metric scale."""
     min_agreeing: Annotated[int, Range(0, 4)] = 2
-    """Other keyframes whose depth must agree with a point's."""
+    """Number of other keyframes whose depth must agree with a point's."""
     agreement: Annotated[float, Range(0.001, 0.2)] = 0.015
-    """Relative difference of depth up to which two keyframes agree."""
+    """Largest relative difference of depths that agree."""
     memory_mb: Annotated[int, Range(1, 100000)] = 64
-    """Points of a flight kept in memory; others lie in the run's folder until it is over."""
+    """Points of a flight kept in memory; others are in the run's folder until it ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamConfig:
-    """What viewers on the ground are given; see companion.streaming."""
+    """Streaming to viewers on the ground; see companion.streaming."""
 
     listen: str = "127.0.0.1:9870"
     """HOST:PORT at which viewers connect; "" for none. 0.0.0.0 is every network."""
     budget_kbit_s: Annotated[float, Range(0, 1e6)] = 0.0
-    """All viewers together get no more; 0 leaves it to what the link carries."""
+    """Rate limit of all viewers together; 0: as much as the link carries."""
     most_viewers: Annotated[int, Range(1, 16)] = 4
     web_bind: str = "127.0.0.1"
     """Address at which daemon.viewer = "web" serves its page; 0.0.0.0 is every network."""
     store_mb: Annotated[int, Range(1, 4096)] = 128
-    """Points kept for viewers that come late; what is more is given up, the finest first."""
+    """Points kept for viewers that join late; beyond it the finest are dropped first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,19 +374,19 @@ class DistributedConfig:
     enabled: bool = False
     """Publish the topics. Needs the extra of the same name."""
     stages: tuple[str, ...] = ("tracking", "depth", "cloud")
-    """What this node runs: all, tracking alone, or depth and cloud."""
+    """Stages of this node: all, tracking alone, or depth and cloud."""
     vehicle: str = "drone"
     """Name of the drone in keys; nodes of one drone have the same."""
     listen: tuple[str, ...] = ()
-    """Where others join, as tcp/0.0.0.0:7447; none: loopback, if tracking runs here."""
+    """Endpoints to listen at, as tcp/0.0.0.0:7447; none: loopback, if tracking runs here."""
     connect: tuple[str, ...] = ()
-    """Nodes to join, as tcp/192.168.1.20:7447."""
+    """Endpoints to connect to, as tcp/192.168.1.20:7447."""
     budget_kbit_s: Annotated[float, Range(0, 1e6)] = 8000.0
-    """What depth needs of the flight takes no more of the link; 0 is no limit."""
+    """Rate limit of the bundles for depth nodes; 0 is no limit."""
     jpeg_quality: Annotated[int, Range(30, 100)] = 90
-    """Of frames that depth is made of."""
+    """JPEG quality of frames for depth nodes."""
     backlog_mb: Annotated[int, Range(1, 4096)] = 64
-    """Frames kept for a node that is away or comes late; the oldest are given up."""
+    """Frames kept for a node that is away or joins late; the oldest are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,9 +394,9 @@ class ViewerConfig:
     """The recording and the live viewer."""
 
     colours: Annotated[str, OneOf(("picture", "height", "confidence"))] = "picture"
-    """What the colours of the cloud tell."""
+    """Colour mode of the cloud."""
     rrd_mb: Annotated[int, Range(0, 1000000)] = 4000
-    """Most that a flight's .rrd files may take; the oldest go. 0 for no limit."""
+    """Size limit of a flight's .rrd files; the oldest are deleted. 0 for no limit."""
 
     jpeg_quality: Annotated[int, Range(1, 100)] = 60
     image_width: Annotated[int, Range(32, 8192)] = 640
@@ -405,14 +404,14 @@ class ViewerConfig:
 
 @dataclass(frozen=True, slots=True)
 class ExportConfig:
-    """What a replay writes beside its own results; `companion export` does so afterwards."""
+    """Exports that a replay writes beside its results; `companion export` does so afterwards."""
 
     formats: tuple[str, ...] = ()
     """ply, pcd, las, laz, dsm, ortho, tum, kitti, euroc, gpx, kml, geojson."""
     epsg: Annotated[int, Range(0, 999999)] = 0
-    """Projection of clouds and rasters; 0: the UTM zone in which the flight was."""
+    """Projection of clouds and rasters; 0: UTM zone of the flight."""
     cell_m: Annotated[float, Range(0, 1000)] = 0.0
-    """Side of a raster's cell; 0: twice the spacing of the cloud's points."""
+    """Cell size of rasters; 0: twice the spacing of the cloud's points."""
 
 
 @dataclass(frozen=True, slots=True)

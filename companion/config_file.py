@@ -1,4 +1,4 @@
-"""From a TOML file and `section.key=value` overrides to a checked `Config`, and back to text.
+"""Configuration files: TOML and `section.key=value` overrides as a checked `Config`, and back.
 
 What is wrong is a ConfigError of one line: where, which key, what was wanted, and the nearest key
 known. Nothing is guessed and nothing unknown is passed over.

@@ -19,7 +19,7 @@ class CompanionError(Exception):
 
 
 class InputError(CompanionError):
-    """What the user gave cannot be used."""
+    """Invalid input of the user."""
 
 
 class ConfigError(InputError):
@@ -50,7 +50,7 @@ class InstallError(CompanionError):
 
 
 class StreamError(CompanionError):
-    """What came over the link to a viewer is not what companion sends."""
+    """Invalid data on the link to a viewer or a node."""
 
 
 class StageError(CompanionError):

@@ -1,4 +1,4 @@
-"""How the daemon is: what each source and stage does, and what comes of it.
+"""Health of the daemon: meters of sources and stages, and their report.
 
 Meters count while the work goes on, in whatever thread does it; they ask no clock, every time is
 handed in. What they report is frozen: `SourceHealth`, `StageHealth`, and all of it as `Health`.
@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 WINDOW_S = 5.0
-"""Rates and latencies are those of the last so many seconds."""
+"""Window of rates and latencies."""
 MAX_EVENTS = 2048
-"""More events than this in a window are not kept; rates are then of a shorter time."""
+"""Most events in a window; beyond it rates are of a shorter time."""
 MIN_BETWEEN_LINES_S = 1.0
-"""Changes are told at once, but no more often than this, whatever flaps."""
+"""Least interval of lines about changes."""
 
 SourceState = Literal[
     "missing", "opening", "running", "silent", "frozen", "ended", "driver fault"
@@ -46,7 +46,7 @@ class SourceHealth:
 
 @dataclass(frozen=True, slots=True)
 class StageHealth:
-    """A piece of the pipeline. Latency counts from exposure to result; None where nothing came."""
+    """A stage. Latency is from exposure to result; None without results."""
 
     name: str
     alive: bool = True
@@ -59,15 +59,15 @@ class StageHealth:
     detail: str = ""
     latency_p99_ms: float | None = None
     waiting_mb: float = 0.0
-    """Of messages that it has yet to take."""
+    """Messages that wait for the stage."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeedbackHealth:
-    """The pose that the autopilot is given, or why it is not.
+    """Poses sent to the autopilot, or why none are.
 
-    `why_not` is one of a few constant phrases, by which a change is noticed; numbers belong in
-    `detail`. Latency counts from exposure to sending.
+    `why_not` is one of a few constant phrases, by which a change is detected; numbers belong in
+    `detail`. Latency is from exposure to sending.
     """
 
     mode: str = "off"
@@ -93,33 +93,33 @@ class ProcessLoad:
 
 @dataclass(frozen=True, slots=True)
 class ComputerLoad:
-    """The computer that this runs on. Shares are 0 to 1; None is what it does not tell."""
+    """Load of this computer. Shares are 0 to 1; unknown values are None."""
 
     uptime_s: float = 0.0
     cpu_share: float | None = None
     core_shares: tuple[float, ...] = ()
     gpu_share: float | None = None
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
-    """By the name of the sensor."""
+    """By name of the sensor."""
     fans_rpm: tuple[int, ...] = ()
     memory_used_mib: float | None = None
     memory_total_mib: float | None = None
     disk_kind: str = ""
-    """hdd, ssd, emmc or sd: what the flights are written to; "" where that is not known."""
+    """hdd, ssd, emmc or sd: the disk of the flights; "" where unknown."""
     disk_used_mib: float | None = None
     disk_total_mib: float | None = None
     disk_free_mib: float | None = None
-    """What we may still write, which is less than total minus used."""
+    """Space available to us, which is less than total minus used."""
     processes: tuple[ProcessLoad, ...] = ()
 
     @property
     def temperature_c(self) -> float | None:
-        """The hottest sensor."""
+        """Highest temperature."""
         return max(self.temperatures_c.values(), default=None)
 
     @property
     def memory_share(self) -> float | None:
-        """Share of the memory that is in use."""
+        """Share of memory in use."""
         if self.memory_used_mib is None or not self.memory_total_mib:
             return None
         return self.memory_used_mib / self.memory_total_mib
@@ -127,7 +127,7 @@ class ComputerLoad:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """All of it, at one time. `tracker` is in plain words; `quality` 1 to 100, -1 while lost."""
+    """Health at one time. `tracker` is in plain words; `quality` 1 to 100, -1 while lost."""
 
     t_ns: int
     uptime_s: float = 0.0
@@ -136,24 +136,24 @@ class Health:
     tracker: str = "waiting for the camera"
     quality: int = -1
     scale: str = ""
-    """Where the metric scale comes from, in words; "" while there is none."""
+    """Source of the metric scale, in words; "" without one."""
     pose_latency_p95_ms: float | None = None
     feedback: FeedbackHealth = field(default_factory=FeedbackHealth)
     flight: str = ""
-    """Name of the flight that goes on; "" between flights."""
+    """Name of the current flight; "" between flights."""
     load: ComputerLoad = field(default_factory=ComputerLoad)
     degradation: int = 0
-    """0 is everything; see companion.runtime.governor."""
+    """Load level, 0 is everything; see companion.runtime.governor."""
     degraded: str = ""
-    """What is left out and why, in words."""
+    """Work left out and the reason, in words."""
     loop_delay_p99_ms: float | None = None
     n_warnings: Mapping[str, int] = field(default_factory=dict)
-    """How often each thing was warned of since the start."""
+    """Number of warnings since the start, by kind."""
     set_by_ground: Mapping[str, Any] = field(default_factory=dict)
-    """Keys of the configuration that were set over MAVLink, and to what."""
+    """Keys of the configuration set over MAVLink, and their values."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain types only; what is not a finite number is null."""
+        """Plain types; a number that is not finite is null."""
         document = _plain(dataclasses.asdict(self))
         document["load"]["temperature_c"] = _plain(self.load.temperature_c)
         document["load"]["memory_share"] = _plain(self.load.memory_share)
@@ -161,7 +161,7 @@ class Health:
         return dict(document)
 
     def line(self) -> str:
-        """One line for the journal: what matters in flight first."""
+        """One line for the journal, the most important first."""
         parts = [self._pose(), self._feedback()]
         parts += [_source(source) for source in self.sources]
         parts += [_stage(stage) for stage in self.stages if not stage.alive or stage.n_restarted]
@@ -172,7 +172,7 @@ class Health:
         return "; ".join(part for part in parts if part)
 
     def key(self) -> Hashable:
-        """Equal as long as nothing has changed that is worth a line at once."""
+        """Equal as long as nothing has changed that deserves a line at once."""
         return (
             self.tracker,
             bool(self.scale),
@@ -214,7 +214,7 @@ class Health:
 
 
 class StatusLines:
-    """Says when a status line is due: every so often, and at once when something has changed."""
+    """Schedule of status lines: at intervals, and at once after a change."""
 
     def __init__(self, every_s: float) -> None:
         self._every_ns = round(every_s * 1e9)
@@ -222,7 +222,7 @@ class StatusLines:
         self._last_ns: int | None = None
 
     def step(self, health: Health) -> str | None:
-        """The line that is due now, or None; to be asked several times a second."""
+        """Line that is due now, or None; to be called several times a second."""
         since_ns = None if self._last_ns is None else health.t_ns - self._last_ns
         if since_ns is not None and since_ns < self._every_ns:
             if health.key() == self._key or since_ns < MIN_BETWEEN_LINES_S * 1e9:
@@ -232,7 +232,7 @@ class StatusLines:
 
 
 class RateMeter:
-    """How often something happens, over the last few seconds."""
+    """Rate of events over the last few seconds."""
 
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_ns = round(window_s * 1e9)
@@ -240,12 +240,12 @@ class RateMeter:
         self._lock = threading.Lock()
 
     def add(self, t_ns: int) -> None:
-        """It happened."""
+        """Count an event."""
         with self._lock:
             self._times_ns.append(t_ns)
 
     def hz(self, now_ns: int) -> float:
-        """Its rate; falls to 0 within the window where nothing happens any more."""
+        """Rate; falls to 0 within the window after the last event."""
         with self._lock:
             times = [t for t in self._times_ns if now_ns - t <= self._window_ns]
             n_kept = len(self._times_ns)
@@ -255,7 +255,7 @@ class RateMeter:
 
 
 class SourceMeter:
-    """Counts what comes from a source; may be used from any thread."""
+    """Counters of a source; may be used from any thread."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -268,13 +268,13 @@ class SourceMeter:
         self._rate = RateMeter()
 
     def came(self, t_ns: int) -> None:
-        """Something came at this time, the time of receipt."""
+        """Count an input at its time of receipt."""
         self.n += 1
         self._last_ns = t_ns
         self._rate.add(t_ns)
 
     def health(self, now_ns: int) -> SourceHealth:
-        """As it stands now."""
+        """Health now."""
         last_ns = self._last_ns
         return SourceHealth(
             name=self.name,
@@ -289,7 +289,7 @@ class SourceMeter:
 
 
 class StageMeter:
-    """Counts what a stage does; may be used from any thread."""
+    """Counters of a stage; may be used from any thread."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -302,14 +302,14 @@ class StageMeter:
         self._latency = LatencyMeter()
 
     def done(self, t_ns: int, begun_ns: int | None = None) -> None:
-        """A result came out at this time; what it is of was exposed or begun at `begun_ns`."""
+        """Count a result; its input was exposed or begun at `begun_ns`."""
         self.n += 1
         self._rate.add(t_ns)
         if begun_ns is not None:
             self._latency.add(t_ns, (t_ns - begun_ns) * 1e-6)
 
     def health(self, now_ns: int) -> StageHealth:
-        """As it stands now."""
+        """Health now."""
         return StageHealth(
             name=self.name,
             alive=self.alive,
@@ -325,7 +325,7 @@ class StageMeter:
 
 
 class LatencyMeter:
-    """How long something takes, over the last few seconds; for the delay of the event loop too."""
+    """Percentiles of durations over the last few seconds; of the event loop's delay, too."""
 
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_ns = round(window_s * 1e9)
@@ -333,12 +333,12 @@ class LatencyMeter:
         self._lock = threading.Lock()
 
     def add(self, t_ns: int, ms: float) -> None:
-        """It took so long, and was over at this time."""
+        """Add a duration that ended at this time."""
         with self._lock:
             self._events.append((t_ns, ms))
 
     def percentile_ms(self, percent: float, now_ns: int) -> float | None:
-        """Of so many percent it took no longer; None where there were none."""
+        """Percentile of the durations; None without any."""
         with self._lock:
             recent = sorted(ms for t, ms in self._events if now_ns - t <= self._window_ns)
         if not recent:

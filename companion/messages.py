@@ -1,4 +1,4 @@
-"""Every noun that passes between rooms: frozen, with its time, its unit and its frame in its name.
+"""Messages between packages: frozen, with time, unit and frame in the names of their fields.
 
 `t_ns` is nanoseconds on the flight's own clock: that of the computer which stamped the frames (Unix
 time in recorded flights). Arrays are not to be written to after construction.
@@ -49,7 +49,7 @@ class ImuSample:
 
 
 class PositionSource(Enum):
-    """Where a position comes from; earlier ones are preferred."""
+    """Source of a position; earlier ones are preferred."""
 
     LOCAL = "local position"
     GLOBAL = "global position"
@@ -99,24 +99,24 @@ Telemetry = AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSa
 
 
 class TrackState(Enum):
-    """What the tracker knows."""
+    """State of the tracker."""
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
-    COASTING = "coasting"
-    """Nothing is recognised; the pose is carried on by the autopilot's attitude and velocity."""
+    DEAD_RECKONING = "coasting"
+    """No map points found; the pose is propagated by the autopilot's attitude and velocity."""
     LOST = "lost"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Where one frame was taken, or that it is not known.
+    """Pose of one frame, or none.
 
-    Its pose is `map_from_camera` as believed at that time, and `keyframe_from_camera` relative to
-    keyframe `keyframe_id`, which stays true when the map is corrected. All are None unless
+    `map_from_camera` is the pose as estimated at that time, `keyframe_from_camera` that relative to
+    keyframe `keyframe_id`, which stays valid when the map is corrected. All are None unless
     tracking. `keypoints_px` (N, 2) are distorted pixels of the map points found. `backfilled` marks
-    frames that were placed after the fact (those between the two initial keyframes, say). The
-    sigmas are of the pose in the map by this image alone, the position's in map units.
+    frames that were localised afterwards (those between the two initial keyframes, say). The sigmas
+    are of the pose in the map by this image alone, the position's in map units.
     """
 
     seq: int
@@ -135,15 +135,15 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """Where the body is, as an autopilot may be told: metric, level, and without jumps.
+    """Pose of the body for an autopilot: metric, level, and without jumps.
 
-    `world_from_body` is in local NED metres, or, where no position tells where its zero is, in
-    metres from where the map began. It follows the camera smoothly: what the map learns later is
-    worked in slowly, and only a real discontinuity, which raises `reset_counter`, moves it at once.
+    `world_from_body` is in local NED metres, or, where no position gives its origin, in metres from
+    where the map began. It follows the camera smoothly: later corrections of the map are applied
+    with limited slew, and only a discontinuity, which raises `reset_counter`, moves it at once.
     None while lost or without a metric scale. `velocity_world_m_s` (3,); `sigma_position_m` is one
     standard deviation of the position since the last reset, along each axis, `sigma_attitude_rad`
     of the tilt about each level axis, `sigma_yaw_rad` of the heading, against north; `quality` is
-    1..100, or -1 while the pose is not known.
+    1..100, or -1 while the pose is unknown.
     """
 
     seq: int
@@ -161,7 +161,7 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeAdded:
-    """A new keyframe: which frame it is, and how deep the map points that it sees lie.
+    """A new keyframe: its frame, and the map points that it sees.
 
     `points_camera` (N, 3) are these points in its camera frame, map units.
     """
@@ -174,11 +174,11 @@ class KeyframeAdded:
 
 
 @dataclass(frozen=True, slots=True)
-class Reunited:
-    """A place was known again: keyframe `keyframe_id` shows what `other_id` showed before.
+class LoopClosed:
+    """Place recognised: keyframe `keyframe_id` shows what `other_id` showed before.
 
-    Within the same map a loop closed, which moved the newer end by `moved` map units; else two maps
-    became one, the other's unit being `scale` of this one's.
+    With `same_map` a loop closure, which moved the newer end by `moved` map units; else a map
+    merge, the other map's unit being `scale` of this one's.
     """
 
     t_ns: int
@@ -191,10 +191,10 @@ class Reunited:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Georeference:
-    """How the map lies in the world: local NED in metres.
+    """Transform of the map to the world: local NED in metres.
 
-    `metres_per_unit` is `world_from_map.scale`; the sigmas are one standard deviation. `method`
-    says in words what the scale came from.
+    `metres_per_unit` is `world_from_map.scale`; the sigmas are one standard deviation. `method` is
+    the source of the scale in words.
     """
 
     world_from_map: Similarity
@@ -209,17 +209,17 @@ class Georeference:
 
 
 SPANS_REACH = 6
-"""Keyframes before one, and after it, that tell how its surroundings are stretched."""
+"""Number of keyframes before and after one whose distances give its local scale correction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
-    """The map as it now stands: every keyframe's pose, and the sparse points (N, 3) in map units.
+    """The map now: every keyframe's pose, and the sparse points (N, 3) in map units.
 
-    `unit_of` holds, for keyframes of segments with a scale of their own, how many map units one
-    unit of the keyframe's camera frame is; all others are 1. A keyframe that is missing here has no
-    known place, and what hangs on it has none either. `n_retired` of them have left the map, their
-    neighbours showing all that they showed, and move with those.
+    `scale_of` holds, for keyframes of segments with a scale of their own, the number of map units
+    in one unit of the keyframe's camera frame; all others are 1. A keyframe that is missing here
+    has no known pose, and neither has what is attached to it. `n_retired` redundant keyframes have
+    left the map and move with their neighbours.
     """
 
     revision: int
@@ -227,23 +227,23 @@ class MapUpdate:
     map_from_camera: Mapping[int, Pose]
     points_map: Array
     georeference: Georeference | None
-    unit_of: Mapping[int, float] = field(default_factory=dict)
+    scale_of: Mapping[int, float] = field(default_factory=dict)
     n_retired: int = 0
 
     @property
     def n_keyframes(self) -> int:
-        """Keyframes that the map is made of."""
+        """Keyframes in the map."""
         return len(self.map_from_camera) - self.n_retired
 
     def place_of(self, keyframe_id: int) -> Similarity | None:
-        """The transform `map_from_camera` of a keyframe, unit included; None if not known."""
+        """Transform `map_from_camera` of a keyframe, scale included; None if unknown."""
         pose = self.map_from_camera.get(keyframe_id)
         if pose is None:
             return None
-        return Similarity(self.unit_of.get(keyframe_id, 1.0), pose.rotation, pose.translation)
+        return Similarity(self.scale_of.get(keyframe_id, 1.0), pose.rotation, pose.translation)
 
     def spans_of(self, keyframe_id: int) -> dict[int, float]:
-        """How far some keyframes of about then are from one, in the unit of its camera frame."""
+        """Distances of neighbouring keyframes from one, in the unit of its camera frame."""
         place = self.place_of(keyframe_id)
         if place is None:
             return {}
@@ -251,10 +251,10 @@ class MapUpdate:
         others = [k for k in around if k != keyframe_id and self._with(place, k)]
         return {k: self._span(place, k) for k in others}
 
-    def stretch_of(self, keyframe_id: int, spans: Mapping[int, float]) -> float:
-        """By what factor measures about a keyframe are longer now than when it had these spans.
+    def local_scale_of(self, keyframe_id: int, spans: Mapping[int, float]) -> float:
+        """Local scale correction about a keyframe since it had these spans.
 
-        The median of the spans, each with the weight of its length; 1 where none tells.
+        The median ratio of the spans, weighted by length; 1 without any.
         """
         place = self.place_of(keyframe_id)
         if place is None:
@@ -272,8 +272,8 @@ class MapUpdate:
         return 1.0
 
     def _with(self, place: Similarity, other_id: int) -> bool:
-        """Whether a keyframe is there, and in the same unit."""
-        unit = self.unit_of.get(other_id, 1.0)
+        """Whether a keyframe exists, and has the same scale."""
+        unit = self.scale_of.get(other_id, 1.0)
         return other_id in self.map_from_camera and abs(unit / place.scale - 1.0) < 1e-9
 
     def _span(self, place: Similarity, other_id: int) -> float:
@@ -294,9 +294,9 @@ class PixelState(Enum):
 class DepthMap:
     """Dense depth of a keyframe, in its undistorted pinhole image.
 
-    `depth` (H, W) f32 along z in map units, 0 where there is none; `sigma` (H, W) f32 likewise;
-    `state` (H, W) u8 of `PixelState`; `inlier_ratio` (H, W) f32 0..1; `rgb` (H, W, 3) the
-    undistorted image; `intrinsics` fx, fy, cx, cy.
+    `depth` (H, W) f32 along z in map units, 0 where invalid; `sigma` (H, W) f32 likewise; `state`
+    (H, W) u8 of `PixelState`; `inlier_ratio` (H, W) f32 0..1; `rgb` (H, W, 3) the undistorted
+    image; `intrinsics` fx, fy, cx, cy.
     """
 
     keyframe_id: int
@@ -315,11 +315,11 @@ class DepthMap:
 class PointChunk:
     """Fused points of one keyframe, in its camera frame and map units.
 
-    `points_camera` (N, 3) f32, `rgb` (N, 3) u8, `confidence` (N,) f32 in 0..1; `normals_camera`
-    (N, 3) f32 unit vectors towards the camera, zero where not known; `sigma` (N,) f32 one standard
-    deviation along the line of sight, map units. A moved keyframe moves its chunk: nothing here
-    changes. `spans` are `MapUpdate.spans_of` the keyframe when the points were made; a later map
-    tells by them how its scale has changed there.
+    `points_camera` (N, 3) f32, `rgb` (N, 3) u8, `confidence` (N,) f32 in 0..1; `normals_camera` (N,
+    3) f32 unit vectors towards the camera, zero where unknown; `sigma` (N,) f32 one standard
+    deviation along the line of sight, map units. A chunk moves with its keyframe and is not
+    changed. `spans` are `MapUpdate.spans_of` the keyframe when the points were made, from which a
+    later map gives the local scale correction.
     """
 
     keyframe_id: int
@@ -334,7 +334,7 @@ class PointChunk:
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """Something the user should know of; `what` is a constant, by which it is counted."""
+    """A warning for the user; `what` is a constant, by which it is counted."""
 
     t_ns: int
     what: str
@@ -345,7 +345,7 @@ class Warned:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockReport:
-    """How autopilot boot time was put on the flight's clock."""
+    """Mapping of the autopilot's boot time to the flight's clock."""
 
     method: str
     offset_s: float
@@ -355,7 +355,7 @@ class ClockReport:
 
 
 Message = (
-    Frame | Telemetry | Track | Odometry | KeyframeAdded | Reunited | MapUpdate | DepthMap
+    Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
     | PointChunk | Warned
 )  # fmt: skip
 

@@ -162,7 +162,8 @@ OTHER_REASON = "see its log"
 SWITCHED_OFF = ("off", "switched off")
 """Reasons that are the pilot's own, or the ground's."""
 PARTS: Mapping[str, str] = {
-    "depth": "dense map", "tape": "recording", "recorder": "results", "topics": "remote map link",
+    "depth": "dense map", "recorder": "recording", "results": "results",
+    "topics": "remote map link",
 }  # fmt: skip
 
 OF_WARNING: Mapping[str, PilotMessage] = {
@@ -227,7 +228,7 @@ JOURNAL_ONLY = frozenset({
 
 
 def of_warning(what: str, detail: str = "", good: bool = False) -> PilotText | None:
-    """What the pilot is told of a `Warned`; None where that is nothing."""
+    """Text for the pilot about a `Warned`; None without one."""
     if what in JOURNAL_ONLY:
         return None
     message = OF_WARNING.get(what)

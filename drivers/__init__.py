@@ -1,1 +1,1 @@
-"""The edge towards cameras, autopilots and recorded flights: all becomes stamped messages."""
+"""Drivers: cameras, autopilots and recorded flights as stamped messages."""

@@ -1,4 +1,4 @@
-"""A recorded flight, whatever it was recorded in: frames in order of time, and what was logged."""
+"""A recorded flight of any format: frames in order of time, and telemetry."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from companion.messages import Frame, Warned
 from drivers.images.frame_source import FrameSource
-from drivers.images.prefetch import Ahead
+from drivers.images.prefetch import Prefetch
 from drivers.telemetry.telemetry_log import Pictures, TelemetryLog
 
-FRAMES_AHEAD = 4
+PREFETCHED = 4
 ENDS_EARLY = "the video ends early"
-"""What a flight with fewer frames than its list of times warns of."""
+"""Warning about fewer frames than the list of times has."""
 
 
 class TruePose(NamedTuple):
-    """Where a frame truly was taken: `world_from_camera` in metres, in a world of the format's."""
+    """Ground truth of a frame: `world_from_camera` in metres, in a world of the format's."""
 
     t_ns: int
     world_from_camera: Pose
 
 
 class Flight:
-    """A flight that can be read; `open_flight` makes one."""
+    """A readable flight; created by `open_flight`."""
 
     def __init__(
         self,
@@ -47,9 +47,9 @@ class Flight:
         self.path = path
         self.camera = camera
         self.warnings = tuple(warnings)
-        """What was found amiss on opening."""
+        """Warnings on opening."""
         self.source = source
-        """Where its pictures lie."""
+        """Source of its images."""
         self._numbers = numbers
         self._times_ns = times_ns
         self._read_log = read_log
@@ -58,7 +58,7 @@ class Flight:
 
     @property
     def n_frames(self) -> int:
-        """Frames that have a time and a picture."""
+        """Number of frames that have a time and an image."""
         return len(self._numbers)
 
     @property
@@ -82,28 +82,28 @@ class Flight:
         return self._times_ns[-1] + 1
 
     def n_frames_between(self, start_ns: int | None = None, stop_ns: int | None = None) -> int:
-        """How many frames `frames` has to decode between these times."""
+        """Number of frames that `frames` has to decode between these times."""
         first, beyond = self._part(start_ns, stop_ns)
         return beyond - first
 
     def frames(
         self, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Frame | Warned]:
-        """Frames with start_ns <= t_ns < stop_ns, decoded a few ahead in another thread.
+        """Frames with start_ns <= t_ns < stop_ns, prefetched in another thread.
 
-        `seq` is the number in the source. A picture that cannot be decoded comes as a Warned.
+        `seq` is the number in the source. An image that cannot be decoded comes as a Warned.
         """
         first, beyond = self._part(start_ns, stop_ns)
-        ahead = Ahead(self._decode(first, beyond), FRAMES_AHEAD)
+        prefetch = Prefetch(self._decode(first, beyond), PREFETCHED)
         try:
-            yield from ahead
+            yield from prefetch
         finally:
-            ahead.close()
+            prefetch.close()
 
     def telemetry(self) -> TelemetryLog:
-        """Everything that the autopilot logged, on the flight's clock; read once, then kept.
+        """All telemetry, on the flight's clock; read once, then kept.
 
-        FlightError where none of it is of the time of the frames.
+        FlightError where none of it overlaps the time of the frames.
         """
         if self._telemetry is None:
             pictures = Pictures(
@@ -113,11 +113,11 @@ class Flight:
         return self._telemetry
 
     def truth(self) -> Sequence[TruePose]:
-        """Where its frames truly were, where the format tells; for scoring only."""
+        """Ground truth of the frames, where the format has it; for scoring only."""
         return self._read_truth()
 
     def _host_from_file_ns(self, file_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Times on the flight's clock of times by the video's own, beyond its ends at its rate."""
+        """Times on the flight's clock of times of the video, extrapolated at its ends."""
         own_ns = np.array(self.source.own_times_ns(), np.int64)[self._numbers]
         inside = np.clip(file_ns, own_ns[0], own_ns[-1])
         after_ns = np.interp(inside - own_ns[0], own_ns - own_ns[0], self._since_start())

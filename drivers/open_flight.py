@@ -1,4 +1,4 @@
-"""The one door to recorded flights: what is given is recognised by what it is, not by its name."""
+"""Opens recorded flights; the format is recognised by content, not by name."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from drivers.telemetry.telemetry_folder import READERS as LOGS
 
 
 class Format(NamedTuple):
-    """A format of recorded flights; `recognises` looks at a file or a folder that exists."""
+    """Format of recorded flights; `recognises` examines an existing file or folder."""
 
     name: str
     recognises: Callable[[Path], bool]
@@ -51,7 +51,7 @@ FOLDERS = (
     Format("geotagged photographs", is_geotagged, open_geotagged),
     Format("video or images", has_pictures, open_flight_folder),
 )
-"""In the order in which they are tried."""
+"""In the order of detection."""
 
 
 def open_flight(
@@ -59,13 +59,13 @@ def open_flight(
 ) -> Flight:
     """Open a flight of any known format and check all of it but the telemetry.
 
-    FlightError where it is amiss, or of no known format.
+    FlightError where it is invalid, or of no known format.
     """
     return format_of(path).open(path, config, telemetry or TelemetryConfig())
 
 
 def format_of(path: Path) -> Format:
-    """The format of what lies there; FlightError where it is none."""
+    """Format of a file or folder; FlightError where it is none."""
     if not path.exists():
         raise FlightError(f"{path}: there is no such file or folder")
     try:

@@ -1,4 +1,4 @@
-"""What every test can rely on: fixed seeds, and no network beyond this machine."""
+"""Common setup of all tests: fixed seeds, and no network beyond this machine."""
 
 from __future__ import annotations
 

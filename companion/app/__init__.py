@@ -1,4 +1,4 @@
-"""The commands: arguments turned into one call each, and what came of it as an exit status.
+"""Commands: arguments become one call each, its outcome an exit status.
 
 May import everything; nothing imports it.
 """

@@ -1,4 +1,4 @@
-"""companion batch: many flights replayed on many cores or machines, and one page about all.
+"""companion batch: replays many flights on many cores or machines, with one page about all.
 
 Each flight is a task of Dask, which runs it in a process of its own. What is done already, with the
 same files and settings, is not done again.
@@ -28,12 +28,12 @@ from companion.products.report.batch_page import batch_page
 
 DONE, INDEX, THUMBNAIL = "batch.json", "index.html", "thumbnail.jpg"
 MOST_FILES = 1000
-"""Of a flight's folder that are looked at for changes; a flight of images has its list besides."""
+"""Files of a flight's folder checked for changes; a flight of images has its list besides."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class BatchResult:
-    """What became of one flight; `error` is "" where it is done, `report` then its numbers."""
+    """Outcome of one flight: `error`, or "" and the numbers of its `report`."""
 
     name: str
     flight: Path
@@ -83,7 +83,7 @@ def batch(
 
 
 def replay_one(name: str, flight: Path, out: Path, config: Config, mark: str) -> BatchResult:
-    """One task; where it runs is Dask's affair. What is wrong with a flight ends that one only."""
+    """One Dask task. An error of the flight ends that flight only."""
     folder = out / name
     try:
         replay(
@@ -145,7 +145,7 @@ def _n_cores() -> int:
 
 
 def _named(flights: Sequence[Path]) -> dict[str, Path]:
-    """A name for each flight, that of its folder or file; a number where two have the same."""
+    """Unique name of each flight: that of its folder or file, numbered where two are equal."""
     out: dict[str, Path] = {}
     for flight in flights:
         own = flight.absolute()
@@ -158,7 +158,7 @@ def _named(flights: Sequence[Path]) -> dict[str, Path]:
 
 
 def _mark(flight: Path, config: Config) -> str:
-    """Changes when the files, the settings or the program do."""
+    """Hash of the files' names, sizes and times, the settings and the program version."""
     inside = sorted(flight.iterdir())[:MOST_FILES] if flight.is_dir() else [flight]
     files = []
     for path in inside:
@@ -173,7 +173,7 @@ def _mark(flight: Path, config: Config) -> str:
 
 
 def _done(folder: Path, mark: str) -> dict[str, Any] | None:
-    """The report of a flight that was done with the same mark; None if there is none."""
+    """Report of a flight that was done with the same mark, or None."""
     try:
         said = json.loads((folder / DONE).read_bytes())
     except (OSError, ValueError):

@@ -1,6 +1,6 @@
-"""`companion calibrate`: from a board held before a camera to the camera's calibration file.
+"""`companion calibrate`: a camera's calibration file from views of a calibration board.
 
-A calibration that may not be flown with is refused with the reason, and nothing is written.
+A calibration that is not fit for flight is refused with the reason, and nothing is written.
 """
 
 from __future__ import annotations
@@ -35,37 +35,37 @@ from drivers.camera.camera_source import CameraSource, EndOfPictures
 from drivers.images.frame_source import FrameSource, Video, find_frames
 
 MAX_SEARCHED = 400
-"""Pictures of a recording in which the board is looked for, the sharpest of each stretch."""
+"""Images of a recording that are searched for the board, the sharpest of each interval."""
 MAX_VIEWS = 40
-"""Views that a lens is fitted to; more of them make it slower and hardly better."""
+"""Views for the lens fit; more make it slower and hardly better."""
 MAX_LIVE_VIEWS = 80
 LIVE_NOVELTY, LIVE_GAIN = 0.05, 0.005
-"""Views of a live camera are kept when they are so unlike those before, or cover so much more."""
+"""Least novelty, or gain of coverage, of a view of a live camera."""
 LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
-"""A lens is fitted to the views of a live camera from so many on, and again after so many more."""
+"""Views of a live camera before the first lens fit, and between two fits."""
 READ_S = 0.25
-"""A live camera is waited for so long before Ctrl-C is looked for."""
+"""Longest read of a live camera, so that Ctrl-C is noticed."""
 MIN_FOUND = 0.05
-"""Of the pictures must show the board, else it is asked whether they show another."""
+"""Least share of images with the board; below it other boards are tried."""
 N_UNFOUND_KEPT = 12
-"""Pictures without the board that are kept, to tell what else is on them."""
+"""Images without the board that are kept, to detect another board on them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationReport:
-    """What a calibration came to, and where it was written."""
+    """Result of a calibration, and where it was written."""
 
     name: str
     calibration: Calibration
     n_pictures: int
-    """In which the board was looked for."""
+    """Images searched for the board."""
     n_found: int
     n_blurred: int
     toml: Path
     picture: Path
 
     def __str__(self) -> str:
-        """Some lines for the terminal."""
+        """Text for the terminal."""
         made = self.calibration
         fx, fy, cx, cy = (
             f"{key} {value:.2f} ± {sigma:.2f}"
@@ -93,8 +93,9 @@ def calibrate(
 ) -> CalibrationReport:
     """Calibrate from a video, a folder of images, or a live camera, into `out`.
 
-    InputError when the board is not there, or the result may not be used; then no file is touched.
-    A KeyboardInterrupt out of `progress` ends a live camera's views; what there is must do.
+    InputError without a board, or when the result is not fit for use; then no file is touched. A
+    KeyboardInterrupt raised by `progress` ends the views of a live camera; those taken must
+    suffice.
     """
     chart = parse_chart(board)
     if model not in ("auto", *MODELS):
@@ -125,7 +126,7 @@ def calibrate(
 
 
 def print_board(board: str, path: Path) -> str:
-    """Write the board as a page to print, .pdf or .png; returns the paper that it is for."""
+    """Write the board as a page to print, .pdf or .png; return the paper size."""
     form = path.suffix.lower().lstrip(".")
     if form not in ("pdf", "png"):
         raise InputError(f"--print-board {path}: wanted a name that ends in .pdf or .png")
@@ -139,7 +140,7 @@ def print_board(board: str, path: Path) -> str:
 
 @dataclass(slots=True)
 class _Gathered:
-    """What was found so far."""
+    """Views found so far."""
 
     chart: Chart
     views: list[View] = field(default_factory=list)
@@ -152,7 +153,7 @@ class _Gathered:
     unfound: list[Bytes] = field(default_factory=list)
 
     def look(self, number: int, grey: Bytes, *, only_new: bool) -> str:
-        """Look for the board in a picture; "" when it gave a view, else why it gave none."""
+        """Search an image for the board; "" when it gives a view, else the reason."""
         height, width = grey.shape
         if self.n_searched and self.size != (width, height):
             raise InputError(
@@ -180,7 +181,7 @@ class _Gathered:
         return ""
 
     def covered(self) -> Coverage:
-        """Where the board was."""
+        """Coverage of the image by the views so far."""
         return coverage(self.views, self.lit.mask(*self.size))
 
     def _is_new(self, view: View) -> bool:
@@ -207,8 +208,8 @@ def _search(frames: FrameSource, gathered: _Gathered, progress: Progress) -> Non
     """Views of a recording."""
     progress.start(frames.n_frames)
     try:
-        stretch = math.ceil(frames.n_frames / MAX_SEARCHED)
-        for number, grey, done in _sharpest(frames, stretch):
+        interval = math.ceil(frames.n_frames / MAX_SEARCHED)
+        for number, grey, done in _sharpest(frames, interval):
             gathered.look(number, grey, only_new=False)
             progress.update(done, "looking for the board", len(gathered.views))
     finally:
@@ -217,22 +218,22 @@ def _search(frames: FrameSource, gathered: _Gathered, progress: Progress) -> Non
         raise InputError(f"{frames.path}: none of its {frames.n_frames} pictures can be decoded")
 
 
-def _sharpest(frames: FrameSource, stretch: int) -> Iterator[tuple[int, Bytes, int]]:
-    """Number and grey picture of the sharpest of each stretch, and how many were decoded so far."""
+def _sharpest(frames: FrameSource, interval: int) -> Iterator[tuple[int, Bytes, int]]:
+    """Number and grey image of the sharpest of each interval, and how many are decoded so far."""
     best: tuple[float, int, Bytes] | None = None
     for number, rgb in frames.pictures(0, frames.n_frames - 1):
         if rgb is not None:
             grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-            sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).std()) if stretch > 1 else 0.0
+            sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).std()) if interval > 1 else 0.0
             if best is None or sharpness > best[0]:
                 best = sharpness, number, grey
-        if best is not None and ((number + 1) % stretch == 0 or number + 1 == frames.n_frames):
+        if best is not None and ((number + 1) % interval == 0 or number + 1 == frames.n_frames):
             yield best[1], best[2], number + 1
             best = None
 
 
 def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Progress) -> None:
-    """Views of a live camera, until they are enough or its user stops."""
+    """Views of a live camera, until there are enough or the user stops."""
     progress.start(0)
     try:
         source.open()
@@ -243,7 +244,7 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
             if picture is None:
                 progress.update(number, "no picture comes", len(gathered.views))
                 continue
-            amiss = gathered.look(number, picture.grey, only_new=True)
+            problem = gathered.look(number, picture.grey, only_new=True)
             number += 1
             covered = gathered.covered()
             wanted = advice(gathered.views, covered, made)
@@ -255,10 +256,10 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
             if not wanted:
                 break
             # what to do is said where the board is seen well, else why it is not
-            seen_well = amiss in ("", "move the board")
-            progress.update(number, wanted if seen_well else amiss, len(gathered.views))
+            seen_well = problem in ("", "move the board")
+            progress.update(number, wanted if seen_well else problem, len(gathered.views))
     except (KeyboardInterrupt, EndOfPictures):
-        pass  # what there is must do; if it does not, the reason is told
+        pass  # the views so far must suffice; if they do not, the reason is given
     finally:
         source.close()
         progress.finish()
@@ -267,7 +268,7 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
 
 
 def _judged(gathered: _Gathered, called: str, model: str) -> Calibration:
-    """The calibration, when it may be used."""
+    """The calibration, if it is fit for use."""
     refused = f"{called}: not calibrated: "
     n, found = gathered.n_searched, gathered.n_found
     if found < MIN_FOUND * n:  # perhaps by chance, on a board that is another one

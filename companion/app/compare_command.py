@@ -1,4 +1,4 @@
-"""companion compare: what a change of the program, its settings or the machine does to a flight."""
+"""companion compare: effect of a change of program, settings or machine on a flight."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.products.run_folder import read_run
 def compare(run_a: Path, run_b: Path, out: Path | None) -> Comparison:
     """Compare the folders of two runs; with `out`, write compare.html and compare.json there.
 
-    InputError where one of them is no run, or they are not of one flight.
+    InputError where one of them is no run, or they are of different flights.
     """
     found = compare_runs(read_run(run_a), read_run(run_b))
     if out is not None:
@@ -26,7 +26,7 @@ def compare(run_a: Path, run_b: Path, out: Path | None) -> Comparison:
 
 
 def in_words(found: Comparison) -> str:
-    """The comparison in a few lines."""
+    """Summary of the comparison."""
     if found.identical:
         return "poses and cloud are the same to the last bit"
     n, unit = numbers(found), found.unit
@@ -50,7 +50,7 @@ def in_words(found: Comparison) -> str:
 
 
 def beyond(found: Comparison, most_apart: float | None, most_cloud: float | None) -> list[str]:
-    """Which limits are not kept: poses apart (RMS), 95 % of each cloud from the other."""
+    """Limits exceeded: RMS distance of poses, 95th percentile of distances between the clouds."""
     out = []
     poses, cloud = found.poses, numbers(found)["cloud"]
     if most_apart is not None:

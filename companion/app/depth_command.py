@@ -31,16 +31,16 @@ from drivers.datasets.posed_layouts import open_posed_images
 
 MAX_TURN_RAD = np.radians(35.0)
 RANGE_FRAMES = 60
-"""Images over which points are followed to find the range of depths."""
+"""Images over which points are tracked to find the depth range."""
 MAX_FRAMES = 400
-"""Images around one reference that are taken at most."""
+"""Most images around one reference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What of a data set is wanted: one reference or all, frames A to B.
+    """Selection: one reference or all, frames A to B.
 
-    `range_m` is the least and the greatest depth; None has them found for each reference.
+    `range_m` is the least and the greatest depth; None has them estimated for each reference.
     """
 
     reference: int | None
@@ -49,7 +49,7 @@ class Wanted:
 
 
 class Reconstruction:
-    """The engine on one data set; keeps undistorted images as long as they may be needed."""
+    """Depth engine on one data set; caches undistorted images."""
 
     def __init__(self, images: PosedImages, config: Config, device: ComputeDevice) -> None:
         self.images = images
@@ -62,21 +62,21 @@ class Reconstruction:
         self._kept: dict[int, Bytes] = {}
 
     def picture(self, position: int) -> Bytes:
-        """The undistorted RGB image at a position."""
+        """Undistorted RGB image (H, W, 3) at a position."""
         if position not in self._kept:
             for at, rgb in self.images.pictures([position]):
                 self._kept[at] = self._undistortion.image(rgb)
         return self._kept[position]
 
     def load(self, positions: list[int]) -> None:
-        """Have these images at hand, and no others."""
+        """Load these images and drop all others."""
         self._kept = {p: self._kept[p] for p in positions if p in self._kept}
         missing = [p for p in positions if p not in self._kept]
         for at, rgb in self.images.pictures(missing):
             self._kept[at] = self._undistortion.image(rgb)
 
     def grey(self, position: int) -> Bytes:
-        """The undistorted grey image at a position."""
+        """Undistorted grey image (H, W) at a position."""
         return np.asarray(cv2.cvtColor(self.picture(position), cv2.COLOR_RGB2GRAY), np.uint8)
 
     def pose(self, position: int) -> Pose:
@@ -97,7 +97,7 @@ class Reconstruction:
     def depth_map(
         self, reference: int, others: list[int], near_m: float, far_m: float
     ) -> tuple[DepthMap, list[UpdateLog], Spent]:
-        """Depth of one reference from images in this order; what each took, and all."""
+        """Depth map of one reference from images in this order; log of each update; total time."""
         engine, begun_ms = self.engine, self._wall_ms()
         with self.times("begin"):
             engine.begin(self.grey(reference), near_m, far_m)
@@ -141,9 +141,9 @@ def reconstruct(
     path: Path, out: Path | None, config: Config, wanted: Wanted, progress: Progress,
     alone: Callable[[DepthMap], None] | None = None,
 ) -> list[DepthMap]:  # fmt: skip
-    """Depth of the wanted references; with their cloud and depth.json into the folder `out`.
+    """Depth of the selected references; with their cloud and depth.json into the folder `out`.
 
-    `alone` is given each map as it is before others are asked about it.
+    `alone` is called with each map before the consensus with other references.
     """
     images = open_posed_images(path)
     device = choose_device(config.opencl)
@@ -246,7 +246,7 @@ def _references(
 
 
 def _others(images: PosedImages, positions: list[int], reference: int, reach_m: float) -> list[int]:
-    """Images from near enough that look the same way, the nearest in time first."""
+    """Nearby images with a similar viewing direction, the nearest in time first."""
     out = []
     for position in positions:
         relative = _relative(images, reference, position)

@@ -1,4 +1,4 @@
-"""`companion devices`: what a configuration can name on this machine."""
+"""`companion devices`: cameras, serial ports and OpenCL devices of this machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivers.system.serial_devices import SerialDevice, serial_devices
 
 
 def devices(as_json: bool, verbose: bool = False) -> str:
-    """Cameras, serial ports and OpenCL devices, as text for people or as JSON."""
+    """Cameras, serial ports and OpenCL devices, as text or as JSON."""
     found_cameras, found_ports, compute = cameras(), serial_devices(), measured_anew()
     if as_json:
         document = {
@@ -37,7 +37,7 @@ def devices(as_json: bool, verbose: bool = False) -> str:
 
 
 def opencl_devices(as_json: bool, verbose: bool) -> tuple[str, bool]:
-    """OpenCL devices only, and whether one of them works."""
+    """OpenCL devices, and whether one of them works."""
     compute = measured_anew()
     works = bool(in_order(compute))
     if as_json:
@@ -59,7 +59,7 @@ def _as_json(document: dict[str, Any]) -> str:
 
 
 def opencl_lines(compute: list[MeasuredDevice], verbose: bool) -> list[str]:
-    """Each device with its speed or what is wrong, and which one is taken."""
+    """Each device with its speed or its problem, and the one selected."""
     lines = ["OpenCL devices (opencl.device)"]
     for device in compute:
         speed = device.problem or f"{device.frames_per_s:.0f} frames/s of 640 x 480"

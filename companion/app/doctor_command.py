@@ -1,7 +1,7 @@
-"""`companion doctor`: which of the autopilot's parameters keep it from using our pose.
+"""`companion doctor`: parameters of the autopilot that keep it from using our pose.
 
-It reads over the configured link, or through the router of a daemon that holds that link. With
-`write` it sets them, after asking, reads each back, and looks again.
+Reads over the configured link, or through the router of a daemon that holds that link. With `write`
+sets them, after confirmation, reads each back, and examines again.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from drivers.system.login_console import login_console_on
 from drivers.system.status_socket import ask_status, found_socket_path
 
 PATIENCE_S, SEARCH_PATIENCE_S = 10.0, 25.0
-"""The second where the baud rate is to be found out."""
+"""The second where the baud rate must be detected."""
 ROUNDS = 3
-"""A parameter that is set may bring others to light."""
+"""A parameter that is set may reveal others."""
 ANY_ADDRESS = ("0.0.0.0", "::")
 GOOD, IN_THE_WAY = 0, 1
 
@@ -38,7 +38,7 @@ Ask = Callable[[str], bool]
 
 @dataclass(slots=True)
 class Examination:
-    """What was found, and what was done about it."""
+    """Findings, and the parameters written."""
 
     vehicle: Vehicle
     where: str
@@ -47,16 +47,16 @@ class Examination:
     n_examined: int
     written: list[dict[str, Any]] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
-    """What the autopilot did not take, in words."""
+    """Parameters that the autopilot refused, in words."""
 
     @property
     def in_the_way(self) -> list[Finding]:
-        """Without what is only to be known."""
+        """Findings that prevent use of the pose."""
         return [finding for finding in self.findings if finding.in_the_way]
 
     @property
     def reboot_for(self) -> list[str]:
-        """What was set and is used after a reboot only."""
+        """Parameters written that take effect after a reboot."""
         return [each["name"] for each in self.written if each["reboot"]]
 
 
@@ -69,10 +69,9 @@ def doctor(
     out: TextIO | None = None,
     ask: Ask | None = None,
 ) -> int:
-    """Examine, print, and set if told to; 0 if nothing stands in the way, else 1.
+    """Examine, print, and set on request; 0 if nothing prevents use of the pose, else 1.
 
-    InputError for a configuration or usage that cannot be, SourceError if there is no autopilot to
-    examine.
+    InputError for an impossible configuration or usage, SourceError without an autopilot.
     """
     out = sys.stdout if out is None else out
     ask = _ask_at_terminal if ask is None else ask
@@ -184,7 +183,7 @@ def _ask_at_terminal(question: str) -> bool:
 
 
 def _running_daemon(config: Config) -> Mapping[str, Any] | None:
-    """What the daemon that runs on this machine says of itself; None if there is none."""
+    """Status document of the daemon on this machine; None if there is none."""
     try:
         return ask_status(found_socket_path(config.daemon.socket))
     except SourceError:
@@ -192,7 +191,7 @@ def _running_daemon(config: Config) -> Mapping[str, Any] | None:
 
 
 def _url_to_ask_at(config: Config, daemon: Mapping[str, Any] | None) -> str:
-    """The link itself, unless a daemon holds it: then a place of its router."""
+    """The link itself, or an endpoint of the router where a daemon holds the link."""
     url = config.link.url
     if daemon is None or link_endpoint(url).kind not in ("serial", "udpin"):
         return url
@@ -209,7 +208,7 @@ def _url_to_ask_at(config: Config, daemon: Mapping[str, Any] | None) -> str:
 
 
 def _latency_ms(daemon: Mapping[str, Any] | None) -> float | None:
-    """From exposure to sending, as the daemon measures it in flight."""
+    """Latency from exposure to sending, as measured by the daemon in flight."""
     feedback = (daemon or {}).get("feedback")
     latency = feedback.get("latency_p50_ms") if isinstance(feedback, Mapping) else None
     return float(latency) if isinstance(latency, (int, float)) else None

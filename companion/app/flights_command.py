@@ -1,4 +1,4 @@
-"""companion flights: the recordings of live flights listed, looked into, cut, checked, deleted."""
+"""companion flights: list, show, trim, export, verify and prune recordings of live flights."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DAY_S = 86400
 
 
 def found_recording(given: str, folder: Path) -> Path:
-    """The recording that is meant: a file, a flight's folder, or its name in `folder`."""
+    """Path of a recording given as a file, a flight's folder, or a flight's name in `folder`."""
     for path in (Path(given), folder / given):
         if path.is_file():
             return path
@@ -44,27 +44,27 @@ def found_recording(given: str, folder: Path) -> Path:
 
 
 def recordings_meant(given: Sequence[str], folder: Path) -> list[Path]:
-    """The recordings of these flights, of all in `folder` where none is named."""
+    """Recordings of these flights; of all in `folder` where none is named."""
     if not given:
         return [path for flight in flights_in(folder) for path in recordings_in(flight.path)]
     return [found_recording(each, folder) for each in given]
 
 
 def correct_names(folder: Path) -> None:
-    """Name flights by their dates that a daemon had no time for; those recorded now stay."""
+    """Rename flights by corrected dates where the daemon had no time; not those being recorded."""
     for flight in flights_in(folder):
         named_by_date(flight.path)
 
 
 def correction_ns(path: Path) -> int:
-    """What is to be added to the times of a recording for the clock's having been wrong."""
+    """Correction to add to the times of a recording, ns."""
     flight = path.parent.parent if path.parent.name.startswith("part-") else path.parent
     date = read_date(flight)
     return 0 if date is None else round(date.correction_s * 1e9)
 
 
 def list_flights(folder: Path, as_json: bool) -> str:
-    """A line for each recording, the oldest first."""
+    """One line for each recording, the oldest first."""
     rows = [
         {
             "path": os.fspath(path),
@@ -92,7 +92,7 @@ def list_flights(folder: Path, as_json: bool) -> str:
 
 
 def show_flight(path: Path, as_json: bool) -> str:
-    """All that a recording says of itself."""
+    """Description of a recording."""
     summary, correction = summarise(path), correction_ns(path)
     if as_json:
         return json.dumps(_document(summary, correction), indent=2)
@@ -116,18 +116,18 @@ def show_flight(path: Path, as_json: bool) -> str:
 
 
 def verify_flights(paths: Sequence[Path], progress: Progress) -> tuple[str, bool]:
-    """Check all checksums; a line for each recording, and whether all are well."""
+    """Check all checksums; a line for each recording, and whether all are intact."""
     total = sum(path.stat().st_size for path in paths if path.is_file())
     progress.start(max(1, total // MB))
     lines, done, good = [], 0, True
     for path in paths:
         before = done
 
-        def told(n_bytes: int, before: int = before) -> None:
+        def on_progress(n_bytes: int, before: int = before) -> None:
             progress.update((before + n_bytes) // MB, "checked", 0)
 
         try:
-            summary = summarise(path, told)
+            summary = summarise(path, on_progress)
         except FlightError as error:
             lines.append(str(error))
             good = False
@@ -146,7 +146,7 @@ def verify_flights(paths: Sequence[Path], progress: Progress) -> tuple[str, bool
 def trim_flight(
     path: Path, start_s: float | None, stop_s: float | None, out: Path, progress: Progress
 ) -> str:
-    """Write a part of a recording, in seconds from its first picture, to a file of its own."""
+    """Write a time span, in seconds from the first image, to a recording of its own."""
     recording = _opened(path)
     try:
         first_ns, last_ns = recording.pictures[0].t_ns, recording.pictures[-1].t_ns
@@ -181,7 +181,7 @@ def prune_flights(
     folder: Path, *, keep_newest: int | None, older_than_days: float | None,
     free_mb: float | None, dry_run: bool,
 ) -> str:  # fmt: skip
-    """Delete finished flights, the oldest first, as far as one of the reasons given holds."""
+    """Delete finished flights, the oldest first, while one of the given conditions holds."""
     if keep_newest is None and older_than_days is None and free_mb is None:
         raise InputError("say what may go: --keep-newest, --older-than or --free")
     flights = flights_in(folder)
@@ -251,7 +251,7 @@ def _enough(going: Sequence[FlightPlace], needed: float) -> list[FlightPlace]:
 
 
 def _age_s(flight: FlightPlace, now_ns: int) -> float:
-    """Since its date, or the latest of a flight before it; 0 where no clock was ever right."""
+    """Seconds since its date, or the latest date of a flight before it; 0 without a clock."""
     if flight.not_before_s is None:
         return 0.0
     return now_ns * 1e-9 - flight.not_before_s

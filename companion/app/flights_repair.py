@@ -1,4 +1,4 @@
-"""companion flights repair: recordings that nobody ended get their ends."""
+"""companion flights repair: adds the missing end to recordings that were cut short."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from drivers.recording.repair import in_place, unfinished
 
 MB = 1 << 20
 STEP_BYTES, REST_S = 4 * MB, 0.1
-"""Gently: so much is read between two rests."""
+"""Bytes read between two pauses with --gently."""
 
 
 def repair_flights(
     paths: Sequence[Path], progress: Progress, gently: bool = False
 ) -> Iterator[tuple[str, bool]]:
-    """A line for each recording that was cut short, and whether it is whole now.
+    """One line for each recording that was cut short, and whether it is whole now.
 
-    What is whole, or still being recorded, is passed over, and so is what is no recording at all.
+    Passes over whole recordings, those being written, and files that are no recordings.
     """
     found = [path for path in paths if _is_unfinished(path)]
     progress.start(max(1, sum(path.stat().st_size for path in found) // MB))
@@ -29,14 +29,14 @@ def repair_flights(
     for path in found:
         rested = 0
 
-        def told(n_bytes: int, before: int = before) -> None:
+        def on_progress(n_bytes: int, before: int = before) -> None:
             nonlocal rested
             progress.update((before + n_bytes) // MB, "read", 0)
             if gently and n_bytes - rested >= STEP_BYTES:
                 rested = n_bytes
                 wait_s(never, REST_S)
 
-        mended = in_place(path, told)
+        mended = in_place(path, on_progress)
         before += path.stat().st_size
         yield _in_words(path, mended), mended is not None
     progress.finish()

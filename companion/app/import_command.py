@@ -1,4 +1,4 @@
-"""companion import: a flight of any format that can be read, as a flight folder or recording."""
+"""companion import: any readable flight as a flight folder or recording."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ WRITERS: dict[str, Callable[[Flight, Path, Callable[[int], None]], int]] = {
     "": write_flight_folder,
     ".mcap": write_recording,
 }
-"""By how the name ends."""
+"""By suffix of the output."""
 
 
 def import_flight(
-    source: Path, out: Path, config: Config, progress: Progress, told: Callable[[str], None]
+    source: Path, out: Path, config: Config, progress: Progress, notify: Callable[[str], None]
 ) -> int:
     """Read a flight and write it as a folder or, as FILE.mcap, a recording; return its frames.
 
-    `told` hears what was amiss. InputError where it cannot be read, or not be written.
+    `notify` takes remarks about the source. InputError where it cannot be read or written.
     """
     if out.suffix not in WRITERS:
         raise InputError(f"{out}: wanted is the name of a folder, or of a file ending in .mcap")
     flight = open_flight(source, config.camera, config.telemetry)
     log = flight.telemetry()
     for remark in log.remarks:
-        told(remark)
+        notify(remark)
     for warned in (*flight.warnings, *log.warnings):
-        told(f"{warned.what}: {warned.detail}" if warned.detail else warned.what)
+        notify(f"{warned.what}: {warned.detail}" if warned.detail else warned.what)
     progress.start(flight.n_frames)
     try:
         return WRITERS[out.suffix](flight, out, lambda n: progress.update(n, "imported", 0))

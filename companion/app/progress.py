@@ -1,4 +1,4 @@
-"""How far a replay or a calibration has come, for whoever watches it."""
+"""Progress of a replay or a calibration."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from rich.text import Text
 
 
 class Progress(Protocol):
-    """Told of every frame, between frames, when nothing is half done."""
+    """Receives updates between frames."""
 
     def start(self, total_frames: int) -> None:
-        """Frames are about to come; 0 where it is not known how many."""
+        """Called before the first frame; `total_frames` is 0 where unknown."""
 
     def update(self, done: int, state: str, n_points: int) -> None:
-        """So many frames are done, this is the state, so many points are there (or views)."""
+        """Called after each frame: frames done, state, points (or views) so far."""
 
     def finish(self) -> None:
-        """No more frames come."""
+        """Called after the last frame."""
 
 
 class NoProgress:
-    """Shows nothing."""
+    """Null object."""
 
     def start(self, total_frames: int) -> None:
         """Show nothing."""
@@ -38,7 +38,7 @@ class NoProgress:
 
 
 class TerminalProgress:
-    """A line in a terminal: bar, frames (or what `unit` says) done, their rate, state, points."""
+    """Progress bar: frames (or `unit`) done, their rate, state, points."""
 
     def __init__(self, stream: TextIO, counted: str = "points", unit: str = "frames") -> None:
         self._bar = RichProgress(
@@ -80,5 +80,5 @@ class _PerSecond(ProgressColumn):
 
 
 def progress_on(stream: TextIO, counted: str = "points", unit: str = "frames") -> Progress:
-    """A bar where there is a terminal to show it, nothing elsewhere."""
+    """Bar on a terminal, null object elsewhere."""
     return TerminalProgress(stream, counted, unit) if stream.isatty() else NoProgress()

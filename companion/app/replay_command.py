@@ -1,4 +1,4 @@
-"""A logged flight through the very stages that fly: from folder to map, recording and report."""
+"""Replay of a recorded flight through the stages of the daemon: map, recording, report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from companion.messages import Frame, Message
 from companion.products.flight_result import FlightResult, RunFacts
 from companion.products.report.write_results import write_results
 from companion.products.surroundings import peak_memory_mb, versions
-from companion.runtime.gaps import with_gaps_named
+from companion.runtime.gaps import with_gap_warnings
 from companion.runtime.paced_replay import PacedFeed
 from companion.runtime.pipeline import Pipeline, Sink, in_order_of_time, in_words
 from companion.streaming.viewer import FileViewer, LiveViewer
@@ -29,7 +29,7 @@ from drivers.open_flight import open_flight
 from drivers.telemetry.telemetry_log import TelemetryLog
 
 LEAD_NS = 10_000_000_000
-"""Telemetry from so long before the first frame is used."""
+"""Telemetry used from before the first frame."""
 
 
 def replay(
@@ -42,22 +42,22 @@ def replay(
     viewer: str,
     paced: bool,
     progress: Progress,
-    told: Callable[[str], None] = lambda remark: None,
+    notify: Callable[[str], None] = lambda remark: None,
 ) -> FlightResult:
     """Replay a flight into the folder `out`; InputError when it cannot begin.
 
-    `told` hears how the telemetry was read, which OpenCL devices were refused, and where a viewer
-    shows it.
+    `notify` takes remarks: how the telemetry was read, OpenCL devices refused, address of the
+    viewer.
 
-    What was done so far is written also when it is interrupted or fails on the way. Where only the
-    dense map failed, all frames are tracked and written with the cloud so far; StageError then.
+    Results so far are written also when it is interrupted or fails on the way. Where only the dense
+    map fails, all frames are tracked and written with the cloud so far; then StageError.
     """
     flight = open_flight(flight_path, config.camera, config.telemetry)
     start_ns, stop_ns = _span(flight, start_s, stop_s)
     log = flight.telemetry()
     for remark in log.remarks:
-        told(f"telemetry: {remark}")
-    devices = choose_devices(config.opencl, told) if config.depth.enabled else None
+        notify(f"telemetry: {remark}")
+    devices = choose_devices(config.opencl, notify) if config.depth.enabled else None
     out.mkdir(parents=True, exist_ok=True)
     times = StageTimes()
     result = FlightResult(out, config.cloud.memory_mb)
@@ -77,7 +77,7 @@ def replay(
             )
             sinks.append(live)
             if live.page:
-                told(f"viewer: open {live.page}")
+                notify(f"viewer: open {live.page}")
         depth = _depth_stage(config, flight, devices, times)
         pipeline = Pipeline(
             LocalisationStage(config, flight.camera, times, beside=paced), depth, sinks,
@@ -107,7 +107,7 @@ def replay(
                 write_results(out, result, facts, config.cloud.voxel_m)
                 result.close()
         if devices is not None and devices.failures:
-            told(f"dense map: {devices.described}")
+            notify(f"dense map: {devices.described}")
         if pipeline.depth_fault is not None:
             raise StageError(
                 f"the dense map failed after {result.n_depth_maps} depth maps: "
@@ -149,7 +149,7 @@ def _run(
     for warning in (*flight.warnings, *log.warnings):
         pipeline.feed(warning)
     samples = [s for s in log.samples if start_ns - LEAD_NS <= s.t_ns <= stop_ns]
-    feed: Iterable[Message] = with_gaps_named(
+    feed: Iterable[Message] = with_gap_warnings(
         in_order_of_time(samples, flight.frames(start_ns, stop_ns))
     )
     player = PacedFeed(feed) if paced else None

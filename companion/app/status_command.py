@@ -1,4 +1,4 @@
-"""`companion status`: what the running daemon says of itself, as a table or as JSON."""
+"""`companion status`: status of the running daemon, as a table or as JSON."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ NOTHING = "-"
 def show_status(
     path: Path, out: TextIO, *, as_json: bool, watch: bool, stop: threading.Event
 ) -> None:
-    """Ask once, or again and again until `stop`. SourceError where no daemon answers.
+    """Ask once, or repeatedly until `stop`. SourceError where no daemon answers.
 
-    While watching, too, a daemon that goes away ends it.
+    While watching, a daemon that goes away ends it, too.
     """
     while True:
         document = ask_status(path)
@@ -85,7 +85,7 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
 
 
 def _settings(settings: Mapping[str, Any]) -> str:
-    """What the ground has set."""
+    """Settings changed by the ground station."""
     parts = [f"{key} = {value}" for key, value in sorted(settings.items())]
     return ", ".join(parts) + " (by the ground)" if parts else "nothing by the ground"
 

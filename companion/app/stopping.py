@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, taken between two frames so that nothing is left half done."""
+"""SIGINT and SIGTERM, deferred to the end of a frame."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from companion.app.progress import Progress
 
 
 class StopSignals:
-    """A context in which SIGINT and SIGTERM raise KeyboardInterrupt.
+    """Context in which SIGINT and SIGTERM raise KeyboardInterrupt.
 
-    Once frames run, the first one waits for the end of the frame; after the last frame, while
+    Once frames run, the first signal waits for the end of the frame; after the last frame, while
     results are written, it is only kept in `received`. A second one never waits.
     """
 
@@ -36,11 +36,11 @@ class StopSignals:
 
     @property
     def exit_status(self) -> int:
-        """What a shell expects of a program that a signal stopped: 130 or 143."""
+        """Exit status of a program stopped by a signal: 130 or 143."""
         return 128 + (self.received or signal.SIGINT)
 
     def between_frames(self, progress: Progress) -> Progress:
-        """The same progress, at whose updates a stop is taken."""
+        """The same progress, at whose updates a stop takes effect."""
         return _StoppableProgress(progress, self)
 
     def defer(self) -> None:

@@ -1,4 +1,4 @@
-"""A small picture of a flight, by which people know it again."""
+"""Thumbnail of a flight."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTH_PX, QUALITY = 240, 80
 
 
 def thumbnail(flight: Path, config: CameraConfig) -> bytes:
-    """JPEG of the frame in its middle; empty where none can be decoded. FlightError likewise."""
+    """JPEG of the middle frame; empty where none can be decoded. FlightError likewise."""
     opened = open_flight(flight, config)
     middle_ns = opened.times_ns[opened.n_frames // 2]
     for frame in opened.frames(middle_ns):

@@ -1,4 +1,4 @@
-"""`companion view`: the map at the ground station, in a window or a browser."""
+"""`companion view`: viewer at the ground station, in a window or a browser."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ LOOK_S = 0.2
 END_S = 1.0
 
 
-def view(host: str, where: str, bind: str, colours: str, told: Callable[[str], None]) -> int:
-    """Show what a companion at `host` sees, until Ctrl-C or until its window is closed.
+def view(host: str, where: str, bind: str, colours: str, notify: Callable[[str], None]) -> int:
+    """View the companion at `host` until Ctrl-C or until its window is closed.
 
-    The exit status. InputError where nothing can be shown here.
+    Returns the exit status. InputError where nothing can be shown here.
     """
     try:
-        link = GroundLink(*host_and_port(host), told)
+        link = GroundLink(*host_and_port(host), notify)
     except StreamError as error:
         raise InputError(str(error)) from error
     screen = Screen(where, bind)
     if screen.page:
-        told(f"open {screen.page}")
+        notify(f"open {screen.page}")
     stop = threading.Event()
     faults: list[BaseException] = []
 

@@ -1,1 +1,1 @@
-"""The daemon: what runs while a drone is switched on."""
+"""The daemon: runs from power on to power off."""

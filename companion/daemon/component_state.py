@@ -1,16 +1,16 @@
-"""How the companion is in one word of a HEARTBEAT."""
+"""State of the companion for its HEARTBEAT."""
 
 from __future__ import annotations
 
 from companion.health import Health
 
 BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, POWEROFF = 1, 2, 3, 4, 5, 7
-"""Of MAV_STATE."""
+"""MAV_STATE values."""
 NO_CAMERA = ("missing", "opening", "silent", "frozen", "ended", "driver fault")
 
 
 def component_state(health: Health) -> int:
-    """MAV_STATE: not up yet, waiting for a flight, finding its way, at work, or blind in flight."""
+    """MAV_STATE: boot (no camera), standby, calibrating, active, or critical (no pose)."""
     camera = next((source for source in health.sources if source.name == "camera"), None)
     is_blind = camera is not None and camera.state in NO_CAMERA
     if not health.flight:

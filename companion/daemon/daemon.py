@@ -1,8 +1,8 @@
-"""The long-running program: camera, autopilot and stages joined, from power on to power off.
+"""The daemon: joins camera, autopilot and stages, from power on to power off.
 
-The event loop does I/O only. The camera has a thread, every heavy stage a process; what they give
-comes in by `call_soon_threadsafe`. Nothing that comes loose in flight ends it: it is named, waited
-for, and taken up again.
+The event loop does I/O only. The camera has a thread, every heavy stage a process; their output
+comes in by `call_soon_threadsafe`. No failure in flight ends it: the part is reported and
+restarted.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.live_flight import Listener, LiveFlight, makes_depth
-from companion.daemon.flights.recording_recovery import LeftOvers
+from companion.daemon.flights.recording_recovery import RecordingRecovery
 from companion.daemon.health_watch import HealthWatch
 from companion.daemon.link_watch import LinkWatch
 from companion.daemon.loop_delay import measure_loop_delay
-from companion.daemon.missing_devices import Missing
+from companion.daemon.missing_devices import MissingDevices
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.pose_sender import PoseSender
+from companion.daemon.recorder_notes import RecorderNotes
 from companion.daemon.reload import reloaded
-from companion.daemon.tape_notes import TapeNotes
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.errors import CompanionError
 from companion.geometry.camera import Camera
@@ -72,22 +72,22 @@ from drivers.system.service_manager import ServiceManager
 from drivers.system.status_socket import StatusSocket, own_socket_path
 
 NOT_THERE = ("missing", "driver fault")
-"""States of sources that are tried again."""
+"""States of sources that are retried."""
 WATCH_S = 0.2
 START_S = 180.0
-"""Stages have so long to come up once nothing is missing any more; the first time they compile."""
+"""Time for stages to start once no device is missing; the first time they compile."""
 FAULT, BAD_INPUT = 1, 2
 """Exit statuses."""
 NO_PROGRESS = "frames come and no pose, whatever is tried: left to the service manager's watchdog"
-SPARE_AGAIN_S = 1.0
+STANDBY_RETRY_S = 1.0
 WRITE_S = 0.2
-"""What counts while armed may take so long to be written down at the end."""
+"""Time to write the armed settings at the end."""
 END_S = 2.6
-"""A stop takes little longer, whatever hangs."""
+"""Longest stop, whatever hangs."""
 
 
 class Daemon:
-    """Everything that runs; `run` gives the exit status. To be made within the event loop."""
+    """All parts of the daemon; `run` gives the exit status. Create it within the event loop."""
 
     def __init__(self, load: Callable[[], Config]) -> None:
         self._load = load
@@ -105,7 +105,7 @@ class Daemon:
         self._config = config = resumed.config
         kept |= resumed.by_ground
         self._stays_off = resumed.by_ground.get("feedback.mode") == "off"
-        """Whether the pilot is still to be told so, once there is one to hear it."""
+        """Whether the pilot is still to be told so, once the link is up."""
         if before is not None:
             self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
         self._stop = asyncio.Event()
@@ -144,17 +144,17 @@ class Daemon:
             config, clock, self._journal, self._feed, self._link, self._sender, self._flights,
             self._loop_delay,
         )  # fmt: skip
-        self._notes = TapeNotes(clock, self._flights, self._watch, self._link)
+        self._notes = RecorderNotes(clock, self._flights, self._watch, self._link)
         self._reports: VehicleReports | None = None
         if self._link is not None:
             self._reports = VehicleReports(
                 self._link, clock, self._watch, config.feedback.obstacle_distance
             )
-        self._left_overs = LeftOvers(
+        self._recovery = RecordingRecovery(
             Path(config.daemon.flights), clock, self._on_warned, lambda: self._armed
         )
-        self._missing = Missing(config.daemon.missing_device_s)
-        self._spare_later: asyncio.TimerHandle | None = None
+        self._missing = MissingDevices(config.daemon.missing_device_s)
+        self._standby_later: asyncio.TimerHandle | None = None
         self._by_ground = self._watch.set_by_ground = kept
         self._ground: GroundControl | None = None
         if self._link is not None and self._reports is not None and config.control.enabled:
@@ -164,7 +164,7 @@ class Daemon:
             )  # fmt: skip
 
     async def run(self) -> int:
-        """Run until told to stop or unable to go on; the exit status."""
+        """Run until stopped or unable to continue; the exit status."""
         loop, config = self._loop, self._config
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, self._stop.set)
@@ -182,7 +182,7 @@ class Daemon:
             self._watch.govern(),
             measure_loop_delay(self._clock, self._loop_delay),
             self._notes.run(),
-            self._left_overs.run(),
+            self._recovery.run(),
         ]
         if self._link is not None:
             work.append(self._link.run())
@@ -229,7 +229,7 @@ class Daemon:
     # -- what comes in --------------------------------------------------------------------------
 
     def _on_frame(self, frame: Frame) -> None:
-        """A frame, in the camera's thread."""
+        """Take a frame; in the camera's thread."""
         self._watch.frame_came()
         if self._camera is None:
             self._soon(self._camera_known)
@@ -237,7 +237,7 @@ class Daemon:
         self._flights.frame(frame)
 
     def _on_warned(self, warning: Warned) -> None:
-        """Something to be told, in any thread."""
+        """Take a warning; in any thread."""
         if self._journal.warn(warning):
             text = of_warning(warning.what, warning.detail, warning.good)
             if text is not None:
@@ -245,7 +245,7 @@ class Daemon:
         self._soon(self._flights.take, warning)
 
     def _on_telemetry(self, sample: Telemetry) -> None:
-        """A sample, in the event loop."""
+        """Take a sample; in the event loop."""
         self._flights.take(sample)
         if isinstance(sample, AttitudeSample):
             if self._sender is not None:
@@ -254,7 +254,7 @@ class Daemon:
             self._set_armed(sample.armed)
 
     def _listener(self, flight: LiveFlight) -> Listener:
-        """What a flight gives comes in here, but only as long as it is the one that flies."""
+        """Callbacks for the output of a flight, active while that flight is the current one."""
 
         def current(take: Callable[[Any], None]) -> Callable[[Any], None]:
             def later(message: Any) -> None:
@@ -338,12 +338,12 @@ class Daemon:
         if self._flights.current is flight:
             self._flights.end()
             self._begin_if_due()
-        elif self._flights.is_spare(flight):
-            self._flights.discard_spare()
-            self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+        elif self._flights.is_standby(flight):
+            self._flights.discard_standby()
+            self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
 
     def _unusable(self, why: str) -> None:
-        """On the ground somebody is there to read it; in the air the pose goes on without."""
+        """On the ground exit with the error; in the air the pose goes on without the stage."""
         if not self._armed:
             self._give_up(why, BAD_INPUT)
 
@@ -361,7 +361,7 @@ class Daemon:
                 self._link.system_status = component_state(health)
             if self._flights.current is not None:
                 origin = self._link.origin if self._link is not None else None
-                self._flights.current.tell(health, origin)
+                self._flights.current.publish_health(health, origin)
             now_s = (self._clock.now_ns() - began_ns) * 1e-9
             if not self._is_ready and self._watch.up:
                 self._is_ready = True
@@ -391,7 +391,7 @@ class Daemon:
                 self._give_up(gone)
 
     def _reload(self) -> None:
-        """SIGHUP: take over what can be changed while running, and say what cannot."""
+        """SIGHUP: apply what can change while running, and report what cannot."""
         if self._is_ready:
             self._service.reloading()
         try:
@@ -424,16 +424,16 @@ class Daemon:
 
     @property
     def config(self) -> Config:
-        """What counts now."""
+        """Configuration in force."""
         return self._config
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are; as they last were where nothing is heard."""
+        """Whether the motors are armed; the last known state where nothing is heard."""
         return self._arming.armed
 
     def take_over(self, config: Config) -> None:
-        """Go on with another configuration: at once where that can be, else with the next map."""
+        """Continue with another configuration: at once where possible, else with the next map."""
         old, self._config = self._config, config
         if self._arming.holds:
             for name in list(self._arming.waiting):
@@ -443,7 +443,7 @@ class Daemon:
                 self._arming.waiting["feedback.mode"] = old.feedback.mode
             self._hold()
         if config.daemon != old.daemon:
-            self._missing = Missing(config.daemon.missing_device_s)
+            self._missing = MissingDevices(config.daemon.missing_device_s)
         self._watch.reconfigure(config)
         if self._sender is not None:
             self._sender.reconfigure(config.feedback)
@@ -456,19 +456,19 @@ class Daemon:
             flight.set_dense(makes_depth(config))
             flight.set_budget(config.stream.budget_kbit_s)
             return
-        self._flights.discard_spare()
-        if self._spare_later is not None:
-            self._spare_later.cancel()
-        self._spare_later = self._loop.call_later(SPARE_AGAIN_S, self._begin_if_due)
+        self._flights.discard_standby()
+        if self._standby_later is not None:
+            self._standby_later.cancel()
+        self._standby_later = self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
 
     # -- what holds until the motors are disarmed, see Arming ------------------------------------
 
     def _hold(self) -> None:
-        """What counts now shall count if this ends in the air and is begun again."""
+        """Keep the settings in force for a restart in the air."""
         self._arming.hold(self._config, self._by_ground, monotonic_s())
 
     def _let_go(self) -> None:
-        """The motors are disarmed: the configuration has its say again."""
+        """Disarmed: apply the changes that were held."""
         waiting = {
             name: value
             for name, value in self._arming.let_go().items()
@@ -479,7 +479,7 @@ class Daemon:
         for name in waiting:
             self._by_ground.pop(name, None)
         shown = ", ".join(f"{name} = {value}" for name, value in waiting.items())
-        self._journal.say(f"disarmed: what has waited for that counts now: {shown}", WARNING)
+        self._journal.say(f"disarmed: held changes take effect: {shown}", WARNING)
         if waiting.get("feedback.mode", "off") != "off":
             self._tell_pilot(POSITION_ENABLED())
         self.take_over(with_values(self._config, waiting))
@@ -497,7 +497,7 @@ class Daemon:
         self._journal.say(text, WARNING)
 
     def _autopilot_boot_s(self) -> float | None:
-        """When the autopilot was started, CLOCK_MONOTONIC; None while its clock is not known."""
+        """Boot time of the autopilot, CLOCK_MONOTONIC; None while its clock is unknown."""
         report = self._link.clock_filter.report() if self._link is not None else None
         return None if report is None else report.offset_s - self._clock.epoch_ns * 1e-9
 
@@ -505,12 +505,12 @@ class Daemon:
         return self._link is not None and self._link.alive
 
     def prepare(self) -> None:
-        """Have a flight at hand beside the one that goes on."""
+        """Start the processes of a standby flight."""
         if self._camera is not None:
             self._flights.prepare(self._config, self._camera)
 
     def begin_flight(self) -> None:
-        """Begin one with a map of its own, where one is due."""
+        """Begin a flight with a map of its own, where one is due."""
         self._begin_if_due(take_up=False)
 
     def _give_up(self, why: str, status: int = FAULT) -> None:
@@ -527,7 +527,7 @@ class Daemon:
         self._on_warned(Warned(self._clock.now_ns(), text))
 
     def _soon(self, call: Callable[..., object], *arguments: Any) -> None:
-        """Have something done in the event loop; from any thread, nothing once it has ended."""
+        """Call in the event loop; from any thread, ignored once the loop has ended."""
         try:
             self._loop.call_soon_threadsafe(call, *arguments)
         except RuntimeError:

@@ -1,6 +1,6 @@
-"""What the daemon knows of itself, put together; and what follows from it while it runs.
+"""Health of the daemon, and the reactions to it.
 
-The governor's levels go to the flight from here, and a pose loop that hangs is noticed here.
+The governor's load levels go to the flight from here, and a hanging pose loop is detected here.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from companion.health import (
     StatusLines,
 )
 from companion.messages import MapUpdate, Odometry, PointChunk, Track, TrackState, Warned
-from companion.runtime.governor import Governor, Pressure
+from companion.runtime.governor import Governor, LoadSample
 from companion.timing.clock import FlightClock, monotonic_s
 from drivers.camera.camera_feed import CameraFeed
 from drivers.mavlink.autopilot_link import AutopilotLink
@@ -34,28 +34,28 @@ from drivers.system.system_load import SystemLoad
 
 GOVERN_NS = 1_000_000_000
 STUCK_NS = 3_000_000_000
-"""Frames come but no track does: the pose loop hangs,"""
+"""Time with frames but no track after which the pose loop counts as hanging,"""
 BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
-"""unless it works: then the computer has too much else to do, and it is given longer."""
+"""unless it uses the processor: then the computer is overloaded, and it gets more time."""
 START_S = 120.0
-"""A localisation that is not ready by then never will be; the first of all compiles its loops."""
+"""Longest start of localisation; the first of all compiles its loops."""
 PATIENCE_NS = 20_000_000_000
-"""Frames come, localisation was started again, and still no track: nothing here will help."""
+"""Time with frames but no track, after a restart of localisation, before the daemon gives up."""
 NO_SIGN_S = 10.0
-"""A stage that has been at one step for so long is not well; when it is ended: see live.flight."""
+"""A stage in one step for longer is reported as down; it is restarted later, see live_flight."""
 SETTLE_NS = 3_000_000_000
-"""Beginning a map takes long, and tells nothing of what comes after."""
+"""Time after the begin of a map that is ignored: initialisation is slow."""
 STUCK = "localisation hangs and is ended"
 IN_WORDS = {
     TrackState.INITIALISING: "initialising",
     TrackState.TRACKING: "tracking",
-    TrackState.COASTING: "coasting",
+    TrackState.DEAD_RECKONING: "coasting",
     TrackState.LOST: "lost",
 }
 
 
 class HealthWatch:
-    """Counts what goes by, and says how all is. To be used in the event loop."""
+    """Counts messages and computes health. To be used in the event loop."""
 
     def __init__(
         self,
@@ -87,17 +87,17 @@ class HealthWatch:
         self._scale = ""
         self._recent = LatencyMeter(1.0)
         self.set_by_ground: Mapping[str, Any] = {}
-        """Keys of the configuration, and what they were set to in flight."""
+        """Keys of the configuration, and the values set by the ground."""
         self._pose = StageMeter("localisation")
         self._depth = StageMeter("depth")
 
     @property
     def too_hot(self) -> bool:
-        """Whether work is left out because of the temperature."""
+        """Whether the load level is reduced because of the temperature."""
         return "hot" in self._governor.degraded
 
     def reconfigure(self, config: Config) -> None:
-        """Take over what has changed."""
+        """Apply a changed configuration."""
         if config.daemon == self._config:
             return
         if config.daemon.hot_c != self._config.hot_c:
@@ -107,18 +107,18 @@ class HealthWatch:
         self._lines = StatusLines(config.daemon.status_every_s)
 
     def restart(self) -> None:
-        """Another flight begins."""
+        """Begin another flight."""
         self._odometry, self._scale, self._n_dropped = None, "", 0
         self._odometry_ns = self._clock.now_ns()
         self._governed_ns = 0
 
     def frame_came(self) -> None:
-        """A frame; from the camera's thread."""
+        """Count a frame; from the camera's thread."""
         now_ns = self._clock.now_ns()
         self._last_frame_ns = now_ns
 
     def take_odometry(self, odometry: Odometry) -> None:
-        """The odometry of a frame."""
+        """Count the odometry of a frame."""
         now_ns = self._clock.now_ns()
         if odometry.state is not TrackState.TRACKING:
             self._settled_ns = now_ns + SETTLE_NS
@@ -127,7 +127,7 @@ class HealthWatch:
         self._recent.add(now_ns, (now_ns - odometry.t_ns) * 1e-6)
 
     def take_mapped(self, message: Track | MapUpdate | PointChunk) -> None:
-        """What the map has become."""
+        """Take the depth latency from points, and the source of the scale from the map."""
         if isinstance(message, PointChunk):
             self._depth.done(self._clock.now_ns(), message.t_ns)
         elif isinstance(message, MapUpdate):
@@ -136,7 +136,7 @@ class HealthWatch:
 
     @property
     def up(self) -> bool:
-        """Whether the stages are ready for frames, and the way to the autopilot is open."""
+        """Whether the stages are ready for frames, and the link is open."""
         link_open = self._link is None or self._link.health.state != "missing"
         return link_open and self._flights.stages_up
 
@@ -164,7 +164,7 @@ class HealthWatch:
         return now_ns - self._odometry_ns < (BUSY_STUCK_NS if works else STUCK_NS)
 
     def kill_stuck(self) -> None:
-        """End a localisation that hangs, so that another takes its place."""
+        """End a localisation that hangs, so that it is restarted."""
         flight, now_ns = self._flights.current, self._clock.now_ns()
         if flight is not None:
             self._odometry_ns = now_ns
@@ -172,13 +172,13 @@ class HealthWatch:
             flight.kill_localisation()
 
     def end_stalled(self) -> None:
-        """End whatever other stage hangs."""
-        for flight in (self._flights.current, self._flights.spare):
+        """End any other stage that hangs."""
+        for flight in (self._flights.current, self._flights.standby):
             if flight is not None:
                 flight.end_stalled()
 
     async def govern(self) -> None:
-        """Read the load and leave out work where there is too much; ends by cancellation."""
+        """Read the load and set load levels; ends by cancellation."""
         loop = asyncio.get_running_loop()
         while True:
             flight = self._flights.current
@@ -200,7 +200,7 @@ class HealthWatch:
             return
         dropped_hz = (n_dropped - self._n_dropped) * 1e9 / (now_ns - self._governed_ns)
         self._n_dropped, self._governed_ns = n_dropped, now_ns
-        changed = self._governor.step(now_ns, Pressure(
+        changed = self._governor.step(now_ns, LoadSample(
             cpu_share=self.load.cpu_share,
             memory_share=self.load.memory_share,
             temperature_c=self.load.temperature_c,
@@ -213,20 +213,20 @@ class HealthWatch:
     def _apply(self) -> None:
         level = self._governor.level
         if self._flights.current is not None:
-            self._flights.current.set_shares(
+            self._flights.current.set_load_levels(
                 level.feature_share, level.dense_share, level.viewer
             )
 
     def line_due(self) -> str | None:
-        """The status line, if it is due now."""
+        """Status line for the journal, if due."""
         return self._lines.step(self.health())
 
     def document(self) -> dict[str, Any]:
-        """What `companion status` shows."""
+        """Status document of `companion status`."""
         return {"version": __version__, **self.health().to_json()}
 
     def health(self) -> Health:
-        """How all is now."""
+        """Health now."""
         now_ns, flight = self._clock.now_ns(), self._flights.current
         odometry = self._odometry if flight is not None else None
         sources = [self._feed.health] + ([self._link.health] if self._link is not None else [])

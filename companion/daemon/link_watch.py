@@ -1,4 +1,4 @@
-"""What goes wrong on the autopilot's wire and at the router's places, which no message tells."""
+"""Warnings about the autopilot's wire and the router's clients that no message reports."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.router import ClientCounts
 
 LOOK_NS = 1_000_000_000
-NAME_AGAIN_NS = 10_000_000_000
+WARN_AGAIN_NS = 10_000_000_000
 FEW = 3
-"""So many in a second are nothing: a port that is just opened begins within a packet."""
+"""Errors per second that are ignored: a port just opened begins within a packet."""
 
 DAMAGED = "damaged data on the autopilot's link"
 REFUSED = "a client of the router is refused"
@@ -21,17 +21,17 @@ NO_MAVLINK = "a client of the router sends damaged data"
 
 
 class LinkWatch:
-    """Looks at a port's counters once a second, and warns of those that rise."""
+    """Checks a port's counters once a second, and warns of those that rise."""
 
     def __init__(self, port: MavlinkPort, warn: Callable[[Warned], None]) -> None:
         self._port, self._warn = port, warn
         self._looked_ns = 0
         self._n_bad = 0
         self._clients: dict[str, ClientCounts] = {}
-        self._named_ns: dict[tuple[str, str], int] = {}
+        self._warned_ns: dict[tuple[str, str], int] = {}
 
     def step(self, now_ns: int) -> None:
-        """Look, if it is time."""
+        """Check the counters, if it is time."""
         if now_ns - self._looked_ns < LOOK_NS:
             return
         self._looked_ns = now_ns
@@ -47,12 +47,12 @@ class LinkWatch:
                 self._risen(SLOW, name, now.n_dropped_out - was.n_dropped_out, "packets given up")
 
     def _risen(self, what: str, name: str, n: int, of: str) -> None:
-        last_ns = self._named_ns.get((what, name))
-        if n > FEW and (last_ns is None or self._looked_ns - last_ns >= NAME_AGAIN_NS):
+        last_ns = self._warned_ns.get((what, name))
+        if n > FEW and (last_ns is None or self._looked_ns - last_ns >= WARN_AGAIN_NS):
             # names of clients that come and go have their port in them
-            self._named_ns = {
-                key: t_ns for key, t_ns in self._named_ns.items()
-                if self._looked_ns - t_ns < NAME_AGAIN_NS
+            self._warned_ns = {
+                key: t_ns for key, t_ns in self._warned_ns.items()
+                if self._looked_ns - t_ns < WARN_AGAIN_NS
             }  # fmt: skip
-            self._named_ns[what, name] = self._looked_ns
+            self._warned_ns[what, name] = self._looked_ns
             self._warn(Warned(self._looked_ns, what, f"{name}: {n} {of} in a second"))

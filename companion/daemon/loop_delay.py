@@ -1,4 +1,4 @@
-"""How late the event loop is: what stamps made in it may be wrong by."""
+"""Delay of the event loop: the error of stamps that are taken in it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TICK_S = 0.01
 
 
 async def measure_loop_delay(clock: FlightClock, meter: LatencyMeter) -> None:
-    """Note again and again how much later than asked the loop wakes up; ends by cancellation."""
+    """Measure by how much the loop wakes up late, repeatedly; ends by cancellation."""
     while True:
         asked_ns = clock.now_ns() + round(TICK_S * 1e9)
         await asyncio.sleep(TICK_S)

@@ -1,19 +1,19 @@
-"""Devices that stay missing: a service that goes on without its camera is a service that lies."""
+"""Exit condition: a camera or an autopilot that stays missing."""
 
 from __future__ import annotations
 
 from companion.health import Health
 
 
-class Missing:
-    """Tells when a camera or an autopilot has been missing for too long; never in the air."""
+class MissingDevices:
+    """Reports a camera or an autopilot missing for too long; never in the air."""
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
         self._since_s: dict[str, float] = {}
 
     def step(self, health: Health, now_s: float, armed: bool) -> str:
-        """What is to end the daemon, in words; "" as long as nothing is."""
+        """Reason to end the daemon; "" without one."""
         for source in health.sources:
             there = source.state not in ("missing", "opening", "silent", "driver fault")
             if there or armed or not self._limit_s:

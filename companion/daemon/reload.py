@@ -1,4 +1,4 @@
-"""What of a configuration can be changed while the daemon runs."""
+"""Configuration keys that can change while the daemon runs."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ FIXED_SECTIONS = frozenset({"camera", "mount", "link", "router", "distributed"})
 FIXED_KEYS = frozenset({
     "daemon.socket", "daemon.prometheus_port", "feedback.mode", "feedback.obstacle_distance",
 })  # fmt: skip
-"""These are taken at the start. All else counts at once or from the next flight on."""
+"""Keys read at the start only. All others take effect at once or with the next flight."""
 
 
 def reloaded(running: Config, read: Config) -> tuple[Config, list[str]]:
-    """The configuration to go on with, and the changed keys that need a restart."""
+    """Configuration in force after a reload, and the changed keys that need a restart."""
     old, new = dump(running), dump(read)
     cannot = [
         f"{section}.{key}"

@@ -1,4 +1,4 @@
-"""What the autopilot and the ground are told beside the pose: this computer, and obstacles."""
+"""Reports to the autopilot and the ground beside the pose: this computer, and obstacles."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MAX_AGE_NS = 500_000_000
 
 
 class VehicleReports:
-    """Sends ONBOARD_COMPUTER_STATUS, each second unless asked otherwise, and OBSTACLE_DISTANCE."""
+    """Sends ONBOARD_COMPUTER_STATUS, by default each second, and OBSTACLE_DISTANCE."""
 
     def __init__(
         self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, obstacles: bool
@@ -38,12 +38,12 @@ class VehicleReports:
         self._link, self._clock, self._watch = link, clock, watch
         self._obstacles = obstacles
         self.computer_hz = COMPUTER_HZ
-        """How often the computer's state is sent, 5 a second at most; 0: not."""
+        """Rate of the computer's status, at most 5 Hz; 0: none."""
         self._camera_from_body = Pose.identity()
         self.restart(None)
 
     def restart(self, camera: Camera | None) -> None:
-        """Another flight, whose map is another."""
+        """Begin another flight with another map."""
         self._cloud = RecentCloud()
         self._track: Track | None = None
         self._map: MapUpdate | None = None
@@ -51,7 +51,7 @@ class VehicleReports:
             self._camera_from_body = camera.body_from_camera.inverse()
 
     def take(self, message: Track | MapUpdate | PointChunk) -> None:
-        """Take what the map has become."""
+        """Take a track, a map update or points."""
         if isinstance(message, Track):
             self._track = message
         elif isinstance(message, MapUpdate):
@@ -60,7 +60,7 @@ class VehicleReports:
             self._cloud.add(message)
 
     async def run(self) -> None:
-        """Send for ever; ends by cancellation."""
+        """Send until cancelled."""
         loop = asyncio.get_running_loop()
         credit = 0.0
         while True:
@@ -77,14 +77,14 @@ class VehicleReports:
                     self._link.send(message)
 
     def computer_status(self) -> object:
-        """ONBOARD_COMPUTER_STATUS of now."""
+        """ONBOARD_COMPUTER_STATUS now."""
         message: object = computer_status(
             self._clock.now_ns(), self._watch.load, too_hot=self._watch.too_hot
         )
         return message
 
     def questions(self, feedback: Callable[[], FeedbackConfig]) -> Mapping[int, Command]:
-        """How it is answered who asks for messages of ours, or for their rates."""
+        """Handler of requests for our messages and their rates."""
 
         def set_computer_rate(rate_hz: float | None) -> None:
             self.computer_hz = COMPUTER_HZ if rate_hz is None else rate_hz
@@ -108,7 +108,7 @@ class VehicleReports:
         ).commands
 
     def _obstacle_distance(self) -> object | None:
-        """OBSTACLE_DISTANCE of now, from the map's own pose; None while that is not known."""
+        """OBSTACLE_DISTANCE now, from the map's own pose; None while that is unknown."""
         track, update, now_ns = self._track, self._map, self._clock.now_ns()
         if (
             track is None or track.state is not TrackState.TRACKING

@@ -194,7 +194,7 @@ def _stretch(held: _Held, place: Similarity, update: MapUpdate) -> float:
     depth = depth_map.depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
     known = depth > 0
     ratio = typical_ratio(points[inside][known, 2] / depth[known])
-    return update.stretch_of(depth_map.keyframe_id, held.spans) if ratio is None else ratio
+    return update.local_scale_of(depth_map.keyframe_id, held.spans) if ratio is None else ratio
 
 
 def _unit(vectors: Array) -> Array:

@@ -317,7 +317,7 @@ class LocalisationStage:
             return None
         sigma_m = SIGMA_COASTING_M_S * blind_ns * 1e-9
         return replace(
-            track, state=TrackState.COASTING, map_from_camera=predicted,
+            track, state=TrackState.DEAD_RECKONING, map_from_camera=predicted,
             sigma_position=last.sigma_position + sigma_m / placed.world_from_map.scale,
             sigma_rotation_rad=last.sigma_rotation_rad + SIGMA_COASTING_RAD_S * blind_ns * 1e-9,
         )  # fmt: skip

@@ -103,7 +103,7 @@ class SmoothOdometry:
         `velocity_map` the camera's velocity in it with its standard deviation.
         """
         pose = track.map_from_camera
-        known = track.state in (TrackState.TRACKING, TrackState.COASTING)
+        known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None or georeference is None:
             return self._unknown(track)
         if segment != self._segment or self._georeference is None:
@@ -111,7 +111,7 @@ class SmoothOdometry:
         elif georeference is not self._georeference:
             self._change(georeference)
         raw = self._raw(georeference, pose)
-        if track.state is TrackState.COASTING:
+        if track.state is TrackState.DEAD_RECKONING:
             return self._coast(track, raw)
         if self._coasting:
             self._land(raw, track.t_ns)

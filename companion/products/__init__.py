@@ -1,1 +1,1 @@
-"""What a run leaves behind: trajectory, cloud and report."""
+"""Results of a run: trajectory, cloud, report, exports."""

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic file writes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, data: bytes | Iterable[bytes], durable: bool = False) -> None:
-    """Put `data`, whole or in parts, at `path`, replacing what was there in one step.
+    """Put `data`, whole or in parts, at `path`, replacing the old file in one step.
 
-    Raises OSError. A write that fails half way leaves the old file as it was, and nothing of its
-    own. With `durable` it waits until the disk has it, so that it outlasts a loss of power.
+    Raises OSError. A failed write leaves the old file as it was, and no partial file. With
+    `durable` it waits until the data is on disk, and so survives a loss of power.
     """
     part = path.with_name(f".{path.name}.part")
     try:

@@ -18,11 +18,11 @@ PAPERS_MM = {
 LEAST_MARGIN_MM = 4.0
 INCH_MM = 25.4
 DOTS_PER_INCH, MOST_DOTS = 300, 8000
-"""Of a PNG; a large board is drawn coarser, so that the page fits into memory."""
+"""Resolution of a PNG; lower for a large board, so that the page fits into memory."""
 
 
 def board_page(chart: Chart, form: str) -> tuple[bytes, str]:
-    """The page as "png" or "pdf", and what paper it is for."""
+    """The page as "png" or "pdf", and its paper size."""
     rectangles = chart.black_m() * 1000
     square_mm = chart.square_m * 1000
     across_mm, down_mm = (chart.columns + 1) * square_mm, (chart.rows + 1) * square_mm
@@ -58,7 +58,7 @@ def board_page(chart: Chart, form: str) -> tuple[bytes, str]:
 
 
 def _paper(across_mm: float, down_mm: float) -> tuple[str, float, float]:
-    """The smallest that holds the board, upright or across; else one of its own."""
+    """Smallest paper that holds the board, portrait or landscape; else a custom size."""
     for name, (short, long) in PAPERS_MM.items():
         for width, height in ((long, short), (short, long)):
             if min(width - across_mm, height - down_mm) >= 2 * LEAST_MARGIN_MM:

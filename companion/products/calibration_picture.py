@@ -1,4 +1,4 @@
-"""One picture that shows how good a calibration is, and where it is not."""
+"""Picture of a calibration's quality."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ STYLE: Any = {
     "figure.facecolor": CARD,
 }  # fmt: skip
 LONGEST_ARROW = 0.05
-"""Of the picture's width: how long a large residual is drawn."""
+"""Longest arrow of a residual, as a share of the picture's width."""
 
 
 def calibration_png(calibration: Calibration, name: str, board: str) -> bytes:
-    """Corners over the picture, what the lens leaves unexplained, and the lens itself."""
+    """PNG: corner coverage, reprojection residuals, and the distortion of the lens."""
     camera = calibration.camera
     with matplotlib.rc_context(STYLE):
         tall = camera.height / camera.width
@@ -135,7 +135,7 @@ def _draw_views(axes: Axes, calibration: Calibration) -> None:
 
 
 def _draw_distortion(axes: Axes, camera: Camera) -> None:
-    """How far the lens moves a place from where one without distortion would have it."""
+    """Displacement of pixels by the lens distortion."""
     across, down = np.meshgrid(
         np.linspace(0, camera.width - 1, 97), np.linspace(0, camera.height - 1, 73)
     )
@@ -165,7 +165,7 @@ def _draw_distortion(axes: Axes, camera: Camera) -> None:
 
 
 def _arrows(axes: Axes, camera: Camera, at: Array, shift: Array) -> None:
-    """Of one length at most: directions, the colours tell how far."""
+    """Arrows of limited length for directions; colours show the length."""
     size = np.linalg.norm(shift, axis=-1, keepdims=True)
     longest = float(np.nanpercentile(size, 90))
     length = 0.05 * camera.width * np.minimum(size / max(longest, 1e-9), 1.0)
@@ -177,7 +177,7 @@ def _arrows(axes: Axes, camera: Camera, at: Array, shift: Array) -> None:
 
 
 def _levels(largest: float) -> Array:
-    """Round steps; closer together where they would all lie at the rim."""
+    """Round contour levels; closer together where all would lie at the border."""
     if largest > 400:  # a fisheye: without its distortion the rim would be far outside
         steps = np.array([1.0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000])
         top = float(steps[np.searchsorted(steps, min(largest, steps[-2])) + 1])
@@ -187,7 +187,7 @@ def _levels(largest: float) -> Array:
 
 
 def _round(value: float) -> float:
-    """The nearest 1, 2 or 5 times a power of ten, not above."""
+    """Largest 1, 2 or 5 times a power of ten that is not above."""
     unit = 10.0 ** np.floor(np.log10(value))
     return float(max(m for m in (1, 2, 5) if m * unit <= value * 1.0001) * unit)
 

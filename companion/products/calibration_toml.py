@@ -1,4 +1,4 @@
-"""A calibration as the TOML file that a live run is given as `camera.calibration`."""
+"""A calibration as TOML, for `camera.calibration` of a live run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COEFFICIENTS = {
 
 
 def calibration_toml(calibration: Calibration, name: str, board: str, source: str) -> bytes:
-    """The file: the lens, and under [quality] what speaks for it."""
+    """The file: lens parameters, and its quality under [quality]."""
     camera = calibration.camera
     lens: dict[str, object] = {
         "name": name,

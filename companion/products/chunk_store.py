@@ -1,4 +1,4 @@
-"""The chunks of a flight: the newest in memory, the others in a file that goes when it is over."""
+"""Point chunks of a flight: the newest in memory, the others in a temporary file."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ class _Stored:
     t_ns: int
     spans: Mapping[int, float]
     begin: int
-    """in the file"""
+    """Offset in the file."""
     n: int
 
 
 class ChunkStore:
-    """One chunk for each keyframe; of their points no more than `memory_mb` in memory.
+    """One chunk per keyframe; at most `memory_mb` of their points in memory.
 
-    What is more lies in a file without a name in `folder`, which the system removes however the
-    program ends; without a folder all stays in memory. Chunks that the disk does not take are
-    given up: `n_given_up` points so far.
+    The rest lies in an unlinked file in `folder`, which the system removes however the program
+    ends; without a folder all stays in memory. Chunks that the disk does not take are dropped:
+    `n_given_up` points so far.
     """
 
     def __init__(self, folder: Path | None = None, memory_mb: float = np.inf) -> None:
@@ -50,13 +50,13 @@ class ChunkStore:
         self.n_given_up = 0
 
     def put(self, chunk: PointChunk) -> None:
-        """Take a chunk, in the place of an earlier one of that keyframe."""
+        """Add a chunk; replaces an earlier one of that keyframe."""
         before = self._held.pop(chunk.keyframe_id, None)
         if before is not None:
             self._n_held -= len(before.rgb)
             self.n_points -= len(before.rgb)
         elif chunk.keyframe_id in self._stored:
-            # its room in the file is lost: this is rare
+            # its space in the file is lost, which is rare
             self.n_points -= self._stored.pop(chunk.keyframe_id).n
         self._held[chunk.keyframe_id] = chunk
         self._n_held += len(chunk.rgb)
@@ -80,7 +80,7 @@ class ChunkStore:
 
     @property
     def keyframe_ids(self) -> list[int]:
-        """Of which there is a chunk, ascending."""
+        """Keyframes that have a chunk, ascending."""
         return sorted([*self._held, *self._stored])
 
     def get(self, keyframe_id: int) -> PointChunk:
@@ -101,7 +101,7 @@ class ChunkStore:
         )  # fmt: skip
 
     def close(self) -> None:
-        """Let go of all, the file included."""
+        """Free memory and file."""
         self._held.clear()
         self._stored.clear()
         self._n_held = 0

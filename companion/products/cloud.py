@@ -1,4 +1,4 @@
-"""A cloud in the world."""
+"""Point cloud in the world."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Cloud:
         return len(self.points)
 
     def part(self, index: NDArray[Any] | slice) -> Cloud:
-        """Some of it."""
+        """Subset by mask or indices."""
         return Cloud(
             self.points[index], self.rgb[index], self.confidence[index], self.normals[index],
             self.sigma[index],
@@ -45,7 +45,7 @@ def no_cloud() -> Cloud:
 
 
 def joined(clouds: Sequence[Cloud]) -> Cloud:
-    """One after the other."""
+    """Concatenation of clouds."""
     parts = clouds or [no_cloud()]
     return Cloud(
         np.concatenate([c.points for c in parts]), np.concatenate([c.rgb for c in parts]),
@@ -55,7 +55,7 @@ def joined(clouds: Sequence[Cloud]) -> Cloud:
 
 
 def placed(chunk: PointChunk, world_from_camera: Similarity) -> Cloud:
-    """A chunk in the world."""
+    """Points of a chunk in the world."""
     turn = world_from_camera.rotation.T.astype(np.float32)
     return Cloud(
         world_from_camera.apply(chunk.points_camera.astype(np.float64)).astype(np.float32),

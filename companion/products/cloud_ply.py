@@ -1,4 +1,4 @@
-"""The cloud as a binary PLY file."""
+"""Point cloud as a binary PLY file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VERTEX = np.dtype(
     ]
 )  # fmt: skip
 AT_ONCE = 100_000
-"""Vertices that are in memory as they are written."""
+"""Vertices in memory while writing."""
 KINDS = {"f": "float", "u": "uchar"}
 
 
@@ -29,7 +29,7 @@ def cloud_ply(cloud: Cloud, unit: str, origin: GeoOrigin | None) -> bytes:
 
 
 def ply_parts(cloud: Cloud, unit: str, origin: GeoOrigin | None) -> Iterator[bytes]:
-    """The same, part by part."""
+    """The same, in parts."""
     head = [
         "ply",
         "format binary_little_endian 1.0",

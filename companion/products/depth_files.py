@@ -1,4 +1,4 @@
-"""What `companion depth` writes: a depth map per reference, and the cloud."""
+"""Files of `companion depth`: a depth map per reference, and the cloud."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def write_depth(out: Path, depth_map: DepthMap) -> None:
 
 
 def write_cloud(out: Path, chunks: Sequence[PointChunk], places: Mapping[int, Pose]) -> None:
-    """Write cloud.ply, in the frame and unit of the poses."""
+    """Write cloud.ply, in the frame and units of the poses."""
     poses = [places[chunk.keyframe_id] for chunk in chunks]
     at = [Similarity(1.0, pose.rotation, pose.translation) for pose in poses]
     cloud = joined([placed(c, place) for c, place in zip(chunks, at, strict=True)])

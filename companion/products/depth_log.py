@@ -1,4 +1,4 @@
-"""What the depth of images with known poses took, as depth.json."""
+"""Timing log of `companion depth`, as depth.json."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from companion.messages import DepthMap, PixelState
 from companion.products.atomic_file import write_atomically
 
 COPIES = {"upload": "upload_ms", "read-back": "read_back_ms", "copy": "copy_ms"}
-"""What is no kernel, by the names that the engine has for it."""
+"""Transfers, by the engine's names for them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """Milliseconds: on the device by OpenCL's events, and the rest of the wall time on the host.
+    """Milliseconds on the device by OpenCL events, and the rest of the wall time on the host.
 
-    `copy_ms` is from buffer to buffer. Where device and host work side by side, `host_ms` is what
-    the host works, or waits, beyond the device's time.
+    `copy_ms` is from buffer to buffer. Where device and host overlap, `host_ms` is the host's time
+    beyond the device's.
     """
 
     upload_ms: float = 0.0
@@ -31,14 +31,14 @@ class Spent:
 
     @staticmethod
     def of(wall_ms: float, device_ms: Mapping[str, float]) -> Spent:
-        """From wall time and what the engine says of the device."""
+        """From wall time and the device times of the engine."""
         kernels = {name: ms for name, ms in device_ms.items() if name not in COPIES}
         copies = {key: device_ms.get(name, 0.0) for name, key in COPIES.items()}
         host_ms = max(wall_ms - sum(device_ms.values()), 0.0)
         return Spent(kernel_ms=kernels, host_ms=host_ms, **copies)
 
     def rounded(self) -> dict[str, Any]:
-        """For JSON."""
+        """Rounded for JSON."""
         return {
             "upload_ms": round(self.upload_ms, 3),
             "kernel_ms": {name: round(ms, 3) for name, ms in self.kernel_ms.items()},
@@ -49,7 +49,7 @@ class Spent:
 
 @dataclass(frozen=True, slots=True)
 class UpdateLog:
-    """One image taken: pixels that were still worked on after it, converged and diverged ones."""
+    """One image: pixels still updated after it, converged and diverged ones."""
 
     frame: int
     pixels_worked_on: int
@@ -60,7 +60,7 @@ class UpdateLog:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceLog:
-    """One reference: `searched` of the images of `updates` were searched; `spent` is of all."""
+    """One reference: `searched` of the images of `updates` were searched; `spent` is the total."""
 
     reference: int
     range_m: tuple[float, float]
@@ -73,7 +73,7 @@ def write_log(
     out: Path, *, device: str, layout: str, maps: Sequence[DepthMap],
     log: Sequence[ReferenceLog], stages: Mapping[str, Any],
 ) -> None:  # fmt: skip
-    """Write depth.json; `maps` are those of the log."""
+    """Write depth.json; `maps` are the depth maps of the log."""
     references = [_reference(r, depth_map) for r, depth_map in zip(log, maps, strict=True)]
     content = {
         "device": device, "layout": layout, "in_all": in_all([r.spent for r in log]).rounded(),
@@ -83,7 +83,7 @@ def write_log(
 
 
 def in_all(parts: Sequence[Spent]) -> Spent:
-    """The sum."""
+    """Sum of times."""
     kernels: dict[str, float] = {}
     for part in parts:
         for name, ms in part.kernel_ms.items():

@@ -1,4 +1,4 @@
-"""A few depth maps of a flight, kept as small pictures: coloured depth beside the image."""
+"""Thumbnails of some depth maps of a flight: coloured depth beside the image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WIDTH_PX = 400
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthPicture:
-    """A keyframe's image (JPEG) and its depth in colours (PNG, transparent where there is none).
+    """Image of a keyframe (JPEG) and its depth in colours (PNG, transparent where invalid).
 
     Colours run from `near` to `far`, in units of the keyframe's camera frame.
     """
@@ -31,7 +31,7 @@ class DepthPicture:
 
 
 class DepthPictures:
-    """Every so many depth maps of a flight of any length, never more than `MAX_HELD`."""
+    """A sample of the depth maps of a flight of any length, at most `MAX_HELD`."""
 
     def __init__(self) -> None:
         self._every = 1
@@ -39,7 +39,7 @@ class DepthPictures:
         self.n_seen = 0
 
     def take(self, depth_map: DepthMap) -> None:
-        """Keep a picture of the depth map if it is its turn."""
+        """Keep a picture of the depth map if it is due."""
         turn = self.n_seen
         self.n_seen += 1
         if turn % self._every or not (depth_map.depth > 0).any():
@@ -50,7 +50,7 @@ class DepthPictures:
             self._held = [(n, p) for n, p in self._held if n % self._every == 0]
 
     def spread(self, n: int) -> list[DepthPicture]:
-        """At most `n` pictures, evenly from what is held, in order of time."""
+        """At most `n` pictures, evenly spread in time, in order of time."""
         held = [picture for _, picture in self._held]
         if len(held) <= n:
             return held
@@ -58,7 +58,7 @@ class DepthPictures:
 
 
 def picture_of(depth_map: DepthMap) -> DepthPicture:
-    """Encode a depth map, near red and far blue; at least one pixel must have a depth."""
+    """Encode a depth map, near red and far blue; needs at least one valid pixel."""
     known = depth_map.depth > 0
     near, far = (float(v) for v in np.percentile(depth_map.depth[known], [2, 98]))
     _, jpeg = cv2.imencode(
@@ -75,7 +75,7 @@ def picture_of(depth_map: DepthMap) -> DepthPicture:
 
 
 def depth_colours(depth: Floats, near: float, far: float) -> Bytes:
-    """Colours (H, W, 4), BGRA, even in inverse depth as the eye and the error are; 0 where none."""
+    """Colours (H, W, 4), BGRA, linear in inverse depth; 0 where invalid."""
     known = depth > 0
     inverse = 1.0 / np.where(known, depth, 1.0)
     closeness = (inverse - 1 / far) / max(1 / near - 1 / far, 1e-12)

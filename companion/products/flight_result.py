@@ -1,4 +1,4 @@
-"""What is known of a flight once it is over, gathered message by message."""
+"""Results of a flight, gathered message by message."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from companion.messages import (
     DepthMap,
     Frame,
     Georeference,
+    LoopClosed,
     MapUpdate,
     Message,
     PointChunk,
     PositionSample,
     PositionSource,
-    Reunited,
     Track,
     Warned,
 )
@@ -38,15 +38,15 @@ from companion.timing.clock import StageTimes
 
 POSITION_STEP_NS = 100_000_000
 VOXEL_PER_DEPTH = 0.01
-"""Side of a voxel over the median depth, while there is no metre."""
+"""Voxel size over the median depth, without a metric scale."""
 GIVEN_UP = "points were given up, as the disk does not take them"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunFacts:
-    """What the messages do not tell of a run; `stage_times` is `StageTimes.summary()`.
+    """Facts of a run beside its messages; `stage_times` is `StageTimes.summary()`.
 
-    `origin` is where local NED has its zero. `completed` is False when the run was stopped.
+    `origin` is the geodetic origin of local NED. `completed` is False when the run was stopped.
     """
 
     stage_times: Mapping[str, Mapping[str, float]]
@@ -66,7 +66,7 @@ class RunFacts:
 
 
 class WorldPose(NamedTuple):
-    """Where a frame was taken: `world_from_camera` in metres, or in map units without a scale."""
+    """Pose of a frame: `world_from_camera` in metres, or in map units without a scale."""
 
     seq: int
     t_ns: int
@@ -75,7 +75,7 @@ class WorldPose(NamedTuple):
 
 @dataclass(slots=True)
 class WarningCount:
-    """How often one thing was warned of, and what the first said."""
+    """Number of warnings of one kind, and the first detail."""
 
     count: int
     first_t_ns: int
@@ -83,11 +83,10 @@ class WarningCount:
 
 
 class FlightResult:
-    """A sink that keeps what the results are made of.
+    """Sink that keeps the data that results are made of.
 
-    It holds one track for each frame, a dozen small pictures and the autopilot's path at 10 Hz at
-    most. Of the points of all keyframes it holds `memory_mb` at most, if `folder` can take the
-    others.
+    It holds one track per frame, a dozen small pictures and the autopilot's path at 10 Hz at most.
+    Of the points of all keyframes it holds `memory_mb` at most, if `folder` can take the others.
     """
 
     def __init__(self, folder: Path | None = None, memory_mb: float = np.inf) -> None:
@@ -96,13 +95,13 @@ class FlightResult:
         self.last_t_ns: int | None = None
         self.warnings: dict[str, WarningCount] = {}
         self.update: MapUpdate | None = None
-        self.reunions: list[Reunited] = []
+        self.loop_closures: list[LoopClosed] = []
         self._tracks = TrackStore()
         self._chunks = ChunkStore(folder, memory_mb)
         self._median_depths: dict[int, float] = {}
         self._kernel_times = StageTimes()
         self._positions: dict[PositionSource, tuple[array[int], array[float]]] = {}
-        """times, and the coordinates of one place after the other"""
+        """Times, and coordinates one after the other."""
         self._pictures = DepthPictures()
 
     def take(self, message: Message) -> None:
@@ -116,8 +115,8 @@ class FlightResult:
             self._tracks.put(message)
         elif isinstance(message, MapUpdate):
             self.update = message
-        elif isinstance(message, Reunited):
-            self.reunions.append(message)
+        elif isinstance(message, LoopClosed):
+            self.loop_closures.append(message)
         elif isinstance(message, PointChunk):
             self._take_points(message)
         elif isinstance(message, DepthMap):
@@ -149,45 +148,45 @@ class FlightResult:
             warnings.count += 1
 
     def close(self) -> None:
-        """Let go of the points, and of the file that holds them."""
+        """Free the points, and the file that holds them."""
         self._chunks.close()
 
     @property
     def georeference(self) -> Georeference | None:
-        """How the map lies in the world; None without a scale."""
+        """Georeference of the map; None without a scale."""
         return self.update.georeference if self.update is not None else None
 
     @property
     def unit(self) -> str:
-        """What lengths are in: m, or map units without a scale."""
+        """Unit of lengths: m, or map units without a scale."""
         return "m" if self.georeference is not None else "map units"
 
     @property
     def n_keyframes(self) -> int:
-        """Keyframes of the map as it ended."""
+        """Keyframes of the final map."""
         return self.update.n_keyframes if self.update is not None else 0
 
     @property
     def n_points(self) -> int:
-        """Points of all keyframes, before they are thinned together."""
+        """Points of all keyframes, before voxel filtering."""
         return self._chunks.n_points
 
     @property
     def n_depth_maps(self) -> int:
-        """Depth maps that were made."""
+        """Number of depth maps."""
         return self._pictures.n_seen
 
     def kernel_times(self) -> dict[str, dict[str, float]]:
-        """What each kernel took for one depth map, in the form of `StageTimes.summary()`."""
+        """Time of each kernel per depth map, in the form of `StageTimes.summary()`."""
         return self._kernel_times.summary()
 
     @property
     def tracks(self) -> list[Track]:
-        """One track for each frame, in order of frames; of its poses the one by its keyframe."""
+        """One track per frame, in order of frames, with poses relative to keyframes."""
         return list(self._tracks)
 
     def poses(self) -> list[WorldPose]:
-        """All frames whose place is known, in order, by the map as it ended."""
+        """Poses of all localised frames, in order, by the final map."""
         out = []
         for track in self._tracks:
             if track.keyframe_id is None or track.keyframe_from_camera is None:
@@ -202,9 +201,9 @@ class FlightResult:
         return out
 
     def cloud(self, voxel_m: float) -> Cloud:
-        """All chunks in the world, one point in each cube of side `voxel_m`.
+        """All chunks in the world, one point per voxel of side `voxel_m`.
 
-        Without a scale the cube is a hundredth of the median depth. The result does not depend on
+        Without a scale the side is a hundredth of the median depth. The result does not depend on
         the order in which chunks came.
         """
         gathering = self.gather_cloud(voxel_m)
@@ -216,9 +215,9 @@ class FlightResult:
                 return cloud
 
     def gather_cloud(self, voxel_m: float) -> Generator[float, None, Cloud]:
-        """The same a chunk at a time, for who has other things to do: how far it is, 0 to 1.
+        """The same in slices, for a caller with other work: yields progress, 0 to 1.
 
-        Places are those of when it began; chunks that come meanwhile are left out.
+        Uses the keyframe poses at its beginning; chunks that come meanwhile are left out.
         """
         update, georeference = self.update, self.georeference
         if update is None:
@@ -234,23 +233,23 @@ class FlightResult:
         metric = georeference is not None
         depths = [place.scale * self._median_depths[key] for key, place in places.items()]
         voxel = voxel_m if metric else VOXEL_PER_DEPTH * float(np.median(depths))
-        stretches: dict[int, float] = {}
-        parts = [partial(self._placed, k, p, update, stretches) for k, p in places.items()]
+        local_scales: dict[int, float] = {}
+        parts = [partial(self._placed, k, p, update, local_scales) for k, p in places.items()]
         return (yield from gathered(parts, self.n_points, voxel))
 
     def _placed(
-        self, keyframe_id: int, place: Similarity, update: MapUpdate, stretches: dict[int, float]
+        self, keyframe_id: int, place: Similarity, update: MapUpdate, local_scales: dict[int, float]
     ) -> Cloud:
-        """A chunk in the world; none where the disk was full meanwhile."""
+        """Points of a chunk in the world; none where the disk was full."""
         if keyframe_id not in self._chunks:
             return no_cloud()
         chunk = self._chunks.get(keyframe_id)
-        if keyframe_id not in stretches:
-            stretches[keyframe_id] = _stretch(chunk, update)
-        return placed(chunk, replace(place, scale=stretches[keyframe_id] * place.scale))
+        if keyframe_id not in local_scales:
+            local_scales[keyframe_id] = _local_scale(chunk, update)
+        return placed(chunk, replace(place, scale=local_scales[keyframe_id] * place.scale))
 
     def autopilot_path(self) -> tuple[PositionSource, Array, Array] | None:
-        """The autopilot's own path from its best source: t_ns (N,), NED metres (N, 3)."""
+        """Path of the autopilot by its best source: t_ns (N,), NED metres (N, 3)."""
         for source in PositionSource:
             times, places = self._positions.get(source, (array("q"), array("d")))
             if len(times) >= 2:
@@ -262,11 +261,11 @@ class FlightResult:
         return self._pictures.spread(n)
 
 
-def _stretch(chunk: PointChunk, update: MapUpdate) -> float:
-    """By what factor points are further away in the map as it is now; by spans if it has few."""
+def _local_scale(chunk: PointChunk, update: MapUpdate) -> float:
+    """Local scale correction of a chunk in the newest map; by spans where points are few."""
     place = update.place_of(chunk.keyframe_id)
     if place is None:
         return 1.0
     in_camera = place.inverse().apply(update.points_map)
     ratio = stretch_of_points(chunk.points_camera.astype(np.float64), in_camera)
-    return update.stretch_of(chunk.keyframe_id, chunk.spans) if ratio is None else ratio
+    return update.local_scale_of(chunk.keyframe_id, chunk.spans) if ratio is None else ratio

@@ -1,4 +1,4 @@
-"""One cloud of many parts, made a few tiles at a time: little more memory than it takes itself."""
+"""Voxel filter for many parts, a few tiles at a time: little more memory than the result."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from companion.products.cloud import Cloud, no_cloud
 from companion.products.voxel_cloud import Tile, VoxelCloud, tiles_of
 
 AT_ONCE = 2_000_000
-"""Points, before they are thinned, of the tiles that are worked on together."""
+"""Points, before voxel filtering, of the tiles of one round."""
 GROWTH = 1.125
 
 
 def gathered(
     parts: Sequence[Callable[[], Cloud]], n_points: int, voxel: float
 ) -> Generator[float, None, Cloud]:
-    """One point for each cube of side `voxel` of all parts; how far it is on the way, 0 to 1.
+    """One point per voxel of all parts; yields progress, 0 to 1.
 
-    A part is asked for again and again: once for each round that it has points in, and once more
-    to find out which these are. A cloud of `AT_ONCE` of `n_points` takes one round.
+    A part is loaded once for each round in which it has points, and once more to find these rounds.
+    A cloud of `AT_ONCE` of `n_points` takes one round.
     """
     low: Array | None = None
     touched: list[set[Tile]] = [set() for _ in parts]
@@ -56,7 +56,7 @@ def gathered(
 
 
 def _rounds(counts: dict[Tile, int]) -> Generator[set[Tile], None, None]:
-    """Tiles in their order, as many together as there is room for."""
+    """Tiles in order, grouped by what fits into memory."""
     together: set[Tile] = set()
     n = 0
     for tile in sorted(counts):
@@ -70,7 +70,7 @@ def _rounds(counts: dict[Tile, int]) -> Generator[set[Tile], None, None]:
 
 
 class _Growing:
-    """Arrays that grow where they lie, so that they are never there twice."""
+    """Arrays that grow in place, so that they never exist twice."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[Any]] = {

@@ -1,4 +1,4 @@
-"""A small file whose newest content counts, written beside the event loop."""
+"""Latest-wins file writer beside the event loop."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from companion.products.atomic_file import sync, write_atomically
 
 
 class NewestFile:
-    """Writes in a thread of its own: a disk that hangs holds up nothing, and costs no more memory.
+    """Writes in a thread of its own: a disk that hangs delays nothing and costs no more memory.
 
-    `failed` is called in that thread with what went wrong.
+    `failed` is called in that thread with the error.
     """
 
     def __init__(self, path: Path, failed: Callable[[str], None]) -> None:
@@ -23,18 +23,18 @@ class NewestFile:
         threading.Thread(target=self._run, name=f"write {path.name}", daemon=True).start()
 
     def put(self, data: bytes | None) -> None:
-        """Have this in the file from now on; None: no file."""
+        """Set the content of the file; None deletes it."""
         with self._changed:
             self._newest, self._due = data, True
             self._changed.notify_all()
 
     def wait(self, seconds: float) -> bool:
-        """Wait until all is written, at most so long; whether it is."""
+        """Wait until all is written, at most this long; whether it is."""
         with self._changed:
             return self._changed.wait_for(lambda: not (self._due or self._busy), seconds)
 
     def close(self, seconds: float = 0.0) -> None:
-        """Write what is still to be written, and end; waits for it at most so long."""
+        """Write the rest and end; waits for it at most this long."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

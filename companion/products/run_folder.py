@@ -1,4 +1,4 @@
-"""A finished run, read back from its folder."""
+"""Reads a finished run back from its folder."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from companion.products.flight_result import WorldPose
 FORMER_NAMES = ("x", "y", "z", "red", "green", "blue", "confidence")
 MAX_HEAD = 4096
 FORMER_VERTEX = np.dtype([(name, VERTEX[name]) for name in FORMER_NAMES])
-"""As runs of earlier versions wrote it, without normals and standard deviations."""
+"""Vertex of earlier versions, without normals and standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedRun:
-    """What a run wrote: its poses and cloud in the world, and its report's numbers.
+    """Results of a run: its poses and cloud in the world, and its report's numbers.
 
-    The world is local NED in metres if `metric`, else the map's own axes and units. `origin` is
-    where NED has its zero, None where no place on Earth is known.
+    The world is local NED in metres if `metric`, else the map's own axes and units. `origin` is the
+    geodetic origin of NED, None where unknown.
     """
 
     path: Path
@@ -40,7 +40,7 @@ class FinishedRun:
 
 
 def read_run(folder: Path) -> FinishedRun:
-    """Read the folder of a run; InputError where it is none, or not whole."""
+    """Read the folder of a run; InputError where it is none, or incomplete."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; wanted is the --out of a replay")
     report = _report(folder / "report.json")

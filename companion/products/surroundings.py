@@ -1,4 +1,4 @@
-"""What a report says of the program and the machine that it ran on."""
+"""Program versions and memory use for the report."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ LIBRARIES = ("numpy", "opencv-python-headless", "pyopencl", "pymavlink", "filter
 
 
 def versions() -> dict[str, str]:
-    """Of the program, Python and the libraries whose versions can change results."""
+    """Versions of the program, Python and the libraries that can change results."""
     found = {name: metadata.version(name) for name in LIBRARIES}
     return {"companion": __version__, "python": platform.python_version(), **found}
 
 
 def peak_memory_mb() -> float:
-    """Of this process."""
+    """Peak memory of this process, MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

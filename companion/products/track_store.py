@@ -1,4 +1,4 @@
-"""The tracks of a flight as rows of arrays: hours of flight are some megabytes."""
+"""Tracks of a flight as rows of arrays: hours of flight take some megabytes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ ROW = np.dtype(
     ]
 )  # fmt: skip
 BLOCK = 4096
-"""Rows that are made room for at once."""
+"""Rows allocated at once."""
 
 
 class TrackStore:
-    """Tracks in any order, one for each frame out: the last that was tracking, else the last.
+    """Takes tracks in any order, gives one per frame: the last that was tracking, else the last.
 
-    What is kept of each is what results are made of; where its keyframe was at that time, its key
-    points and its sigmas are not.
+    Keeps of each what results need; the keyframe's pose at that time, keypoints and sigmas are
+    dropped.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class TrackStore:
         self._n = 0
 
     def put(self, track: Track) -> None:
-        """Take a track."""
+        """Add a track."""
         at = self._n % BLOCK
         if at == 0:
             self._blocks.append(np.zeros(BLOCK, ROW))
@@ -51,7 +51,7 @@ class TrackStore:
         self._n += 1
 
     def __iter__(self) -> Iterator[Track]:
-        """One for each frame, in order of frames."""
+        """One track per frame, in order of frames."""
         if not self._n:
             return
         rows = np.concatenate(self._blocks)[: self._n]

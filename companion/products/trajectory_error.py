@@ -1,7 +1,6 @@
-"""How far an estimated path lies from the true one: absolute and relative errors, scale, heading.
+"""Trajectory error: absolute (ATE) and relative (RPE) errors, scale, heading.
 
-The terms are those of Sturm et al. (IROS 2012): ATE after the best alignment, RPE between frames
-that follow each other.
+After Sturm et al. (IROS 2012): ATE after the best alignment, RPE between consecutive frames.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array, Similarity, quaternion_from_rotation
 
-MAX_APART_NS = 4_000_000
-"""Poses belong to the same frame when their times are no further apart."""
+MAX_TIME_DIFFERENCE_NS = 4_000_000
+"""Largest time difference of poses of the same frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,17 +28,17 @@ class Path:
         return len(self.t_ns)
 
     def at(self, index: NDArray[np.int64]) -> Path:
-        """Some of the poses."""
+        """Subset of the poses."""
         return Path(self.t_ns[index], self.centres[index], self.rotations[index])
 
 
 @dataclass(frozen=True, slots=True)
 class PathErrors:
-    """Root mean squares over the frames that both paths have; lengths in metres.
+    """RMS errors over the frames that both paths have; lengths in metres.
 
     `rpe_m` and `rpe_deg` are of the motion from each frame to the next, after alignment by
-    similarity. `scale_error` is relative; `heading_error_deg` is the yaw that is left between the
-    two worlds.
+    similarity. `scale_error` is relative; `heading_error_deg` is the remaining yaw between the two
+    worlds.
     """
 
     n_common: int
@@ -55,18 +54,18 @@ class PathErrors:
 
 
 def paired(estimate: Path, truth: Path) -> tuple[Path, Path]:
-    """The poses of the frames that both have."""
+    """Poses of the frames that both have."""
     after = np.clip(np.searchsorted(truth.t_ns, estimate.t_ns), 1, len(truth) - 1)
     before_is_nearer = np.abs(truth.t_ns[after - 1] - estimate.t_ns) < np.abs(
         truth.t_ns[after] - estimate.t_ns
     )
     nearest = np.where(before_is_nearer, after - 1, after)
-    same = np.abs(truth.t_ns[nearest] - estimate.t_ns) < MAX_APART_NS
+    same = np.abs(truth.t_ns[nearest] - estimate.t_ns) < MAX_TIME_DIFFERENCE_NS
     return estimate.at(np.flatnonzero(same)), truth.at(nearest[same])
 
 
 def align(a: Array, b: Array, with_scale: bool) -> Similarity:
-    """What takes points `a` (N, 3) to `b` with the least squared error (Umeyama 1991)."""
+    """Similarity from points `a` (N, 3) to `b` with the least squared error (Umeyama 1991)."""
     mean_a, mean_b = a.mean(0), b.mean(0)
     u, singular, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -77,7 +76,7 @@ def align(a: Array, b: Array, with_scale: bool) -> Similarity:
 
 
 def align_by_yaw(a: Array, b: Array) -> Similarity:
-    """As `align`, turning about the vertical only."""
+    """As `align`, with rotation about the vertical only."""
     mean_a, mean_b = a.mean(0), b.mean(0)
     p, q = (a - mean_a)[:, :2], (b - mean_b)[:, :2]
     yaw = np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum())
@@ -87,7 +86,7 @@ def align_by_yaw(a: Array, b: Array) -> Similarity:
 
 
 def path_errors(estimate: Path, truth: Path) -> PathErrors | None:
-    """Errors of an estimate; None where fewer than three frames are in both."""
+    """Errors of an estimate; None with fewer than three common frames."""
     found, wanted = paired(estimate, truth)
     if len(found) < 3:
         return None
@@ -127,7 +126,7 @@ def _steps(path: Path, scale: float) -> tuple[Array, Array]:
 
 
 def _heading_error_deg(found: Path, wanted: Path) -> float:
-    """Mean yaw between the two attitudes, as the estimate has them in its own world."""
+    """Mean yaw between the attitudes of the two paths, each in its own world."""
     off = np.matmul(found.rotations, wanted.rotations.transpose(0, 2, 1))
     mean = off.mean(0)
     return abs(float(np.degrees(np.arctan2(mean[1, 0] - mean[0, 1], mean[0, 0] + mean[1, 1]))))

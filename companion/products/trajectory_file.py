@@ -1,4 +1,4 @@
-"""The camera's path as a TUM file."""
+"""Camera path as a TUM file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def trajectory_tum(poses: Sequence[WorldPose], unit: str, origin: GeoOrigin | No
 
 
 def frame_lines(unit: str, origin: GeoOrigin | None) -> list[str]:
-    """What the world is, in ASCII, for the heads of files."""
+    """Description of the world frame, in ASCII, for file headers."""
     if unit == "m":
         lines = ["world: local NED (x north, y east, z down), metres"]
     else:

@@ -1,4 +1,4 @@
-"""A cloud that is thinned while it grows, so that what is thinned out takes no room."""
+"""Incremental voxel filter: points that are thinned out take no memory."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from companion.messages import Floats
 from companion.products.cloud import Cloud, joined, no_cloud
 
 TILE_VOXELS = 256
-"""Side of a tile, north and east: each is thinned by itself."""
+"""Side of a tile, north and east, in voxels; each tile is filtered by itself."""
 LEAST_WAITING = 20_000
-"""Points that wait in a tile before it is thinned, or half as many as it has."""
+"""Points that wait in a tile before it is filtered, or half as many as it has."""
 
 
 Tile = tuple[int, int]
 
 
 def tiles_of(points: Floats, low: Array, voxel: float) -> tuple[list[Tile], NDArray[np.int64]]:
-    """The tiles that points (N, 3) lie in, in their order, and which of them each lies in (N,)."""
+    """Tiles that points (N, 3) lie in, sorted, and the index of each point's tile (N,)."""
     side = voxel * TILE_VOXELS
     tiles = np.floor((points[:, :2].astype(np.float64) - low[:2]) / side).astype(np.int64)
     found, which = np.unique(tiles, axis=0, return_inverse=True)
@@ -30,10 +30,10 @@ def tiles_of(points: Floats, low: Array, voxel: float) -> tuple[list[Tile], NDAr
 
 
 class VoxelCloud:
-    """One point for each cube of side `voxel`, the most confident, else the earliest.
+    """One point per voxel of side `voxel`: the most confident, else the earliest.
 
-    The cubes begin at `low` (3,), by default the lowest corner of what is added first. Where
-    `only` some tiles are wanted, points of others are left out.
+    The voxel grid begins at `low` (3,), by default the lowest corner of the first points. With
+    `only`, points of other tiles are ignored.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class VoxelCloud:
         self._tiles: dict[Tile, list[Cloud]] = {}
 
     def add(self, cloud: Cloud) -> None:
-        """Take more points."""
+        """Add points."""
         if len(cloud) == 0:
             return
         if self._low is None:
@@ -62,7 +62,7 @@ class VoxelCloud:
                 waiting[:] = [self._thinned(waiting)]
 
     def finished(self) -> Iterator[Cloud]:
-        """All of it, tile by tile in their order; nothing is left here."""
+        """The cloud, tile by tile in order; the filter is empty afterwards."""
         for tile in sorted(self._tiles):
             yield self._thinned(self._tiles.pop(tile))
 

@@ -1,4 +1,4 @@
-"""How stages are run: in order or as processes; mailboxes, frame ring, load levels, gaps.
+"""Execution of stages: in order or as processes; mailboxes, frame ring, load levels, gaps.
 
-Knows stages by their messages only; what each of them does is in `stages`.
+Knows stages by their messages only; their work is in `stages`.
 """

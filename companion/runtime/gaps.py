@@ -1,6 +1,6 @@
-"""Notices what does not come: missing frames, an image that stands still, telemetry that stops.
+"""Gap detection: missing frames, a frozen image, telemetry that stops.
 
-It changes nothing in the flow of messages; it adds a `Warned` where something is amiss.
+Messages pass unchanged; a `Warned` is added at a gap.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import numpy as np
 from companion.messages import AttitudeSample, Bytes, Frame, Message, PositionSample, Warned
 
 GAP_IN_INTERVALS = 5
-"""A silence is a gap from so many usual intervals on."""
+"""Silence of this many median intervals is a gap."""
 MIN_INTERVALS = 3
-"""With fewer nothing is usual yet."""
+"""Intervals needed for a median."""
 MIN_FRAME_GAP_S = 0.3
 MIN_TELEMETRY_GAP_S = 2.0
 STILL_S = 0.5
 STILL_GREY = 0.3
-"""Images that differ by less than this, in grey levels, are the same one, encoded again."""
+"""Largest mean difference of equal images that were encoded again, grey levels."""
 SAMPLE_STEP = 8
 
 
-class Rhythm:
-    """How often something comes: its usual interval and its last time."""
+class IntervalMonitor:
+    """Median interval and last time of a periodic input."""
 
     def __init__(self, min_gap_s: float) -> None:
         self._min_gap_s = min_gap_s
@@ -33,7 +33,7 @@ class Rhythm:
         self._last_ns: int | None = None
 
     def silence_s(self, t_ns: int) -> float | None:
-        """How long nothing has come at this time if that is a gap, else None."""
+        """Seconds since the last arrival if that is a gap, else None."""
         if self._last_ns is None or len(self._intervals_s) < MIN_INTERVALS:
             return None
         silence_s = (t_ns - self._last_ns) * 1e-9
@@ -41,21 +41,21 @@ class Rhythm:
         limit_s = max(self._min_gap_s, GAP_IN_INTERVALS * usual_s)
         return silence_s if silence_s > limit_s else None
 
-    def beat(self, t_ns: int) -> None:
-        """It came."""
+    def arrived(self, t_ns: int) -> None:
+        """Note an arrival."""
         if self._last_ns is not None:
             self._intervals_s.append((t_ns - self._last_ns) * 1e-9)
         self._last_ns = t_ns
 
 
-class GapWatch:
-    """Hears every message, in order of time, and says what is amiss."""
+class GapMonitor:
+    """Takes every message in order of time, and warns of gaps."""
 
     def __init__(self) -> None:
-        self._frames = Rhythm(MIN_FRAME_GAP_S)
+        self._frames = IntervalMonitor(MIN_FRAME_GAP_S)
         self._telemetry = {
-            "attitude": Rhythm(MIN_TELEMETRY_GAP_S),
-            "position": Rhythm(MIN_TELEMETRY_GAP_S),
+            "attitude": IntervalMonitor(MIN_TELEMETRY_GAP_S),
+            "position": IntervalMonitor(MIN_TELEMETRY_GAP_S),
         }
         self._silent: set[str] = set()
         self._image: Bytes | None = None
@@ -65,9 +65,9 @@ class GapWatch:
     def step(self, message: Message) -> list[Warned]:
         """Take one message."""
         if isinstance(message, AttitudeSample):
-            self._hear("attitude", message.t_ns)
+            self._arrived("attitude", message.t_ns)
         elif isinstance(message, PositionSample):
-            self._hear("position", message.t_ns)
+            self._arrived("position", message.t_ns)
         elif isinstance(message, Frame):
             return [
                 *self._missing_frames(message),
@@ -76,19 +76,19 @@ class GapWatch:
             ]
         return []
 
-    def _hear(self, kind: str, t_ns: int) -> None:
-        self._telemetry[kind].beat(t_ns)
+    def _arrived(self, kind: str, t_ns: int) -> None:
+        self._telemetry[kind].arrived(t_ns)
         self._silent.discard(kind)
 
     def _missing_frames(self, frame: Frame) -> Iterator[Warned]:
         silence_s = self._frames.silence_s(frame.t_ns)
-        self._frames.beat(frame.t_ns)
+        self._frames.arrived(frame.t_ns)
         if silence_s is not None:
             yield Warned(frame.t_ns, "frames are missing", f"none for {silence_s:.1f} s")
 
     def _silent_telemetry(self, t_ns: int) -> Iterator[Warned]:
-        for kind, rhythm in self._telemetry.items():
-            silence_s = rhythm.silence_s(t_ns)
+        for kind, monitor in self._telemetry.items():
+            silence_s = monitor.silence_s(t_ns)
             if silence_s is not None and kind not in self._silent:
                 self._silent.add(kind)
                 yield Warned(t_ns, f"{kind} telemetry stops", f"none for {silence_s:.1f} s")
@@ -103,9 +103,9 @@ class GapWatch:
             yield Warned(frame.t_ns, "the image stands still", f"for {STILL_S:g} s or more")
 
 
-def with_gaps_named(messages: Iterable[Message]) -> Iterator[Message]:
-    """The same messages, and before the one that shows a gap a `Warned`."""
-    watch = GapWatch()
+def with_gap_warnings(messages: Iterable[Message]) -> Iterator[Message]:
+    """The same messages, with a `Warned` before the one that reveals a gap."""
+    watch = GapMonitor()
     for message in messages:
         yield from watch.step(message)
         yield message

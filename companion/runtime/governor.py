@@ -1,9 +1,9 @@
-"""What is left out when the computer is too busy or too hot: always in the same order.
+"""Load governor: load levels for a computer that is too busy or too hot, in a fixed order.
 
-First the viewer, then the dense map, then features. The pose itself is never touched: the last
-level gives it less to do for each frame, not fewer frames. One step at a time, each given time to
-work before the next; a step back is taken when all has been easy for a while, and later each time
-that it turns out to have been too early.
+First the viewer is reduced, then the dense map, then features. The pose has priority: the last
+level gives it less work per frame, not fewer frames. One level at a time, each with time to take
+effect before the next. With hysteresis: a level is lowered after some time with headroom, and later
+each time that this turns out to have been too early.
 """
 
 from __future__ import annotations
@@ -12,33 +12,33 @@ from dataclasses import dataclass
 
 MAX_POSE_LATENCY_MS = 60.0
 """From exposure to pose, 95th percentile."""
-EASY_LATENCY_SHARE = 0.75
+HEADROOM_LATENCY_SHARE = 0.75
 NEARLY_LATE_SHARE = 0.9
 SEVERE_LATENCY_SHARE = 2.0
 FULL_CPU_SHARE = 0.97
-"""A full processor is no harm by itself (the dense map takes what is left over), but makes a pose
-that is nearly late a late one."""
+"""A full processor is harmless by itself (the dense map takes the rest), but makes a pose that is
+nearly late a late one."""
 FULL_MEMORY_SHARE = 0.92
-EASY_MEMORY_SHARE = 0.85
+HEADROOM_MEMORY_SHARE = 0.85
 MAX_DROPPED_HZ = 1.0
-"""Frames that the pose had no time for."""
+"""Frames dropped by localisation."""
 COOLER_C = 5.0
-"""So much below the limit is cool again."""
+"""Temperature below the limit at which it counts as cool again."""
 SEVERE_C = 7.0
-"""So much above the limit is about where processors slow themselves down."""
-PRESSING_S = 1.0
-"""So long on end: a second in which a map begins or a viewer joins is no reason."""
+"""Temperature above the limit at which processors throttle themselves."""
+OVERLOADED_S = 1.0
+"""Least duration of an overload: one second of initialisation or a joining viewer is ignored."""
 SETTLE_S = 2.0
 SETTLE_HEAT_S = 15.0
 SETTLE_SEVERE_S = 1.0
-CALM_S = 10.0
-MAX_CALM_S = 160.0
+RECOVERY_S = 10.0
+MAX_RECOVERY_S = 160.0
 FORGET_S = 300.0
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """What may be done at one level. `dense_share` of keyframes get a depth map."""
+    """Work allowed at one level. `dense_share` of keyframes get a depth map."""
 
     number: int
     left_out: str
@@ -60,10 +60,10 @@ LEVELS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Pressure:
-    """How hard it is going; None where that is not known. All of about the last second.
+class LoadSample:
+    """Measured load of about the last second; None where unknown.
 
-    A longer time would have a step judged by what was before it.
+    A longer window would judge a level by the time before it.
     """
 
     cpu_share: float | None = None
@@ -74,42 +74,42 @@ class Pressure:
 
 
 class Governor:
-    """Decides the level; to be asked about once a second."""
+    """Chooses the level; to be called about once a second."""
 
     def __init__(self, hot_c: float, max_pose_latency_ms: float = MAX_POSE_LATENCY_MS) -> None:
         self._hot_c = hot_c
         self._max_latency_ms = max_pose_latency_ms
         self.level = LEVELS[0]
         self.why = ""
-        """What led to the present level, in words."""
+        """Reason of the present level, in words."""
         self._raised_ns: int | None = None
         self._lowered_ns: int | None = None
-        self._easy_since_ns: int | None = None
-        self._calm_s = CALM_S
-        self._pressing_since_ns: int | None = None
+        self._headroom_since_ns: int | None = None
+        self._recovery_s = RECOVERY_S
+        self._overloaded_since_ns: int | None = None
 
     @property
     def degraded(self) -> str:
-        """What is left out and why; "" where nothing is."""
+        """Work left out, and the reason; "" at level 0."""
         return f"{self.level.left_out}, {self.why}" if self.level.number else ""
 
-    def step(self, t_ns: int, pressure: Pressure) -> bool:
-        """Take what was measured at this time; whether the level has changed."""
-        why, settle_s = self._pressing(pressure)
+    def step(self, t_ns: int, sample: LoadSample) -> bool:
+        """Take a measurement; whether the level has changed."""
+        why, settle_s = self._overload(sample)
         if why:
-            self._easy_since_ns = None
-            if self._pressing_since_ns is None:
-                self._pressing_since_ns = t_ns
-            if t_ns - self._pressing_since_ns < PRESSING_S * 1e9:
+            self._headroom_since_ns = None
+            if self._overloaded_since_ns is None:
+                self._overloaded_since_ns = t_ns
+            if t_ns - self._overloaded_since_ns < OVERLOADED_S * 1e9:
                 return False
             return self._raise(t_ns, why, settle_s)
-        self._pressing_since_ns = None
-        if not self._easy(pressure):
-            self._easy_since_ns = None
+        self._overloaded_since_ns = None
+        if not self._has_headroom(sample):
+            self._headroom_since_ns = None
             return False
-        if self._easy_since_ns is None:
-            self._easy_since_ns = t_ns
-        if self.level.number and t_ns - self._easy_since_ns >= self._calm_s * 1e9:
+        if self._headroom_since_ns is None:
+            self._headroom_since_ns = t_ns
+        if self.level.number and t_ns - self._headroom_since_ns >= self._recovery_s * 1e9:
             self._lower(t_ns)
             return True
         return False
@@ -121,12 +121,12 @@ class Governor:
             return False
         if self._lowered_ns is not None:
             # Soon after a step back: that was too early, the next one waits longer.
-            soon = t_ns - self._lowered_ns < 2 * self._calm_s * 1e9
+            soon = t_ns - self._lowered_ns < 2 * self._recovery_s * 1e9
             forgotten = t_ns - self._lowered_ns > FORGET_S * 1e9
             if soon:
-                self._calm_s = min(2 * self._calm_s, MAX_CALM_S)
+                self._recovery_s = min(2 * self._recovery_s, MAX_RECOVERY_S)
             elif forgotten:
-                self._calm_s = CALM_S
+                self._recovery_s = RECOVERY_S
             self._lowered_ns = None
         self.level, self.why = LEVELS[self.level.number + 1], why
         self._raised_ns = t_ns
@@ -134,45 +134,45 @@ class Governor:
 
     def _lower(self, t_ns: int) -> None:
         self.level = LEVELS[self.level.number - 1]
-        self._lowered_ns = self._easy_since_ns = t_ns
+        self._lowered_ns = self._headroom_since_ns = t_ns
         if not self.level.number:
             self.why = ""
 
-    def _pressing(self, pressure: Pressure) -> tuple[str, float]:
-        """What is too much, in words, and how long a step must be given to help; "" for nothing."""
-        latency_ms, limit_ms = pressure.pose_latency_p95_ms, self._max_latency_ms
+    def _overload(self, sample: LoadSample) -> tuple[str, float]:
+        """Reason of an overload, and seconds for a level to take effect; "" for none."""
+        latency_ms, limit_ms = sample.pose_latency_p95_ms, self._max_latency_ms
         if latency_ms is not None and latency_ms > limit_ms:
             severe = latency_ms > SEVERE_LATENCY_SHARE * limit_ms
             return (
                 f"since poses come {latency_ms:.0f} ms after exposure",
                 SETTLE_SEVERE_S if severe else SETTLE_S,
             )
-        if pressure.pose_dropped_hz > MAX_DROPPED_HZ:
-            return f"since {pressure.pose_dropped_hz:.0f} frames/s go without a pose", SETTLE_S
+        if sample.pose_dropped_hz > MAX_DROPPED_HZ:
+            return f"since {sample.pose_dropped_hz:.0f} frames/s go without a pose", SETTLE_S
         if (
             latency_ms is not None
             and latency_ms > NEARLY_LATE_SHARE * limit_ms
-            and pressure.cpu_share is not None
-            and pressure.cpu_share > FULL_CPU_SHARE
+            and sample.cpu_share is not None
+            and sample.cpu_share > FULL_CPU_SHARE
         ):
             return f"since the processor is full and poses take {latency_ms:.0f} ms", SETTLE_S
-        if pressure.temperature_c is not None and pressure.temperature_c >= self._hot_c:
-            severe = pressure.temperature_c >= self._hot_c + SEVERE_C
+        if sample.temperature_c is not None and sample.temperature_c >= self._hot_c:
+            severe = sample.temperature_c >= self._hot_c + SEVERE_C
             return (
-                f"since it is {pressure.temperature_c:.0f} C hot",
+                f"since it is {sample.temperature_c:.0f} C hot",
                 SETTLE_S if severe else SETTLE_HEAT_S,
             )
-        if pressure.memory_share is not None and pressure.memory_share > FULL_MEMORY_SHARE:
-            return f"since memory is {100 * pressure.memory_share:.0f} % full", SETTLE_S
+        if sample.memory_share is not None and sample.memory_share > FULL_MEMORY_SHARE:
+            return f"since memory is {100 * sample.memory_share:.0f} % full", SETTLE_S
         return "", 0.0
 
-    def _easy(self, pressure: Pressure) -> bool:
-        latency_ms = pressure.pose_latency_p95_ms
+    def _has_headroom(self, sample: LoadSample) -> bool:
+        latency_ms = sample.pose_latency_p95_ms
         return (
-            (latency_ms is None or latency_ms < EASY_LATENCY_SHARE * self._max_latency_ms)
-            and pressure.pose_dropped_hz <= 0.2 * MAX_DROPPED_HZ
+            (latency_ms is None or latency_ms < HEADROOM_LATENCY_SHARE * self._max_latency_ms)
+            and sample.pose_dropped_hz <= 0.2 * MAX_DROPPED_HZ
             and (
-                pressure.temperature_c is None or pressure.temperature_c < self._hot_c - COOLER_C
+                sample.temperature_c is None or sample.temperature_c < self._hot_c - COOLER_C
             )
-            and (pressure.memory_share is None or pressure.memory_share < EASY_MEMORY_SHARE)
+            and (sample.memory_share is None or sample.memory_share < HEADROOM_MEMORY_SHARE)
         )

@@ -1,4 +1,4 @@
-"""A queue of messages of bounded size: where room is short they go by kind, and are counted."""
+"""Message queue of bounded size: on overflow messages are dropped by kind, and counted."""
 
 from __future__ import annotations
 
@@ -11,42 +11,48 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 
-class Fate(IntEnum):
-    """What becomes of a message that waits. Where room is short the lowest kind goes first."""
+class DropPolicy(IntEnum):
+    """Treatment of a waiting message on overflow: the lowest kind is dropped first."""
 
     LATEST_WINS = 0
-    """It gives way to the next of its kind, whether room is short or not."""
+    """Replaced by the next of its kind, even without overflow."""
     PICTURE = 1
-    """Large, and one of many: the oldest goes."""
+    """Large, and one of many: the oldest is dropped first."""
     MAP = 2
-    """Part of the map: the oldest goes when there is no picture left."""
+    """Part of the map: the oldest is dropped when no PICTURE is left."""
     LOSSLESS = 3
-    """Small: the oldest goes when there is nothing else left."""
+    """Small: the oldest is dropped when nothing else is left."""
     ALWAYS = 4
-    """What a stage is told to do: it stays."""
+    """Control message: never dropped."""
 
 
 class Mailbox(Generic[T]):
-    """Messages in order, `room_bytes` of them at most; may be used from any thread.
+    """Queue of messages, at most `capacity_bytes` of them; may be used from any thread.
 
-    A message that is larger than the room is let in when nothing else is there that could go.
+    A message larger than that is let in when nothing else is there that could be dropped.
     """
 
     def __init__(
-        self, fate_of: Callable[[T], Fate], bytes_of: Callable[[T], int], room_bytes: int
+        self,
+        policy_of: Callable[[T], DropPolicy],
+        bytes_of: Callable[[T], int],
+        capacity_bytes: int,
     ) -> None:
-        self._fate_of, self._bytes_of, self._room_bytes = fate_of, bytes_of, room_bytes
-        self._waiting: dict[Fate, deque[tuple[int, int, T]]] = {fate: deque() for fate in Fate}
-        """by fate: how many came before it, its bytes, the message"""
+        self._policy_of, self._bytes_of = policy_of, bytes_of
+        self._capacity_bytes = capacity_bytes
+        self._waiting: dict[DropPolicy, deque[tuple[int, int, T]]] = {
+            policy: deque() for policy in DropPolicy
+        }
+        """By policy: arrival number, size in bytes, message."""
         self._n_put = 0
         self._closed = False
         self._changed = threading.Condition()
         self.n_bytes = 0
-        """Of what waits."""
+        """Size of the waiting messages."""
         self.n_dropped = 0
-        """Frames that gave way to a newer one."""
-        self.n_overflown = 0
-        """Other messages given up for want of room."""
+        """Frames replaced by a newer one."""
+        self.n_overflowed = 0
+        """Other messages dropped on overflow."""
 
     def __len__(self) -> int:
         with self._changed:
@@ -54,20 +60,20 @@ class Mailbox(Generic[T]):
 
     def put(self, message: T) -> None:
         """Add a message; never waits."""
-        fate, size = self._fate_of(message), self._bytes_of(message)
+        policy, size = self._policy_of(message), self._bytes_of(message)
         with self._changed:
-            if fate is Fate.LATEST_WINS and self._waiting[fate]:
-                self._drop(fate)
+            if policy is DropPolicy.LATEST_WINS and self._waiting[policy]:
+                self._drop(policy)
                 self.n_dropped += 1
-            self._waiting[fate].append((self._n_put, size, message))
+            self._waiting[policy].append((self._n_put, size, message))
             self._n_put += 1
             self.n_bytes += size
-            while self.n_bytes > self._room_bytes and self._make_room():
-                self.n_overflown += 1
+            while self.n_bytes > self._capacity_bytes and self._drop_lowest():
+                self.n_overflowed += 1
             self._changed.notify()
 
     def get(self) -> T | None:
-        """The oldest message; waits for one. None once it is closed and empty."""
+        """Oldest message; waits for one. None once it is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or any(self._waiting.values()))
             heads = [held[0] for held in self._waiting.values() if held]
@@ -78,18 +84,18 @@ class Mailbox(Generic[T]):
             return oldest[2]
 
     def close(self) -> None:
-        """No more comes; what is there can still be taken out."""
+        """End input; waiting messages can still be taken out."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
-    def _make_room(self) -> bool:
-        """Give up a message, but not the one that came last; whether there was one to give up."""
-        for fate in (Fate.PICTURE, Fate.MAP, Fate.LOSSLESS):
-            if self._waiting[fate] and self._waiting[fate][0][0] < self._n_put - 1:
-                self._drop(fate)
+    def _drop_lowest(self) -> bool:
+        """Drop a message, but not the newest; whether there was one to drop."""
+        for policy in (DropPolicy.PICTURE, DropPolicy.MAP, DropPolicy.LOSSLESS):
+            if self._waiting[policy] and self._waiting[policy][0][0] < self._n_put - 1:
+                self._drop(policy)
                 return True
         return False
 
-    def _drop(self, fate: Fate) -> None:
-        self.n_bytes -= self._waiting[fate].popleft()[1]
+    def _drop(self, policy: DropPolicy) -> None:
+        self.n_bytes -= self._waiting[policy].popleft()[1]

@@ -1,4 +1,4 @@
-"""How much memory a message holds."""
+"""Memory size of messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SMALL_BYTES, ENTRY_BYTES = 256, 400
 
 
 def size_bytes(message: Any) -> int:
-    """About how many bytes a message holds: its arrays and bytes, its mappings by their length."""
+    """Approximate size of a message: its arrays and bytes, its mappings by their length."""
     parts = fields(message) if is_dataclass(message) else ()
     return SMALL_BYTES + sum(_size(getattr(message, part.name)) for part in parts)
 

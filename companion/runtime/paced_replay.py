@@ -1,7 +1,7 @@
-"""A recorded flight in its own time, with the drops of a live one.
+"""Replay in real time, with the frame drops of a live flight.
 
-A frame that comes while the last is still being worked on takes the place of any other that waits:
-the latest wins and the rest are counted. Telemetry is never dropped.
+A frame that comes while the last is being processed replaces any other that waits: the newest wins,
+the rest are counted. Telemetry is never dropped.
 """
 
 from __future__ import annotations
@@ -10,30 +10,30 @@ import threading
 from collections.abc import Iterable, Iterator
 
 from companion.messages import Frame, Message
-from companion.runtime.mailbox import Fate, Mailbox
+from companion.runtime.mailbox import DropPolicy, Mailbox
 from companion.runtime.message_size import size_bytes
 from companion.timing.clock import monotonic_s, wait_s
 
-ROOM_BYTES = 256 << 20
-"""Of telemetry that waits: more than that of an hour."""
+CAPACITY_BYTES = 256 << 20
+"""Waiting telemetry: more than an hour's."""
 
 
 class PacedFeed:
-    """Plays messages at the times they carry; iterate over it in the working thread."""
+    """Plays messages at the times of their stamps; iterate over it in the working thread."""
 
     def __init__(self, messages: Iterable[Message], speed: float = 1.0) -> None:
         self._messages = messages
         self._speed = speed
         self._waiting: Mailbox[Message] = Mailbox(
-            lambda m: Fate.LATEST_WINS if isinstance(m, Frame) else Fate.LOSSLESS,
-            size_bytes, ROOM_BYTES,
+            lambda m: DropPolicy.LATEST_WINS if isinstance(m, Frame) else DropPolicy.LOSSLESS,
+            size_bytes, CAPACITY_BYTES,
         )  # fmt: skip
         self._stop = threading.Event()
         self._fault: BaseException | None = None
 
     @property
     def n_dropped(self) -> int:
-        """Frames passed over."""
+        """Frames dropped."""
         return self._waiting.n_dropped
 
     def __iter__(self) -> Iterator[Message]:

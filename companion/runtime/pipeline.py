@@ -1,4 +1,4 @@
-"""The stages in their order, and the two ways to run them.
+"""In-process pipeline of the stages, in lockstep or live.
 
 | stage        | listens to                           | gives                           |
 |--------------|--------------------------------------|---------------------------------|
@@ -32,22 +32,22 @@ from companion.messages import (
 from companion.runtime.message_size import size_bytes
 
 DEPTH_QUEUE, DEPTH_QUEUE_BYTES = 64, 128 << 20
-"""Messages that wait for depth, and bytes of them: of large pictures there is room for fewer."""
+"""Capacity of the queue to depth, in messages and bytes."""
 DEPTH_FAILED = "the dense map ends here: the depth stage has failed"
 
 
 class Stage(Protocol):
-    """Messages in, messages out; its own state, nobody else's."""
+    """Messages in, messages out; owns its state."""
 
     def step(self, message: Message) -> list[Message]:
         """Take one message."""
 
     def flush(self) -> list[Message]:
-        """Finish what is still open."""
+        """Finish open work."""
 
 
 class Sink(Protocol):
-    """Where messages leave the pipeline."""
+    """Consumer of all messages of the pipeline."""
 
     def take(self, message: Message) -> None:
         """Take one message; must not take long."""
@@ -56,8 +56,8 @@ class Sink(Protocol):
 class StageThread:
     """A stage in its own thread; its results wait until they are collected.
 
-    A stage that raises is over: what comes after goes unheard, what it gave before can still be
-    collected, and `fault` says what it raised.
+    A stage that raises ends: later messages are ignored, earlier results can still be collected,
+    and `fault` is the exception.
     """
 
     def __init__(self, stage: Stage, lossless: bool) -> None:
@@ -68,13 +68,13 @@ class StageThread:
         self._n_bytes = 0
         self._taken = threading.Condition()
         self.fault: BaseException | None = None
-        """What the stage raised; None while it works."""
+        """Exception of the stage; None while it works."""
         self.n_dropped = 0
         self._thread = threading.Thread(target=self._work, name="depth", daemon=True)
         self._thread.start()
 
     def put(self, message: Message) -> None:
-        """Hand over a message; waits for room in lockstep, else drops frames and keyframes."""
+        """Pass a message; in lockstep waits for capacity, else drops frames and keyframes."""
         size = size_bytes(message)
         with self._taken:
             fits = not self._n_bytes or self._n_bytes + size <= DEPTH_QUEUE_BYTES
@@ -127,7 +127,7 @@ class StageThread:
 
 
 class Pipeline:
-    """The stages joined; feed it messages in order of time."""
+    """The joined stages; feed it messages in order of time."""
 
     def __init__(
         self,
@@ -138,27 +138,27 @@ class Pipeline:
     ) -> None:
         self._localisation = localisation
         self._depth = StageThread(depth, lossless) if depth is not None else None
-        self._fault_told = False
+        self._fault_reported = False
         self._sinks = list(sinks)
         self._t_ns = 0
 
     @property
     def state(self) -> str:
-        """The tracker's state in a word."""
+        """Tracking state as a word."""
         return self._localisation.state.value
 
     @property
     def depth_fault(self) -> BaseException | None:
-        """What the depth stage raised; None where it did not."""
+        """Exception of the depth stage; None without one."""
         return self._depth.fault if self._depth is not None else None
 
     @property
     def n_depth_frames_dropped(self) -> int:
-        """Frames that the depth stage had no time for (never in lockstep)."""
+        """Frames dropped by the depth stage (never in lockstep)."""
         return self._depth.n_dropped if self._depth is not None else 0
 
     def feed(self, message: Message) -> None:
-        """Take one message through all stages."""
+        """Pass one message through all stages."""
         self._publish(message)
         if isinstance(message, Warned):
             return
@@ -170,25 +170,25 @@ class Pipeline:
         if self._depth is not None:
             for out in self._depth.collect():
                 self._publish(out)
-            self._tell_fault()
+            self._warn_fault()
 
     def finish(self) -> None:
-        """Adjust the map, complete the depth, and pass on the rest."""
+        """Final adjustment of the map, complete the depth maps, publish the rest."""
         try:
             last = self._localisation.finish()
         finally:
             if self._depth is not None:
                 for out in self._depth.close():
                     self._publish(out)
-                self._tell_fault()
+                self._warn_fault()
         for out in last:
             self._publish(out)
 
-    def _tell_fault(self) -> None:
-        """Have it among the warnings, once, that the dense map has ended early."""
+    def _warn_fault(self) -> None:
+        """Warn once that the dense map has ended early."""
         fault = self.depth_fault
-        if fault is not None and not self._fault_told:
-            self._fault_told = True
+        if fault is not None and not self._fault_reported:
+            self._fault_reported = True
             self._publish(Warned(self._t_ns, DEPTH_FAILED, in_words(fault)))
 
     def _pass_on(self, message: Message) -> None:
@@ -202,7 +202,7 @@ class Pipeline:
 
 
 def in_words(fault: BaseException) -> str:
-    """A fault in one line: its own text where it was raised on purpose, else its kind as well."""
+    """A fault in one line: its text if raised on purpose, else its type as well."""
     text = " ".join(str(fault).split())
     if isinstance(fault, CompanionError):
         return text

@@ -28,8 +28,8 @@ from typing import Any  # noqa: E402
 
 from companion.errors import CompanionError, InputError  # noqa: E402
 from companion.messages import Frame  # noqa: E402
-from companion.runtime.frame_ring import FrameInRing, FrameRing  # noqa: E402
-from companion.runtime.mail_policy import FRAMES_SHARE, IN_BYTES, fate_of  # noqa: E402
+from companion.runtime.frame_ring import FrameHandle, FrameRing  # noqa: E402
+from companion.runtime.mail_policy import FRAMES_SHARE, IN_BYTES, drop_policy_of  # noqa: E402
 from companion.runtime.mailbox import Mailbox  # noqa: E402
 from companion.runtime.message_size import size_bytes  # noqa: E402
 from companion.runtime.stage_protocol import Failed, Finish, Finished, Progress, Setup  # noqa: E402
@@ -38,13 +38,13 @@ from companion.timing.clock import monotonic_s, wait_s  # noqa: E402
 
 REPORT_EVERY_S = 1.0
 LOWEST_NICE = 19
-"""What is nicer still runs only where nothing else wants the processor."""
+"""Lowest priority: runs only where nothing else wants the processor."""
 SWITCH_S = 5e-4
-"""What works beside the tracker gives it the interpreter so soon."""
+"""Switch interval of the interpreter, so that background threads yield to the tracker."""
 
 
 def main() -> int:
-    """Serve one stage until told to finish, or until the daemon is gone."""
+    """Run one stage until told to finish, or until the daemon is gone."""
     kind, nice, pipe_fd, ring_fd = sys.argv[1], *map(int, sys.argv[2:5])
     os.nice(min(nice, LOWEST_NICE))
     if kind == "localisation":
@@ -86,27 +86,27 @@ def _serve(
 
 
 class _Loop:
-    """Takes one message after the other, and tells how that goes, also of a step that hangs."""
+    """Processes one message after the other, and reports progress, also of a step that hangs."""
 
     def __init__(self, ring: FrameRing, work: Work) -> None:
         self._ring, self._work = ring, work
         self._inbox: Mailbox[Any] = Mailbox(
-            lambda message: fate_of(message, work.latest_only), size_bytes, IN_BYTES
+            lambda message: drop_policy_of(message, work.latest_only), size_bytes, IN_BYTES
         )
         self._n_done = 0
         self._n_overwritten = 0
-        """Frames for which it was too late, or that there was no room for."""
+        """Frames overwritten in the ring or dropped on overflow."""
         self._busy_since_s: float | None = None
 
     def read(self, pipe: Connection[Any, Any]) -> None:
-        """Put what comes into the inbox, frames copied, until the daemon is gone."""
+        """Put incoming messages into the inbox, frames copied, until the daemon is gone."""
         ring, work = self._ring, self._work
         try:
             while True:
                 message = pipe.recv()
-                if isinstance(message, FrameInRing) and not work.latest_only:
-                    room = self._inbox.n_bytes + ring.frame_bytes <= FRAMES_SHARE * IN_BYTES
-                    frame = ring.get(message) if room or not len(self._inbox) else None
+                if isinstance(message, FrameHandle) and not work.latest_only:
+                    capacity = self._inbox.n_bytes + ring.frame_bytes <= FRAMES_SHARE * IN_BYTES
+                    frame = ring.get(message) if capacity or not len(self._inbox) else None
                     if frame is None:
                         self._n_overwritten += 1
                         continue
@@ -118,14 +118,14 @@ class _Loop:
             self._inbox.put(Finish(hurry=True))
 
     def report(self, send: Callable[[Any], None]) -> None:
-        """Tell every now and then how it goes, as long as the process lives."""
+        """Report progress periodically, as long as the process lives."""
         while True:
             wait_s(threading.Event(), REPORT_EVERY_S)
             inbox, work = self._inbox, self._work
-            n_dropped = inbox.n_dropped + inbox.n_overflown + self._n_overwritten
+            n_dropped = inbox.n_dropped + inbox.n_overflowed + self._n_overwritten
             send(
                 Progress(
-                    self._n_done, n_dropped + work.n_turned_away, self._busy_since_s,
+                    self._n_done, n_dropped + work.n_rejected, self._busy_since_s,
                     inbox.n_bytes, work.times.summary(), work.device,
                 )
             )  # fmt: skip
@@ -141,7 +141,7 @@ class _Loop:
                 for out in work.finish(message):
                     send(out)
                 return
-            if isinstance(message, FrameInRing):
+            if isinstance(message, FrameHandle):
                 frame = self._ring.get(message, colour=False)
                 if frame is None:
                     self._n_overwritten += 1
@@ -153,9 +153,9 @@ class _Loop:
 
 
 def _take_real_time() -> None:
-    """The pose before all else, where the service's LimitRTPRIO allows it and a core is left over.
+    """Real-time priority for the pose, if the service's LimitRTPRIO and a spare core allow it.
 
-    Only what takes a frame to its pose: threads that this one starts have the usual policy again.
+    Only for the thread from frame to pose: threads started by it get the usual policy again.
     """
     if resource.getrlimit(resource.RLIMIT_RTPRIO)[0] == 0 or len(os.sched_getaffinity(0)) < 2:
         return

@@ -1,4 +1,4 @@
-"""A stage in a process of its own, seen from the daemon.
+"""Handle of a stage's process in the daemon.
 
 Messages go through a pair of sockets as pickles (both ends are ours, and nobody else has them),
 frames through shared memory. Nothing here makes the caller wait but `wait`.
@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from companion.runtime.frame_ring import FrameRing
-from companion.runtime.mail_policy import OUT_BYTES, fate_of
+from companion.runtime.mail_policy import OUT_BYTES, drop_policy_of
 from companion.runtime.mailbox import Mailbox
 from companion.runtime.message_size import size_bytes
 from companion.runtime.stage_protocol import DriverAtWork, Failed, Finish, Finished, Progress, Setup
@@ -27,15 +27,15 @@ CHILD = "companion.runtime.stage_child"
 BY_DRIVER = (
     signal.SIGABRT, signal.SIGALRM, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV,
 )  # fmt: skip
-"""What ends a process from within; SIGALRM where a driver does not come back."""
+"""Signals of a driver's crash; SIGALRM where a driver does not return."""
 
 
 class StageProcess:
     """Starts the process of a stage, which does nothing before `begin`.
 
-    `deliver` gets its messages, and `ended` one call when it is gone. Both are called from a
-    thread of this object. `ended` gets "" where it was asked to end, else what became of the
-    process, in words. With `every_frame` no frame gives way to a newer one.
+    `deliver` gets its messages, and `ended` one call when it is gone: "" where it was asked to end,
+    else the reason in words. Both are called from a thread of this object. With `every_frame` no
+    frame is dropped for a newer one.
     """
 
     def __init__(
@@ -55,15 +55,15 @@ class StageProcess:
         self._interrupted: str | None = None
         self._begun_s: float | None = None
         self._busy_since_s: float | None = None
-        """As it last said."""
+        """By its last report."""
         self._offered_s: float | None = None
-        """When it was first offered something since it last said that it waits."""
+        """Time of the first message since it last reported that it waits."""
         self._deliver, self._ended = deliver, ended
         self.asked_to_end = False
-        """Whether it was told to end, one way or the other."""
+        """Whether it was asked to finish or killed."""
         self._driver = DriverAtWork()
         self._outbox: Mailbox[Any] = Mailbox(
-            lambda message: fate_of(message, not every_frame), size_bytes, OUT_BYTES
+            lambda message: drop_policy_of(message, not every_frame), size_bytes, OUT_BYTES
         )
         ours, theirs = socket.socketpair()
         self._child = subprocess.Popen(
@@ -80,31 +80,31 @@ class StageProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Process id."""
         return self._child.pid
 
     @property
     def alive(self) -> bool:
-        """Whether it runs."""
+        """Whether the process runs."""
         return self._child.poll() is None
 
     @property
     def n_dropped(self) -> int:
-        """Frames that it did not get or did not get round to."""
+        """Frames dropped before or in the process."""
         inside = self.progress.n_dropped if self.progress is not None else 0
-        return self._outbox.n_dropped + self._outbox.n_overflown + inside
+        return self._outbox.n_dropped + self._outbox.n_overflowed + inside
 
     @property
     def waiting_bytes(self) -> int:
-        """Of messages that it has yet to take, here and in its process."""
+        """Bytes of messages that wait, here and in the process."""
         inside = self.progress.waiting_bytes if self.progress is not None else 0
         return self._outbox.n_bytes + inside
 
     def stalled_s(self, now_s: float) -> float:
-        """For how long it has been at one step, or not taken what it was offered, or starting.
+        """Seconds in its present step, or without reading its input, or starting.
 
-        0 where it waits for work, or was told to end. A process that is stopped or hangs in a
-        driver says nothing more, and what it last said is true the longer the less.
+        0 where it waits for work, or was asked to end. A process that is stopped or hangs in a
+        driver reports nothing more, and its last report ages.
         """
         if self.asked_to_end or self._begun_s is None or self._interrupted is not None:
             return 0.0
@@ -112,14 +112,14 @@ class StageProcess:
         return max(0.0, now_s - since_s) if since_s is not None else 0.0
 
     def begin(self, setup: Setup) -> None:
-        """Say what to do; what is offered before is not for it."""
+        """Send the setup; earlier messages are ignored."""
         self._outbox.put(setup)
         self._begun_s = monotonic_s()
 
     def offer(self, message: Any) -> None:
-        """Hand over a message or a FrameInRing; a frame that waits gives way to a newer one.
+        """Send a message or a FrameHandle; a waiting frame is dropped for a newer one.
 
-        Where more than OUT_BYTES wait, depth maps give way first; see companion.runtime.mailbox.
+        Where more than OUT_BYTES wait, depth maps are dropped first; see companion.runtime.mailbox.
         """
         if self._begun_s is None:
             return
@@ -128,13 +128,13 @@ class StageProcess:
             self._offered_s = monotonic_s()
 
     def ask_to_finish(self, finish: Finish) -> None:
-        """Have it give its last results and end."""
+        """Ask it for its last results and its end."""
         self.asked_to_end = True
         self._outbox.put(finish)
         self._outbox.close()
 
     def wait(self, seconds: float) -> bool:
-        """Wait until it has ended, at most so long; whether it has."""
+        """Wait until it has ended, at most this long; whether it has."""
         self._reader.join(seconds)
         return not self._reader.is_alive()
 
@@ -144,13 +144,13 @@ class StageProcess:
         return self._interrupted is not None
 
     def interrupt(self, why: str = "") -> None:
-        """End it as if it had died by itself: `ended` hears of it, and why if that is given."""
+        """End it as if it had died by itself: `ended` is called, with this reason if given."""
         self._interrupted = why
         self._child.kill()
 
     @property
     def driver(self) -> DriverAtWork | None:
-        """The driver that was at work when the process ended of itself or was interrupted."""
+        """Driver that was at work when the process ended of itself or was interrupted."""
         status = self._child.poll()
         if status is None or self.failed is not None or not self._driver.identity:
             return None

@@ -1,4 +1,4 @@
-"""What passes between the daemon and the process of a stage, beside the messages themselves."""
+"""Control messages between the daemon and the process of a stage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.products.flight_result import RunFacts
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """The first thing a stage's process is told; the recorder gets the flight's folder."""
+    """First message to a stage's process; recorder and results get the flight's folder."""
 
     config: Config
     camera: Camera
@@ -25,10 +25,10 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class Finish:
-    """The last thing it is told: give the last results.
+    """Last message to a stage: give the last results.
 
-    With `hurry` what takes long is left out. The recorder gets what its report states. With
-    `keep_map` the vehicle flies on, and another process may go on with the map.
+    With `hurry` slow results are left out. `results` gets the facts of its report. With `keep_map`
+    the vehicle flies on, and another process may continue the map.
     """
 
     hurry: bool
@@ -38,22 +38,22 @@ class Finish:
 
 @dataclass(frozen=True, slots=True)
 class KeepMap:
-    """Have localisation keep its map in a file; and take up what is in it, if so said."""
+    """Localisation keeps its map in a file, and with `take_up` resumes the map found there."""
 
     path: Path
     take_up: bool
 
 
 @dataclass(frozen=True, slots=True)
-class SetShare:
-    """How much of its work a stage is to do, 0 to 1; see companion.runtime.governor."""
+class SetLoadLevel:
+    """Share of its work that a stage is to do, 0 to 1; see companion.runtime.governor."""
 
-    share: float
+    level: float
 
 
 @dataclass(frozen=True, slots=True)
 class TakeSnapshot:
-    """Have the recorder write the cloud as it is now; `origin` where the world has a known one."""
+    """Write the cloud as it is now; `origin` where the world's is known. For `results`."""
 
     number: int
     origin: GeoOrigin | None = None
@@ -61,7 +61,7 @@ class TakeSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """How far a snapshot is; it is over when it has a `path`, or `why_not` says that it failed."""
+    """Progress of a snapshot; finished with a `path`, or failed with `why_not`."""
 
     number: int
     percent: int = 0
@@ -72,10 +72,10 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What a stage's process says of itself, every second or so, whatever it is at.
+    """Periodic report of a stage's process.
 
-    `busy_since_s` is when the step began that it is in (CLOCK_MONOTONIC, the same for all processes
-    of a computer); None while it waits for work.
+    `busy_since_s` is the begin of its present step (CLOCK_MONOTONIC, the same for all processes of
+    a computer); None while it waits for work.
     """
 
     n_done: int = 0
@@ -88,7 +88,7 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class DriverAtWork:
-    """From now on a device's driver is at work, in which it may end the process; or no more ("").
+    """A device's driver is at work, and may end the process; or no longer ("").
 
     `identity` and `named` are those of the device.
     """
@@ -99,7 +99,7 @@ class DriverAtWork:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The stage cannot do its work and ends: why, and whether what the user gave is to blame."""
+    """The stage cannot do its work and ends: the reason, and whether user input is to blame."""
 
     why: str
     by_input: bool = False

@@ -1,4 +1,4 @@
-"""A stage as its process sees it, and which module does it."""
+"""Interface of a stage in its process, and the look-up of its module."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from companion.timing.clock import StageTimes
 
 
 class Work(ABC):
-    """What all stages have; `step` and `finish` are theirs."""
+    """Base class of stages; `step` and `finish` are theirs."""
 
     latest_only = False
-    """Whether it wants the latest frame only, and that without its colours."""
+    """Whether it wants the newest frame only, without colours."""
     outlives_daemon = False
     """Whether it finishes by itself when the daemon is gone; else it ends at once."""
     device = ""
@@ -25,12 +25,12 @@ class Work(ABC):
         self.times = StageTimes()
 
     @property
-    def n_turned_away(self) -> int:
-        """Messages taken and then given up."""
+    def n_rejected(self) -> int:
+        """Messages taken and then dropped."""
         return 0
 
     def begin(self, tell: Callable[[Any], None]) -> None:  # noqa: B027 - most have nothing to do
-        """Before the first message; `tell` takes what the daemon is to know at once."""
+        """Called before the first message; `tell` sends a message to the daemon at once."""
 
     @abstractmethod
     def step(self, message: Any) -> Iterable[Message | Snapshot]:
@@ -38,18 +38,18 @@ class Work(ABC):
 
     @abstractmethod
     def finish(self, finish: Finish) -> Iterable[Message | Snapshot]:
-        """Give what is left."""
+        """Give the last results."""
 
 
 class WorkModule(Protocol):
-    """A module that makes a stage. Its import loads all that the stage needs."""
+    """Module of a stage. Importing it loads all that the stage needs."""
 
     def work(self, setup: Setup) -> Work:
-        """The stage that a setup asks for."""
+        """The stage for a setup."""
 
 
 def module_of(kind: str) -> WorkModule:
-    """Load what does a kind of work: localisation, depth or recorder."""
+    """Import the module `companion.stages.<kind>_work`."""
     module: Any = importlib.import_module(f"companion.stages.{kind}_work")
     loaded: WorkModule = module
     return loaded

@@ -1,1 +1,1 @@
-"""The program as a service of this computer: set up, and taken away again."""
+"""Installation of the program as a service, and its removal."""

@@ -1,4 +1,4 @@
-"""Which Python environment the service runs from: the present one, or one made for it."""
+"""Python environment of the service: the present one, or one made for it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from companion.service.shipped import clone
 from companion.service.steps import Step, command
 
 HIDDEN = (Path("/home"), Path("/root"), Path("/run/user"))
-"""What ProtectHome= of the unit hides."""
+"""Folders hidden by ProtectHome= of the unit."""
 MARK = "made-by-companion-install"
 PYTHON = Path("/usr/bin/python3")
 OLDEST, FIRST_TOO_NEW = (3, 10), (3, 14)
 
 
 def present_environment() -> Path:
-    """That of the program that runs."""
+    """Environment of the running program."""
     return Path(sys.prefix)
 
 
 def why_unfit(environment: Path) -> str:
-    """Why a service of another user could not run from it, in words; "" where it could."""
+    """Reason why a service of another user cannot run from it; "" where it can."""
     program = environment / "bin/companion"
     if not program.is_file():
         return f"{program} is not there"
@@ -41,7 +41,7 @@ def why_unfit(environment: Path) -> str:
 
 
 def environment_made(folder: Path, unit_user: str) -> list[Step]:
-    """Steps that make an environment at a folder from this clone; InputError where none can be."""
+    """Steps that make an environment in a folder from this clone; InputError if impossible."""
     source = clone()
     if source is None:
         raise InputError(
@@ -93,6 +93,6 @@ def _check_python() -> None:
 
 
 def _version(folder: Path) -> str:
-    """Of the companion that is installed in an environment; "" where none is."""
+    """Version of companion installed in an environment; "" without one."""
     found = sorted(folder.glob("lib/python3*/site-packages/companion-*.dist-info"))
     return found[0].name.split("-")[1].removesuffix(".dist") if found else ""

@@ -1,4 +1,4 @@
-"""Which folder of flights a command means that was not told one."""
+"""Default folder of flights for commands."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from companion.service.install_paths import PACKAGED_UNITS, SYSTEM, Places, user
 def flights_meant(
     config: Path | None, overrides: Sequence[str], services: Sequence[Places]
 ) -> Path:
-    """Where `companion run`, told the same, or else an installed service puts its flights.
+    """Folder where `companion run` with the same options, or else a service puts its flights.
 
-    With a configuration or `daemon.flights` among the overrides: what these say, from here. Else
-    what the first of the services says in its own configuration, from its working directory. With
-    no service either: what the defaults say, from here.
+    With a configuration or `daemon.flights` among the overrides: by these, relative to here. Else
+    by the configuration of the first installed service, relative to its working directory. Without
+    a service: by the defaults, relative to here.
     """
-    told = config is not None or any(each.startswith("daemon.flights") for each in overrides)
-    service = None if told or not services else services[0]
+    given = config is not None or any(each.startswith("daemon.flights") for each in overrides)
+    service = None if given or not services else services[0]
     if service is not None:
         config = service.config
     elif config is not None:
@@ -31,7 +31,7 @@ def flights_meant(
 
 
 def installed_services(environment: Mapping[str, str] = os.environ) -> list[Places]:
-    """The user's own, then the computer's, as far as they are set up."""
+    """Installed services: the user's own, then the computer's."""
     found = []
     try:
         own = user_places(environment)

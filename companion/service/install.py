@@ -1,7 +1,7 @@
 """`companion install` and `companion uninstall`: a service of this computer, or of one user.
 
-Everything that can be refused is refused before the first step; steps that are done already are
-left out, so that it can be run again after an update.
+All checks come before the first step; steps already done are skipped, so that it can be run again
+after an update.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from companion.service.steps import Step, carry_out, command, file_written, remo
 from drivers.mavlink.wire.link_url import link_endpoint
 from drivers.system.login_console import login_console_on, login_consoles
 
-Told = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 def install(
-    config: Path | None, told: Told, *, user: bool, venv: Path | None, now: bool, dry_run: bool
+    config: Path | None, notify: Notify, *, user: bool, venv: Path | None, now: bool, dry_run: bool
 ) -> None:
-    """Set the service up; InputError before anything is done, InstallError with all undone."""
+    """Set the service up; InputError before any change, InstallError with all changes undone."""
     places = user_places() if user else SYSTEM
     _check_can_act(user, dry_run)
     settings = load_config(config or (places.config if places.config.exists() else None))
@@ -57,19 +57,19 @@ def install(
         steps.append(file_written(places.rules, shipped(RULES).encode()))
         steps += _rules_read()
     steps += _enabled(places, now)
-    carry_out(steps, told, dry_run)
+    carry_out(steps, notify, dry_run)
     if not dry_run and settings.depth.enabled:
-        _have_opencl_device(environment, told)
+        _have_opencl_device(environment, notify)
     for remark in _remarks(settings, user):
-        told(f"note: {remark}")
+        notify(f"note: {remark}")
     if not dry_run:
         systemctl = " ".join(places.systemctl)
-        told(f"edit {places.config}, then: {systemctl} restart companion" if not now else
+        notify(f"edit {places.config}, then: {systemctl} restart companion" if not now else
              f"how it is: {systemctl} status companion, companion status")  # fmt: skip
 
 
-def uninstall(told: Told, *, user: bool, purge: bool, dry_run: bool) -> None:
-    """Take the service away; flights and configuration stay unless purged."""
+def uninstall(notify: Notify, *, user: bool, purge: bool, dry_run: bool) -> None:
+    """Remove the service; flights and configuration stay unless purged."""
     places = user_places() if user else SYSTEM
     _check_can_act(user, dry_run)
     steps = [*_stopped(places), _disabled(places), removed(places.unit)]
@@ -82,11 +82,11 @@ def uninstall(told: Told, *, user: bool, purge: bool, dry_run: bool) -> None:
         steps += [removed(folder) for folder in places.kept]
         if not user:
             steps.append(_no_account())
-    carry_out(steps, told, dry_run)
+    carry_out(steps, notify, dry_run)
     if not purge:
         left = [str(folder) for folder in places.kept if folder.exists()]
         if left:
-            told(f"kept: {', '.join(left)}; --purge takes them away")
+            notify(f"kept: {', '.join(left)}; --purge takes them away")
 
 
 def _check_can_act(user: bool, dry_run: bool) -> None:
@@ -178,19 +178,19 @@ def _configuration(places: Places, given: Path | None) -> list[Step]:
     return [*steps, file_written(places.config, content)]
 
 
-def _have_opencl_device(environment: Path, told: Told) -> None:
-    """Install a driver where no device works; without one the service maps nothing, and flies."""
+def _have_opencl_device(environment: Path, notify: Notify) -> None:
+    """Install a driver where no device works; without one the service makes no dense map."""
     source = clone()
     if source is None:
         return
     try:
         command("sh", source / "packaging/opencl.sh", environment)
     except InstallError as error:
-        told(f"note: {error}")
+        notify(f"note: {error}")
 
 
 def _rules_read() -> list[Step]:
-    """None where udev does not run, as in an image: it reads them as it starts."""
+    """Step that reloads udev rules; None where udev does not run, as in an image."""
 
     def do() -> None:
         command("udevadm", "control", "--reload")

@@ -1,4 +1,4 @@
-"""Where a service's files lie: of the computer, or of one user."""
+"""Paths of a service's files: of the computer, or of one user."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from companion.errors import InputError
 
 ACCOUNT = "companion"
 GROUPS = ("video", "dialout", "render")
-"""Of cameras, serial ports and GPUs."""
+"""Groups of cameras, serial ports and GPUs."""
 UNIT = "companion.service"
 RULES = "99-companion.rules"
 PACKAGED_UNITS = (Path("/usr/lib/systemd/system", UNIT), Path("/lib/systemd/system", UNIT))
@@ -20,18 +20,18 @@ OWN_ENVIRONMENT = Path("/opt/companion")
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """`rules` is None where no rules for devices can be set."""
+    """Paths; `rules` is None where no udev rules can be set."""
 
     unit: Path
     config: Path
     rules: Path | None
     working: Path
-    """Its working directory, where what it is told in relative paths lies."""
+    """Working directory, which relative paths refer to."""
     kept: tuple[Path, ...]
-    """What only --purge takes away: configuration, flights, caches, logs."""
+    """Removed by --purge only: configuration, flights, caches, logs."""
     systemctl: tuple[str, ...]
     manager: Path
-    """There only while the service manager runs."""
+    """Exists only while the service manager runs."""
 
 
 SYSTEM = Places(
@@ -46,7 +46,7 @@ SYSTEM = Places(
 
 
 def user_places(environment: Mapping[str, str] = os.environ) -> Places:
-    """Those of the user whose environment this is; InputError where it states no home."""
+    """Paths for the user of this environment; InputError where it states no home."""
     home = environment.get("HOME", "")
     if not home:
         raise InputError("$HOME is not set; --user wants to know whose service it is to be")

@@ -1,4 +1,4 @@
-"""The files that come with the program: in its package, or beside it in a clone."""
+"""Files shipped with the program: in its package, or beside it in a clone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ UNIT_PROGRAM = str(OWN_ENVIRONMENT / "bin/companion")
 
 
 def shipped(name: str) -> str:
-    """The text of a unit, of the rules for devices, or of the configuration."""
+    """Text of a unit, of the udev rules, or of the configuration."""
     for path in (PACKAGED / name, CLONE / PLACES_IN_CLONE.get(name, "systemd") / name):
         if path.is_file():
             return path.read_text("utf-8")
@@ -22,12 +22,12 @@ def shipped(name: str) -> str:
 
 
 def clone() -> Path | None:
-    """The folder from which the program can be installed elsewhere, if it runs from one."""
+    """Folder of the clone that the program runs from; None for an installed package."""
     return CLONE if (CLONE / "pyproject.toml").is_file() else None
 
 
 def unit_for(program: Path, user: bool) -> str:
-    """The unit, with the program at its place."""
+    """The unit, with the path of the program."""
     text = shipped("companion-user.service" if user else "companion.service")
     changed = text.replace(f"ExecStart={UNIT_PROGRAM} ", f"ExecStart={program} ")
     assert f"ExecStart={program} " in changed and (user or str(SYSTEM.config) in changed)

@@ -1,4 +1,4 @@
-"""What is done to a computer, step by step: told, left out where it is done, undone on failure."""
+"""Installation steps: reported, skipped where done, undone on failure."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pathlib import Path
 from companion.errors import InstallError
 
 PATIENCE_S = 900.0
-"""A command may take so long: an environment is filled over a slow network."""
+"""Timeout of a command: an environment is filled over a slow network."""
 
 
 def nothing() -> None:
-    """Leave all as it is."""
+    """Do nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,15 +29,15 @@ class Step:
     undo: Callable[[], None] = nothing
 
 
-def carry_out(steps: Sequence[Step], told: Callable[[str], None], dry_run: bool) -> None:
-    """Do what is not done yet; InstallError where that fails, with all as it was before."""
+def carry_out(steps: Sequence[Step], notify: Callable[[str], None], dry_run: bool) -> None:
+    """Do the steps that are not done yet; on failure undo them and raise InstallError."""
     begun: list[Step] = []
     for step in steps:
         if step.is_done():
-            told(f"already there: {step.what}")
+            notify(f"already there: {step.what}")
             continue
         if dry_run:
-            told(f"would do: {step.what}")
+            notify(f"would do: {step.what}")
             continue
         begun.append(step)
         try:
@@ -49,7 +49,7 @@ def carry_out(steps: Sequence[Step], told: Callable[[str], None], dry_run: bool)
             after = f"; not undone: {', '.join(left)}" if left else "; nothing is left of it"
             why = error.strerror if isinstance(error, OSError) and error.strerror else error
             raise InstallError(f"{step.what}: {why}{after}") from None
-        told(f"done: {step.what}")
+        notify(f"done: {step.what}")
 
 
 def _undo(begun: list[Step]) -> list[str]:
@@ -63,7 +63,7 @@ def _undo(begun: list[Step]) -> list[str]:
 
 
 def command(*words: str | Path) -> None:
-    """Run a command; InstallError with the last thing it said where it fails."""
+    """Step that runs a command; InstallError with its last output where it fails."""
     text = " ".join(map(str, words))
     try:
         done = subprocess.run(
@@ -80,7 +80,7 @@ def command(*words: str | Path) -> None:
 
 
 def file_written(path: Path, content: bytes, mode: int = 0o644) -> Step:
-    """A file with this content; folders above it are made."""
+    """Step that writes a file, and makes the folders above it."""
     before: list[bytes] = []
     made: list[Path] = []
     part = path.with_name(f".{path.name}.part")
@@ -114,7 +114,7 @@ def file_written(path: Path, content: bytes, mode: int = 0o644) -> Step:
 
 
 def removed(path: Path) -> Step:
-    """A file or a folder that is no longer there."""
+    """Step that removes a file or a folder."""
 
     def do() -> None:
         if path.is_dir() and not path.is_symlink():

@@ -1,1 +1,1 @@
-"""Stages in processes of their own: what is heavy can neither delay nor bring down what flies."""
+"""Stages in processes of their own: heavy work can neither delay nor crash the daemon."""

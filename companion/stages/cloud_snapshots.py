@@ -1,4 +1,4 @@
-"""The cloud as it is in mid-flight, as a file: gathered between the recorder's other work."""
+"""Cloud snapshots in flight, gathered in slices between the messages that stage `results` takes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.runtime.stage_protocol import Snapshot, TakeSnapshot
 from companion.timing.clock import monotonic_s
 
 WORK_S = 0.01
-"""For so long it holds up a message that the recorder has to take."""
+"""Longest delay of a message to stage `results`, seconds."""
 GATHERED_PERCENT = 90
 NO_POINTS = "there are no points yet"
 BUSY = "another is being written"
@@ -30,7 +30,7 @@ class CloudSnapshots:
         self._refused: list[Snapshot] = []
 
     def begin(self, asked: TakeSnapshot) -> None:
-        """Begin one; refused while another is under way."""
+        """Begin a snapshot; refused while another is under way."""
         if self._gathering is not None:
             self._refused.append(Snapshot(asked.number, why_not=BUSY))
             return
@@ -38,7 +38,7 @@ class CloudSnapshots:
         self._gathering = self._result.gather_cloud(self._voxel_m)
 
     def step(self) -> list[Snapshot]:
-        """Go on for a moment; what there is to tell."""
+        """Work for a moment; progress to report."""
         out, self._refused = self._refused, []
         if self._gathering is None or self._asked is None:
             return out

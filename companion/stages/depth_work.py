@@ -1,4 +1,4 @@
-"""What the camera sees, as a process."""
+"""Stage `depth`: dense depth and cloud."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from companion.dense.depth_stage import DepthStage
 from companion.dense.device_takeover import Devices
 from companion.dense.opencl import ListedDevice
 from companion.messages import DepthMap, Message
-from companion.runtime.stage_protocol import DriverAtWork, Finish, SetShare, Setup
+from companion.runtime.stage_protocol import DriverAtWork, Finish, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 
 FIRST_PATIENCE_S = 120.0
 """Drivers may compile kernels when they first run: on a small processor that takes most of a
 minute."""
 PATIENCE_S = 30.0
-"""A depth map takes 0.1 to 2 s, on a processor that has ten times as much else to do 20 s."""
+"""A depth map takes 0.1 to 2 s, on an overloaded processor 20 s."""
 
 
 class _Depth(Work):
@@ -35,7 +35,7 @@ class _Depth(Work):
         self._stage: DepthStage | None = None
 
     def begin(self, tell: Callable[[Any], None]) -> None:
-        """Find the device, which may take long."""
+        """Choose the device, which may take long."""
         self._tell = tell
         setup = self._setup
         self._devices = choose_devices(
@@ -48,8 +48,8 @@ class _Depth(Work):
 
     def step(self, message: Any) -> Iterable[Message]:
         assert self._stage is not None and self._devices is not None
-        if isinstance(message, SetShare):
-            self._stage.set_share(message.share)
+        if isinstance(message, SetLoadLevel):
+            self._stage.set_share(message.level)
             return []
         out = self._stage.step(message)
         if any(isinstance(each, DepthMap) for each in out):
@@ -63,9 +63,9 @@ class _Depth(Work):
 
     @contextmanager
     def _watched(self, device: ListedDevice) -> Iterator[None]:
-        """SIGALRM ends the process where the driver does not come back.
+        """Watchdog: SIGALRM ends the process where the driver does not return.
 
-        The kernel sends it, so that it does not matter what the driver holds meanwhile.
+        The kernel sends it, whatever the driver holds.
         """
         self._used = device.identity
         patience_s = PATIENCE_S if self._used in self._proven else FIRST_PATIENCE_S
@@ -79,5 +79,5 @@ class _Depth(Work):
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return _Depth(setup)

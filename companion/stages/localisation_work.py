@@ -1,4 +1,4 @@
-"""Where the camera is, as a process: always with the latest frame."""
+"""Stage `localisation`: the camera's pose, always from the newest frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, Message, Warned
-from companion.runtime.stage_protocol import Finish, KeepMap, SetShare, Setup
+from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import not_kept
 from companion.stages.map_keeper import Kept, MapKeeper
@@ -35,12 +35,12 @@ class _Localisation(Work):
         self._stage = LocalisationStage(setup.config, setup.camera, self.times, beside=True)
         self._keeper: MapKeeper | None = None
         self._to_take_up: Kept | None = None
-        self._told_fault = ""
+        self._reported_fault = ""
         self._kept_ns = 0
 
     def step(self, message: Any) -> Iterable[Message]:
-        if isinstance(message, SetShare):
-            self._stage.set_effort(message.share)
+        if isinstance(message, SetLoadLevel):
+            self._stage.set_effort(message.level)
             return []
         if isinstance(message, KeepMap):
             self._begin_keeping(message)
@@ -57,7 +57,7 @@ class _Localisation(Work):
         try:
             kept = self._keeper.take()
         except CheckpointError as error:
-            print(f"companion: the map from before is of no use: {error}", file=sys.stderr)
+            print(f"companion: map checkpoint rejected: {error}", file=sys.stderr)
         else:
             self._to_take_up = kept if message.take_up else None
 
@@ -70,9 +70,9 @@ class _Localisation(Work):
         keeper = self._keeper
         if keeper is None or keeper.busy or frame.t_ns - self._kept_ns < KEEP_EVERY_NS:
             return
-        if keeper.fault and keeper.fault != self._told_fault:
+        if keeper.fault and keeper.fault != self._reported_fault:
             yield Warned(frame.t_ns, NOT_KEPT, keeper.fault)
-        self._told_fault = keeper.fault
+        self._reported_fault = keeper.fault
         try:
             checkpoint = self._stage.checkpoint()
         except Exception as error:  # a bug in what is kept for later must not end the pose of now
@@ -87,5 +87,5 @@ class _Localisation(Work):
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return _Localisation(setup)

@@ -1,8 +1,8 @@
-"""The file in which the map of a flight is kept while it goes on, and read by who takes over.
+"""Checkpoint file of a flight's map, from which another process resumes in the air.
 
-It lies where it outlives a process but not the computer's next start, if there is such a place:
-systemd's RuntimeDirectory is in memory, and writing a few megabytes each second wears nothing out.
-Nothing is synchronised to a disk, therefore.
+Where possible it lies in memory, so that it survives the process but not a reboot: systemd's
+RuntimeDirectory. Writing a few megabytes each second then wears nothing out. It is not synchronised
+to disk.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from companion.timing.clock import since_boot_ns
 from drivers.system.computer_boot import computer_boot
 
 MOST_READ_BYTES = 64_000_000
-"""Nothing that was written here is larger by far."""
+"""Larger than any checkpoint."""
 
 
 class Kept(NamedTuple):
-    """What was kept, and when its last frame was, by `since_boot_ns`."""
+    """A checkpoint, and the time of its last frame by `since_boot_ns`."""
 
     checkpoint: Checkpoint
     tracked_ns: int
@@ -42,8 +42,8 @@ class Kept(NamedTuple):
 class MapKeeper:
     """Writes checkpoints in a thread of its own.
 
-    That has the process's priority: one that is lower could be made to wait with the interpreter
-    in its hands, and the pose with it.
+    The thread has the process's priority: with a lower one it could be preempted while it holds the
+    interpreter lock, and delay the pose.
     """
 
     def __init__(self, path: Path, setup: Setup) -> None:
@@ -54,7 +54,7 @@ class MapKeeper:
         self._closed = False
         self._changed = threading.Condition()
         self.fault = ""
-        """Why nothing can be kept; "" while it can."""
+        """Reason why nothing can be written; "" without one."""
         self._thread = threading.Thread(target=self._work, name="map keeper", daemon=True)
         self._thread.start()
 
@@ -64,15 +64,15 @@ class MapKeeper:
         return self._waiting is not None
 
     def put(self, checkpoint: Checkpoint) -> None:
-        """Have a checkpoint written, whose last frame has just been tracked; never waits."""
+        """Write a checkpoint, whose last frame has just been tracked; never waits."""
         with self._changed:
             self._waiting = checkpoint, since_boot_ns()
             self._changed.notify()
 
     def take(self) -> Kept | None:
-        """What another process has kept; None if nothing. CheckpointError says what is wrong.
+        """Checkpoint of another process; None without one, CheckpointError if unusable.
 
-        It is there once only: should it bring this process down, too, the next begins without.
+        It is removed at once: should it crash this process, too, the next one begins without.
         """
         try:
             self._be_ours()
@@ -102,7 +102,7 @@ class MapKeeper:
         return Kept(checkpoint, said["tracked_ns"])
 
     def close(self, forget: bool) -> None:
-        """Write no more, and leave nothing for others to take up if so said."""
+        """End writing; with `forget` remove the file."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -111,7 +111,7 @@ class MapKeeper:
             self._remove()
 
     def _be_ours(self) -> None:
-        """OSError where others may have put there what they like."""
+        """OSError where other users could have written the file."""
         folder = self._path.parent.stat()
         if folder.st_uid not in (os.getuid(), 0) or folder.st_mode & stat.S_IWOTH:
             raise PermissionError(errno.EPERM, "its folder is not ours alone")

@@ -1,57 +1,42 @@
-"""What is left of a flight, as a process: its recording, and its results when it is over."""
+"""Stage `recorder`: the MCAP recording of a flight, all its input and what it sent."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import ExitStack
 from typing import Any
 
 from companion.errors import StageError
 from companion.messages import Message
-from companion.products.flight_result import FlightResult
-from companion.products.report.write_results import write_results
-from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from companion.products.surroundings import versions
+from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
-from companion.stages.cloud_snapshots import CloudSnapshots
-from companion.streaming.viewer import FileViewer
+from drivers.recording.recorder import Recorder
 
 
 class _Recorder(Work):
+    outlives_daemon = True
+
     def __init__(self, setup: Setup) -> None:
         super().__init__()
         if setup.folder is None:
             raise StageError("a recorder needs a folder")
-        self._folder, self._voxel_m = setup.folder, setup.config.cloud.voxel_m
-        self._open = ExitStack()
-        self._folder.mkdir(parents=True, exist_ok=True)
-        self._result = FlightResult(self._folder, setup.config.cloud.memory_mb)
-        self._snapshots = CloudSnapshots(self._folder, self._result, self._voxel_m)
-        self._recording = self._open.enter_context(
-            FileViewer(
-                setup.config.viewer, setup.camera, self._folder / "flight.rrd", indexed=False
-            )
-        )
+        setup.folder.mkdir(parents=True, exist_ok=True)
+        self._recorder = Recorder(setup.folder, setup.config, setup.camera, versions())
 
-    def step(self, message: Any) -> Iterable[Message | Snapshot]:
-        if isinstance(message, TakeSnapshot):
-            self._snapshots.begin(message)
-            return self._snapshots.step()
-        self._result.take(message)
-        self._recording.take(message)
-        return self._snapshots.step()
+    @property
+    def n_rejected(self) -> int:
+        """Images and other messages dropped because the disk was full or too slow."""
+        return self._recorder.n_dropped.total()
+
+    def step(self, message: Any) -> Iterable[Message]:
+        self._recorder.take(message)
+        return self._recorder.warnings()
 
     def finish(self, finish: Finish) -> Iterable[Message]:
-        try:
-            self._open.close()
-        finally:  # a recording that cannot be written is no reason to lose the results
-            if finish.facts is not None:
-                write_results(
-                    self._folder, self._result, finish.facts, self._voxel_m, page=not finish.hurry
-                )
-        self._result.close()
-        return []
+        self._recorder.close()
+        return self._recorder.warnings()
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return _Recorder(setup)

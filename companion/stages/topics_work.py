@@ -1,6 +1,6 @@
-"""What nodes elsewhere and other programs are told of a flight, as a process: topics over Zenoh.
+"""Stage `topics`: publishes the flight over Zenoh to other nodes and programs.
 
-The flight's other stages neither wait for this one nor miss it.
+The flight's other stages neither wait for this one nor need it.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ from drivers.system.zenoh_bus import LAST, URGENT, USUAL, ZenohBus
 TOPICS = {"pose": URGENT, "keyframe": USUAL, "map": USUAL, "depth": LAST, "cloud": LAST}
 BYTES_S_PER_KBIT_S = 125.0
 NEW_SHARE = 0.75
-"""Of the budget for what is new; the rest is for making up what was missed."""
+"""Share of the budget for new bundles; the rest is for catching up."""
 GONE_S = 5.0
 LINGER_S = 10.0
-"""After a flight so long for who still fetches it."""
+"""Time after a flight for nodes that still fetch it."""
 STEP_S = 0.1
 MALFORMED = "questions came over the network that cannot be read"
 TAKEN, NOT_TAKEN = "a node elsewhere makes the depth", "no node elsewhere makes depth any more"
 
 
 class Topics(Work):
-    """Gathers what nodes fetch, and publishes; InputError where Zenoh cannot be had."""
+    """Builds bundles for depth nodes, and publishes topics; InputError where Zenoh is unusable."""
 
     def __init__(self, setup: Setup) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class Topics(Work):
         self._backlog = Backlog(self._run, config.backlog_mb << 20, bytes_s)
         self._update: MapUpdate | None = None
         self._is_fetched = False
-        self._n_malformed, self._tell_malformed_at = 0, 1
+        self._n_malformed, self._warn_malformed_at = 0, 1
         self.about = Envelope(
             "flight",
             {"flight": self._flight, "run": self._run, "camera": camera_fields(setup.camera)},
@@ -74,19 +74,19 @@ class Topics(Work):
         ).pack()
         self.bus = ZenohBus(config)
         for topic, priority in TOPICS.items():
-            self.bus.announce(topic, priority)
+            self.bus.declare_publisher(topic, priority)
         self.bus.serve("flight", lambda asked: self.about)
         self.bus.serve("map", lambda asked: self._map())
         self.bus.serve("depth_input", self._depth_input)
         self.device = "nobody fetches"
 
     @property
-    def n_turned_away(self) -> int:
-        """Frames that the budget had no room for, and bundles that nobody came for in time."""
-        return self._gatherer.n_dropped + self._backlog.n_given_up
+    def n_rejected(self) -> int:
+        """Frames beyond the budget, and bundles that nobody fetched in time."""
+        return self._gatherer.n_dropped + self._backlog.n_evicted
 
     def step(self, message: Any) -> Iterable[Message]:
-        """Take one message; says when somebody begins or ceases to fetch."""
+        """Take one message; warns when a node begins or ceases to fetch."""
         if isinstance(message, (Frame, Track, KeyframeAdded, MapUpdate)):
             if isinstance(message, MapUpdate):
                 self._update = message
@@ -103,7 +103,7 @@ class Topics(Work):
         return self._changes(message.t_ns) if isinstance(message, Frame) else []
 
     def finish(self, finish: Finish) -> Iterable[Message]:
-        """Leave, if not in a hurry once the last is fetched by who has fetched so far."""
+        """Disconnect; if not in a hurry after the last bundle has been fetched."""
         self._take_bundle(self._gatherer.last())
         until_s = monotonic_s() + (0.0 if finish.hurry else LINGER_S)
         while self._fetches() and self._backlog.fetched < self._backlog.newest:
@@ -125,8 +125,8 @@ class Topics(Work):
             self._publish("map", partial(map_envelope, self._flight, update))
 
     def _publish(self, topic: str, envelope: Callable[[], Envelope]) -> None:
-        """Send what somebody has subscribed to; else it is not even made."""
-        if self.bus.is_wanted(topic):
+        """Publish if there are subscribers; else the message is not even encoded."""
+        if self.bus.has_subscribers(topic):
             self.bus.publish(topic, envelope().pack())
 
     def _map(self) -> bytes | None:
@@ -134,7 +134,7 @@ class Topics(Work):
         return map_envelope(self._flight, update).pack() if update is not None else None
 
     def _depth_input(self, asked: bytes) -> bytes | None:
-        """Called in a thread of the bus; what cannot be read gets no answer."""
+        """Answer a query, in a thread of the bus; malformed queries get no answer."""
         try:
             request = unpack(asked)
             run, after = request.text("run"), request.integer("after", -1)
@@ -153,11 +153,11 @@ class Topics(Work):
             self._is_fetched = fetches
             self.device = "fetched" if fetches else "nobody fetches"
             yield Warned(t_ns, TAKEN if fetches else NOT_TAKEN, good=fetches)
-        if self._n_malformed >= self._tell_malformed_at:
-            self._tell_malformed_at = 2 * self._n_malformed
+        if self._n_malformed >= self._warn_malformed_at:
+            self._warn_malformed_at = 2 * self._n_malformed
             yield Warned(t_ns, MALFORMED, f"{self._n_malformed} so far")
 
 
 def work(setup: Setup) -> Work:
-    """The stage that a setup asks for."""
+    """The stage for a setup."""
     return Topics(setup)

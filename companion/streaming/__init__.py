@@ -1,6 +1,6 @@
-"""The flight as it is shown: what there is to see, and how it gets over a link to who looks on.
+"""Streaming of a flight to viewers over thin links.
 
-Knows neither Rerun nor the stages. On board `story` turns messages into items, `store` holds the
-newest of each, and a `session` for each viewer chooses what its link is given next; on the ground
-`ground_link` gives the items back.
+Knows neither Rerun nor the stages. On board `scene_encoder` turns messages into items, `item_store`
+holds the newest of each, and a `session` per viewer schedules them on its link; on the ground
+`ground_link` receives the items.
 """

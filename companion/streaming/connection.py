@@ -1,4 +1,4 @@
-"""The drone's end of a viewer's connection: a socket that never waits."""
+"""On-board end of a viewer's TCP connection: a non-blocking socket."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ import socket
 import struct
 
 from companion.errors import StreamError
-from companion.streaming.framing import HELLO, HELLO_BYTES, TAKEN, VIEWER_BYTES
+from companion.streaming.framing import ACKNOWLEDGED, HELLO, HELLO_BYTES, VIEWER_BYTES
 from companion.streaming.session import Session
 
 NOT_SENT_BYTES = 4096
-"""The kernel takes no more than this beyond what the network takes from it."""
+"""TCP_NOTSENT_LOWAT: the kernel buffers no more than this beyond what is in flight."""
 GIVE_UP_MS = 20_000
-"""A viewer that the network does not reach for so long connects anew."""
+"""TCP_USER_TIMEOUT: a viewer unreachable for this long reconnects."""
 HEADERS_BYTES = 66
-"""Of a packet: Ethernet, IP and TCP with time stamps."""
+"""Headers of a packet: Ethernet, IP and TCP with time stamps."""
 TCP_INFO_BYTES, SEGMENTS_AT, SENT_AT = 232, 136, 200
-"""Where struct tcp_info (linux/tcp.h) has tcpi_segs_out and tcpi_bytes_sent."""
+"""Size of struct tcp_info (linux/tcp.h), and offsets of tcpi_segs_out and tcpi_bytes_sent."""
 MOST_READ = 4096
 
 
 class Connection:
-    """Reads what a viewer says; sends what its session has for it. Raises OSError when it is gone.
+    """Reads from a viewer; sends what its session has for it. OSError when it is gone.
 
-    StreamError is raised for a peer that is no viewer.
+    StreamError for a peer that is no viewer.
     """
 
     def __init__(self, opened: socket.socket, peer: str, now_s: float) -> None:
         self.socket, self.peer = opened, peer
         self.since_s = now_s
         self.viewer: bytes | None = None
-        """Its name; None until it has said it."""
+        """Name of the viewer; None before its HELLO."""
         self.session: Session | None = None
         self._read = bytearray()
         self._left = b""
@@ -46,7 +46,7 @@ class Connection:
             opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"bbr")
 
     def read(self, now_s: float) -> bool:
-        """Take in what has come; whether the viewer has said who it is just now."""
+        """Read what has come; whether the viewer has just identified itself."""
         data = self.socket.recv(MOST_READ)
         if not data:
             raise ConnectionResetError("the viewer has closed the connection")
@@ -60,20 +60,20 @@ class Connection:
             self.viewer = bytes(self._read[HELLO_BYTES - VIEWER_BYTES : HELLO_BYTES])
             del self._read[:HELLO_BYTES]
             is_new = True
-        n = len(self._read) // TAKEN.size
+        n = len(self._read) // ACKNOWLEDGED.size
         if n and self.session is not None:
-            (total,) = TAKEN.unpack_from(self._read, (n - 1) * TAKEN.size)
+            (total,) = ACKNOWLEDGED.unpack_from(self._read, (n - 1) * ACKNOWLEDGED.size)
             self.session.acknowledged(now_s, total)
-            del self._read[: n * TAKEN.size]
+            del self._read[: n * ACKNOWLEDGED.size]
         return is_new
 
     def send(self, now_s: float, budget_bytes: int) -> int:
-        """Send a piece of what there is, if there is room; how many bytes went."""
+        """Send a piece if there is one and the socket has capacity; number of bytes sent."""
         if self.session is None or not self.is_writable():
             return 0
         if not self._left:
-            room = min(self.session.window.room_bytes(), budget_bytes)
-            self._left = self.session.next_piece(now_s, room) or b""
+            capacity = min(self.session.window.available_bytes(), budget_bytes)
+            self._left = self.session.next_piece(now_s, capacity) or b""
             if not self._left:
                 return 0
         n = self.socket.send(self._left)
@@ -85,7 +85,7 @@ class Connection:
         return bool(select.select([], [self.socket], [], 0)[1])
 
     def wire_bytes(self, n_given: int) -> int:
-        """Bytes on the wire, headers and repeats included, beyond those counted so far.
+        """Bytes on the wire, with headers and retransmissions, since the last call.
 
         `n_given` is what was given to the kernel, which may not have sent it yet.
         """
@@ -100,5 +100,5 @@ class Connection:
         return more
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the socket."""
         self.socket.close()

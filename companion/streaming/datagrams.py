@@ -1,4 +1,4 @@
-"""The drone's end of datagrams to viewers: who hears them, and whether they get through."""
+"""On-board end of datagrams to viewers: their addresses, and whether datagrams get through."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import contextlib
 import socket
 from dataclasses import dataclass
 
-from companion.streaming.framing import greeted
+from companion.streaming.framing import read_hello
 
 HEADERS_BYTES = 42
-"""Of a datagram: Ethernet, IP and UDP."""
-DEAF_AFTER_S = 3.0
-"""A viewer that has got none for so long is taken to get none."""
+"""Headers of a datagram: Ethernet, IP and UDP."""
+UNREACHABLE_AFTER_S = 3.0
+"""A viewer that has received none for this long counts as unreachable by datagram."""
 
 
 @dataclass(slots=True)
-class _Ear:
+class _Peer:
     address: tuple[str, int]
-    n_came: int
-    came_s: float
+    n_received: int
+    received_s: float
 
 
 class Datagrams:
-    """The UDP side of a port at which viewers connect by TCP."""
+    """UDP side of a port at which viewers connect by TCP."""
 
     def __init__(self, listener: socket.socket) -> None:
         self.socket = socket.socket(listener.family, socket.SOCK_DGRAM)
@@ -32,39 +32,43 @@ class Datagrams:
             self.socket.close()
             raise
         self.socket.setblocking(False)
-        self._ears: dict[bytes, _Ear] = {}
+        self._peers: dict[bytes, _Peer] = {}
 
-    def hear(self, now_s: float, peers: dict[bytes, str]) -> None:
-        """Take in what viewers say; `peers` are the addresses from which viewers are connected.
+    def receive(self, now_s: float, peers: dict[bytes, str]) -> None:
+        """Receive from viewers; `peers` are the addresses from which viewers are connected.
 
-        Whoever is not among them is sent nothing.
+        Anybody else is sent nothing.
         """
         with contextlib.suppress(OSError):
             while True:
                 data, address = self.socket.recvfrom(256)
-                found = greeted(data)
+                found = read_hello(data)
                 if found is None or peers.get(found[0]) != address[0]:
                     continue
-                viewer, n_came = found
-                before = self._ears.get(viewer)
-                gets_any = before is not None and n_came != before.n_came
-                came_s = now_s if gets_any or before is None else before.came_s
-                self._ears[viewer] = _Ear(address, n_came, came_s)
-        self._ears = {viewer: ear for viewer, ear in self._ears.items() if viewer in peers}
+                viewer, n_received = found
+                before = self._peers.get(viewer)
+                gets_any = before is not None and n_received != before.n_received
+                received_s = now_s if gets_any or before is None else before.received_s
+                self._peers[viewer] = _Peer(address, n_received, received_s)
+        self._peers = {viewer: peer for viewer, peer in self._peers.items() if viewer in peers}
 
-    def work(self, viewer: bytes, now_s: float) -> bool:
-        """Whether datagrams get through to a viewer."""
-        ear = self._ears.get(viewer)
-        return ear is not None and ear.n_came > 0 and now_s - ear.came_s < DEAF_AFTER_S
+    def get_through(self, viewer: bytes, now_s: float) -> bool:
+        """Whether datagrams reach a viewer."""
+        peer = self._peers.get(viewer)
+        return (
+            peer is not None
+            and peer.n_received > 0
+            and now_s - peer.received_s < UNREACHABLE_AFTER_S
+        )
 
-    def is_heard(self, viewer: bytes) -> bool:
-        """Whether it is known where to send them."""
-        return viewer in self._ears
+    def has_peer(self, viewer: bytes) -> bool:
+        """Whether a viewer's address is known."""
+        return viewer in self._peers
 
     def send(self, viewer: bytes, data: bytes) -> int:
-        """Send one; how many bytes that takes. Nothing where the network has no room now."""
+        """Send one; its size in bytes. Nothing where the network has no capacity now."""
         try:
-            self.socket.sendto(data, self._ears[viewer].address)
+            self.socket.sendto(data, self._peers[viewer].address)
         except OSError:
             return 0
         return len(data) + HEADERS_BYTES

@@ -1,4 +1,4 @@
-"""Depth as a picture for people: near is red, far is blue, nothing is black."""
+"""Depth map as a colour image: near is red, far is blue, invalid is black."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PNG = "image/png"
 
 
 def depth_picture(depth_map: DepthMap) -> DepthItem | None:
-    """The picture of a depth map; None where it has no depth at all."""
+    """Colour image of a depth map; None where no pixel is valid."""
     depth = depth_map.depth
     known = depth > 0
     if not known.any():

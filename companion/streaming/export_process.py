@@ -1,7 +1,7 @@
-"""The process of an exporter: messages come in by its standard input, and go to viewers by TCP.
+"""Process of an exporter: messages come in on its standard input, and go to viewers by TCP.
 
-The first thing that it is told is an ExportSetup. It says in lines of JSON where it listens, and
-each second how it is. When its input ends it gives viewers a moment to take the last of it.
+The first message is an ExportSetup. It reports in lines of JSON where it listens, and each second
+its health. When its input ends it gives viewers a moment to receive the rest.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from typing import Any
 
 from companion.config import StreamConfig
 from companion.streaming.exporter import Exporter, open_listener
-from companion.streaming.item_store import Store
+from companion.streaming.item_store import ItemStore
 from companion.streaming.items import FlightItem, Item
 from companion.streaming.parts import parts_of
-from companion.streaming.scene_encoder import Story
+from companion.streaming.scene_encoder import SceneEncoder
 from companion.timing.clock import monotonic_s, wait_s
 
 OWN = "127.0.0.1:0"
-"""Where viewers of this machine find it, on a port of their own."""
+"""Address for viewers of this machine, on a port of their own."""
 PATH_STEP_NS = 200_000_000
 REPORT_EVERY_S = 1.0
 BIND_AGAIN_S = 1.0
 DRAIN_S = 2.5
 NICE = 10
-"""The pose comes first."""
+"""The pose has priority."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExportSetup:
-    """What it needs to know. `listen` is "" where only viewers of this machine are wanted."""
+    """Setup of the process. `listen` is "" where only viewers of this machine are wanted."""
 
     flight: FlightItem
     stream: StreamConfig
     listen: str
     n_own: int = 0
-    """Viewers of this machine that are sure to come."""
+    """Viewers of this machine that are expected."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetBudget:
-    """All viewers together get no more from now on; 0 for no limit."""
+    """Limit the rate of all viewers together; 0 for no limit."""
 
     kbit_s: float
 
@@ -64,16 +64,16 @@ def main() -> int:
     except EOFError:
         return 0
     config = setup.stream
-    exporter = Exporter(Store(config.store_mb << 20), config.most_viewers, config.budget_kbit_s)
+    exporter = Exporter(ItemStore(config.store_mb << 20), config.most_viewers, config.budget_kbit_s)
     own = open_listener(OWN)
     exporter.listen(own)
     _say({"own": own.getsockname()[1]})
-    ended, told = threading.Event(), threading.Event()
+    ended, finished = threading.Event(), threading.Event()
     threading.Thread(
         target=_take_in, args=(exporter, setup.flight, ended), name="messages", daemon=True
     ).start()
     threading.Thread(
-        target=_report, args=(exporter, setup.listen, told), name="report", daemon=True
+        target=_report, args=(exporter, setup.listen, finished), name="report", daemon=True
     ).start()
 
     def end() -> None:
@@ -81,7 +81,7 @@ def main() -> int:
         until_s = monotonic_s() + DRAIN_S
         while not exporter.is_drained(setup.n_own) and monotonic_s() < until_s:
             wait_s(threading.Event(), 0.02)
-        told.set()
+        finished.set()
         exporter.stop()
 
     threading.Thread(target=end, name="end", daemon=True).start()
@@ -90,7 +90,7 @@ def main() -> int:
 
 
 def _take_in(exporter: Exporter, flight: FlightItem, ended: threading.Event) -> None:
-    story = Story(flight, PATH_STEP_NS)
+    encoder = SceneEncoder(flight, PATH_STEP_NS)
     try:
         _give(exporter, [flight])
         while True:
@@ -98,9 +98,9 @@ def _take_in(exporter: Exporter, flight: FlightItem, ended: threading.Event) -> 
             if isinstance(message, SetBudget):
                 exporter.set_budget(message.kbit_s)
             else:
-                _give(exporter, story.take(message))
+                _give(exporter, encoder.take(message))
     except (EOFError, OSError):  # the flight is over
-        _give(exporter, story.close())
+        _give(exporter, encoder.close())
     finally:
         ended.set()
 
@@ -111,7 +111,7 @@ def _give(exporter: Exporter, items: list[Item]) -> None:
 
 
 def _report(exporter: Exporter, listen: str, ended: threading.Event) -> None:
-    """Open the door when it can be opened: the flight before may have it for a while."""
+    """Listen when the port is free (the flight before may still have it), and report health."""
     is_open = not listen
     while not ended.is_set():
         said: dict[str, Any] = {}

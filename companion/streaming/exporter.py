@@ -1,4 +1,4 @@
-"""Serves what a store has to viewers that connect. In a process of its own; see export_process."""
+"""Server of a store's items to viewers. In a process of its own; see export_process."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from collections.abc import Sequence
 from companion.errors import StreamError
 from companion.streaming.connection import Connection
 from companion.streaming.datagrams import Datagrams
-from companion.streaming.item_store import Store
+from companion.streaming.item_store import ItemStore
 from companion.streaming.items import Item
 from companion.streaming.parts import Part
-from companion.streaming.send_window import Budget
+from companion.streaming.send_window import TokenBucket
 from companion.streaming.session import Session
 from companion.timing.clock import monotonic_s
 
 TICK_S, IDLE_S = 0.005, 0.05
 HELLO_WITHIN_S = 5.0
 MOST_REMEMBERED = 8
-"""Viewers of which it is known what they have; those that came longest ago are forgotten."""
+"""Sessions kept of disconnected viewers; the oldest are forgotten."""
 PIECES_AT_ONCE = 16
 
 
 class Exporter:
     """A loop over sockets; `take` may be called from another thread, and waits for no viewer."""
 
-    def __init__(self, store: Store, most_viewers: int, budget_kbit_s: float) -> None:
+    def __init__(self, store: ItemStore, most_viewers: int, budget_kbit_s: float) -> None:
         self._store, self._most = store, most_viewers
-        self._budget = Budget(budget_kbit_s)
+        self._budget = TokenBucket(budget_kbit_s)
         self._lock = threading.Lock()
         self._selector = selectors.DefaultSelector()
         self._datagrams: list[Datagrams] = []
@@ -45,16 +45,16 @@ class Exporter:
         self._stopping = threading.Event()
         self.n_refused = 0
         self._n_skipped_before = 0
-        """By viewers that are forgotten."""
+        """Skipped items of forgotten sessions."""
 
     def take(self, item: Item, parts: Sequence[Part]) -> None:
-        """Keep and send an item, whose parts are made already."""
+        """Keep and send an item with its encoded parts."""
         with self._lock:
             self._store.put(item, parts)
-        self._rouse()
+        self._wake_up()
 
     def listen(self, listener: socket.socket) -> None:
-        """Take viewers that connect there; to be called before `run`."""
+        """Accept viewers at a socket; to be called before `run`."""
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
         with contextlib.suppress(OSError):  # somebody has that port: poses go with all else
@@ -63,24 +63,24 @@ class Exporter:
             self._selector.register(datagrams.socket, selectors.EVENT_READ)
 
     def set_budget(self, kbit_s: float) -> None:
-        """What all viewers together get from now on; 0 for no limit. From any thread."""
+        """Limit the rate of all viewers together; 0 for no limit. From any thread."""
         self._budget.set_rate(kbit_s)
-        self._rouse()
+        self._wake_up()
 
     def stop(self) -> None:
         """End `run`; from any thread."""
         self._stopping.set()
-        self._rouse()
+        self._wake_up()
 
     def is_drained(self, n_least: int = 0) -> bool:
-        """Whether all viewers that are connected, so many at least, have taken all there is."""
+        """Whether all connected viewers, at least `n_least`, have received everything."""
         with self._lock:
             sessions = [c.session for c in self._connections]
             done = [session is not None and session.is_complete for session in sessions]
         return all(done) and len(done) >= n_least
 
     def report(self) -> dict[str, float]:
-        """How many viewers there are, what they get, and what they were not given."""
+        """Number of viewers, their rate, and data that was skipped."""
         with self._lock:
             sessions = [c.session for c in self._connections if c.session is not None]
             skipped = sum(s.n_skipped.total() for s in self._sessions.values())
@@ -88,7 +88,7 @@ class Exporter:
                 "viewers": len(sessions),
                 "kbit_s": sum(s.window.rate_bytes_s for s in sessions) / 125,
                 "budget_kbit_s": self._budget.bytes_s / 125,
-                "skipped": self._n_skipped_before + skipped + self._store.n_given_up.total(),
+                "skipped": self._n_skipped_before + skipped + self._store.n_evicted.total(),
                 "map_mib": self._store.points_bytes / 2**20,
             }
 
@@ -98,7 +98,7 @@ class Exporter:
             while not self._stopping.is_set():
                 busy = self._step()
                 for key, _ in self._selector.select(TICK_S if busy else IDLE_S):
-                    self._attend(key.fileobj)
+                    self._handle_event(key.fileobj)
         finally:
             for connection in list(self._connections):
                 self._forget(connection)
@@ -108,7 +108,7 @@ class Exporter:
             self._wake.close()
             self._woken.close()
 
-    def _attend(self, fileobj: object) -> None:
+    def _handle_event(self, fileobj: object) -> None:
         now_s = monotonic_s()
         if fileobj is self._woken:
             with contextlib.suppress(BlockingIOError):
@@ -117,7 +117,7 @@ class Exporter:
         for datagrams in self._datagrams:
             if fileobj is datagrams.socket:
                 connected = {c.viewer: c.peer for c in self._connections if c.viewer is not None}
-                datagrams.hear(now_s, connected)
+                datagrams.receive(now_s, connected)
                 return
         connection = next((c for c in self._connections if c.socket is fileobj), None)
         if connection is None:
@@ -127,7 +127,7 @@ class Exporter:
         try:
             with self._lock:
                 if connection.read(now_s):
-                    self._greet(connection)
+                    self._begin_session(connection)
         except BlockingIOError:
             pass
         except (OSError, StreamError):
@@ -147,8 +147,8 @@ class Exporter:
         self._given[connection] = 0
         self._selector.register(opened, selectors.EVENT_READ)
 
-    def _greet(self, connection: Connection) -> None:
-        """A viewer that is known goes on where it was; its connection before is no more."""
+    def _begin_session(self, connection: Connection) -> None:
+        """Resume the session of a known viewer, and close its former connection."""
         assert connection.viewer is not None
         for other in list(self._connections):
             if other is not connection and other.viewer == connection.viewer:
@@ -167,10 +167,10 @@ class Exporter:
         for viewer in idle[: max(0, len(self._sessions) - MOST_REMEMBERED)]:
             gone = self._sessions.pop(viewer)
             self._n_skipped_before += gone.n_skipped.total()
-            self._store.leave(gone)
+            self._store.unsubscribe(gone)
 
     def _step(self) -> bool:
-        """Send what can be sent; whether more may be to send soon."""
+        """Send what can be sent; whether there may be more soon."""
         now_s = monotonic_s()
         n_viewers = sum(c.session is not None for c in self._connections)
         self._connections.append(self._connections.pop(0)) if self._connections else None
@@ -192,20 +192,20 @@ class Exporter:
         self._send_pose(connection.session, connection.viewer, now_s)
         for _ in range(PIECES_AT_ONCE):
             with self._lock:
-                n = connection.send(now_s, self._budget.room_bytes(now_s))
+                n = connection.send(now_s, self._budget.available_bytes(now_s))
             if not n:
                 break
             self._given[connection] += n
             self._budget.charge(connection.wire_bytes(self._given[connection]))
         else:
-            self._rouse()
+            self._wake_up()
         self._budget.charge(connection.wire_bytes(self._given[connection]))
 
     def _send_pose(self, session: Session, viewer: bytes | None, now_s: float) -> None:
-        """The newest pose by datagram, where that may get through."""
-        datagrams = next((d for d in self._datagrams if viewer and d.is_heard(viewer)), None)
-        session.datagrams_work = bool(datagrams and viewer and datagrams.work(viewer, now_s))
-        if datagrams is None or viewer is None or not self._budget.room_bytes(now_s):
+        """Send the newest pose by datagram, where that may get through."""
+        datagrams = next((d for d in self._datagrams if viewer and d.has_peer(viewer)), None)
+        session.datagrams_work = bool(datagrams and viewer and datagrams.get_through(viewer, now_s))
+        if datagrams is None or viewer is None or not self._budget.available_bytes(now_s):
             return
         with self._lock:
             data = session.next_datagram(now_s)
@@ -222,8 +222,8 @@ class Exporter:
                 self._selector.unregister(connection.socket)
             connection.close()
 
-    def _rouse(self) -> None:
-        with contextlib.suppress(OSError):  # it has been told already, or is gone
+    def _wake_up(self) -> None:
+        with contextlib.suppress(OSError):  # already woken, or closed
             self._wake.send(b"\0")
 
 

@@ -1,4 +1,4 @@
-"""Frames as JPEG, as large as what a link carries allows."""
+"""Frames as JPEG, of a size that the link can carry."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ SIZES = ((640, 60), (480, 50), (320, 45), (240, 40), (160, 35))
 """Width and JPEG quality, best first."""
 GUESS_BYTES = (40_000, 20_000, 9_000, 5_000, 2_500)
 PER_SECOND = 2.0
-"""A size is used that lets so many through in a second."""
+"""Least rate of pictures; the largest size is used that reaches it."""
 MOST_FOUND = 300
 
 
 def picture_of(image: ImageItem, width: int, quality: int) -> PictureItem:
-    """The picture of a frame, no wider than it is; its points in pixels of the picture."""
+    """Picture of a frame, no wider than it is; found points in pixels of the picture."""
     height_px, width_px = image.rgb.shape[:2]
     shrink = min(1.0, width / width_px)
     small: Bytes = image.rgb
@@ -32,7 +32,7 @@ def picture_of(image: ImageItem, width: int, quality: int) -> PictureItem:
 
 
 def as_wide(picture: PictureItem, width: int) -> PictureItem:
-    """The same picture, this wide; as it is where it cannot be decoded."""
+    """The same picture at this width; unchanged where it cannot be decoded."""
     image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         return picture
@@ -43,14 +43,14 @@ def as_wide(picture: PictureItem, width: int) -> PictureItem:
     return PictureItem(picture.t_ns, jpeg.tobytes(), width, found)
 
 
-class Pictures:
-    """Makes pictures for one viewer."""
+class AdaptiveJpeg:
+    """Encodes pictures for one viewer at the size that its link can carry."""
 
     def __init__(self) -> None:
         self._bytes = list(GUESS_BYTES)
 
     def encoded(self, image: ImageItem | None, share_bytes_s: float) -> bytes | None:
-        """The bytes of a picture for which so much of the link may be used; None without one."""
+        """Bytes of a picture for this share of the link's rate; None without one."""
         if image is None:
             return None
         fits = [k for k, n in enumerate(self._bytes) if n * PER_SECOND <= share_bytes_s]

@@ -1,4 +1,4 @@
-"""Pieces of items on a TCP connection: so small that what is urgent never waits behind what is not.
+"""Framing of items on a TCP connection: in pieces, so that urgent items need not wait for others.
 
 From the drone: kind (one byte, its high bit set in the last piece of an item), length (u16), piece.
 Of each kind one item at a time is on its way, so that pieces of different kinds may mix. Kind 0
@@ -22,7 +22,7 @@ from companion.errors import StreamError
 HELLO = b"CMPV\x01"
 VIEWER_BYTES = 16
 HELLO_BYTES = len(HELLO) + VIEWER_BYTES
-TAKEN = struct.Struct("<Q")
+ACKNOWLEDGED = struct.Struct("<Q")
 COUNT = struct.Struct("<I")
 HEAD = struct.Struct("<BH")
 HEAD_BYTES = HEAD.size
@@ -31,32 +31,32 @@ MOST_ITEM_BYTES = 16 << 20
 
 
 def frame(kind: int, piece: bytes, is_last: bool) -> bytes:
-    """A piece as it goes over the wire."""
+    """A piece with its header."""
     return HEAD.pack(kind | (LAST if is_last else 0), len(piece)) + piece
 
 
-def greeting(viewer: bytes, n_came: int) -> bytes:
-    """The viewer's datagram."""
-    return HELLO + viewer + COUNT.pack(n_came & 0xFFFFFFFF)
+def hello_datagram(viewer: bytes, n_received: int) -> bytes:
+    """Datagram of a viewer: its name, and the number of datagrams received."""
+    return HELLO + viewer + COUNT.pack(n_received & 0xFFFFFFFF)
 
 
-def greeted(data: bytes) -> tuple[bytes, int] | None:
+def read_hello(data: bytes) -> tuple[bytes, int] | None:
     """Name and count of such a datagram; None for any other."""
     if len(data) != HELLO_BYTES + COUNT.size or not data.startswith(HELLO):
         return None
-    (n_came,) = COUNT.unpack(data[HELLO_BYTES:])
-    return data[len(HELLO) : HELLO_BYTES], n_came
+    (n_received,) = COUNT.unpack(data[HELLO_BYTES:])
+    return data[len(HELLO) : HELLO_BYTES], n_received
 
 
 class Reassembly:
-    """Bytes as they come, to items."""
+    """Reassembles items from bytes."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
         self._items: dict[int, bytearray] = {}
 
     def take(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Kind and payload of the items that are whole now; StreamError where that cannot be."""
+        """Kind and payload of completed items; StreamError for malformed data."""
         self._bytes += data
         out = []
         at = 0

@@ -1,7 +1,6 @@
-"""The ground's end of a viewer's connection: items as they come, whatever the link does.
+"""Ground end of a viewer's connection: items as they come, across lost connections.
 
-What is acknowledged is what whoever takes the items has taken, so that a screen that is slow makes
-the drone send less.
+Items are acknowledged when the consumer has taken them, so that a slow screen slows the sender.
 """
 
 from __future__ import annotations
@@ -14,43 +13,47 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 
 from companion.errors import StreamError
-from companion.streaming.framing import HELLO, TAKEN, VIEWER_BYTES, Reassembly, greeting
+from companion.streaming.framing import (
+    ACKNOWLEDGED,
+    HELLO,
+    VIEWER_BYTES,
+    Reassembly,
+    hello_datagram,
+)
 from companion.streaming.item_codec import decode
 from companion.streaming.items import Item, PoseItem
 from companion.timing.clock import monotonic_s, wait_s
 
 PORT = 9870
 CONNECT_S = 1.0
-"""An attempt is given up after so long, and another made: after an outage the first that can get
-through shall do so soon."""
+"""Timeout of an attempt to connect, so that a later one can succeed soon after an outage."""
 SILENT_S = 3.0
-"""The drone says something twice a second; after so long without, the connection is taken to be
-dead."""
-TAKE_EVERY_S, TAKE_EVERY_BYTES = 0.04, 8192
+"""The drone sends twice a second; a connection silent for this long counts as dead."""
+ACKNOWLEDGE_EVERY_S, ACKNOWLEDGE_EVERY_BYTES = 0.04, 8192
 RECEIVE_BYTES = 65536
-GREET_EVERY_S = 1.0
+HELLO_EVERY_S = 1.0
 
 
 class GroundLink:
-    """`items` gives them until `stop` is set; `told` hears in words what becomes of the link.
+    """`items` gives them until `stop` is set; `notify` takes the state of the link in words.
 
     Without `again` the end of the first connection is the end.
     """
 
     def __init__(
-        self, host: str, port: int, told: Callable[[str], None], again: bool = True
+        self, host: str, port: int, notify: Callable[[str], None], again: bool = True
     ) -> None:
         self.host, self.port = host, port
-        self._told, self._again = told, again
+        self._notify, self._again = notify, again
         self._viewer = os.urandom(VIEWER_BYTES)
         self.n_connections = 0
         self.n_bytes = self.n_datagrams = 0
         self._pose_ns = -(2**63)
 
     def items(self, stop: threading.Event) -> Iterator[Item]:
-        """What the drone sends; an item is acknowledged when the next one is asked for.
+        """Items of the drone; one is acknowledged when the next one is asked for.
 
-        StreamError for a drone that speaks otherwise.
+        StreamError for a drone of another protocol.
         """
         is_away = False
         while not stop.is_set():
@@ -58,18 +61,18 @@ class GroundLink:
                 opened = self._connect()
             except OSError as error:
                 if not is_away:
-                    self._told(f"waiting for {self.host}:{self.port} ({error.strerror or error})")
+                    self._notify(f"waiting for {self.host}:{self.port} ({error.strerror or error})")
                 is_away = True
                 wait_s(stop, 0.2)
                 continue
-            self._told(f"connected to {self.host}:{self.port}")
+            self._notify(f"connected to {self.host}:{self.port}")
             is_away = False
             self.n_connections += 1
             with closing(opened), closing(self._datagrams()) as datagrams:
                 try:
                     yield from self._received(opened, datagrams, stop)
                 except OSError as error:
-                    self._told(f"the link to {self.host} is lost ({error.strerror or error})")
+                    self._notify(f"the link to {self.host} is lost ({error.strerror or error})")
                     if not self._again:
                         return
                     wait_s(stop, 0.2)
@@ -82,7 +85,7 @@ class GroundLink:
         return opened
 
     def _datagrams(self) -> socket.socket:
-        """What brings poses beside the connection, where it can."""
+        """Socket for poses by datagram, where possible."""
         found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_DGRAM)[0]
         opened = socket.socket(found[0], socket.SOCK_DGRAM)
         opened.setblocking(False)
@@ -90,7 +93,7 @@ class GroundLink:
         return opened
 
     def _poses(self, datagrams: socket.socket) -> Iterator[PoseItem]:
-        """Poses that have come beside the connection, and are the newest."""
+        """Poses that have come by datagram and are the newest."""
         with suppress(OSError):  # nothing more, or nobody there
             while True:
                 data = datagrams.recv(256)
@@ -109,7 +112,7 @@ class GroundLink:
         greeted_s = 0.0
         self._pose_ns = -(2**63)
         while not stop.is_set():
-            select.select([opened, datagrams], [], [], TAKE_EVERY_S)
+            select.select([opened, datagrams], [], [], ACKNOWLEDGE_EVERY_S)
             yield from self._poses(datagrams)
             try:
                 data = opened.recv(RECEIVE_BYTES)
@@ -118,10 +121,10 @@ class GroundLink:
             if data == b"":
                 raise ConnectionResetError("closed by the drone")
             now_s = monotonic_s()
-            if now_s - greeted_s > GREET_EVERY_S:
+            if now_s - greeted_s > HELLO_EVERY_S:
                 greeted_s = now_s
                 with suppress(OSError):  # nobody hears it, and TCP brings all
-                    datagrams.send(greeting(self._viewer, self.n_datagrams))
+                    datagrams.send(hello_datagram(self._viewer, self.n_datagrams))
             if data is not None:
                 heard_s = now_s
                 for kind, payload in parts.take(data):
@@ -140,9 +143,11 @@ class GroundLink:
                 raise TimeoutError("nothing has come for a while")
             n_new = n_taken - n_acknowledged
             if n_new and (
-                n_new >= TAKE_EVERY_BYTES or now_s - acknowledged_s >= TAKE_EVERY_S or data is None
+                n_new >= ACKNOWLEDGE_EVERY_BYTES
+                or now_s - acknowledged_s >= ACKNOWLEDGE_EVERY_S
+                or data is None
             ):
-                opened.sendall(TAKEN.pack(n_taken))
+                opened.sendall(ACKNOWLEDGED.pack(n_taken))
                 n_acknowledged, acknowledged_s = n_taken, now_s
 
 

@@ -1,4 +1,4 @@
-"""Items as bytes, and back. Little-endian; what is not known is nan.
+"""Items as bytes, and back. Little-endian; unknown values are nan.
 
 | kind | payload |
 |---|---|
@@ -56,7 +56,7 @@ from companion.streaming.point_codec import decode_points, encode_points
 
 
 class Kind(IntEnum):
-    """What an item on the wire is."""
+    """Kinds of item on the wire."""
 
     FLIGHT = 1
     POSE = 2
@@ -82,14 +82,14 @@ SHOWN = list(Shown)
 LEVELS = [WHOLE, COARSE, FINE]
 MOST_JSON_BYTES = 65536
 NOWHERE_UNITS = 1e-6
-"""The scale of a keyframe that lies nowhere now."""
+"""Scale that marks a keyframe without a known pose."""
 WORLD = -1
 LENS = ("width", "height", "fx", "fy", "cx", "cy")
-"""Of a camera, what a viewer needs."""
+"""Camera fields that a viewer needs."""
 
 
 def encode(item: Item) -> bytes:
-    """The bytes of an item; a raw image has none."""
+    """Bytes of an item; a raw image has none."""
     if isinstance(item, FlightItem):
         return _flight(item)
     if isinstance(item, PoseItem):
@@ -120,7 +120,7 @@ def encode(item: Item) -> bytes:
 
 
 def decode(kind: int, data: bytes) -> Item:
-    """The item that bytes are of; StreamError for what is none."""
+    """Item of these bytes; StreamError for malformed ones."""
     try:
         return _decode(Kind(kind), data)
     except (ValueError, KeyError, TypeError, IndexError, struct.error, zlib.error) as error:
@@ -162,7 +162,7 @@ def _decode(kind: Kind, data: bytes) -> Item:
 
 
 def encode_place(keyframe_id: int, place: Similarity | None) -> bytes:
-    """The bytes of one place; WORLD is the number of world_from_map."""
+    """Bytes of one place; WORLD is the number of world_from_map."""
     if place is None:
         return PLACE.pack(keyframe_id, NOWHERE_UNITS, 0.0, 0.0, 0.0, *_quaternion(np.eye(3)))
     return PLACE.pack(

@@ -1,7 +1,7 @@
-"""The newest of everything there is to see, ready for the wire. Bounded, whatever the flight.
+"""Newest items of a flight, encoded for the wire, in bounded memory.
 
-What is kept is what a viewer that comes now must be given. The points are nearly all of it; when
-they are more than there is room for, the finest of the oldest go first, counted.
+It holds what a viewer that connects now must be given. Points are nearly all of it; beyond the
+capacity the finest of the oldest are evicted, counted.
 """
 
 from __future__ import annotations
@@ -18,53 +18,53 @@ MOST_LOG_LINES = 200
 MOST_PIECES = 20_000
 
 
-class Follower(Protocol):
-    """Who hears of what is new."""
+class StoreListener(Protocol):
+    """Notified of new items."""
 
     def changed(self, kind: Kind, key: Hashable) -> None:
-        """There is a new one of a kind."""
+        """There is a new item of a kind."""
 
 
-class Store:
-    """Takes items, and tells its followers. To be used by one thread at a time."""
+class ItemStore:
+    """Takes items, and notifies its listeners. To be used by one thread at a time."""
 
-    def __init__(self, room_bytes: int) -> None:
-        self._room = room_bytes
+    def __init__(self, available_bytes: int) -> None:
+        self._capacity_bytes = available_bytes
         self._held: dict[Kind, OrderedDict[Hashable, bytes]] = {k: OrderedDict() for k in Kind}
         self._n_logged = 0
         self.points_bytes = 0
         self.image: ImageItem | None = None
         self.flight: FlightItem | None = None
         self.status: StatusItem | None = None
-        self.n_given_up: Counter[str] = Counter()
-        """What there was no room for, by what it was."""
-        self._followers: list[Follower] = []
+        self.n_evicted: Counter[str] = Counter()
+        """Evicted items, by kind."""
+        self._listeners: list[StoreListener] = []
 
-    def follow(self, follower: Follower) -> None:
-        """Have somebody told of all there is, oldest first, and from now on of all that is new."""
-        self._followers.append(follower)
+    def subscribe(self, listener: StoreListener) -> None:
+        """Notify a listener of all items, oldest first, and of new ones from now on."""
+        self._listeners.append(listener)
         for kind, held in self._held.items():
             for key in held:
-                follower.changed(kind, key)
+                listener.changed(kind, key)
         if self.image is not None:
-            follower.changed(Kind.PICTURE, NEWEST)
+            listener.changed(Kind.PICTURE, NEWEST)
         if self.status is not None:
-            follower.changed(Kind.STATUS, NEWEST)
+            listener.changed(Kind.STATUS, NEWEST)
 
-    def leave(self, follower: Follower) -> None:
-        """Somebody is told nothing any more."""
-        self._followers.remove(follower)
+    def unsubscribe(self, listener: StoreListener) -> None:
+        """Notify a listener no more."""
+        self._listeners.remove(listener)
 
     def get(self, kind: Kind, key: Hashable) -> bytes | None:
-        """What there is now; None where it was given up."""
+        """Payload of an item; None where it was evicted."""
         return self._held[kind].get(key)
 
     def take(self, item: Item) -> None:
-        """Keep an item in the place of an older one of the same thing."""
+        """Keep an item; replaces an older one with the same key."""
         self.put(item, parts_of(item))
 
     def put(self, item: Item, parts: Iterable[Part]) -> None:
-        """The same, with the item's parts made already: to make them takes time."""
+        """The same, with the parts encoded already: encoding takes time."""
         if isinstance(item, ImageItem):
             self.image = item
             self._tell(Kind.PICTURE, NEWEST)
@@ -81,10 +81,10 @@ class Store:
         for kind, most in ((Kind.LOG, MOST_LOG_LINES), (Kind.PATH, MOST_PIECES),
                            (Kind.AUTOPILOT, MOST_PIECES)):  # fmt: skip
             while len(self._held[kind]) > most:
-                self._drop_oldest(kind)
+                self._evict_oldest(kind)
         for kind in (Kind.FINE, Kind.COARSE):
-            while self.points_bytes > self._room and self._held[kind]:
-                self._drop_oldest(kind)
+            while self.points_bytes > self._capacity_bytes and self._held[kind]:
+                self._evict_oldest(kind)
 
     def _hold(self, kind: Kind, key: Hashable, payload: bytes) -> None:
         before = self._held[kind].pop(key, b"")  # so that the newest is the last
@@ -93,12 +93,12 @@ class Store:
             self.points_bytes += len(payload) - len(before)
         self._tell(kind, key)
 
-    def _drop_oldest(self, kind: Kind) -> None:
+    def _evict_oldest(self, kind: Kind) -> None:
         _, payload = self._held[kind].popitem(last=False)
         if kind in (Kind.COARSE, Kind.FINE):
             self.points_bytes -= len(payload)
-        self.n_given_up[kind.name.lower()] += 1
+        self.n_evicted[kind.name.lower()] += 1
 
     def _tell(self, kind: Kind, key: Hashable) -> None:
-        for follower in self._followers:
-            follower.changed(kind, key)
+        for listener in self._listeners:
+            listener.changed(kind, key)

@@ -1,4 +1,4 @@
-"""What there is to see of a flight, piece by piece. A newer item of the same thing replaces it.
+"""Items of a flight to be shown. A newer item with the same key replaces the older one.
 
 World is local NED in metres, or the map where no scale is known.
 """
@@ -23,29 +23,29 @@ NO_PIXELS: Floats = np.zeros((0, 2), np.float32)
 
 
 class Shown(Enum):
-    """What the tracker does, as a pilot reads it."""
+    """Tracking state, in the pilot's words."""
 
     WAITING = "Waiting"
     INITIALISING = "Initialising"
     TRACKING = "Tracking"
-    COASTING = "Coasting"
+    DEAD_RECKONING = "Coasting"
     LOST = "Lost"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlightItem:
-    """Which flight it is; everything else is of this one."""
+    """Identity of the flight that all other items are of."""
 
     flight_id: str
     name: str
     camera: Camera
     origin: GeoOrigin | None = None
-    """Where the world's zero is, as far as known."""
+    """Geodetic origin of the world, as far as known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseItem:
-    """Where the camera is now. What is not known is None, quality -1."""
+    """Pose of the camera now. Unknown values are None, quality -1."""
 
     t_ns: int
     shown: Shown
@@ -58,7 +58,7 @@ class PoseItem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StatusItem:
-    """How the companion is: numbers and words by name; see companion.streaming.status_facts."""
+    """Status: numbers and words by name; see companion.streaming.status_facts."""
 
     t_ns: int
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class LogItem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacesItem:
-    """Where keyframes lie in the map, those that have moved; None for one that lies nowhere now.
+    """Poses of keyframes that have moved, in the map; None for one without a known pose.
 
     `world_from_map` is there when it has changed.
     """
@@ -118,7 +118,7 @@ class PointsItem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SparseItem:
-    """The tracker's own points (N, 3) in the map."""
+    """Sparse map points (N, 3) in the map."""
 
     t_ns: int
     points_map: Floats
@@ -145,7 +145,7 @@ class PictureItem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthItem:
-    """Depth of the newest keyframe as a picture, near is red; and what its kernels took."""
+    """Depth of the newest keyframe as a picture, near is red; and the times of its kernels."""
 
     t_ns: int
     image: bytes

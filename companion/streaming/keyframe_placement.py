@@ -1,4 +1,4 @@
-"""Where keyframes, and what hangs on them, lie; what of that has moved. Asks no clock, no I/O."""
+"""Poses of keyframes and the data attached to them, as the map moves. No clock, no I/O."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from companion.messages import SPANS_REACH, KeyframeAdded, MapUpdate, PointChunk
 from companion.streaming.items import PlacesItem
 
 MOVED_UNITS = 1e-4
-"""Of a keyframe that moves less, or grows by a smaller part, nothing is told."""
+"""Least movement, or relative change of scale, of a keyframe that is sent."""
 
 
-class Placing:
-    """Follows a map, and gives places of what has moved.
+class KeyframePlacement:
+    """Follows a map, and gives the poses of moved keyframes.
 
-    A keyframe's place has the scale by which the map has been stretched about it since its points
-    were measured, so that points which were sent once lie where they would be measured now.
+    A keyframe's place has the local scale correction of the map since its points were measured, so
+    that points sent once lie where they would be measured now.
     """
 
     def __init__(self) -> None:
@@ -27,29 +27,29 @@ class Placing:
         """world_from_map, once known."""
         self._update: MapUpdate | None = None
         self._mapped: dict[int, Similarity] = {}
-        """places as the map has them"""
-        self._told: dict[int, Similarity] = {}
-        """and with their stretch, as they were told last"""
+        """Places in the newest map."""
+        self._sent: dict[int, Similarity] = {}
+        """Places with their local scale correction, as last sent."""
         self._spans: dict[int, Mapping[int, float]] = {}
-        self._stretch: dict[int, float] = {}
+        self._local_scale: dict[int, float] = {}
 
     def added(self, keyframe: KeyframeAdded) -> list[PlacesItem]:
-        """A keyframe, before the map tells of it."""
+        """Take a new keyframe, before the map has it."""
         pose = keyframe.map_from_camera
         keyframe_id = keyframe.keyframe_id
         self._mapped[keyframe_id] = Similarity(1.0, pose.rotation, pose.translation)
-        return self._told_of(keyframe.t_ns, {keyframe_id: self._mapped[keyframe_id]})
+        return self._changes_of(keyframe.t_ns, {keyframe_id: self._mapped[keyframe_id]})
 
     def measured(self, chunk: PointChunk) -> list[PlacesItem]:
-        """Points, which may be of a map before the newest."""
+        """Take points, which may be of a map before the newest."""
         self._spans[chunk.keyframe_id] = chunk.spans
         if self._update is None or chunk.keyframe_id not in self._mapped:
             return []
-        self._stretch_now([chunk.keyframe_id], self._update)
-        return self._told_of(chunk.t_ns, {chunk.keyframe_id: self._mapped[chunk.keyframe_id]})
+        self._update_local_scale([chunk.keyframe_id], self._update)
+        return self._changes_of(chunk.t_ns, {chunk.keyframe_id: self._mapped[chunk.keyframe_id]})
 
     def mapped(self, update: MapUpdate) -> list[PlacesItem]:
-        """The map as it now stands."""
+        """Take a new map."""
         self._update = update
         places: dict[int, Similarity | None] = {}
         changed: set[int] = set()
@@ -65,31 +65,31 @@ class Placing:
             places[keyframe_id] = None
             changed.add(keyframe_id)
             del self._mapped[keyframe_id]
-        self._stretch_now(_about(changed), update)
+        self._update_local_scale(_about(changed), update)
         world = update.georeference.world_from_map if update.georeference is not None else None
-        return self._told_of(update.t_ns, places, world)
+        return self._changes_of(update.t_ns, places, world)
 
-    def _stretch_now(self, keyframe_ids: Iterable[int], update: MapUpdate) -> None:
+    def _update_local_scale(self, keyframe_ids: Iterable[int], update: MapUpdate) -> None:
         for keyframe_id in keyframe_ids:
             spans = self._spans.get(keyframe_id)
             if spans:
-                self._stretch[keyframe_id] = update.stretch_of(keyframe_id, spans)
+                self._local_scale[keyframe_id] = update.local_scale_of(keyframe_id, spans)
 
-    def _told_of(
+    def _changes_of(
         self, t_ns: int, places: Mapping[int, Similarity | None], world: Similarity | None = None
     ) -> list[PlacesItem]:
-        """What there is to tell of places in the map."""
+        """Places that have changed since they were last sent."""
         moved: dict[int, Similarity | None] = {}
         for keyframe_id, place in places.items():
             if place is None:
-                if self._told.pop(keyframe_id, None) is not None:
+                if self._sent.pop(keyframe_id, None) is not None:
                     moved[keyframe_id] = None
                 continue
-            stretch = self._stretch.get(keyframe_id, 1.0)
-            if stretch != 1.0:
-                place = replace(place, scale=stretch * place.scale)
-            if not _same(self._told.get(keyframe_id), place, MOVED_UNITS):
-                moved[keyframe_id] = self._told[keyframe_id] = place
+            local_scale = self._local_scale.get(keyframe_id, 1.0)
+            if local_scale != 1.0:
+                place = replace(place, scale=local_scale * place.scale)
+            if not _same(self._sent.get(keyframe_id), place, MOVED_UNITS):
+                moved[keyframe_id] = self._sent[keyframe_id] = place
         if world is None or _same(self.world, world, MOVED_UNITS):
             world = None
         else:
@@ -98,7 +98,7 @@ class Placing:
 
 
 def _about(keyframe_ids: Iterable[int]) -> set[int]:
-    """These and all whose spans may end at one of them."""
+    """These keyframes and all whose spans may end at one of them."""
     reach = range(-SPANS_REACH, SPANS_REACH + 1)
     return {keyframe_id + k for keyframe_id in keyframe_ids for k in reach}
 

@@ -1,4 +1,4 @@
-"""What of an item goes over the wire: bytes, their kind, and a key by which they are replaced."""
+"""Parts of items on the wire: bytes, their kind, and the key by which they are replaced."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from companion.streaming.items import (
 from companion.streaming.point_codec import coarse_of
 
 COARSE_CELLS = 60
-"""The coarse level has one point for each cube of so small a part of the median distance."""
+"""Voxel size of the coarse level over the median distance."""
 COARSE_MOST = 1500
 NEWEST = 0
-"""The key of what there is one of."""
+"""Key of items of which there is only one."""
 
 
 class Part(NamedTuple):
@@ -40,7 +40,7 @@ class Part(NamedTuple):
 
 
 def parts_of(item: Item) -> list[Part]:
-    """The parts of an item. Pictures and status have none: they are made for each viewer."""
+    """Parts of an item. Pictures and status have none: they are encoded for each viewer."""
     if isinstance(item, PointsItem):
         return _points(item)
     if isinstance(item, PlacesItem):
@@ -64,7 +64,7 @@ def parts_of(item: Item) -> list[Part]:
 
 
 def _points(item: PointsItem) -> list[Part]:
-    """Points in two levels, of which the second has what the first has not."""
+    """Points in two levels of detail; the second holds what the first lacks."""
     n = len(item.points_camera)
     if n == 0:
         return []

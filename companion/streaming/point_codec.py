@@ -18,7 +18,7 @@ from companion.messages import Bytes, Floats
 
 STEPS_PER_DEPTH = 1024
 MOST_BITS = 20
-"""Of a coordinate; what is wider gets a larger step."""
+"""Bits of a coordinate; a wider range gets a larger step."""
 HEAD = struct.Struct("<Iffff")
 N_MOST = 2_000_000
 LEVELS_OF_CONFIDENCE = 7
@@ -54,7 +54,7 @@ def encode_points(points: Floats, rgb: Bytes, confidence: Floats) -> bytes:
 
 
 def decode_points(data: bytes) -> tuple[Floats, Bytes, Floats]:
-    """Points (N, 3), colours (N, 3) and confidences (N,); StreamError for what is no such thing."""
+    """Points (N, 3), colours (N, 3), confidences (N,); StreamError for malformed bytes."""
     try:
         n, step, *low = HEAD.unpack_from(data)
         if n == 0:
@@ -84,10 +84,7 @@ def decode_points(data: bytes) -> tuple[Floats, Bytes, Floats]:
 
 
 def coarse_of(points: Floats, side: float, most: int) -> NDArray[np.intp]:
-    """Which points (indices) make the coarse level: one in each cube of that side, `most` at most.
-
-    Of a cube it is the first.
-    """
+    """Indices of the coarse level: the first point in each voxel of that side, `most` at most."""
     if len(points) == 0:
         return np.zeros(0, np.intp)
     cells = np.floor((points - points.min(axis=0)) / np.float32(side)).astype(np.uint64)
@@ -114,7 +111,7 @@ SHIFTS = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F
 
 
 def _spread(value: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Put two zeros before each of the low 21 bits."""
+    """Insert two zeros before each of the low 21 bits."""
     for shift, mask in SHIFTS:
         value = (value | (value << np.uint64(shift))) & np.uint64(mask)
     return value
@@ -129,7 +126,7 @@ def _gather(value: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _varints(values: NDArray[np.uint64]) -> bytes:
-    """Seven bits a byte, low ones first; a set high bit says that more follow."""
+    """LEB128: seven bits a byte, low ones first; a set high bit says that more follow."""
     n_bytes = np.ones(len(values), np.int64)
     rest = values >> np.uint64(7)
     while rest.any():

@@ -1,4 +1,4 @@
-"""Messages to items: what of a flight is to be seen. Asks no clock and does no I/O."""
+"""Scene encoder: messages to items for viewers. No clock, no I/O."""
 
 from __future__ import annotations
 
@@ -42,32 +42,32 @@ from companion.streaming.items import (
     SparseItem,
     StatusItem,
 )
-from companion.streaming.keyframe_placement import Placing
+from companion.streaming.keyframe_placement import KeyframePlacement
 from companion.streaming.status_facts import StatusFacts
 
 Watched = Message | Health | GeoOrigin
-"""What may be told."""
+"""Messages that can be shown."""
 STATUS_EVERY_NS = 1_000_000_000
 SPEED_OVER_NS = 400_000_000
 PIECE = 50
 """Positions in a piece of a path: only the last piece grows, so that long flights cost no more."""
 PIECE_STEP = 5
-"""A piece is told anew when it has grown by so many."""
+"""A piece is sent again when it has grown by this many."""
 AUTOPILOT_STEP_NS = 200_000_000
 SPARSE_EVERY = 5
 MOST_IMAGES_HELD = 4
-"""Frames that wait for the points that will be found in them."""
+"""Frames that wait for their track."""
 IN_WORDS = {
     TrackState.INITIALISING: Shown.INITIALISING,
     TrackState.TRACKING: Shown.TRACKING,
-    TrackState.COASTING: Shown.COASTING,
+    TrackState.DEAD_RECKONING: Shown.DEAD_RECKONING,
     TrackState.LOST: Shown.LOST,
 }
 
 
 @dataclass(slots=True)
 class _Piece:
-    """The piece of a path that grows."""
+    """Piece of a path that still grows."""
 
     number: int = 0
     keyframe_id: int = -1
@@ -75,8 +75,8 @@ class _Piece:
     n_waiting: int = 0
 
 
-class Story:
-    """A flight as it is told. `path_step_ns` thins the camera's path."""
+class SceneEncoder:
+    """Encodes one flight. `path_step_ns` thins the camera's path."""
 
     def __init__(self, flight: FlightItem, path_step_ns: int = 0) -> None:
         self.flight = replace(flight, origin=None)
@@ -85,7 +85,7 @@ class Story:
         self._facts = StatusFacts()
         self._status_ns = -(2**63)
         self._update: MapUpdate | None = None
-        self._placing = Placing()
+        self._placement = KeyframePlacement()
         self._path, self._autopilot_path = _Piece(), _Piece()
         self._path_ns, self._autopilot_ns = -(2**63), -(2**63)
         self._last_position_map: Array | None = None
@@ -98,11 +98,11 @@ class Story:
 
     @property
     def camera(self) -> Camera:
-        """Whose flight it is."""
+        """Camera of the flight."""
         return self.flight.camera
 
     def take(self, message: Watched) -> list[Item]:
-        """What a message shows."""
+        """Items that show a message."""
         if isinstance(message, GeoOrigin):
             self._origin = message
             return self._origin_if_known()
@@ -121,7 +121,7 @@ class Story:
             out += self._map(message)
         elif isinstance(message, PointChunk):
             self._facts.points_came(message.keyframe_id, len(message.points_camera))
-            out += self._placing.measured(message)
+            out += self._placement.measured(message)
             out.append(PointsItem(
                 message.t_ns, message.keyframe_id, WHOLE, message.points_camera, message.rgb,
                 message.confidence,
@@ -130,7 +130,7 @@ class Story:
             item = depth_picture(message)
             out += [item] if item is not None else []
         elif isinstance(message, KeyframeAdded):
-            out += self._placing.added(message)
+            out += self._placement.added(message)
         elif isinstance(message, PositionSample):
             out += self._autopilot(message)
         elif isinstance(message, Warned):
@@ -142,11 +142,11 @@ class Story:
         return out + self._status(message)
 
     def close(self) -> list[Item]:
-        """What still waits."""
+        """Items that are still held back."""
         out: list[Item] = list(self._images.values())
         self._images.clear()
         for piece in (self._path, self._autopilot_path):
-            out += self._told(piece, max(self._path_ns, self._autopilot_ns))
+            out += self._items_of(piece, max(self._path_ns, self._autopilot_ns))
         return out
 
     # -- the camera ------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ class Story:
             return []
         self._shown = shown
         self._facts.shown = shown
-        bad = shown in (Shown.COASTING, Shown.LOST)
+        bad = shown in (Shown.DEAD_RECKONING, Shown.LOST)
         return [LogItem(track.t_ns, f"Tracker: {shown.value.lower()}", bad)]
 
     def _image_of(self, track: Track) -> list[Item]:
@@ -190,7 +190,7 @@ class Story:
 
     def _pose(self, track: Track, pose: Pose) -> PoseItem:
         height = None
-        world = self._placing.world
+        world = self._placement.world
         if world is not None:
             pose = world.apply_to_pose(pose)
             height = float(-pose.translation[2])
@@ -201,7 +201,7 @@ class Story:
         )
 
     def _measure_speed(self, t_ns: int, world: Array) -> None:
-        """Where nothing else tells the speed it is that of the last while."""
+        """Estimate the speed from recent poses, where no other source gives it."""
         before = self._speed_from
         if before is None or t_ns - before[0] > 5 * SPEED_OVER_NS:
             self._speed_from = (t_ns, world)
@@ -213,27 +213,27 @@ class Story:
     # -- paths -----------------------------------------------------------------------------------
 
     def _extend(self, track: Track) -> list[Item]:
-        """Add a position to the path, in the frame of the keyframe that it is known by."""
+        """Add a position to the path, in the frame of its keyframe."""
         keyframe_id, relative = track.keyframe_id, track.keyframe_from_camera
         if keyframe_id is None or relative is None or track.map_from_camera is None:
             return []
         self._path_ns = track.t_ns
         piece, out = self._path, []
         if keyframe_id != piece.keyframe_id or len(piece.strip) > PIECE:
-            out += self._told(piece, track.t_ns)
+            out += self._items_of(piece, track.t_ns)
             before = self._last_position_map if piece.strip else None
             self._path = piece = _Piece(piece.number + 1, keyframe_id)
             if before is not None:  # a piece begins where the last one ends
-                place = self._place_now(track, track.map_from_camera, relative)
+                place = self._keyframe_pose(track, track.map_from_camera, relative)
                 piece.strip.append(place.inverse().apply(before).astype(np.float32))
         piece.strip.append(relative.translation.astype(np.float32))
         piece.n_waiting += 1
         self._last_position_map = track.map_from_camera.translation
-        return out + (self._told(piece, track.t_ns) if piece.n_waiting >= PIECE_STEP else [])
+        return out + (self._items_of(piece, track.t_ns) if piece.n_waiting >= PIECE_STEP else [])
 
-    def _place_now(self, track: Track, pose: Pose, relative: Pose) -> Similarity:
-        """Where the tracker has its keyframe, of which the map may not have told yet."""
-        units = self._update.unit_of if self._update is not None else {}
+    def _keyframe_pose(self, track: Track, pose: Pose, relative: Pose) -> Similarity:
+        """Pose of the tracker's keyframe, which the map may not have yet."""
+        units = self._update.scale_of if self._update is not None else {}
         scale = units.get(track.keyframe_id or 0, 1.0)
         rotation = pose.rotation @ relative.rotation.T
         return Similarity(
@@ -241,11 +241,11 @@ class Story:
         )
 
     def _break_path(self, t_ns: int) -> list[Item]:
-        out = self._told(self._path, t_ns)
+        out = self._items_of(self._path, t_ns)
         self._path = _Piece(self._path.number + 1)
         return out
 
-    def _told(self, piece: _Piece, t_ns: int) -> list[Item]:
+    def _items_of(self, piece: _Piece, t_ns: int) -> list[Item]:
         if piece.n_waiting == 0 or len(piece.strip) < 2:
             return []
         piece.n_waiting = 0
@@ -266,10 +266,10 @@ class Story:
         piece.strip.append(np.asarray(sample.position_ned_m, np.float32))
         piece.n_waiting += 1
         if len(piece.strip) > PIECE:
-            out = self._told(piece, sample.t_ns)
+            out = self._items_of(piece, sample.t_ns)
             self._autopilot_path = _Piece(piece.number + 1, strip=piece.strip[-1:])
         elif piece.n_waiting >= PIECE_STEP:
-            out = self._told(piece, sample.t_ns)
+            out = self._items_of(piece, sample.t_ns)
         return out
 
     # -- the map ---------------------------------------------------------------------------------
@@ -278,13 +278,13 @@ class Story:
         self._update = update
         self._facts.mapped(update)
         out = self._origin_if_known()
-        out += self._placing.mapped(update)
+        out += self._placement.mapped(update)
         if update.revision % SPARSE_EVERY == 1:
             out.append(SparseItem(update.t_ns, update.points_map.astype(np.float32)))
         return out
 
     def _origin_if_known(self) -> list[Item]:
-        """Where the world lies on the earth, once the map is known to lie in that world."""
+        """Geodetic origin, once the map is known to be georeferenced."""
         found = self._update.georeference if self._update is not None else None
         if found is None or not found.has_origin or self._origin is self.flight.origin:
             return []
@@ -294,11 +294,11 @@ class Story:
     # -- status ----------------------------------------------------------------------------------
 
     def _status(self, message: Watched) -> list[Item]:
-        """How all is, about once a second of the flight."""
+        """Status item, about once a second of the flight."""
         if isinstance(message, GeoOrigin):
             return []
         since = message.t_ns - self._status_ns
         if not isinstance(message, (Track, Health)) or since < STATUS_EVERY_NS:
             return []
         self._status_ns = message.t_ns
-        return [StatusItem(message.t_ns, self._facts.as_told(self._quality))]
+        return [StatusItem(message.t_ns, self._facts.facts(self._quality))]

@@ -1,10 +1,10 @@
-"""How much may be on its way to a viewer: as much as the link carries without a queue growing.
+"""Congestion window to a viewer: as many bytes in flight as the link carries without queueing.
 
-A window of unacknowledged bytes. It grows while it is what limits the sender and the standing delay
-(the least round trip of late) stays near the least there was; it shrinks when the standing delay
-shows a queue. Losses, which TCP repairs, delay some acknowledgements but not all, and so do not
-shrink it. After Arun and Balakrishnan, Copa (NSDI 2018), whose standing delay this is, and LEDBAT
-(RFC 6817), whose target it has.
+A window of unacknowledged bytes. It grows while it limits the sender and the standing delay (the
+least recent round trip) stays near the base round trip; it shrinks when the standing delay shows a
+queue. Losses, which TCP repairs, delay some acknowledgements but not all, and so do not shrink it.
+After Arun and Balakrishnan, Copa (NSDI 2018), for the standing delay, and LEDBAT (RFC 6817), for
+the target.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from collections import deque
 LEAST_BYTES = 6_000
 MOST_BYTES = 4 << 20
 LEAST_USED = 1_000
-"""Less room than this is none: a piece would be too small."""
+"""Less than this is not used: a piece would be too small."""
 QUEUE_S = 0.05
-"""Delay beyond the least that counts as a queue."""
+"""Delay above the base round trip that counts as a queue."""
 STANDING_S = 0.1
-"""The standing delay is over so long, or two round trips where that is longer: what repairs a loss
-delays all that follows it by one."""
+"""Window of the standing delay, or two round trips if that is longer: a retransmission delays all
+that follows by one."""
 FORGET_S = 20.0
-"""The least round trip is that of the last so long, or twice so long."""
-CREEP_S = 0.005
-"""By so much more than before it the least may have our own queue in it, on a link that is always
-full. Then no more than LEAST_BYTES is on its way for a round trip, which measures it anew."""
+"""Time window of the base round trip."""
+BASE_RISE_S = 0.005
+"""A rise of the base round trip by more may include our own queue, on a link that is always full.
+Then at most LEAST_BYTES are in flight for a round trip, to measure it anew."""
 SHRINK = 0.8
 RATE_OVER_S = 1.0
 
 
-class Window:
-    """Counts what is sent and acknowledged; times are seconds of one monotonic clock."""
+class SendWindow:
+    """Counts bytes sent and acknowledged; times are seconds of one monotonic clock."""
 
     def __init__(self) -> None:
         self.size_bytes = float(LEAST_BYTES)
@@ -38,43 +38,43 @@ class Window:
         self.acknowledged_bytes = 0
         self.round_trip_s: float | None = None
         """The newest; None before any."""
-        self._on_way: deque[tuple[int, float]] = deque()
-        self._least: list[tuple[float, float]] = []
+        self._in_flight: deque[tuple[int, float]] = deque()
+        self._base: list[tuple[float, float]] = []
         self._standing: deque[tuple[float, float]] = deque()
         self._delivered: deque[tuple[float, int]] = deque()
         self._limited_at = -1
-        """What was sent up to here left no room; so acknowledged, it says that more would do."""
+        """Bytes sent when the window was last full; their acknowledgement shows that it limits."""
         self._shrunk_s = -1e9
         self._has_seen_queue = False
         self._drains_from: int | None = None
-        """While the least is measured anew: what was sent before that."""
+        """Bytes sent before the base round trip began to be measured anew; None otherwise."""
 
     @property
-    def on_way_bytes(self) -> int:
-        """Sent and not yet acknowledged."""
+    def in_flight_bytes(self) -> int:
+        """Bytes sent and not yet acknowledged."""
         return self.sent_bytes - self.acknowledged_bytes
 
-    def room_bytes(self) -> int:
-        """So much more may be sent now."""
+    def available_bytes(self) -> int:
+        """Bytes that may be sent now."""
         drains = self._drains_from is not None
-        room = (LEAST_BYTES if drains else int(self.size_bytes)) - self.on_way_bytes
-        if room < LEAST_USED and not drains:
+        capacity = (LEAST_BYTES if drains else int(self.size_bytes)) - self.in_flight_bytes
+        if capacity < LEAST_USED and not drains:
             self._limited_at = self.sent_bytes
-        return max(0, room)
+        return max(0, capacity)
 
     def sent(self, now_s: float, n_bytes: int) -> None:
-        """So much went out."""
+        """Count bytes sent."""
         self.sent_bytes += n_bytes
-        self._on_way.append((self.sent_bytes, now_s))
+        self._in_flight.append((self.sent_bytes, now_s))
 
     def acknowledged(self, now_s: float, total_bytes: int) -> None:
-        """So much in all has been taken by the viewer."""
+        """Take the total of bytes acknowledged by the viewer."""
         if not self.acknowledged_bytes < total_bytes <= self.sent_bytes:
             return
         n_new, self.acknowledged_bytes = total_bytes - self.acknowledged_bytes, total_bytes
         went_s = None
-        while self._on_way and self._on_way[0][0] <= total_bytes:
-            went_s = self._on_way.popleft()[1]
+        while self._in_flight and self._in_flight[0][0] <= total_bytes:
+            went_s = self._in_flight.popleft()[1]
         self._delivered.append((now_s, total_bytes))
         while self._delivered[0][0] < now_s - RATE_OVER_S and len(self._delivered) > 2:
             self._delivered.popleft()
@@ -85,13 +85,13 @@ class Window:
         self.round_trip_s = now_s - went_s
         self._adjust(now_s, self.round_trip_s, n_new)
 
-    def waited_s(self, now_s: float) -> float:
-        """How long the oldest that is on its way has been."""
-        return now_s - self._on_way[0][1] if self._on_way else 0.0
+    def oldest_age_s(self, now_s: float) -> float:
+        """Age of the oldest bytes in flight, seconds."""
+        return now_s - self._in_flight[0][1] if self._in_flight else 0.0
 
     @property
     def rate_bytes_s(self) -> float:
-        """What has got through of late; 0 before anything has."""
+        """Recent goodput; 0 before any acknowledgement."""
         if len(self._delivered) < 2:
             return 0.0
         (t0, n0), (t1, n1) = self._delivered[0], self._delivered[-1]
@@ -99,17 +99,17 @@ class Window:
 
     @property
     def capacity_bytes_s(self) -> float:
-        """What the link would carry, by window and round trip; 0 while not known."""
-        if self.round_trip_s is None or not self._least:
+        """Capacity of the link, by window and round trip; 0 while unknown."""
+        if self.round_trip_s is None or not self._base:
             return 0.0
-        return self.size_bytes / max(min(r for _, r in self._least) + QUEUE_S / 2, 1e-3)
+        return self.size_bytes / max(min(r for _, r in self._base) + QUEUE_S / 2, 1e-3)
 
     def _adjust(self, now_s: float, round_trip_s: float, n_new: int) -> None:
-        least_s = self._least_s(now_s, round_trip_s)
+        base_s = self._base_s(now_s, round_trip_s)
         self._standing.append((now_s, round_trip_s))
-        while self._standing[0][0] < now_s - max(STANDING_S, 2 * least_s):
+        while self._standing[0][0] < now_s - max(STANDING_S, 2 * base_s):
             self._standing.popleft()
-        queue_s = min(r for _, r in self._standing) - least_s
+        queue_s = min(r for _, r in self._standing) - base_s
         if queue_s > QUEUE_S:
             self._has_seen_queue = True
             if now_s - self._shrunk_s > max(STANDING_S, round_trip_s):
@@ -119,19 +119,19 @@ class Window:
             gain = 0.25 if self._has_seen_queue else 1.0
             self.size_bytes = min(MOST_BYTES, self.size_bytes + gain * n_new)
 
-    def _least_s(self, now_s: float, round_trip_s: float) -> float:
-        """The least round trip, in two halves of which the older is forgotten."""
-        if not self._least or now_s - self._least[-1][0] > FORGET_S:
-            if self._least and self._least[-1][1] > self._least[0][1] + CREEP_S:
+    def _base_s(self, now_s: float, round_trip_s: float) -> float:
+        """Base round trip: the least of two windows of time, of which the older expires."""
+        if not self._base or now_s - self._base[-1][0] > FORGET_S:
+            if self._base and self._base[-1][1] > self._base[0][1] + BASE_RISE_S:
                 self._drains_from = self.sent_bytes
-            self._least = [*self._least[-1:], (now_s, round_trip_s)]
-        elif round_trip_s < self._least[-1][1]:
-            self._least[-1] = (self._least[-1][0], round_trip_s)
-        return min(r for _, r in self._least)
+            self._base = [*self._base[-1:], (now_s, round_trip_s)]
+        elif round_trip_s < self._base[-1][1]:
+            self._base[-1] = (self._base[-1][0], round_trip_s)
+        return min(r for _, r in self._base)
 
 
-class Budget:
-    """A bucket of bytes that fills at a rate, 0 for no limit; it may be overdrawn by one piece."""
+class TokenBucket:
+    """Token bucket: fills at a rate, 0 for no limit; may be overdrawn by one piece."""
 
     def __init__(self, kbit_s: float) -> None:
         self.bytes_s = kbit_s * 125.0
@@ -139,11 +139,11 @@ class Budget:
         self._t_s: float | None = None
 
     def set_rate(self, kbit_s: float) -> None:
-        """Fill at another rate from now on."""
+        """Change the rate."""
         self.bytes_s = kbit_s * 125.0
 
-    def room_bytes(self, now_s: float) -> int:
-        """So much may be sent now."""
+    def available_bytes(self, now_s: float) -> int:
+        """Bytes that may be sent now."""
         if self.bytes_s <= 0:
             return MOST_BYTES
         if self._t_s is not None:
@@ -153,5 +153,5 @@ class Budget:
         return max(0, int(self._held))
 
     def charge(self, n_bytes: int) -> None:
-        """So much was sent."""
+        """Count bytes sent."""
         self._held -= n_bytes

@@ -1,9 +1,9 @@
-"""What one viewer is given next.
+"""Scheduler of the items that one viewer is sent.
 
 Pose and state come first, then the map from coarse to fine, then pictures; of anything that the
 link has no time for only the newest waits.
 
-Nothing here can wait or grow: what waits are names of things that the store has.
+Nothing here waits or grows: the queues hold keys of items in the store.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from collections import Counter, deque
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
 
-from companion.streaming.frame_jpeg import Pictures
+from companion.streaming.frame_jpeg import AdaptiveJpeg
 from companion.streaming.framing import HEAD_BYTES, frame
 from companion.streaming.item_codec import Kind, encode
-from companion.streaming.item_store import Store
+from companion.streaming.item_store import ItemStore
 from companion.streaming.parts import NEWEST
-from companion.streaming.send_window import Window
+from companion.streaming.send_window import SendWindow
 
 ORDER = (
     Kind.FLIGHT, Kind.POSE, Kind.STATUS, Kind.LOG, Kind.PLACES, Kind.PATH, Kind.AUTOPILOT,
@@ -25,24 +25,24 @@ ORDER = (
 )  # fmt: skip
 PICTURES = (Kind.PICTURE, Kind.DEPTH)
 PICTURE_SHARE = 0.15
-"""Of what is sent, pictures have so much while the map is not there yet; then all that is left."""
+"""Share of the rate for pictures until the map is complete; then they get the rest."""
 MOST_CREDIT_BYTES = 20_000
 POSE_SHARE, POSE_BYTES = 0.15, 120
 MOST_POSES_HZ, LEAST_POSES_HZ = 30.0, 2.0
 POSES_BESIDE_HZ = 2.0
-"""Poses over the connection where datagrams bring them as well."""
+"""Rate of poses on the connection where datagrams get through."""
 STATUS_EVERY_S, ALIVE_EVERY_S = 1.0, 0.5
 PICTURES_HZ = 15.0
 PLACES_AT_ONCE = 40
 PIECE_S = 0.02
 LEAST_PIECE, MOST_PIECE = 1000, 16_000
 ASSUMED_BYTES_S = 30_000.0
-"""The rate before any is known."""
+"""Initial rate."""
 Keys = list[Hashable]
 
 
 @dataclass(slots=True)
-class _Going:
+class _Partial:
     """An item that is partly sent."""
 
     keys: Keys
@@ -53,31 +53,31 @@ class _Going:
 class Session:
     """One viewer, over all of its connections; times are seconds of one monotonic clock."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: ItemStore) -> None:
         self._store = store
-        self.window = Window()
+        self.window = SendWindow()
         self._waiting: dict[Kind, dict[Hashable, None]] = {kind: {} for kind in ORDER}
-        self._going: dict[Kind, _Going] = {}
-        self._on_way: deque[tuple[int, Kind, Keys]] = deque()
-        self._went_s = dict.fromkeys((*ORDER, None), -1e9)
-        self._pictures = Pictures()
+        self._partial: dict[Kind, _Partial] = {}
+        self._in_flight: deque[tuple[int, Kind, Keys]] = deque()
+        self._sent_s = dict.fromkeys((*ORDER, None), -1e9)
+        self._pictures = AdaptiveJpeg()
         self._credit = 0.0
         self.is_connected = True
-        """Whether there is somebody for whom what it is not given counts as skipped."""
+        """Whether skipped items are counted."""
         self._pose_is_new = False
         self._datagram_s = -1e9
         self.datagrams_work = False
-        """Whether poses get through beside the connection."""
+        """Whether poses get through by datagram."""
         self.limit_bytes_s = 0.0
-        """What the budget allows this viewer; 0 for no limit."""
+        """Rate limit of this viewer; 0 for none."""
         self.n_skipped: Counter[str] = Counter()
-        """Poses and pictures that gave way to newer ones."""
+        """Poses and pictures replaced by newer ones."""
         self.n_sent: Counter[str] = Counter()
         """Bytes, by kind."""
-        store.follow(self)
+        store.subscribe(self)
 
     def changed(self, kind: Kind, key: Hashable) -> None:
-        """There is a new one of a kind."""
+        """There is a new item of a kind."""
         waiting = self._waiting[kind]
         if kind is Kind.POSE:
             self.n_skipped["poses"] += self._pose_is_new and self.is_connected
@@ -88,41 +88,41 @@ class Session:
         waiting[key] = None
 
     def reconnected(self) -> None:
-        """Another connection: what was not acknowledged by the one before is sent again."""
-        for _, kind, keys in self._on_way:
-            self._again(kind, keys)
-        for kind, going in self._going.items():
-            self._again(kind, going.keys)
-        self._on_way.clear()
-        self._going.clear()
-        self.window = Window()
-        self._went_s = dict.fromkeys(self._went_s, -1e9)
+        """A new connection: unacknowledged items of the one before are sent again."""
+        for _, kind, keys in self._in_flight:
+            self._queue_again(kind, keys)
+        for kind, partial in self._partial.items():
+            self._queue_again(kind, partial.keys)
+        self._in_flight.clear()
+        self._partial.clear()
+        self.window = SendWindow()
+        self._sent_s = dict.fromkeys(self._sent_s, -1e9)
         self.changed(Kind.FLIGHT, NEWEST)
 
     def acknowledged(self, now_s: float, total_bytes: int) -> None:
-        """The viewer has taken so much in all of this connection."""
+        """Take the total of bytes acknowledged on this connection."""
         self.window.acknowledged(now_s, total_bytes)
-        while self._on_way and self._on_way[0][0] <= self.window.acknowledged_bytes:
-            self._on_way.popleft()
+        while self._in_flight and self._in_flight[0][0] <= self.window.acknowledged_bytes:
+            self._in_flight.popleft()
 
     @property
     def rate_bytes_s(self) -> float:
-        """What the link is taken to carry for this viewer."""
+        """Estimated rate of the link for this viewer."""
         rate = self.window.capacity_bytes_s or ASSUMED_BYTES_S
         return min(rate, self.limit_bytes_s) if self.limit_bytes_s > 0 else rate
 
     @property
     def n_waiting(self) -> int:
-        """How many things of the map it has not been given."""
+        """Number of map items not yet sent."""
         return sum(len(self._waiting[kind]) for kind in ORDER[3:-2])
 
     @property
     def is_complete(self) -> bool:
-        """Whether it has taken all there is."""
-        return not self._on_way and not self._going and not any(self._waiting.values())
+        """Whether everything has been received."""
+        return not self._in_flight and not self._partial and not any(self._waiting.values())
 
     def next_datagram(self, now_s: float) -> bytes | None:
-        """The newest pose, if it is time for it and it has not been sent."""
+        """The newest pose, if due and not sent yet."""
         every_s = self._pose_every_s() if self.datagrams_work else 1.0 / POSES_BESIDE_HZ
         if not self._pose_is_new or now_s - self._datagram_s < every_s:
             return None
@@ -131,29 +131,29 @@ class Session:
         return bytes([Kind.POSE]) + payload if payload is not None else None
 
     def next_piece(self, now_s: float, most_bytes: int) -> bytes | None:
-        """A piece of what comes next, framed; None if there is nothing now, or no room for it."""
+        """Next piece to send, framed; None if there is none now, or no capacity."""
         rate = self.rate_bytes_s
         most = int(min(max(rate * PIECE_S, LEAST_PIECE), MOST_PIECE, most_bytes - HEAD_BYTES))
         if most < min(LEAST_PIECE, MOST_PIECE) // 4:
             return None
         kind = self._next_kind(now_s, rate)
         if kind is None:
-            if now_s - self._went_s[None] < ALIVE_EVERY_S:
+            if now_s - self._sent_s[None] < ALIVE_EVERY_S:
                 return None
             return self._sent(now_s, None, frame(0, b"", True))
-        going = self._going[kind]
-        piece = going.payload[going.at : going.at + most]
-        going.at += len(piece)
-        is_last = going.at >= len(going.payload)
+        partial = self._partial[kind]
+        piece = partial.payload[partial.at : partial.at + most]
+        partial.at += len(piece)
+        is_last = partial.at >= len(partial.payload)
         framed = self._sent(now_s, kind, frame(kind, piece, is_last))
         if is_last:
-            del self._going[kind]
-            self._on_way.append((self.window.sent_bytes, kind, going.keys))
+            del self._partial[kind]
+            self._in_flight.append((self.window.sent_bytes, kind, partial.keys))
         return framed
 
     def _sent(self, now_s: float, kind: Kind | None, framed: bytes) -> bytes:
         self.window.sent(now_s, len(framed))
-        self._went_s[None] = now_s
+        self._sent_s[None] = now_s
         if kind is not None:
             self.n_sent[kind.name.lower()] += len(framed)
         earned = -len(framed) if kind in PICTURES else PICTURE_SHARE * len(framed)
@@ -161,32 +161,32 @@ class Session:
         return framed
 
     def _next_kind(self, now_s: float, rate: float) -> Kind | None:
-        """The first kind in order of which a piece can go now."""
+        """First kind in order of priority of which a piece can go now."""
         for kind in ORDER:
             if kind is Kind.COARSE and self._credit > 0:
                 for picture in PICTURES:
-                    if self._may_go(picture, now_s, rate, PICTURE_SHARE * rate):
+                    if self._can_send(picture, now_s, rate, PICTURE_SHARE * rate):
                         return picture
             share = rate
             if kind in PICTURES:
                 # one that fits in the share goes on in it
                 busy = self._waiting[Kind.COARSE] or self._waiting[Kind.FINE]
                 share = PICTURE_SHARE * rate if busy else rate / 2
-            if self._may_go(kind, now_s, rate, share):
+            if self._can_send(kind, now_s, rate, share):
                 return kind
         return None
 
-    def _may_go(self, kind: Kind, now_s: float, rate: float, share: float) -> bool:
-        """Whether something of a kind is going, or can begin to."""
-        if kind in self._going:
+    def _can_send(self, kind: Kind, now_s: float, rate: float, share: float) -> bool:
+        """Whether an item of a kind is partly sent, or one can begin."""
+        if kind in self._partial:
             return True
-        if now_s - self._went_s[kind] < self._every_s(kind, rate):
+        if now_s - self._sent_s[kind] < self._every_s(kind, rate):
             return False
         while self._waiting[kind]:
             keys, payload = self._taken(kind, now_s, share)
             if payload is not None:  # else the store has given it up
-                self._went_s[kind] = now_s
-                self._going[kind] = _Going(keys, payload)
+                self._sent_s[kind] = now_s
+                self._partial[kind] = _Partial(keys, payload)
                 return True
         return False
 
@@ -232,11 +232,11 @@ class Session:
             "budget_kbit_s": round(self.limit_bytes_s / 125) or None,
             "waiting": self.n_waiting,
             "skipped": dict(self.n_skipped),
-            "given_up": dict(self._store.n_given_up),
+            "given_up": dict(self._store.n_evicted),
         }
         return encode(replace(status, facts={**status.facts, **link}))
 
-    def _again(self, kind: Kind, keys: Keys) -> None:
+    def _queue_again(self, kind: Kind, keys: Keys) -> None:
         for key in keys:
             if key not in self._waiting[kind]:
                 self._waiting[kind] = {key: None, **self._waiting[kind]}

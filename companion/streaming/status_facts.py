@@ -1,6 +1,6 @@
-"""How the companion is, in few numbers and words by name, for the plots and the status panel.
+"""Status of the companion as numbers and words by name, for plots and the status panel.
 
-What is not known is left out.
+Unknown values are left out.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from companion.streaming.items import Shown
 
 RATE_OVER_NS = 2_000_000_000
 RECENT_NS = 30_000_000_000
-"""A warning is on the panel for so long."""
+"""Time for which a warning is shown."""
 MOST_WARNINGS = 3
 
 
 class StatusFacts:
-    """Gathers them."""
+    """Collects the values."""
 
     def __init__(self) -> None:
         self.shown = Shown.WAITING
@@ -34,7 +34,7 @@ class StatusFacts:
         self._t_ns = 0
 
     def tracked(self, track: Track) -> None:
-        """A frame has its pose, or has none."""
+        """Take the track of a frame."""
         self._t_ns = max(self._t_ns, track.t_ns)
         if track.map_from_camera is not None:
             self._tracked.append(track.t_ns)
@@ -42,22 +42,22 @@ class StatusFacts:
             self._tracked.popleft()
 
     def points_came(self, keyframe_id: int, n: int) -> None:
-        """A keyframe has this many points."""
+        """Take the number of points of a keyframe."""
         self._n_points_in_all += n - self._n_points.get(keyframe_id, 0)
         self._n_points[keyframe_id] = n
 
     def mapped(self, update: MapUpdate) -> None:
-        """The map as it stands."""
+        """Take a new map."""
         self._update = update
 
     def warned(self, warning: Warned) -> None:
-        """Something that the user should know of."""
+        """Take a warning."""
         if not warning.good:
             self._warned.pop(warning.what, None)
             self._warned[warning.what] = warning.t_ns
 
-    def as_told(self, quality: int) -> dict[str, Any]:
-        """All of them."""
+    def facts(self, quality: int) -> dict[str, Any]:
+        """All values by name."""
         found = self._update.georeference if self._update is not None else None
         span_ns = self._tracked[-1] - self._tracked[0] if len(self._tracked) > 1 else 0
         recent = [w for w, t in self._warned.items() if t > self._t_ns - RECENT_NS]

@@ -1,4 +1,4 @@
-"""What nodes on several machines tell each other: messages as bytes, and what waits to be fetched.
+"""Messages between nodes on several machines: encoding, and bundles to be fetched.
 
 Knows no network: drivers.system.zenoh_bus has that. docs/topics.md is the schema.
 """

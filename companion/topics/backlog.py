@@ -1,7 +1,7 @@
-"""Bundles that wait to be fetched, whoever comes and whenever: the oldest go when room is short.
+"""Bundles that wait to be fetched; the oldest are evicted when capacity is short.
 
-Whoever fetches says what they have; nothing here knows them, so that they may vanish, come back,
-and begin anew.
+Stateless for clients: each states what it has, so that clients may vanish, come back, and begin
+anew.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from companion.topics.envelope import Envelope
 from companion.topics.keyframe_bundle import Bundle, MapChange
 
 SAVED_S = 2.0
-"""Of a budget that was not used, so much is kept."""
+"""Seconds of unused budget that are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,20 +29,20 @@ class _Held:
 class Backlog:
     """To be used by several threads. A budget of 0 is no limit."""
 
-    def __init__(self, run: str, room_bytes: int, budget_bytes_s: float) -> None:
-        self._run, self._room_bytes, self._budget_bytes_s = run, room_bytes, budget_bytes_s
+    def __init__(self, run: str, capacity_bytes: int, budget_bytes_s: float) -> None:
+        self._run, self._capacity_bytes, self._budget_bytes_s = run, capacity_bytes, budget_bytes_s
         self._held: deque[_Held] = deque()
         self._n_bytes = 0
         self._map: MapUpdate | None = None
         self._lock = threading.Lock()
         self._allowed_bytes, self._allowed_s = 0.0, 0.0
-        self.n_given_up = 0
-        """Bundles that had to go before anybody had fetched them."""
+        self.n_evicted = 0
+        """Bundles evicted before anybody had fetched them."""
         self.fetched = -1
-        """The newest that was fetched."""
+        """Newest bundle fetched."""
         self.newest = -1
         self.fetched_s = float("-inf")
-        """When somebody last asked."""
+        """Time of the last query."""
 
     def put(self, bundle: Bundle, update: MapUpdate | None) -> None:
         """Add a bundle; `update` is the whole map after it."""
@@ -52,16 +52,17 @@ class Backlog:
             self._n_bytes += len(held.data)
             self.newest = held.number
             self._map = update
-            while self._n_bytes > self._room_bytes and len(self._held) > 1:
+            while self._n_bytes > self._capacity_bytes and len(self._held) > 1:
                 oldest = self._held.popleft()
                 self._n_bytes -= len(oldest.data)
-                self.n_given_up += oldest.number > self.fetched
+                self.n_evicted += oldest.number > self.fetched
 
     def after(self, run: str, number: int, now_s: float, whole: bool = False) -> bytes:
-        """What follows bundle `number` of a run, as bytes: a bundle, or `wait` where none may go.
+        """Bytes of the bundle after bundle `number` of a run, or `wait` where none may go.
 
         Where bundles between are gone, or with `whole`, the whole map comes first, in a bundle that
-        has the number before. Another run's number counts for nothing: then the oldest follows.
+        has the number before. The number of another run counts for nothing: then the oldest
+        follows.
         """
         with self._lock:
             self.fetched_s = now_s
@@ -95,5 +96,5 @@ class Backlog:
 def _without_points(update: MapUpdate) -> MapUpdate:
     return MapUpdate(
         update.revision, update.t_ns, update.map_from_camera, np.zeros((0, 3)),
-        update.georeference, update.unit_of, update.n_retired,
+        update.georeference, update.scale_of, update.n_retired,
     )  # fmt: skip

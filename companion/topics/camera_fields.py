@@ -1,4 +1,4 @@
-"""A camera as fields, and back."""
+"""Camera model as JSON fields, and back."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ N_COEFFICIENTS = {Distortion.NONE: 0, Distortion.RADTAN: 5, Distortion.EQUIDISTA
 
 
 def camera_fields(camera: Camera) -> dict[str, Any]:
-    """What the JSON object `camera` has."""
+    """Fields of the JSON object `camera`."""
     body = camera.body_from_camera
     return {
         "width": camera.width, "height": camera.height,
@@ -28,7 +28,7 @@ def camera_fields(camera: Camera) -> dict[str, Any]:
 
 
 def camera_of(part: Envelope) -> Camera:
-    """The camera of such an object; StreamError for what is none."""
+    """Camera of such an object; StreamError for an invalid one."""
     width = part.integer("width", LEAST_SIDE, MOST_SIDE)
     height = part.integer("height", LEAST_SIDE, MOST_SIDE)
     if width * height > MOST_PIXELS:

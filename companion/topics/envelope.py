@@ -1,7 +1,7 @@
 """Fields and arrays as bytes: a length (u32, little-endian), a JSON object, then the arrays.
 
 The object's `arrays` lists name, type (as numpy writes it, little-endian) and shape of each, in
-their order. What is not known is null in the object and nan in an array.
+their order. Unknown values are null in the object and nan in an array.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ MOST_ARRAYS, MOST_DIMENSIONS = 32, 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Envelope:
-    """Fields and arrays; getters raise StreamError for what is missing or not as wanted."""
+    """Fields and arrays; getters raise StreamError for missing or invalid values."""
 
     kind: str
     fields: Mapping[str, Any]
     arrays: Mapping[str, NDArray[Any]]
 
     def pack(self) -> bytes:
-        """The bytes of it."""
+        """Encoded bytes."""
         arrays = {name: _little(array) for name, array in self.arrays.items()}
         listed = [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()]
         head = {"version": VERSION, "kind": self.kind, **self.fields, "arrays": listed}
@@ -45,14 +45,14 @@ class Envelope:
         )
 
     def integer(self, name: str, low: int = 0, high: int = 2**62) -> int:
-        """A whole number within limits."""
+        """Integer within limits."""
         value = self.fields.get(name)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             raise StreamError(f"{self.kind}: {name} is not a whole number from {low} to {high}")
         return value
 
     def number(self, name: str, low: float = -1e12, high: float = 1e12) -> float:
-        """A finite number within limits."""
+        """Finite number within limits."""
         value = self.fields.get(name)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise StreamError(f"{self.kind}: {name} is not a number")
@@ -65,7 +65,7 @@ class Envelope:
         return self.fields.get(name) is not None
 
     def text(self, name: str, most: int = 200) -> str:
-        """A text of at most so many letters."""
+        """Text of limited length."""
         value = self.fields.get(name)
         if not isinstance(value, str) or len(value) > most:
             raise StreamError(f"{self.kind}: {name} is not a text of at most {most} letters")
@@ -79,14 +79,14 @@ class Envelope:
         return value
 
     def part(self, name: str) -> Envelope:
-        """An object in the object, without arrays."""
+        """A nested object, without arrays."""
         value = self.fields.get(name)
         if not isinstance(value, dict):
             raise StreamError(f"{self.kind}: {name} is not an object")
         return Envelope(f"{self.kind}.{name}", value, {})
 
     def array(self, name: str, dtype: str, *shape: int, finite: bool = True) -> NDArray[Any]:
-        """An array of a type and shape, -1 being any length; finite unless said otherwise."""
+        """Array of a type and shape, -1 being any length; finite unless stated otherwise."""
         array = self.arrays.get(name)
         if array is None or array.dtype.str != np.dtype(dtype).str or array.ndim != len(shape):
             raise StreamError(f"{self.kind}: {name} is not an array of {dtype}")
@@ -98,7 +98,7 @@ class Envelope:
 
 
 def unpack(data: bytes) -> Envelope:
-    """Read an envelope; StreamError for what is none. The arrays may be views of `data`."""
+    """Decode an envelope; StreamError if invalid. The arrays may be views of `data`."""
     try:
         return _unpack(data)
     except (ValueError, TypeError, RecursionError, struct.error) as error:
@@ -138,7 +138,7 @@ def _unpack(data: bytes) -> Envelope:
 
 
 def finite_or_none(value: float) -> float | None:
-    """What JSON can say of a number."""
+    """A number for JSON; None unless finite."""
     return float(value) if math.isfinite(value) else None
 
 

@@ -1,9 +1,8 @@
-"""Frames, tracks, keyframes and the map, gathered into bundles: only what depth can use.
+"""Builds bundles of frames, tracks, keyframes and map changes: only data that depth can use.
 
-Of the frames between two keyframes those are taken that lie far enough apart to tell depth, and
-no more than the budget allows: a keyframe that could not have enough of them gets none, so that
-the next one has all that it needs. Until a keyframe tells which frames are wanted they wait as
-JPEG.
+Of the frames between two keyframes those are taken that have enough baseline for depth, and no more
+than the budget allows: a keyframe that could not have enough of them gets none, so that the next
+one has all that it needs. Until the next keyframe tells which frames are needed they wait as JPEG.
 """
 
 from __future__ import annotations
@@ -21,22 +20,22 @@ MOST_WAITING, MOST_WAITING_BYTES = 240, 24 << 20
 MOST_PICTURES = 48
 MOST_TRACKS = 1000
 LEAST_STEP = 0.01
-"""Of the median depth: frames that lie nearer to each other tell the same."""
+"""Least baseline of frames over the median depth."""
 LEAST_FRAMES = 4
-"""Beside its own that a keyframe needs to get depth."""
+"""Frames beside its own that a keyframe needs to get depth."""
 SAVED_NS = 3_000_000_000
-"""Budget that was not used is kept for so long."""
+"""Time for which unused budget is kept."""
 GREY_SHARE = 0.9
-"""Of the bytes of a picture in colour, what it takes in grey."""
+"""Size of a grey picture over that of the same in colour."""
 
 
 class Gatherer:
-    """Gives a bundle whenever the map was told; `budget_bytes_s` of 0 is no limit."""
+    """Gives a bundle at each map update; `budget_bytes_s` of 0 is no limit."""
 
     def __init__(self, run: str, budget_bytes_s: float, jpeg_quality: int) -> None:
         self._run, self._budget_bytes_s, self._quality = run, budget_bytes_s, jpeg_quality
         self.n_dropped = 0
-        """Frames that depth could have used, but for the budget or the room to wait in."""
+        """Frames useful for depth, dropped for the budget or for capacity."""
         self._frames: OrderedDict[int, tuple[int, bytes]] = OrderedDict()
         self._frame_bytes = 0
         self._tracks: list[Track] = []
@@ -44,10 +43,10 @@ class Gatherer:
         self._tracked: dict[int, Track] = {}
         self._changes = MapChanges()
         self._number = 0
-        self._room_bytes, self._room_ns = SAVED_NS * 1e-9 * budget_bytes_s, 0
+        self._budget_left_bytes, self._budget_at_ns = SAVED_NS * 1e-9 * budget_bytes_s, 0
         self._last_place: tuple[float, ...] | None = None
         self.keyframe_jpegs: dict[int, bytes] = {}
-        """Pictures of the keyframes of the last bundle, by number of keyframe."""
+        """Pictures of the keyframes of the last bundle, by keyframe id."""
 
     def take(self, message: Frame | Track | KeyframeAdded | MapUpdate) -> Bundle | None:
         """Take one message, in the order in which localisation gives it."""
@@ -64,17 +63,21 @@ class Gatherer:
         return None
 
     def last(self) -> Bundle:
-        """What is left when the flight is over."""
+        """Last bundle of the flight."""
         return self._bundle(None, over=True)
 
     def _wait(self, frame: Frame) -> None:
         jpeg = jpeg_of(frame.rgb, self._quality)
         self._frames[frame.seq] = (frame.t_ns, jpeg)
         self._frame_bytes += len(jpeg)
-        if self._room_ns:
-            self._room_bytes += max(frame.t_ns - self._room_ns, 0) * 1e-9 * self._budget_bytes_s
-        self._room_bytes = min(self._room_bytes, SAVED_NS * 1e-9 * self._budget_bytes_s)
-        self._room_ns = frame.t_ns
+        if self._budget_at_ns:
+            self._budget_left_bytes += (
+                max(frame.t_ns - self._budget_at_ns, 0) * 1e-9 * self._budget_bytes_s
+            )
+        self._budget_left_bytes = min(
+            self._budget_left_bytes, SAVED_NS * 1e-9 * self._budget_bytes_s
+        )
+        self._budget_at_ns = frame.t_ns
         while len(self._frames) > MOST_WAITING or self._frame_bytes > MOST_WAITING_BYTES:
             seq = next(iter(self._frames))
             self._forget(seq)
@@ -93,7 +96,7 @@ class Gatherer:
         return bundle
 
     def _pictures(self) -> list[Picture]:
-        """Frames up to the newest keyframe; older ones are decided on and wait no more."""
+        """Frames up to the newest keyframe; older ones are taken or dropped."""
         newest = max(keyframe.seq for keyframe in self._keyframes)
         owners = {k.seq: k.keyframe_id for k in self._keyframes if k.seq in self._frames}
         self.keyframe_jpegs = {i: self._frames[seq][1] for seq, i in owners.items()}
@@ -105,7 +108,7 @@ class Gatherer:
             if seq not in owners:
                 jpeg = without_colour(jpeg, self._quality)
             out.append(Picture(seq, t_ns, jpeg, seq in owners))
-            self._room_bytes -= len(jpeg)
+            self._budget_left_bytes -= len(jpeg)
         self.n_dropped += len(useful) - len(chosen)
         for seq in [s for s in self._frames if s <= newest]:
             self._forget(seq)
@@ -113,7 +116,7 @@ class Gatherer:
         return out
 
     def _spread(self, seqs: Sequence[int], keyframes: set[int]) -> list[int]:
-        """Frames of which each shows something else than the one before; keyframes always."""
+        """Frames with enough baseline between them; keyframes always."""
         depths = np.concatenate([k.points_camera[:, 2] for k in self._keyframes])
         step = LEAST_STEP * float(np.median(depths)) if len(depths) else 0.0
         out = []
@@ -133,17 +136,17 @@ class Gatherer:
         return out
 
     def _affordable(self, seqs: list[int], keyframes: set[int]) -> list[int]:
-        """Those that the budget has room for, evenly spread."""
+        """Frames within the budget, evenly spread."""
         others = [seq for seq in seqs if seq not in keyframes]
-        room = MOST_PICTURES - len(keyframes)
+        capacity = MOST_PICTURES - len(keyframes)
         if self._budget_bytes_s and others:
             own_bytes = sum(len(self._frames[seq][1]) for seq in keyframes)
             each_bytes = GREY_SHARE * float(np.mean([len(self._frames[s][1]) for s in others]))
-            room = min(room, int((self._room_bytes - own_bytes) / each_bytes))
-            if room < min(LEAST_FRAMES, len(others)):
+            capacity = min(capacity, int((self._budget_left_bytes - own_bytes) / each_bytes))
+            if capacity < min(LEAST_FRAMES, len(others)):
                 return []
-        if len(others) > room:
-            kept = np.unique(np.linspace(0, len(others) - 1, max(room, 0)).astype(int))
+        if len(others) > capacity:
+            kept = np.unique(np.linspace(0, len(others) - 1, max(capacity, 0)).astype(int))
             others = [others[k] for k in kept]
         return sorted([*others, *keyframes])
 

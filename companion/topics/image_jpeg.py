@@ -1,4 +1,4 @@
-"""Images as JPEG, and back from a network that may send anything."""
+"""Images as JPEG, and validated decoding of what a network sends."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from companion.messages import Bytes
 
 MARKER, START, FIRST_FRAME, LAST_FRAME = 0xFF, 0xD8, 0xC0, 0xCF
 NO_FRAMES = frozenset({0xC4, 0xC8, 0xCC})
-"""Tables, among the markers of frames."""
+"""Markers of tables, in the range of frame markers."""
 
 
 def jpeg_of(image: Bytes, quality: int) -> bytes:
@@ -22,7 +22,7 @@ def jpeg_of(image: Bytes, quality: int) -> bytes:
 
 
 def without_colour(jpeg: bytes, quality: int) -> bytes:
-    """The same in grey; at the quality that it was made with hardly anything more is lost."""
+    """The same in grey; at its quality hardly anything more is lost."""
     grey = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise StreamError("a JPEG that cannot be decoded")
@@ -30,7 +30,7 @@ def without_colour(jpeg: bytes, quality: int) -> bytes:
 
 
 def image_of(jpeg: bytes, width: int, height: int, colour: bool) -> Bytes:
-    """Its pixels, (H, W, 3) RGB or (H, W); StreamError where it is not an image of that size.
+    """Pixels, (H, W, 3) RGB or (H, W); StreamError where it is no image of that size.
 
     The size is read before anything is decoded: a few bytes can claim to be a gigapixel.
     """
@@ -49,7 +49,7 @@ def image_of(jpeg: bytes, width: int, height: int, colour: bool) -> Bytes:
 
 
 def size_of(jpeg: bytes) -> tuple[int, int] | None:
-    """Width and height that a JPEG's frame header states; None where there is none."""
+    """Width and height by the frame header of a JPEG; None without one."""
     if jpeg[:2] != bytes([MARKER, START]):
         return None
     at = 2

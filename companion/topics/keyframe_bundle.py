@@ -1,7 +1,7 @@
-"""What the depth stage needs from one keyframe to the next, as one message that is fetched.
+"""Bundle: input of the depth stage from one keyframe to the next, as one message.
 
-In a bundle frames come first, then their tracks, the keyframes, and what of the map has changed
-since the bundle before: in that order the depth stage takes them.
+Frames come first, then their tracks, the keyframes, and the changes of the map since the bundle
+before: in that order the depth stage takes them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapChange:
-    """The map after a bundle: places that are new or have changed, and which are known no more.
+    """Changes of the map with a bundle: poses new or changed, and keyframes removed.
 
     With `whole` it is all of the map.
     """
@@ -56,7 +56,7 @@ class MapChange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
-    """Bundle `number` of those that process `run` numbers; `over`: it is the flight's last."""
+    """Bundle `number` of process `run`; `over`: it is the flight's last."""
 
     run: str
     number: int
@@ -67,7 +67,7 @@ class Bundle:
     over: bool = False
 
     def pack(self) -> bytes:
-        """The bytes of it."""
+        """Encoded bytes."""
         fields: dict[str, object] = {"run": self.run, "number": self.number, "over": self.over}
         arrays = {**_pictures(self.pictures), **_tracks(self.tracks), **_keyframes(self.keyframes)}
         fields["map"] = None
@@ -84,7 +84,7 @@ class Bundle:
 
 
 def bundle_of(envelope: Envelope) -> Bundle:
-    """The bundle of an envelope; StreamError for what is none."""
+    """Bundle of an envelope; StreamError if invalid."""
     if envelope.kind != "bundle":
         raise StreamError(f"wanted a bundle, and {envelope.kind!r} came")
     change = None
@@ -104,7 +104,7 @@ def bundle_of(envelope: Envelope) -> Bundle:
 
 
 def frame_of(picture: Picture, camera: Camera) -> Frame:
-    """A frame of the camera's size; one that is grey has no colours. StreamError for no such."""
+    """Frame of the camera's size, without colours if grey; StreamError if invalid."""
     image = image_of(picture.jpeg, camera.width, camera.height, picture.in_colour)
     if not picture.in_colour:
         return Frame(picture.seq, picture.t_ns, image, np.repeat(image[..., None], 3, axis=2))
@@ -113,13 +113,13 @@ def frame_of(picture: Picture, camera: Camera) -> Frame:
 
 
 class MapMirror:
-    """The map that changes add up to."""
+    """Map rebuilt from changes."""
 
     def __init__(self) -> None:
         self._places: dict[int, Similarity] = {}
 
     def take(self, change: MapChange) -> MapUpdate:
-        """The map after a change."""
+        """Map after a change."""
         update = change.update
         if change.whole:
             self._places = {}
@@ -135,28 +135,28 @@ class MapMirror:
 
 
 class MapChanges:
-    """What has changed from one state of the map to the next."""
+    """Changes from one state of the map to the next."""
 
     def __init__(self) -> None:
-        self._told: dict[int, tuple[object, ...]] = {}
+        self._given: dict[int, tuple[object, ...]] = {}
         self._is_first = True
 
     def since_last(self, update: MapUpdate) -> MapChange:
-        """The places that differ from those given before; the first time it is the whole map."""
+        """Poses that differ from those given before; the first time the whole map."""
         now = {k: _state(update, k) for k in update.map_from_camera}
         changed = {
-            k: pose for k, pose in update.map_from_camera.items() if now[k] != self._told.get(k)
+            k: pose for k, pose in update.map_from_camera.items() if now[k] != self._given.get(k)
         }
-        removed = [k for k in self._told if k not in now]
-        units = {k: unit for k, unit in update.unit_of.items() if k in changed}
-        whole, self._is_first, self._told = self._is_first, False, now
-        part = replace(update, map_from_camera=changed, unit_of=units, points_map=np.zeros((0, 3)))
+        removed = [k for k in self._given if k not in now]
+        units = {k: unit for k, unit in update.scale_of.items() if k in changed}
+        whole, self._is_first, self._given = self._is_first, False, now
+        part = replace(update, map_from_camera=changed, scale_of=units, points_map=np.zeros((0, 3)))
         return MapChange(part, removed, whole)
 
 
 def _state(update: MapUpdate, keyframe_id: int) -> tuple[object, ...]:
     pose = update.map_from_camera[keyframe_id]
-    unit = update.unit_of.get(keyframe_id, 1.0)
+    unit = update.scale_of.get(keyframe_id, 1.0)
     return unit, pose.rotation.tobytes(), pose.translation.tobytes()
 
 

@@ -1,7 +1,7 @@
-"""Each message that has a topic as an envelope, and back; docs/topics.md says what is in them.
+"""Messages of each topic as envelopes, and back; schema in docs/topics.md.
 
-What does not come from us is a StreamError. Frames, tracks and corrections of the map travel in
-bundles (companion.topics.keyframe_bundle) to the node that makes depth.
+Data that are not of our making are a StreamError. Frames, tracks and corrections of the map travel
+in bundles (companion.topics.keyframe_bundle) to the depth node.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def pose_of_envelope(envelope: Envelope) -> Odometry:
 def keyframe_envelope(
     flight: str, keyframe: KeyframeAdded, update: MapUpdate | None, jpeg: bytes
 ) -> Envelope:
-    """Topic `keyframe`: its picture, and where it was taken as far as that is known now."""
+    """Topic `keyframe`: its picture, and its pose as far as known now."""
     return Envelope("keyframe", {
         "flight": flight, "keyframe_id": keyframe.keyframe_id, "seq": keyframe.seq,
         "t_ns": keyframe.t_ns, **_placed(keyframe.keyframe_id, update),
@@ -92,7 +92,7 @@ def keyframe_envelope(
 
 
 def map_envelope(flight: str, update: MapUpdate) -> Envelope:
-    """Topic `map`: where all keyframes lie now. The sparse points stay where they are."""
+    """Topic `map`: poses of all keyframes. Sparse points are not sent."""
     return Envelope("map", {
         "flight": flight, "revision": update.revision, "t_ns": update.t_ns,
         "n_retired": update.n_retired, "georeference": georeference_fields(update.georeference),
@@ -167,7 +167,7 @@ def cloud_of_envelope(envelope: Envelope) -> PointChunk:
 
 
 def state_of(text: str) -> TrackState:
-    """The state of that name."""
+    """Tracking state of that name."""
     try:
         return TrackState(text)
     except ValueError as error:
@@ -175,7 +175,7 @@ def state_of(text: str) -> TrackState:
 
 
 def places_arrays(update: MapUpdate, keyframe_ids: list[int]) -> dict[str, Any]:
-    """Where some keyframes of a map lie: `ids` (N,) and `map_from_camera` (N, 8)."""
+    """Poses of some keyframes of a map: `ids` (N,) and `map_from_camera` (N, 8)."""
     rows = [place_row(place) for k in keyframe_ids if (place := update.place_of(k)) is not None]
     return {
         "ids": np.array(keyframe_ids, np.int32),
@@ -184,7 +184,7 @@ def places_arrays(update: MapUpdate, keyframe_ids: list[int]) -> dict[str, Any]:
 
 
 def places_of(envelope: Envelope) -> dict[int, Similarity]:
-    """Back from these arrays."""
+    """Decoded from these arrays."""
     ids = envelope.array("ids", "<i4", -1)
     if len(ids) > MOST_KEYFRAMES or (len(ids) and ids.min() < 0):
         raise StreamError(f"{envelope.kind}: no numbers of keyframes")
@@ -196,14 +196,14 @@ def map_update(
     revision: int, t_ns: int, places: dict[int, Similarity], georeference: Georeference | None,
     n_retired: int,
 ) -> MapUpdate:  # fmt: skip
-    """The map in which keyframes lie at these places."""
+    """Map with keyframes at these poses."""
     poses = {k: Pose(place.rotation, place.translation) for k, place in places.items()}
     units = {k: place.scale for k, place in places.items() if place.scale != 1.0}
     return MapUpdate(revision, t_ns, poses, np.zeros((0, 3)), georeference, units, n_retired)
 
 
 def georeference_fields(found: Georeference | None) -> dict[str, Any] | None:
-    """What the JSON object `georeference` has."""
+    """Fields of the JSON object `georeference`."""
     if found is None:
         return None
     return {
@@ -216,7 +216,7 @@ def georeference_fields(found: Georeference | None) -> dict[str, Any] | None:
 
 
 def georeference_of(envelope: Envelope) -> Georeference | None:
-    """Back from the field `georeference`."""
+    """Decoded from the field `georeference`."""
     if not envelope.known("georeference"):
         return None
     part = envelope.part("georeference")
@@ -231,7 +231,7 @@ def georeference_of(envelope: Envelope) -> Georeference | None:
 
 
 def points_of(envelope: Envelope, name: str) -> Floats:
-    """Points (N, 3) before the camera; what lies behind it is left out."""
+    """Points (N, 3) in front of the camera; those behind it are left out."""
     points = envelope.array(name, "<f4", -1, 3)
     if len(points) > MOST_POINTS or (len(points) and np.abs(points).max() > FAR_AWAY):
         raise StreamError(f"{envelope.kind}: {name} are no points")
@@ -240,7 +240,7 @@ def points_of(envelope: Envelope, name: str) -> Floats:
 
 
 def _placed(keyframe_id: int, update: MapUpdate | None) -> dict[str, Any]:
-    """`map_from_camera` and `world_from_camera` of a keyframe, null where not known."""
+    """`map_from_camera` and `world_from_camera` of a keyframe, null where unknown."""
     place = update.place_of(keyframe_id) if update is not None else None
     found = update.georeference if update is not None else None
     world = found.world_from_map @ place if found is not None and place is not None else None

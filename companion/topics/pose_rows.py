@@ -18,9 +18,9 @@ from companion.geometry.transforms import (
 )
 
 POSE_NUMBERS = 7
-"""x y z, then the quaternion w x y z; all nan where there is no pose."""
+"""x y z, then the quaternion w x y z; all nan without a pose."""
 PLACE_NUMBERS = 8
-"""The scale before these."""
+"""A scale, then a pose."""
 FURTHEST = 1e7
 LEAST_NORM = 1e-3
 LEAST_SCALE, MOST_SCALE = 1e-9, 1e9
@@ -39,7 +39,7 @@ def pose_rows(poses: Sequence[Pose | None]) -> Array:
 
 
 def pose_of(row: NDArray[Any] | Sequence[float]) -> Pose | None:
-    """The pose of seven numbers; None where they are nan. StreamError for what is no pose."""
+    """Pose of seven numbers; None where they are nan. StreamError if invalid."""
     numbers = np.asarray(row, np.float64)
     if np.isnan(numbers).all():
         return None
@@ -51,7 +51,7 @@ def pose_of(row: NDArray[Any] | Sequence[float]) -> Pose | None:
 
 
 def known_pose_of(row: NDArray[Any] | Sequence[float]) -> Pose:
-    """The same, where there must be one."""
+    """The same, where a pose is required."""
     pose = pose_of(row)
     if pose is None:
         raise StreamError("a pose is missing")
@@ -64,7 +64,7 @@ def place_row(place: Similarity) -> list[float]:
 
 
 def place_of(row: NDArray[Any] | Sequence[float]) -> Similarity:
-    """The similarity of eight numbers; StreamError for what is none."""
+    """Similarity of eight numbers; StreamError if invalid."""
     scale, pose = float(row[0]), known_pose_of(row[1:])
     if not LEAST_SCALE < scale < MOST_SCALE:
         raise StreamError("a scale out of range")

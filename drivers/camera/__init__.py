@@ -1,1 +1,1 @@
-"""Live cameras: one file for each kind, one registry, one supervising thread."""
+"""Live cameras: one file per kind, one registry, one supervising thread."""

@@ -1,20 +1,20 @@
-"""When pictures were taken that come by a network: the sender's stamps, put on our clock."""
+"""Exposure times of network cameras: the sender's stamps on our clock."""
 
 from __future__ import annotations
 
 MAX_DRIFT = 200e-6
-"""Two clocks of computers do not run apart faster than this."""
+"""Largest drift between two computers' clocks."""
 MAX_LATE_NS = 1_000_000_000
 SETTLED_FALL_NS, SETTLED_AFTER = 5_000_000, 5
-"""So many arrivals that are not much earlier than was known show that no backlog comes any more."""
+"""Number of arrivals not much earlier than the estimate that show the end of a backlog."""
 STEPPED_AFTER_NS = 3_000_000_000
-"""What is later than that for so long is not late: the sender's stamps were set back."""
+"""Lateness that lasts longer is a step of the sender's clock."""
 
 
 class ArrivalClock:
-    """Follows the least delayed of what arrives: a delay only ever makes a picture late.
+    """Offset of the sender's clock by the least delayed arrivals: a delay only makes an image late.
 
-    What all pictures are delayed by (encoding, the network at its best) it cannot see; that is
+    The delay common to all images (encoding, the network at its best) is not observable; that is
     what `camera.stamp_offset_ms` is for.
     """
 
@@ -26,11 +26,11 @@ class ArrivalClock:
 
     @property
     def settled(self) -> bool:
-        """Whether times may be believed: what waited for us before we came arrives all at once."""
+        """Whether times are valid: images buffered before the connection arrive all at once."""
         return self._n_steady >= SETTLED_AFTER
 
     def monotonic_ns(self, sent_ns: int, arrived_ns: int) -> int:
-        """Our time of what the sender stamped `sent_ns`; never later than it arrived."""
+        """CLOCK_MONOTONIC of the sender's stamp `sent_ns`; never later than the arrival."""
         offset_ns = float(arrived_ns - sent_ns)
         if self._offset_ns is None or self._stepped_back(offset_ns, arrived_ns):
             self._offset_ns, self._n_steady = offset_ns, 0

@@ -1,4 +1,4 @@
-"""The Video4Linux cameras of this machine, and what each can do."""
+"""Video4Linux cameras of this machine, and their capabilities."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ NUMBERS = (
 
 @dataclass(frozen=True, slots=True)
 class CameraFormat:
-    """Pictures of one code and size, and the rates at which they come."""
+    """Pixel format and size, and the frame rates available."""
 
     code: str
     width: int
     height: int
     rates_hz: tuple[float, ...] = ()
-    """Fastest first; nothing where the driver does not tell."""
+    """Fastest first; empty where the driver does not list them."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraControl:
-    """A number that can be set."""
+    """A control that can be set."""
 
     name: str
     value: int | None
@@ -42,12 +42,12 @@ class CameraControl:
     step: int
     default: int
     choices: dict[int, str] = field(default_factory=dict)
-    """What the values of a menu mean."""
+    """Names of a menu's values."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraDevice:
-    """A camera; `problem` says why nothing more could be learnt of it."""
+    """A camera; `problem` is the reason why its capabilities could not be read."""
 
     path: str
     stable_path: str = ""
@@ -60,14 +60,14 @@ class CameraDevice:
 
 
 def cameras() -> list[CameraDevice]:
-    """All that give pictures; a camera's other nodes (metadata, output) are left out."""
+    """All capture devices; a camera's other nodes (metadata, output) are left out."""
     return [found for path in _nodes() if (found := _look_at(path)) is not None]
 
 
 def find_camera() -> str:
-    """Path of the only camera there is.
+    """Path of the only camera.
 
-    SourceError where there is none, ConfigError where several would do.
+    SourceError where there is none, ConfigError where there are several.
     """
     found = [each for each in cameras() if each.formats]
     if not found:
@@ -79,7 +79,7 @@ def find_camera() -> str:
 
 
 def stable_path(path: str) -> str:
-    """The name under /dev/v4l/by-id that a camera keeps when it is plugged in anew, or ""."""
+    """Name under /dev/v4l/by-id, which survives replugging; "" without one."""
     target = os.path.realpath(path)
     for link in sorted((DEV / "v4l" / "by-id").glob("*")):
         if os.path.realpath(link) == target:
@@ -88,7 +88,7 @@ def stable_path(path: str) -> str:
 
 
 def sizes_of(node: CaptureNode, codes: Iterable[str]) -> str:
-    """The sizes that a camera has in any of these codes, in words."""
+    """Sizes that a camera has in any of these formats, in words."""
     sizes = dict.fromkeys(_in_words(size) for code in codes for size in node.sizes(code))
     return ", ".join(list(sizes)[:MAX_SIZES_NAMED]) or "it does not say which"
 

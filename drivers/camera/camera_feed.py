@@ -1,4 +1,4 @@
-"""The thread that keeps a camera open and hands on what may be believed of its pictures."""
+"""Camera supervisor: a thread that keeps a camera open and passes on valid frames."""
 
 from __future__ import annotations
 
@@ -29,44 +29,43 @@ ENDED = "the camera's pictures have ended"
 DRIVER_FAULT = "the camera's driver has a fault"
 
 EXPECTED = (CompanionError, OSError)
-"""What a camera or its connection may do at any time; anything else is a bug of its driver."""
+"""Expected failures of a camera or its connection; any other exception is a bug of its driver."""
 RETRY_S = 0.5
-"""Between two attempts to open a camera that is not there."""
+"""Interval of attempts to open a missing camera."""
 READ_S = 0.1
-"""A read waits for so long at most, so that stopping does not."""
+"""Timeout of a read, so that stopping does not block."""
 STOP_S = 2.0
-"""A thread that has not ended by then never will."""
+"""Timeout of the thread's end."""
 FROZEN_S = 1.0
-"""Pictures that have been the same for so long come from a frozen camera."""
+"""Duration of equal images that means a frozen camera."""
 MIN_CONTRAST = 12
-"""Pictures with less than this between dark and bright, as under a lens cap, may well be equal."""
-AMISS_S = 1.5
-"""A camera that has been frozen, or of the wrong size, for so long is opened anew,"""
+"""Least contrast of images that are compared; darker ones, as under a lens cap, may be equal."""
+INVALID_S = 1.5
+"""A camera with invalid images for this long is reopened,"""
 BETWEEN_CURES_S = 5.0
 """but not more often than this."""
 MAX_AHEAD_NS, MAX_BEHIND_NS = 50_000_000, 10_000_000_000
-"""How far a stamp may lie from now."""
+"""Largest difference of a stamp from now."""
 REPEAT_WARNING_S = 10.0
 
 
 @dataclass(slots=True)
 class _Opening:
-    """What is known of the camera since it was opened, CLOCK_MONOTONIC in seconds."""
+    """State since the camera was opened, CLOCK_MONOTONIC in seconds."""
 
     since_s: float
     picture_s: float | None = None
-    """When the last picture of any kind came."""
-    amiss_s: float | None = None
-    """Since when none came that could be handed on, and what is wrong with them."""
-    amiss: str = ""
+    """Arrival of the last image, valid or not."""
+    invalid_s: float | None = None
+    """Time since when all images have been invalid, and the reason."""
+    invalid: str = ""
 
 
 class CameraFeed:
-    """Opens a source, and opens it anew whenever it has gone, for as long as it is to run.
+    """Opens a source, and reopens it whenever it is lost, until stopped.
 
-    `deliver` and `warn` are called in its thread and must not block. A picture that repeats the one
-    before, has another size than the first of all, or a stamp that cannot be true, goes no further
-    and is counted.
+    `deliver` and `warn` are called in its thread and must not block. An image that repeats the one
+    before, has another size than the first of all, or an impossible stamp, is dropped and counted.
     """
 
     def __init__(
@@ -78,9 +77,9 @@ class CameraFeed:
         warn: Callable[[Warned], None],
     ) -> None:
         self.fault: CompanionError | None = None
-        """Why the configured camera can never be opened; the thread has then ended."""
+        """Reason why the configured camera can never be opened; the thread has then ended."""
         self.size: tuple[int, int] | None = None
-        """Width and height of the first picture, which all others must have."""
+        """Width and height of the first image, which all others must have."""
         self._source = source
         self._clock = clock
         self._rate_hz = config.rate_hz
@@ -101,11 +100,11 @@ class CameraFeed:
 
     @property
     def health(self) -> SourceHealth:
-        """As it stands now; may be asked from any thread."""
+        """Health now; from any thread."""
         return self._meter.health(self._clock.now_ns())
 
     def start(self) -> None:
-        """Begin to open the camera."""
+        """Start the thread, which opens the camera."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -143,7 +142,7 @@ class CameraFeed:
         except EXPECTED as error:
             self._set("missing", MISSING, self._in_words(error))
             return False
-        if self._meter.state == "opening":  # else what was amiss may still be
+        if self._meter.state == "opening":  # else the fault may persist
             self._meter.detail = self._source.name
         return True
 
@@ -156,7 +155,7 @@ class CameraFeed:
             self._set_fault(error)
 
     def _read_on(self) -> None:
-        """Hand on pictures until the camera has gone, or should be opened anew."""
+        """Deliver images until the camera is lost, or should be reopened."""
         opening = _Opening(time.monotonic())
         while not self._stop.is_set():
             try:
@@ -172,11 +171,11 @@ class CameraFeed:
                 self._warn(Warned(self._clock.now_ns(), NOT_AS_ASKED, self._source.remarks.pop(0)))
             if picture is not None:
                 opening.picture_s = now_s
-                opening.amiss = self._take(picture)
-                if not opening.amiss:
-                    opening.amiss_s = None
-                elif opening.amiss_s is None:
-                    opening.amiss_s = now_s
+                opening.invalid = self._take(picture)
+                if not opening.invalid:
+                    opening.invalid_s = None
+                elif opening.invalid_s is None:
+                    opening.invalid_s = now_s
             self._meter.n_dropped = self._source.n_dropped + self._n_refused
             if self._should_be_cured(opening, now_s):
                 return
@@ -190,24 +189,24 @@ class CameraFeed:
         if silent:
             self._set("silent", SILENT, f"{source.name}: no picture comes")
             return source.live
-        amiss_s = 0.0 if opening.amiss_s is None else now_s - opening.amiss_s
-        if amiss_s > FROZEN_S and self._meter.state == "running":
-            if opening.amiss == FROZEN:
+        invalid_s = 0.0 if opening.invalid_s is None else now_s - opening.invalid_s
+        if invalid_s > FROZEN_S and self._meter.state == "running":
+            if opening.invalid == FROZEN:
                 self._set("frozen", FROZEN, f"{source.name}: the same picture again and again")
             else:
-                self._set("silent", opening.amiss, f"{source.name}: {opening.amiss}")
-        if not source.live or amiss_s < AMISS_S or now_s - self._cured_s < BETWEEN_CURES_S:
+                self._set("silent", opening.invalid, f"{source.name}: {opening.invalid}")
+        if not source.live or invalid_s < INVALID_S or now_s - self._cured_s < BETWEEN_CURES_S:
             return False
         self._cured_s = now_s
         return True
 
     def _take(self, picture: Picture) -> str:
-        """Hand a picture on, or say what is amiss with it."""
+        """Deliver an image, or return the reason why it is invalid."""
         now_ns = time.monotonic_ns()
-        amiss = self._amiss(picture, now_ns)
-        if amiss:
+        invalid = self._why_invalid(picture, now_ns)
+        if invalid:
             self._n_refused += 1
-            return amiss
+            return invalid
         if self._meter.state != "running":
             self._recovered()
         t_ns = self._clock.from_monotonic_ns(picture.monotonic_ns + self._offset_ns)
@@ -216,7 +215,7 @@ class CameraFeed:
         self._seq += 1
         return ""
 
-    def _amiss(self, picture: Picture, now_ns: int) -> str:
+    def _why_invalid(self, picture: Picture, now_ns: int) -> str:
         height, width = picture.grey.shape
         if self.size is None:
             self.size = width, height
@@ -252,13 +251,13 @@ class CameraFeed:
         return str(error)
 
     def _set_fault(self, error: Exception) -> None:
-        """A bug: where it lies goes to the journal whole, what it is to whoever asks."""
+        """Report a bug: its traceback to the journal, its kind to health."""
         self._faults.tell(error, self._secrets)
         name = type(error).__name__
         self._set("driver fault", DRIVER_FAULT, f"{self._source.name}: {name}, see the journal")
 
     def _set(self, state: SourceState, what: str, detail: str) -> None:
-        """Note what is amiss, and tell of it where that is new."""
+        """Set the state of the source, and warn if it is new."""
         self._meter.state, self._meter.detail = state, detail
         if what not in self._warned_s:
             self._warned_s[what] = time.monotonic()

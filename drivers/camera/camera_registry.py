@@ -1,4 +1,4 @@
-"""The kinds of camera that `camera.source` names: one maker for each."""
+"""Registry of the kinds of camera that `camera.source` names."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from drivers.camera.camera_source import CameraSource
 
 
 def camera_source(config: CameraConfig) -> CameraSource:
-    """The camera that is configured, not yet opened; ConfigError where a key that it needs lacks.
+    """The configured camera, not yet opened; ConfigError where a required key is missing.
 
-    Its library is loaded here and not before: a machine need only have what its own camera wants.
+    Its library is loaded here and not before: a machine needs only the library of its own camera.
     """
     return _MAKERS[config.source](config)
 

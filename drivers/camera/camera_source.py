@@ -1,4 +1,4 @@
-"""What a camera is to the rest: something that opens, gives stamped pictures, and may go away."""
+"""Interface of a camera: opens, gives stamped images, and may be lost."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from companion.messages import Bytes
 
 
 class EndOfPictures(SourceError):  # noqa: N818 - an end, not a fault
-    """The source has shown all that there is; it will show no more."""
+    """The source has no more images."""
 
 
 class DriverFault(Exception):  # noqa: N818 - nothing that a camera can do
-    """A bug of a driver, found by a process of its own; the text is the traceback from there."""
+    """Bug of a driver, found in a process of its own; the text is its traceback."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """One picture of a camera, as it came.
+    """One image of a camera.
 
     `monotonic_ns` is CLOCK_MONOTONIC at mid-exposure, as well as the source knows; `grey` (H, W)
-    u8; `rgb` (H, W, 3) u8. Both are the receiver's own: no driver writes to them any more.
+    u8; `rgb` (H, W, 3) u8. Both are owned by the receiver: no driver writes to them any more.
     """
 
     monotonic_ns: int
@@ -36,24 +36,24 @@ class CameraSource(Protocol):
     name: str
     """For people: a path, a URL without its password."""
     live: bool
-    """Whether opening it anew can help where it gives nothing, or one picture for ever."""
+    """Whether reopening can help where it gives nothing, or the same image for ever."""
     start_s: float
-    """The first picture may take so long after opening."""
+    """Longest time from opening to the first image."""
     silent_s: float
-    """No picture for so long, once there were some, means that it is silent."""
+    """Time without an image, after the first, that means that it is silent."""
     n_dropped: int
-    """Pictures that came, and were damaged or too late to be handed on."""
+    """Images dropped as damaged or too late."""
     remarks: list[str]
-    """What it does otherwise than asked; the reader takes them out."""
+    """Deviations from the request; the reader takes them out."""
 
     def open(self) -> None:
-        """Begin. SourceError: it is not there now. ConfigError: as configured it never will be.
+        """Open. SourceError: not there now. ConfigError: impossible as configured.
 
-        OSError is taken for a SourceError. Whatever else it or `read` raises is a bug.
+        OSError counts as SourceError. Any other exception of it or of `read` is a bug.
         """
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The newest picture, None if none came in time; SourceError when the camera has gone."""
+        """Newest image, None if none came in time; SourceError when the camera is lost."""
 
     def close(self) -> None:
-        """End, whatever state it is in; can be called twice."""
+        """Close, in any state; can be called twice."""

@@ -1,4 +1,4 @@
-"""A recorded flight, a folder of images or a video as a camera: played in the time it was taken."""
+"""A recorded flight, a folder of images or a video as a camera, in real time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from companion.messages import Bytes
 from drivers.camera.camera_source import EndOfPictures, Picture
 from drivers.images.frame_source import VIDEO_SUFFIXES, FrameSource, Video, find_frames
 from drivers.images.frame_times import read_frame_times
-from drivers.images.prefetch import Ahead
+from drivers.images.prefetch import Prefetch
 
-DECODED_AHEAD = 3
+PREFETCHED = 3
 
 
 class FileCamera:
-    """Each picture comes when it is due; those whose successor is due already are left out."""
+    """Gives each image when it is due; skips those whose successor is due already."""
 
     live = False
     start_s = 5.0
@@ -38,13 +38,13 @@ class FileCamera:
         self._numbers: list[int] = []
         self._after_ns: list[int] = []
         self._source: FrameSource | None = None
-        self._ahead: Ahead[tuple[int, Bytes | None]] | None = None
+        self._prefetch: Prefetch[tuple[int, Bytes | None]] | None = None
         self._pictures: Iterator[tuple[int, Bytes | None]] = iter(())
         self._begun_ns = 0
         self._waiting: tuple[int, Bytes] | None = None
 
     def open(self) -> None:
-        """Find the pictures and their times, and begin to decode; see `CameraSource`."""
+        """Find the images and their times, and start to decode; see `CameraSource`."""
         self.close()
         try:
             self._source = _frames(self._path)
@@ -73,22 +73,22 @@ class FileCamera:
         return Picture(due_ns, grey, rgb)
 
     def close(self) -> None:
-        """End the decoding."""
-        ahead, self._ahead = self._ahead, None
-        if ahead is not None:
-            ahead.close()
+        """Stop decoding."""
+        prefetch, self._prefetch = self._prefetch, None
+        if prefetch is not None:
+            prefetch.close()
         self._pictures, self._waiting = iter(()), None
 
     def _begin(self) -> None:
         assert self._source is not None
-        self._ahead = Ahead(
-            self._source.pictures(self._numbers[0], self._numbers[-1]), DECODED_AHEAD
+        self._prefetch = Prefetch(
+            self._source.pictures(self._numbers[0], self._numbers[-1]), PREFETCHED
         )
-        self._pictures = iter(self._ahead)
+        self._pictures = iter(self._prefetch)
 
     def _next(self) -> tuple[int, Bytes]:
-        """The next picture that is not too late, and when it is due by the monotonic clock."""
-        if self._ahead is None:
+        """Next image that is not too late, and when it is due by CLOCK_MONOTONIC."""
+        if self._prefetch is None:
             raise SourceError(f"{self.name}: not open")
         while True:
             for number, rgb in self._pictures:
@@ -104,7 +104,7 @@ class FileCamera:
                 return self._begun_ns + self._after_ns[at], rgb
             if not self._repeat:
                 raise EndOfPictures(f"{self.name}: all {len(self._numbers)} pictures were shown")
-            self._ahead.close()
+            self._prefetch.close()
             mean_ns = self._after_ns[-1] // max(1, len(self._after_ns) - 1)
             # a machine that cannot keep up does not begin in the past
             self._begun_ns = max(

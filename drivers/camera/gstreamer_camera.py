@@ -1,4 +1,4 @@
-"""Whatever GStreamer has a pipeline for (CSI cameras of a Jetson, …), stamped by the pipeline.
+"""GStreamer pipelines as cameras (CSI cameras of a Jetson, …), stamped by the pipeline.
 
 The pipeline runs in a process of its own, see `drivers.camera.gstreamer_child`.
 """
@@ -25,7 +25,7 @@ CHILD = Path(__file__).with_name("gstreamer_child.py")
 SYSTEM_PYTHON = "/usr/bin/python3"
 OPEN_S = 5.0
 END_S = 1.0
-"""A pipeline that has not ended by itself in this time is killed."""
+"""Time after which a pipeline that has not ended is killed."""
 PIPE_BYTES = 1 << 20
 INSTALL = (
     "apt install python3-gi gir1.2-gstreamer-1.0 gstreamer1.0-plugins-base "
@@ -37,7 +37,7 @@ Answer = tuple[bytes, int, int, int, int, bytes]
 
 
 class GstreamerCamera:
-    """A camera behind a pipeline that is configured up to its appsink."""
+    """Camera behind a pipeline that is configured up to its appsink."""
 
     live = True
     start_s = 8.0
@@ -108,7 +108,7 @@ class GstreamerCamera:
         return Picture(t_ns, *arrays)
 
     def close(self) -> None:
-        """End the pipeline, by force if need be."""
+        """Stop the pipeline, by force if need be."""
         child, self._child = self._child, None
         self._received.clear()
         self._asked = False
@@ -131,7 +131,7 @@ class GstreamerCamera:
             pass  # it has ended; what it said before that is still to be read
 
     def _receive(self, timeout_s: float) -> Answer | None:
-        """The next answer, None if it is not there in time; SourceError if none will come."""
+        """Next answer, None if it does not come in time; SourceError if none will come."""
         assert self._child is not None and self._child.stdout is not None
         deadline_s = time.monotonic() + timeout_s
         pipe = self._child.stdout.fileno()

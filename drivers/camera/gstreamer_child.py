@@ -1,4 +1,4 @@
-"""Runs a GStreamer pipeline for `drivers.camera.gstreamer_camera`, in the system's own Python.
+"""Process of a GStreamer pipeline for `drivers.camera.gstreamer_camera`, in the system's Python.
 
 It needs nothing but the standard library and PyGObject, which a virtual environment does not have,
 and a camera's plugin that crashes or hangs takes only this process with it. Python 3.8 will do.
@@ -17,10 +17,10 @@ import sys
 import traceback
 
 HEADER = struct.Struct("<4sIIIqI")
-"""What it is, width, height, bytes in a row, CLOCK_MONOTONIC in ns or 0, bytes that follow."""
+"""Kind, width, height, bytes per row, CLOCK_MONOTONIC in ns or 0, number of bytes that follow."""
 OPENED, NEVER, GONE, ENDED, FAULT = b"open", b"nevr", b"gone", b"ends", b"bugs"
-"""Running; cannot be, for the reason that follows; has failed, likewise; no more pictures; a bug
-of this program, whose traceback follows."""
+"""Running; impossible, for the reason that follows; failed, likewise; no more images; a bug of this
+program, whose traceback follows."""
 CODES = {"NV12": b"NV12", "YUY2": b"YUYV", "GRAY8": b"GREY"}
 APPSINK = (
     " ! videoconvert ! video/x-raw,format=(string){" + ",".join(CODES) + "}"
@@ -30,21 +30,21 @@ POLL_NS = 100_000_000
 
 
 class Answers:
-    """Where answers go. Not standard output: plugins print there."""
+    """Output stream of the answers. Not standard output: plugins print there."""
 
     def __init__(self) -> None:
         self._fd = os.dup(1)
         os.dup2(2, 1)
 
     def send(self, kind: bytes, data: bytes = b"", width=0, height=0, stride=0, t_ns=0) -> None:  # type: ignore[no-untyped-def]
-        """One answer."""
+        """Send one answer."""
         left = memoryview(HEADER.pack(kind, width, height, stride, t_ns, len(data)) + data)
         while left:
             left = left[os.write(self._fd, left) :]
 
 
 def main() -> None:
-    """Serve one pipeline."""
+    """Run one pipeline."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one that asks
     answers = Answers()
     try:
@@ -112,7 +112,7 @@ def _answer(Gst, pipeline, sample, answers) -> None:  # type: ignore[no-untyped-
     form = sample.get_caps().get_structure(0)
     width, height = form.get_int("width")[1], form.get_int("height")[1]
     code = CODES[form.get_string("format")]
-    # the default layout, which all keep to that are not told of another by an appsink
+    # the default layout, unless an appsink negotiates another
     stride = ((2 * width if code == b"YUYV" else width) + 3) // 4 * 4
     buffer = sample.get_buffer()
     t_ns = 0

@@ -1,4 +1,4 @@
-"""The camera model of a live run: of its calibration file, or as configured."""
+"""Camera model of a live run: from its calibration file, or as configured."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from drivers.images.calibration_file import FORWARD_UPRIGHT, assumed_camera, rea
 def live_camera(
     config: CameraConfig, mount: MountConfig, width: int, height: int
 ) -> tuple[Camera, list[str]]:
-    """The camera of a live run with pictures of this size, and in words what is not known of it.
+    """Camera of a live run for images of this size, and a remark on what is only assumed.
 
-    FlightError or ConfigError where what is configured cannot be. A flight folder played as a
+    FlightError or ConfigError where the configuration is impossible. A flight folder played as a
     camera brings its own calibration, and so does the test pattern.
     """
     warnings = []
@@ -56,7 +56,7 @@ def live_camera(
 
 
 def body_from_camera(mount: MountConfig) -> Pose:
-    """The place of a camera that is mounted as configured."""
+    """Mounting of a camera, as configured."""
     turned = quaternion_from_euler(
         math.radians(mount.roll_deg), math.radians(mount.pitch_deg), math.radians(mount.yaw_deg)
     )

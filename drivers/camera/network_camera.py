@@ -1,4 +1,4 @@
-"""RTSP and other network video by PyAV (FFmpeg): what is newest, decoded as it arrives."""
+"""RTSP and other network video by PyAV (FFmpeg): the newest image, decoded as it arrives."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from drivers.camera.arrival_clock import ArrivalClock
 from drivers.camera.camera_source import EndOfPictures, Picture
 
 OPEN_S = 4.0
-"""To connect and learn what the stream is."""
+"""Timeout to connect and to analyse the stream."""
 READ_S = 2.0
-"""Without a packet for so long the connection counts as lost."""
+"""Time without a packet after which the connection counts as lost."""
 MAX_WAIT_FOR_ORDER_US = 100_000
-"""UDP packets that overtake each other are put in order within this time."""
+"""Reordering window of UDP packets."""
 NO_STAMPS = 0x80
 """AVFMT_NOTIMESTAMPS: the stream has none (JPEG over HTTP), and FFmpeg makes them up."""
 BRIGHTNESS_FIRST = frozenset({"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "nv12", "gray"})
-"""Pixel formats whose first plane is the grey picture."""
+"""Pixel formats whose first plane is the grey image."""
 
 
 @dataclass(slots=True)
@@ -38,11 +38,11 @@ class _Newest:
 
 
 class NetworkCamera:
-    """A video stream; what it cannot decode in time is left out, never queued."""
+    """Video stream; images that it cannot decode in time are dropped, never queued."""
 
     live = True
     start_s = 8.0
-    """Until a picture that needs no other before it: some cameras send one every few seconds."""
+    """Time to the first intra picture: some cameras send one every few seconds."""
     silent_s = 2.0
 
     def __init__(self, config: CameraConfig) -> None:
@@ -70,7 +70,7 @@ class NetworkCamera:
         self._receiver = receiver
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The newest picture that has been decoded; see `CameraSource`."""
+        """Newest decoded image; see `CameraSource`."""
         receiver = self._receiver
         if receiver is None:
             raise SourceError(f"{self.name}: not open")
@@ -83,19 +83,19 @@ class NetworkCamera:
         return Picture(newest.monotonic_ns, *_arrays(newest.frame))
 
     def close(self) -> None:
-        """Disconnect; a connection that hangs is left to its own time limit."""
+        """Disconnect; a connection that hangs is left to its own timeout."""
         receiver, self._receiver = self._receiver, None
         if receiver is not None:
             receiver.end()
 
 
 class _Receiver:
-    """Receives and decodes in a thread of its own: each picture builds on the one before."""
+    """Receives and decodes in a thread of its own: each image depends on the one before."""
 
     def __init__(self, config: CameraConfig, name: str) -> None:
         self.opened = threading.Event()
         self.error: Exception | None = None
-        """SourceError or ConfigError, or else a bug, with the place where it lies."""
+        """SourceError or ConfigError, or else a bug, with its place."""
         self._config = config
         self._name = name
         self._ended = threading.Event()
@@ -103,18 +103,18 @@ class _Receiver:
         self._newest: _Newest | None = None
         self._n_dropped = 0
         self._heard_s = 0.0
-        """When the last packet came; RTSP reports a time that ran out as damaged data."""
+        """Arrival of the last packet; RTSP reports a timeout as damaged data."""
         self.thread = threading.Thread(target=self._run, name="network camera", daemon=True)
 
     def take(self, timeout_s: float) -> _Newest | None:
-        """The newest picture, once only."""
+        """Newest image, once only."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest or self.error, timeout_s)
             newest, self._newest = self._newest, None
             return newest
 
     def take_n_dropped(self) -> int:
-        """Pictures left out since this was last asked."""
+        """Images dropped since the last call."""
         with self._changed:
             n, self._n_dropped = self._n_dropped, 0
             return n
@@ -200,7 +200,7 @@ class _Receiver:
 
 
 def without_secrets(url: str) -> str:
-    """An address without user, password and query, fit to be printed."""
+    """Address without user, password and query, fit to be printed."""
     try:
         parts = urlsplit(url)
         host = parts.hostname or ""

@@ -1,7 +1,6 @@
-"""A camera that there is not: it flies circles over a textured plain, and where it is, is known.
+"""Simulated camera: flies circles over a textured plain, with known poses.
 
-Its place is a function of CLOCK_MONOTONIC alone, so that whoever wants to compare, in whatever
-process, can compute it.
+The pose is a function of CLOCK_MONOTONIC alone, so that any process can compute it for comparison.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ DEFAULT_HFOV_DEG = 75.0
 BODY_FROM_CAMERA = Pose(
     np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)
 )
-"""It looks straight down, and forward is up in its pictures."""
+"""Looks straight down; forward is up in the image."""
 
 
 def pattern_optics(config: CameraConfig) -> Camera:
-    """The camera, exactly; it is as wide as `camera.assumed_hfov_deg`."""
+    """Camera model, exact; its field of view is `camera.assumed_hfov_deg`."""
     given = assumed_camera(config.width, config.height, config.assumed_hfov_deg or DEFAULT_HFOV_DEG)
     return Camera(
         given.width, given.height, given.fx, given.fy, given.cx, given.cy,
@@ -47,7 +46,7 @@ def pattern_optics(config: CameraConfig) -> Camera:
 
 
 def world_from_body(monotonic_ns: int) -> Pose:
-    """Where the body is, in local NED: a circle that rises and falls, swaying as it goes."""
+    """Pose of the body in local NED: a circle that rises and falls, with changing attitude."""
     turn = 2 * math.pi * (monotonic_ns * 1e-9 / PERIOD_S)
     place = np.array(
         [
@@ -63,12 +62,12 @@ def world_from_body(monotonic_ns: int) -> Pose:
 
 
 def world_from_camera(monotonic_ns: int) -> Pose:
-    """Where the camera is."""
+    """Pose of the camera."""
     return world_from_body(monotonic_ns) @ BODY_FROM_CAMERA
 
 
 class PatternCamera:
-    """Pictures at `camera.rate_hz`; those that there was no time to draw are left out."""
+    """Images at `camera.rate_hz`; skips those that it has no time to draw."""
 
     live = True
     start_s = 5.0
@@ -84,12 +83,12 @@ class PatternCamera:
         self.remarks: list[str] = []
 
     def open(self) -> None:
-        """Begin; see `CameraSource`."""
+        """Open; see `CameraSource`."""
         self._scene = self._scene or PatternScene()
         self._next_ns = time.monotonic_ns() + self._step_ns
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The next picture, once it is due; see `CameraSource`."""
+        """Next image, once it is due; see `CameraSource`."""
         if self._next_ns is None or self._scene is None:
             raise SourceError(f"{self.name}: not open")
         wait_ns = self._next_ns - time.monotonic_ns()
@@ -105,12 +104,12 @@ class PatternCamera:
         return Picture(due_ns, grey, rgb)
 
     def close(self) -> None:
-        """End."""
+        """Close."""
         self._next_ns = None
 
 
 class PatternScene:
-    """A plain at height 0 with table tops over it, so that it is not all in one plane."""
+    """Plain at height 0 with table tops above it, so that the scene is not planar."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(20260101)
@@ -129,7 +128,7 @@ class PatternScene:
         """Height, corner (north, east) and side of each; the lowest first, which others hide."""
 
     def picture(self, camera: Camera, pose: Pose) -> tuple[Bytes, Bytes]:
-        """Grey and RGB as a camera without distortion sees it from above."""
+        """Grey and RGB image of a camera without distortion that looks down on it."""
         size = camera.width, camera.height
         pixel_from_texel = _pixel_from_plane(camera, pose, 0.0) @ self._plain_from_texel
         grey = np.asarray(
@@ -195,7 +194,7 @@ def _texture(rng: np.random.Generator) -> Bytes:
 
 
 def _colours() -> Bytes:
-    """Earth below, grass above: a table (1, 256, 3) from grey to colours about as bright."""
+    """Lookup table (1, 256, 3) from grey to colours of about that brightness."""
     grey = np.arange(256.0)
     red = np.interp(grey, [0, 128, 255], [10, 130, 235])
     green = np.interp(grey, [0, 128, 255], [0, 132, 255])

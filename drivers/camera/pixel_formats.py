@@ -1,4 +1,4 @@
-"""Raw pictures as cameras give them, by their four-letter codes, turned to grey and RGB."""
+"""Pixel formats of cameras by FourCC, converted to grey and RGB."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Arrays = tuple[Bytes, Bytes]
 def to_grey_and_rgb(
     code: str, data: Any, width: int, height: int, stride: int = 0
 ) -> Arrays | None:
-    """Copies of one picture's brightness and colours; None if it is damaged.
+    """Copies of an image's brightness and colours; None if it is damaged.
 
-    `data` is any buffer; `stride` the bytes from one row to the next, 0 for no gaps. Only the codes
-    in `CODES` can be read.
+    `data` is any buffer; `stride` is bytes per row, 0 for no padding. Only formats in `CODES` are
+    supported.
     """
     raw = np.frombuffer(data, np.uint8)
     if code == "MJPG":
@@ -105,4 +105,4 @@ _RAW: dict[str, tuple[int, int, Callable[[Bytes, int, int], Arrays]]] = {
 }
 
 CODES = (*_RAW, "MJPG")
-"""What can be read, the cheapest colours first; a camera without colours gives GREY."""
+"""Supported formats, the cheapest to convert first; a camera without colours gives GREY."""

@@ -1,4 +1,4 @@
-"""USB and other cameras of Video4Linux: stamped by the driver, not when they are read."""
+"""Video4Linux cameras (USB and others), stamped by the driver."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivers.camera.v4l2_node import CaptureNode, FilledBuffer, PictureFormat
 
 N_BUFFERS = 4
 MAX_AGE_NS = 2_000_000_000
-"""A stamp further than this from now is not of the clock that the driver says."""
+"""A stamp further from now is not of the clock that the driver states."""
 MAX_RATE_SHORTFALL = 0.9
 GONE = (errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EIO, errno.EPIPE, errno.EPROTO)
 
@@ -33,12 +33,12 @@ class _Stream:
     buffers: list[mmap.mmap]
     exposure_ns: int
     sequence: int | None = None
-    """Number that the driver gave to the last picture."""
+    """Sequence number of the last image."""
     stamped_by_us: bool = False
 
 
 class V4l2Camera:
-    """A camera at /dev/video…; the one that was opened first is the one opened again."""
+    """Camera at /dev/video…; reopens the one that was opened first."""
 
     live = True
     start_s = 4.0
@@ -53,7 +53,7 @@ class V4l2Camera:
         self._stream: _Stream | None = None
 
     def open(self) -> None:
-        """Set format, rate and controls, and begin; see `CameraSource`."""
+        """Set format, rate and controls, and start; see `CameraSource`."""
         self.close()
         path = self._path or find_camera()
         try:
@@ -73,7 +73,7 @@ class V4l2Camera:
             self._path = stable or self._path
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The newest picture in the driver's queue; see `CameraSource`."""
+        """Newest image in the driver's queue; see `CameraSource`."""
         stream = self._stream
         if stream is None:
             raise SourceError(f"{self.name}: the camera is not open")
@@ -94,7 +94,7 @@ class V4l2Camera:
                 return None
 
     def close(self) -> None:
-        """Stop and give the device back, so that it can come back under its own name."""
+        """Stop and release the device, so that it can come back under its own name."""
         stream, self._stream = self._stream, None
         if stream is None:
             return
@@ -223,7 +223,7 @@ class V4l2Camera:
 
 
 def _by_preference(node: CaptureNode, offered: list[str], config: CameraConfig) -> list[str]:
-    """Codes that can be read, those first that are fast enough at this size, then as in CODES."""
+    """Supported formats, those first that are fast enough at this size, then as in CODES."""
     known = [code for code in CODES if code in offered]
 
     def too_slow(code: str) -> bool:

@@ -12,10 +12,10 @@ UNUSABLE = v4l2.CTRL_FLAG_DISABLED | v4l2.CTRL_FLAG_READ_ONLY
 
 
 def apply_controls(path: str, node: CaptureNode, config: CameraConfig) -> tuple[int, list[str]]:
-    """The exposure time in ns, 0 where the camera chooses it, and what it does not do as asked.
+    """Set the controls; exposure time in ns, 0 for automatic, and deviations from the request.
 
-    What the configuration leaves to the camera is not touched. ConfigError where the camera has no
-    such control or does not take that value.
+    Controls that are not configured are left alone. ConfigError where the camera has no such
+    control or does not take that value.
     """
     controls = {each.id: each for each in node.controls() if not each.flags & UNUSABLE}
     remarks: list[str] = []

@@ -1,4 +1,4 @@
-"""Video4Linux as the kernel speaks it: structures, numbers and requests for capture.
+"""Video4Linux capture interface of the kernel: structures, constants and requests.
 
 Names are those of linux/videodev2.h, without their prefix; layouts are those of 64-bit Linux,
 which are the same on x86-64 and aarch64.
@@ -15,7 +15,7 @@ CAP_VIDEO_CAPTURE = 0x1
 CAP_VIDEO_CAPTURE_MPLANE = 0x1000
 CAP_STREAMING = 0x0400_0000
 CAP_DEVICE_CAPS = 0x8000_0000
-"""`device_caps` is filled in: what this node can do, not the whole device."""
+"""`device_caps` is valid: capabilities of this node, not of the whole device."""
 
 BUF_TYPE_VIDEO_CAPTURE = 1
 BUF_TYPE_VIDEO_CAPTURE_MPLANE = 9
@@ -29,9 +29,9 @@ BUF_FLAG_TIMESTAMP_MASK = 0xE000
 BUF_FLAG_TIMESTAMP_MONOTONIC = 0x2000
 BUF_FLAG_TSTAMP_SRC_MASK = 0x7_0000
 BUF_FLAG_TSTAMP_SRC_EOF = 0x0
-"""The stamp was taken when the last bit of the picture came."""
+"""Stamp at the end of the frame."""
 BUF_FLAG_TSTAMP_SRC_SOE = 0x1_0000
-"""The stamp was taken when the exposure began."""
+"""Stamp at the start of the exposure."""
 
 CTRL_TYPE_INTEGER = 1
 CTRL_TYPE_BOOLEAN = 2
@@ -40,7 +40,7 @@ CTRL_TYPE_INTEGER_MENU = 9
 CTRL_FLAG_DISABLED = 0x1
 CTRL_FLAG_READ_ONLY = 0x4
 CTRL_FLAG_NEXT_CTRL = 0x8000_0000
-"""With the number of a control: the one that comes after it is meant."""
+"""With the number of a control: enumerate the next one."""
 
 CID_AUTOGAIN = 0x98_0912
 CID_GAIN = 0x98_0913
@@ -314,7 +314,7 @@ _READ = 2
 
 
 def _request(direction: int, number: int, about: Any) -> int:
-    """Number of an ioctl as the kernel makes it: way, size of what is handed over, "V", number."""
+    """Number of an ioctl: direction, size of the argument, "V", number."""
     return direction << 30 | ctypes.sizeof(about) << 16 | ord("V") << 8 | number
 
 
@@ -339,9 +339,9 @@ ENUM_FRAMEINTERVALS = _request(_READ | _WRITTEN, 75, Frmivalenum)
 
 
 def ask(fd: int, request: int, about: Any) -> None:
-    """Hand `about` to the driver, which answers in it; OSError where it refuses.
+    """Pass `about` to the driver, which answers in it; OSError where it refuses.
 
-    A request that a signal interrupted is made again, after the signal's handler ran.
+    A request interrupted by a signal is repeated after the signal's handler.
     """
     while True:
         try:

@@ -1,4 +1,4 @@
-"""What a Video4Linux node offers, is told and gives, in our own words."""
+"""Video4Linux device node: capabilities, settings, buffers."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import Any
 from drivers.camera import v4l2_ioctl as v4l2
 
 MAX_ENTRIES = 1024
-"""A driver that lists more of anything than this does not come to an end."""
+"""Limit of a driver's list, which may never end."""
 END_OF_LIST = (errno.EINVAL, errno.ENOTTY, errno.ENODATA)
-"""Past the last entry; no such list; none for this input."""
+"""Errors at the end of a list: past the last entry, no such list, none for this input."""
 MAX_DENOMINATOR = 1001
-"""Rates such as 30000/1001 are met exactly."""
+"""Denominator that represents rates such as 30000/1001 exactly."""
 
 
 @dataclass(frozen=True, slots=True)
 class SizeRange:
-    """Sizes that a camera has: of one only, both ends are the same."""
+    """Range of sizes of a camera: for a single size both ends are equal."""
 
     least: tuple[int, int]
     """Width and height."""
@@ -31,7 +31,7 @@ class SizeRange:
 
 @dataclass(frozen=True, slots=True)
 class PictureFormat:
-    """How pictures lie in memory; `stride` is the bytes of a row, 0 where they have no rows."""
+    """Memory layout of images; `stride` is bytes per row, 0 where they have no rows."""
 
     code: str
     width: int
@@ -42,21 +42,21 @@ class PictureFormat:
 
 @dataclass(frozen=True, slots=True)
 class FilledBuffer:
-    """A picture that the driver has put into one of the buffers, from byte `start` to `end`."""
+    """Buffer filled by the driver: the image is in bytes `start` to `end`."""
 
     index: int
     start: int
     end: int
     stamp_ns: int
     flags: int
-    """BUF_FLAG_…: whether it is damaged, of which clock its stamp is, and of which moment."""
+    """BUF_FLAG_…: damage, clock of the stamp, and its moment."""
     sequence: int
 
 
 class CaptureNode:
     """An open /dev/video…; every call is OSError where the driver refuses or has gone.
 
-    Pictures must lie in one plane, on devices of the multi-planar kind too.
+    Images must lie in one plane, on multi-planar devices too.
     """
 
     def __init__(self, fd: int) -> None:
@@ -74,12 +74,12 @@ class CaptureNode:
         self.gives_pictures = bool(captures and able & v4l2.CAP_STREAMING)
 
     def codes(self) -> list[str]:
-        """Four-letter codes of the formats, in the driver's order."""
+        """FourCC codes of the formats, in the driver's order."""
         listed = self._each(v4l2.ENUM_FMT, lambda: v4l2.Fmtdesc(type=self._type))
         return [_code(each.pixelformat) for each in listed]
 
     def sizes(self, code: str) -> list[SizeRange]:
-        """Sizes of this format; nothing where the driver does not tell."""
+        """Sizes of this format; empty where the driver does not list them."""
         out = []
         for each in self._each(
             v4l2.ENUM_FRAMESIZES, lambda: v4l2.Frmsizeenum(pixel_format=_number(code))
@@ -103,13 +103,13 @@ class CaptureNode:
         return sorted(rates - {0.0}, reverse=True)
 
     def format(self) -> PictureFormat:
-        """The format that is set."""
+        """Format in force."""
         about = v4l2.Format(type=self._type)
         v4l2.ask(self._fd, v4l2.G_FMT, about)
         return self._stated(about)
 
     def set_format(self, code: str, width: int, height: int) -> PictureFormat:
-        """The format that the driver took, which may be another."""
+        """Set a format; the one that the driver took, which may differ."""
         about = v4l2.Format(type=self._type)
         pix = about.fmt.pix_mp if self._mplane else about.fmt.pix
         pix.width, pix.height, pix.pixelformat = width, height, _number(code)
@@ -117,7 +117,7 @@ class CaptureNode:
         return self._stated(about)
 
     def set_rate(self, rate_hz: float) -> float:
-        """The rate that the driver took, 0 where it does not tell."""
+        """Set a rate; the one that the driver took, 0 where unknown."""
         asked = Fraction(rate_hz).limit_denominator(MAX_DENOMINATOR)
         about = v4l2.Streamparm(type=self._type)
         interval = about.parm.capture.timeperframe
@@ -139,7 +139,7 @@ class CaptureNode:
         return out
 
     def menu(self, control: Any) -> dict[int, str]:
-        """What the values of a menu of names mean."""
+        """Names of the values of a menu control."""
         out = {}
         for index in range(max(0, control.minimum), min(control.maximum + 1, MAX_ENTRIES)):
             about = v4l2.Querymenu(id=control.id, index=index)
@@ -148,7 +148,7 @@ class CaptureNode:
         return out
 
     def control(self, number: int) -> int:
-        """A control's value."""
+        """Value of a control."""
         about = v4l2.Control(id=number)
         v4l2.ask(self._fd, v4l2.G_CTRL, about)
         return int(about.value)
@@ -158,7 +158,7 @@ class CaptureNode:
         v4l2.ask(self._fd, v4l2.S_CTRL, v4l2.Control(id=number, value=value))
 
     def make_buffers(self, n: int) -> list[mmap.mmap]:
-        """The driver's own memory for `n` pictures, or as many as it has, not yet queued."""
+        """Allocate the driver's memory for `n` images, or as many as it has, not yet queued."""
         made = v4l2.Requestbuffers(count=n, type=self._type, memory=v4l2.MEMORY_MMAP)
         v4l2.ask(self._fd, v4l2.REQBUFS, made)
         buffers: list[mmap.mmap] = []
@@ -176,12 +176,12 @@ class CaptureNode:
         return buffers
 
     def enqueue(self, index: int) -> None:
-        """Give a buffer to the driver, to be filled."""
+        """Give a buffer to the driver."""
         about, _ = self._buffer(index)
         v4l2.ask(self._fd, v4l2.QBUF, about)
 
     def dequeue(self) -> FilledBuffer | None:
-        """The oldest picture that has come, None if there is none; its buffer is ours then."""
+        """Oldest filled buffer, None without one; it is ours until queued again."""
         about, plane = self._buffer(0)
         try:
             v4l2.ask(self._fd, v4l2.DQBUF, about)
@@ -197,11 +197,11 @@ class CaptureNode:
         )
 
     def start(self) -> None:
-        """Let the pictures come."""
+        """Start streaming."""
         v4l2.ask(self._fd, v4l2.STREAMON, ctypes.c_int32(self._type))
 
     def stop(self) -> None:
-        """No more pictures; all buffers are ours again."""
+        """Stop streaming; all buffers are ours again."""
         v4l2.ask(self._fd, v4l2.STREAMOFF, ctypes.c_int32(self._type))
 
     def _buffer(self, index: int) -> tuple[Any, Any]:

@@ -1,1 +1,1 @@
-"""Recorded flights in the formats of other people: data sets, ROS bags, stills, videos, folders."""
+"""Recorded flights in other formats: data sets, ROS bags, stills, videos, folders."""

@@ -1,4 +1,4 @@
-"""A bag of ROS as a flight: which of its topics is the camera, and which the telemetry."""
+"""ROS bag as a flight: selects the topics of camera and telemetry."""
 
 from __future__ import annotations
 
@@ -42,25 +42,25 @@ MODELS = {
 
 
 def is_ros2_folder(path: Path) -> bool:
-    """Whether a folder has the description that those of ROS 2 have."""
+    """Whether a folder has the metadata file of a ROS 2 bag."""
     return (path / "metadata.yaml").is_file()
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a file is a bag by its name, or a folder has some of ROS 1 in it."""
+    """Whether a file is a bag by its name, or a folder holds ROS 1 bags."""
     if path.is_dir():
         return any(path.glob("*.bag"))
     return path.suffix.lower() in (".bag", ".db3", ".mcap")
 
 
 def open_bag(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """Read all of a bag but its pictures; FlightError where there are none, or it is damaged."""
+    """Read a bag without its images; FlightError where there are none, or it is damaged."""
     with open_bag_file(path) as bag:
         return _Opening(path, bag, config, telemetry).flight()
 
 
 class _Opening:
-    """One reading of a bag from begin to end."""
+    """One pass through a bag."""
 
     def __init__(
         self, path: Path, bag: Bag, config: CameraConfig, telemetry: TelemetryConfig
@@ -105,7 +105,7 @@ class _Opening:
         )  # fmt: skip
 
     def _chosen(self, what: str, *kinds: str, wanted: str = "") -> str | None:
-        """The topic of these kinds with most messages."""
+        """Topic of these types with most messages."""
         found = [topic for kind in kinds for topic in self._of_kind.get(kind, [])]
         if wanted:
             if wanted not in found:
@@ -267,11 +267,11 @@ class _Opening:
 
 
 def _place(topic: str) -> str:
-    """The namespace of a camera: compressed pictures lie one deeper."""
+    """Namespace of a camera: compressed images lie one level deeper."""
     topic = topic.removesuffix("/compressed")
     return topic.rpartition("/")[0]
 
 
 def _field(info: Any, name: str) -> Array:
-    """ROS 1 has these in capitals."""
+    """A field of CameraInfo: ROS 1 has upper-case names."""
     return np.asarray(getattr(info, name, getattr(info, name.upper(), ())), np.float64)

@@ -1,4 +1,4 @@
-"""How the frames of a bag lie in one another, by its static transforms."""
+"""Static transforms between the frames of a bag."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.datasets.bag_samples import pose_of_transform
 
 
 class StaticFrames:
-    """A forest of frames, of /tf_static."""
+    """Forest of frames, from /tf_static."""
 
     def __init__(self) -> None:
         self._next: dict[str, dict[str, Pose]] = {}
@@ -27,7 +27,7 @@ class StaticFrames:
             self._next.setdefault(child, {})[parent] = parent_from_child.inverse()
 
     def between(self, a: str, b: str) -> Pose | None:
-        """The transform `a_from_b`; None where they do not hang together."""
+        """Transform `a_from_b`; None where they are not connected."""
         a, b = _plain(a), _plain(b)
         reached = {a: Pose.identity()}
         waiting = deque([a])
@@ -42,7 +42,7 @@ class StaticFrames:
         return None
 
     def first_known(self, names: Iterable[str]) -> str | None:
-        """The first of these frames that is in a transform."""
+        """First of these frames that has a transform."""
         return next((name for name in names if _plain(name) in self._next), None)
 
 

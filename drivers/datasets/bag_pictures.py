@@ -1,4 +1,4 @@
-"""The pictures of a bag's image topic, raw or compressed."""
+"""Images of a bag's topic, raw or compressed."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ ENCODINGS: dict[str, tuple[str, int, Convert]] = {
     "bayer_gbrg8": ("u1", 1, lambda i: cv2.cvtColor(i, cv2.COLOR_BayerGR2RGB)),
     "bayer_grbg8": ("u1", 1, lambda i: cv2.cvtColor(i, cv2.COLOR_BayerGB2RGB)),
 }
-"""Type of a number, numbers a pixel, and how to RGB."""
+"""Data type, channels, and conversion to RGB."""
 
 
 def rgb_of(message: Any) -> Bytes | None:
-    """The picture (H, W, 3) of a decoded Image or CompressedImage; None where it is damaged.
+    """Image (H, W, 3) of a decoded Image or CompressedImage; None where it is damaged.
 
-    FlightError where its encoding is not known.
+    FlightError for an unknown encoding.
     """
     if hasattr(message, "format"):
         data = np.frombuffer(message.data, np.uint8)
@@ -74,7 +74,7 @@ def rgb_of(message: Any) -> Bytes | None:
 
 
 class BagPictures:
-    """The pictures of one topic, in order of their recording; see `FrameSource`."""
+    """Images of one topic, in order of their recording; see `FrameSource`."""
 
     def __init__(
         self, path: Path, topic: str, recorded_ns: Sequence[int], stamps_ns: Sequence[int],
@@ -88,19 +88,19 @@ class BagPictures:
 
     @property
     def n_frames(self) -> int:
-        """How many pictures the topic has."""
+        """Number of images."""
         return len(self._recorded_ns)
 
     def own_times_ns(self) -> list[int]:
-        """The stamps of the pictures' headers."""
+        """Header stamps of the images."""
         return list(self._stamps_ns)
 
     def epoch(self) -> tuple[int, str]:
-        """Stamps count from 1970."""
+        """Unix epoch."""
         return 0, "the stamps in the bag"
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
-        """Number and RGB image of pictures first..last; None for a damaged or odd-sized one."""
+        """Number and RGB image of images first..last; None for a damaged or odd-sized one."""
         number = first
         # several may have been written in the same nanosecond
         while number > 0 and self._recorded_ns[number - 1] == self._recorded_ns[first]:

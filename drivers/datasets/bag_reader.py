@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2 (sqlite or MCAP), opened for a while, their errors made ours."""
+"""Reader of ROS 1 and ROS 2 bags (sqlite or MCAP), with our errors."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ DAMAGE = (
     struct.error, zlib.error, ArithmeticError, AssertionError, AttributeError, EOFError,
     LookupError, MemoryError, OSError, RecursionError, RuntimeError, TypeError, ValueError,
 )  # fmt: skip
-"""What the readers below raise on files that are not as they should be."""
+"""Exceptions of the readers on damaged files."""
 STAMP_AT = 4
-"""Where a message with a header has its seconds and nanoseconds, in ROS 1 as in ROS 2."""
+"""Offset of a header's seconds and nanoseconds, in ROS 1 as in ROS 2."""
 
 
 class BagMessage(NamedTuple):
-    """A message as it lies in a bag; `recorded_ns` is when it was written there."""
+    """Raw message of a bag; `recorded_ns` is the time of its recording."""
 
     topic: str
     kind: str
@@ -52,7 +52,7 @@ class Bag:
         self._name = name
 
     def topics(self) -> dict[str, tuple[str, int]]:
-        """The kind of message of each topic, as in `sensor_msgs/Image`, and how many there are."""
+        """Type of each topic, as in `sensor_msgs/Image`, and its number of messages."""
         found: dict[str, tuple[str, int]] = {}
         for connection in self._reader.connections:
             _, n = found.get(connection.topic, ("", 0))
@@ -83,7 +83,7 @@ class Bag:
             return None
 
     def stamp_ns(self, message: BagMessage) -> int:
-        """When what it tells of was, by its header; when it was recorded where that is empty."""
+        """Header stamp of a message; time of recording where that is empty."""
         if len(message.raw) < STAMP_AT + 8:
             return message.recorded_ns
         little = not self._reader.is2 or message.raw[1] & 1
@@ -93,7 +93,7 @@ class Bag:
 
 @contextmanager
 def open_bag_file(path: Path) -> Iterator[Bag]:
-    """A bag in a file, or in a folder of one or several; FlightError where there is none."""
+    """Bag in a file, or in a folder of one or several; FlightError where there is none."""
     several = sorted(path.glob("*.bag")) if path.is_dir() else []
     reader = None
     try:

@@ -1,7 +1,7 @@
-"""Messages of ROS as telemetry: world east-north-up and body forward-left-up become NED and FRD.
+"""ROS messages as telemetry: world ENU and body FLU become NED and FRD.
 
-Axes are by REP 103, what an IMU's orientation is relative to by REP 145. A message counts as of
-the body's own frame unless static transforms say how its frame lies in it.
+Axes are by REP 103, the reference of an IMU's orientation by REP 145. A message counts as of the
+body frame unless static transforms say otherwise.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LEAST_PRESSURE_PA = 1e4
 
 
 def imu_samples(message: Any, body_from_imu: Array, with_attitude: bool) -> Iterator[Telemetry]:
-    """Rates and accelerations, and its orientation where it has one."""
+    """Rates and accelerations, and the orientation if valid."""
     turn = FRD_FROM_FLU @ body_from_imu
     gyro = turn @ _xyz(message.angular_velocity)
     yield ImuSample(0, gyro, turn @ _xyz(message.linear_acceleration))
@@ -48,7 +48,7 @@ def imu_samples(message: Any, body_from_imu: Array, with_attitude: bool) -> Iter
 
 
 def odometry_samples(message: Any, body_from_child: Pose) -> Iterator[Telemetry]:
-    """Position, velocity and attitude of an Odometry, which is of its child frame."""
+    """Position, velocity and attitude of an Odometry, in its child frame."""
     rotation = _rotation(message.pose.pose.orientation)
     position = _xyz(message.pose.pose.position)
     if rotation is None:
@@ -74,7 +74,7 @@ def pose_samples(message: Any) -> Iterator[Telemetry]:
 
 
 def fix_samples(message: Any) -> Iterator[GeodeticFix]:
-    """The place of a NavSatFix, unless it says that it has no fix."""
+    """Position of a NavSatFix; none without a fix."""
     if message.status.status < 0:
         return
     sigmas: tuple[float | None, float | None] = (None, None)
@@ -88,13 +88,13 @@ def fix_samples(message: Any) -> Iterator[GeodeticFix]:
 
 
 def pressure_samples(message: Any) -> Iterator[Telemetry]:
-    """Height of a FluidPressure of the air, in pascals."""
+    """Barometric height of a FluidPressure of the air (pascals)."""
     if message.fluid_pressure > LEAST_PRESSURE_PA:
         yield HeightSample(0, height_from_pressure(float(message.fluid_pressure)))
 
 
 def pose_of_transform(transform: Any) -> Pose | None:
-    """A geometry_msgs/Transform; None where its rotation is none."""
+    """Pose of a geometry_msgs/Transform; None for an invalid rotation."""
     rotation = _rotation(transform.rotation)
     return None if rotation is None else Pose(rotation, _xyz(transform.translation))
 

@@ -1,4 +1,4 @@
-"""Sequences of EuRoC MAV and of what is laid out like it (ASL format): folders in `mav0/`.
+"""EuRoC MAV sequences and others in ASL format: folders in `mav0/`.
 
 The body is the frame that the sequence calls so, which is its IMU's; its axes need not be forward,
 right and down, and nothing here turns them. What the sequence was measured with from outside
@@ -37,7 +37,7 @@ def is_euroc(path: Path) -> bool:
 
 
 def open_euroc(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """Camera cam0 and IMU imu0 of a sequence; FlightError where it is not whole."""
+    """Camera cam0 and IMU imu0 of a sequence; FlightError where it is incomplete."""
     mav = _mav(path)
     listing = mav / "cam0" / "data.csv"
     rows = read_rows(listing, 2)

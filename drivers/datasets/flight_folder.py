@@ -1,4 +1,4 @@
-"""A flight folder: pictures, their times, a calibration and the autopilot's log."""
+"""Flight folder: images, their times, a calibration and the autopilot's log."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from drivers.telemetry.video_alignment import read_unaligned
 
 
 def is_flight_folder(path: Path) -> bool:
-    """Whether a folder has the list of times that only a flight folder has."""
+    """Whether a folder has the frame times of a flight folder."""
     return (path / "frames.csv").is_file()
 
 
 def has_pictures(path: Path) -> bool:
-    """Whether a folder has a video or images, which is enough where nothing else is known."""
+    """Whether a folder has a video or images, which is enough for a fallback."""
     wanted = VIDEO_SUFFIXES | IMAGE_SUFFIXES
     inside = [path, *(p for p in (path / "images",) if p.is_dir())]
     return any(p.suffix.lower() in wanted for folder in inside for p in folder.iterdir())
@@ -40,7 +40,7 @@ def has_pictures(path: Path) -> bool:
 def open_flight_folder(
     path: Path, config: CameraConfig, telemetry_config: TelemetryConfig
 ) -> Flight:
-    """Open a flight folder and check all of it but the telemetry; FlightError where it is amiss."""
+    """Open a flight folder and check all but the telemetry; FlightError where invalid."""
     source = find_frames(path)
     numbers, times_ns, warnings = _times(path, source)
     camera, assumed = camera_of(path / "camera.json", source, config, times_ns[0])
@@ -60,11 +60,11 @@ def open_flight_folder(
 def camera_of(
     calibration: Path, source: FrameSource, config: CameraConfig, t_ns: int
 ) -> tuple[Camera, list[Warned]]:
-    """The camera by its file or `K.txt` beside it, else an assumed one, with a warning."""
+    """Camera by its file or `K.txt` beside it, else an assumed one, with a warning."""
     if calibration.exists():
         camera = read_calibration(calibration, source.width, source.height)
-        told = f"{calibration.name} says so itself"
-        return camera, [Warned(t_ns, "the camera is assumed", told)] if camera.assumed else []
+        detail = f"{calibration.name} says so itself"
+        return camera, [Warned(t_ns, "the camera is assumed", detail)] if camera.assumed else []
     matrix = calibration.with_name("K.txt")
     if matrix.exists():
         return read_matrix(matrix, source.width, source.height), []

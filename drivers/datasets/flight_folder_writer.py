@@ -1,4 +1,4 @@
-"""Any flight as a flight folder: what was read of it, so that it is read again as it was."""
+"""Writes any flight as a flight folder, which reads back equal."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from drivers.telemetry.telemetry_csv import NAME, telemetry_csv
 PNG_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
-def write_flight_folder(flight: Flight, out: Path, told: Callable[[int], None]) -> int:
+def write_flight_folder(flight: Flight, out: Path, on_progress: Callable[[int], None]) -> int:
     """Write all of a flight into folder `out`, which must not be there yet, or be empty.
 
-    A video and image files are copied as they are, other pictures become PNG. Return how many
-    frames it has; `told` hears of them on the way. FlightError where it cannot be written, and
-    then nothing is.
+    A video and image files are copied as they are, other images become PNG. Return the number of
+    frames; `on_progress` takes the number done. FlightError where it cannot be written; then
+    nothing is left.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FlightError(f"{out}: is there already; give a folder that is not, or empty")
@@ -37,7 +37,7 @@ def write_flight_folder(flight: Flight, out: Path, told: Callable[[int], None]) 
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
         try:
-            n = _write(flight, part, told)
+            n = _write(flight, part, on_progress)
             if out.exists():
                 out.rmdir()
             os.replace(part, out)
@@ -49,9 +49,9 @@ def write_flight_folder(flight: Flight, out: Path, told: Callable[[int], None]) 
     return n
 
 
-def _write(flight: Flight, folder: Path, told: Callable[[int], None]) -> int:
+def _write(flight: Flight, folder: Path, on_progress: Callable[[int], None]) -> int:
     log = flight.telemetry()
-    listed = _pictures(flight, folder, told)
+    listed = _pictures(flight, folder, on_progress)
     rows = [HEADER, *(f"{number},{t_ns}" for number, t_ns in listed)]
     (folder / "frames.csv").write_text("\n".join(rows) + "\n")
     (folder / "camera.json").write_text(json.dumps(camera_json(flight.camera), indent=1) + "\n")
@@ -72,7 +72,7 @@ def _write(flight: Flight, folder: Path, told: Callable[[int], None]) -> int:
 
 
 def camera_json(camera: Camera) -> dict[str, object]:
-    """A camera as `read_calibration` takes it."""
+    """A camera in the format of `read_calibration`."""
     said: dict[str, object] = {
         "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
         "cx": camera.cx, "cy": camera.cy, "distortion_model": camera.distortion.value,
@@ -85,14 +85,16 @@ def camera_json(camera: Camera) -> dict[str, object]:
     return said
 
 
-def _pictures(flight: Flight, folder: Path, told: Callable[[int], None]) -> list[tuple[int, int]]:
+def _pictures(
+    flight: Flight, folder: Path, on_progress: Callable[[int], None]
+) -> list[tuple[int, int]]:
     """Number in the new folder and time of each frame."""
     source = flight.source
     frames = list(zip(flight.numbers, flight.times_ns, strict=True))
     if isinstance(source, Video):
         name = "camera" + source.path.suffix.lower()
         shutil.copyfile(source.path, folder / name)
-        told(len(frames))
+        on_progress(len(frames))
         return frames
     (folder / "images").mkdir()
     listed: list[tuple[int, int]] = []
@@ -103,7 +105,7 @@ def _pictures(flight: Flight, folder: Path, told: Callable[[int], None]) -> list
                 name = f"{len(listed):06d}{file.suffix.lower()}"
                 shutil.copyfile(file, folder / "images" / name)
                 listed.append((len(listed), t_ns))
-                told(len(listed))
+                on_progress(len(listed))
         return listed
     for frame in flight.frames():
         if isinstance(frame, Frame):
@@ -111,5 +113,5 @@ def _pictures(flight: Flight, folder: Path, told: Callable[[int], None]) -> list
             if not cv2.imwrite(str(path), frame.rgb[..., ::-1], PNG_FAST):
                 raise OSError(5, "the picture was not written")
             listed.append((len(listed), frame.t_ns))
-            told(len(listed))
+            on_progress(len(listed))
     return listed

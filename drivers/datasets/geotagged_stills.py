@@ -1,4 +1,4 @@
-"""A folder of photographs with their places in EXIF, as mapping cameras take them, as a flight."""
+"""Geotagged still images (EXIF) of mapping cameras as a flight."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from drivers.telemetry.telemetry_log import GeodeticFix, LogContent, TelemetryCo
 SUFFIXES = frozenset({".jpg", ".jpeg", ".tif", ".tiff"})
 LEAST = 3
 ZONE_NS = 900_000_000_000
-"""Zones of time are whole quarters of an hour apart."""
+"""Time zones are whole quarters of an hour apart."""
 SECOND_NS = 1_000_000_000
 SUSPECT_CLIMB_M = 20.0
 SUSPECT_SHARE = 0.9
 
 
 def is_geotagged(path: Path) -> bool:
-    """Whether a folder holds photographs, without a video, and one of the first has a place."""
+    """Whether a folder holds stills, without a video, and one of the first is geotagged."""
     if any(p.suffix.lower() in VIDEO_SUFFIXES for p in path.iterdir()):
         return False
     files = _files(path)
@@ -42,7 +42,7 @@ def is_geotagged(path: Path) -> bool:
 
 
 def open_geotagged(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """Photographs in order of time; FlightError where they do not tell it."""
+    """Stills in order of time; FlightError without times."""
     files = _files(path)
     found = [photo for photo in map(read_photo, files) if photo is not None]
     timed = [photo for photo in found if photo.local_ns is not None or photo.utc_ns is not None]
@@ -92,7 +92,7 @@ def _in_order(photos: Sequence[Photo]) -> tuple[list[Photo], list[int]]:
 
 
 def _zone_ns(photos: Sequence[Photo]) -> int:
-    """The camera's clock before that of satellites, as whole quarters of an hour."""
+    """Camera clock minus satellite time, in whole quarters of an hour."""
     apart = [p.local_ns - p.utc_ns for p in photos if p.local_ns is not None and p.utc_ns]
     return round(float(np.median(apart)) / ZONE_NS) * ZONE_NS if apart else 0
 
@@ -149,7 +149,7 @@ def _places(photos: Sequence[Photo], times_ns: Sequence[int]) -> tuple[LogConten
 def _heights(
     placed: Sequence[tuple[int, Photo]], start_ns: int
 ) -> tuple[list[float], list[Warned]]:
-    """Heights by barometer where there is one; where they cannot be believed, one for all."""
+    """Barometric heights if given; one height for all where they are implausible."""
     if not placed:
         return [], []
     relative = [photo.relative_altitude_m for _, photo in placed]
@@ -157,13 +157,13 @@ def _heights(
         first = placed[0][1]
         base_m = (first.altitude_m or 0.0) - (first.relative_altitude_m or 0.0)
         return [base_m + (height or 0.0) for height in relative], []
-    told = [photo.altitude_m for _, photo in placed]
-    known = [height for height in told if height is not None]
-    if len(known) < len(told):
+    heights = [photo.altitude_m for _, photo in placed]
+    known = [height for height in heights if height is not None]
+    if len(known) < len(heights):
         middle = float(np.median(known)) if known else 0.0
         what = "heights are missing in EXIF: the flight is taken to be level"
-        detail = f"{len(told) - len(known)} of {len(told)}; taken: {middle:.1f} m"
-        return [middle] * len(told), [Warned(start_ns, what, detail)]
+        detail = f"{len(heights) - len(known)} of {len(heights)}; taken: {middle:.1f} m"
+        return [middle] * len(heights), [Warned(start_ns, what, detail)]
     t_s = np.array([(t_ns - start_ns) * 1e-9 for t_ns, _ in placed])
     climb = _steady_climb(t_s, np.array(known))
     if climb is None:
@@ -175,9 +175,9 @@ def _heights(
 
 
 def _steady_climb(t_s: Array, height_m: Array) -> float | None:
-    """How far heights drift from begin to end, if that explains most of them; None if it does not.
+    """Drift of heights from begin to end, if that explains most of them; else None.
 
-    Photographs for maps are taken level; a receiver that has just been switched on drifts.
+    Mapping flights are level; a receiver that has just been switched on drifts.
     """
     if len(t_s) < 10 or np.ptp(height_m) < SUSPECT_CLIMB_M:
         return None

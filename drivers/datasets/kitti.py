@@ -1,4 +1,4 @@
-"""Sequences of the KITTI odometry benchmark: `calib.txt`, `times.txt`, `image_2/` or `image_0/`.
+"""KITTI odometry sequences: `calib.txt`, `times.txt`, `image_2/` or `image_0/`.
 
 The true poses lie beside the sequences, `poses/NN.txt`, and are those of the left grey camera.
 """
@@ -21,7 +21,7 @@ from drivers.images.text_table import ns_of_seconds, numbers_of, read_rows
 from drivers.telemetry.telemetry_log import no_telemetry
 
 CAMERAS = ("image_2", "image_0", "image_3", "image_1")
-"""Folders of images: colour is preferred, then the left one."""
+"""Folders of images, in order of preference: colour, then left."""
 
 
 def is_kitti(path: Path) -> bool:
@@ -30,7 +30,7 @@ def is_kitti(path: Path) -> bool:
 
 
 def open_kitti(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """One camera of a sequence; FlightError where it is not whole."""
+    """One camera of a sequence; FlightError where it is incomplete."""
     folder = next((path / name for name in CAMERAS if (path / name).is_dir()), None)
     if folder is None:
         raise FlightError(f"{path}: no images; wanted is one of {', '.join(CAMERAS)}")

@@ -1,6 +1,6 @@
 """Folders of images with poses but without times (REMODE, deep-video-mvs), as a flight.
 
-Their poses are for scoring: the images are taken to come at a nominal rate.
+Their poses are ground truth: the images get times of a nominal rate.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ STEP_NS = 100_000_000
 
 
 def is_posed_folder(path: Path) -> bool:
-    """Whether a folder is of one of these layouts."""
+    """Whether a folder has one of these layouts."""
     posed_video = (path / "K.txt").is_file() and (path / "poses.txt").is_file()
     return posed_video or any(path.glob("*input_sequence*.txt"))
 
 
 def open_posed_flight(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """Open such a folder; FlightError where it is not whole."""
+    """Open such a folder; FlightError where it is incomplete."""
     images = open_posed_images(path)
     times_ns = [number * STEP_NS for number in range(len(images))]
     warned = Warned(times_ns[0], "no times: images are taken to come at 10/s", images.layout)
@@ -42,7 +42,7 @@ def open_posed_flight(path: Path, config: CameraConfig, telemetry: TelemetryConf
 
 
 class PosedPictures:
-    """The pictures of such a folder; see `FrameSource`."""
+    """Images of such a folder; see `FrameSource`."""
 
     def __init__(self, images: PosedImages) -> None:
         self.path = images.path
@@ -51,7 +51,7 @@ class PosedPictures:
 
     @property
     def n_frames(self) -> int:
-        """How many images the folder's list has."""
+        """Number of images in the folder's list."""
         return len(self._images)
 
     def own_times_ns(self) -> list[int]:

@@ -1,6 +1,6 @@
-"""Images whose cameras' poses are known: what the dense engine is measured on.
+"""Images with known camera poses, for measurements of the depth engine.
 
-| layout | told by | poses | truth, for scoring only |
+| layout | recognised by | poses | truth, for scoring only |
 |---|---|---|---|
 | REMODE | `first_200_frames_traj_over_table_input_sequence.txt` or another `*input_sequence*.txt` | world from camera, y up | `truth/`: distance, 0.1 mm |
 | TUM RGB-D | `rgb.txt`, `groundtruth.txt` | nearest within 20 ms | `depth.txt`: depth, 0.2 mm |
@@ -31,11 +31,11 @@ def _no_truth(index: int) -> Floats | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedImages:
-    """Images in order, with the pose `world_from_camera` of each; None where there is none.
+    """Images in order, with the pose `world_from_camera` of each; None where unknown.
 
-    `numbers` are the frames' numbers in their folder, by which they are asked for. `pictures` reads
-    RGB images (H, W, 3) by position in `numbers`, ascending. `truth` gives the true depth (H, W)
-    f32 along z of a frame by position, 0 where unknown, or None.
+    `numbers` are the frames' numbers in their folder. `pictures` reads RGB images (H, W, 3) by
+    ascending positions in `numbers`. `truth` gives the true depth (H, W) f32 along z of a frame by
+    position, 0 where unknown, or None.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class PosedImages:
 
 
 def read_rgb(path: Path) -> Bytes:
-    """An image file as RGB (H, W, 3); FlightError if it is none."""
+    """Image file as RGB (H, W, 3); FlightError if invalid."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise FlightError(f"{path}: not an image that can be read")
@@ -59,7 +59,7 @@ def read_rgb(path: Path) -> Bytes:
 
 
 def read_depth(path: Path, units_per_m: float) -> Floats | None:
-    """A 16 bit depth image (H, W) in metres, 0 where unknown; None where there is no such file."""
+    """16-bit depth image (H, W) in metres, 0 where unknown; None without a file."""
     if not path.exists():
         return None
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -69,7 +69,7 @@ def read_depth(path: Path, units_per_m: float) -> Floats | None:
 
 
 def pictures_of(files: list[Path], camera: Camera) -> Callable[..., Iterator[tuple[int, Bytes]]]:
-    """A reader of files by position; FlightError where one has another size than the camera."""
+    """Reader of files by position; FlightError for an image of another size than the camera's."""
 
     def pictures(positions: Iterable[int]) -> Iterator[tuple[int, Bytes]]:
         for position in positions:

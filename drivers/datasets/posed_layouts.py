@@ -1,4 +1,4 @@
-"""The layouts of folders with posed images, and which of them a folder is."""
+"""Layouts of folders with posed images, and their detection."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from drivers.images.calibration_file import read_calibration
 from drivers.images.frame_source import IMAGE_SUFFIXES
 
 REMODE_FOCAL_PX = (481.2, 480.0)
-"""Of the test set's camera, whose images are 640 x 480."""
+"""Camera of the test set, whose images are 640 x 480."""
 TUM_CAMERAS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "freiburg3": (535.4, 539.2, 320.1, 247.6, (0.0, 0.0, 0.0, 0.0, 0.0)),
 }
 TUM_CAMERA = (525.0, 525.0, 319.5, 239.5, (0.0, 0.0, 0.0, 0.0, 0.0))
-TUM_APART_S = 0.02
+TUM_TIME_DIFFERENCE_S = 0.02
 POSE_GAP_S = 0.5
-"""Poses of a flight further apart than this say nothing of what is between them."""
+"""Longest interval over which poses are interpolated."""
 
 
 def open_posed_images(path: Path) -> PosedImages:
-    """A folder of any known layout; FlightError where it is none, or not whole."""
+    """Folder of any known layout; FlightError for any other, or an incomplete one."""
     if not path.is_dir():
         raise FlightError(f"{path}: there is no such folder")
     sequences = sorted(path.glob("*input_sequence*.txt"))
@@ -95,7 +95,7 @@ def _tum(path: Path) -> PosedImages:
         camera = Camera(width, height, *named[:4], distortion, coefficients)
     nearest = [int(np.abs(pose_s - stamp).argmin()) for stamp in stamps]
     poses = tuple(
-        known[i] if abs(pose_s[i] - stamp) <= TUM_APART_S else None
+        known[i] if abs(pose_s[i] - stamp) <= TUM_TIME_DIFFERENCE_S else None
         for stamp, i in zip(stamps, nearest, strict=True)
     )
     depth_rows = list(_rows(path / "depth.txt", 2)) if (path / "depth.txt").exists() else []
@@ -105,7 +105,7 @@ def _tum(path: Path) -> PosedImages:
         if len(depth_s) == 0:
             return None
         i = int(np.abs(depth_s - stamps[position]).argmin())
-        if abs(depth_s[i] - stamps[position]) > TUM_APART_S:
+        if abs(depth_s[i] - stamps[position]) > TUM_TIME_DIFFERENCE_S:
             return None
         return read_depth(path / depth_rows[i][1], 5000.0)
 
@@ -179,7 +179,7 @@ def _tum_poses(path: Path) -> tuple[Array, list[Pose]]:
 
 
 def _rows(path: Path, n_words: int) -> Iterator[list[str]]:
-    """Lines of a table, split, without comments; FlightError where one is short or none is."""
+    """Rows of a table, split, without comments; FlightError for a short row or none."""
     try:
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -1,6 +1,6 @@
-"""Sequences of the TUM RGB-D benchmark and of what is laid out like it: images in `rgb.txt`.
+"""TUM RGB-D sequences and others of that layout: images in `rgb.txt`.
 
-Only the colour images are read: the depth images are no camera's of ours.
+Only the colour images are read.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def is_tum_rgbd(path: Path) -> bool:
 
 
 def open_tum_rgbd(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """The colour images of a sequence; FlightError where it is not whole."""
+    """Colour images of a sequence; FlightError where it is incomplete."""
     listing = path / "rgb.txt"
     stamped = [(ns_of_seconds(listing, t), path / name) for t, name, *_ in read_rows(listing, 2)]
     source, numbers, times_ns, warnings = listed_images(listing, stamped)

@@ -1,4 +1,4 @@
-"""A video by itself, with what lies beside it under the same name, as a flight."""
+"""Single video, with files of the same name beside it, as a flight."""
 
 from __future__ import annotations
 

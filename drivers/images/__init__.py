@@ -1,1 +1,1 @@
-"""Images from files, their times and metadata, and the calibration file of a camera."""
+"""Images from files, their times and metadata, and camera calibration files."""

@@ -1,4 +1,4 @@
-"""A camera's calibration file: intrinsics, distortion and the camera's place on the body."""
+"""Camera calibration file: intrinsics, distortion, and mounting on the body."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ FORWARD_UPRIGHT: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 
 
 
 def read_calibration(path: Path, width: int, height: int) -> Camera:
-    """The camera of a JSON or TOML file, which must be for pictures of this size.
+    """Camera of a JSON or TOML file, which must be for images of this size.
 
-    FlightError otherwise. Coefficients stand under their names or as a list `D`, where radtan's
-    fifth may be left out.
+    FlightError otherwise. Coefficients are given by name or as a list `D`, where radtan's fifth may
+    be left out.
     """
     content = _content(path)
     size = tuple(_number(path, content, key) for key in ("width", "height"))
@@ -65,7 +65,7 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
 
 
 def read_matrix(path: Path, width: int, height: int) -> Camera:
-    """The camera of an intrinsic matrix as text, three rows of three; FlightError if it is none."""
+    """Camera of an intrinsic matrix as text, three rows of three; FlightError if invalid."""
     matrix = np.array([numbers_of(path, words[:3]) for words in read_rows(path, 3)])
     if matrix.shape != (3, 3) or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise FlightError(f"{path}: wanted an intrinsic matrix, three rows of three numbers")
@@ -76,7 +76,7 @@ def read_matrix(path: Path, width: int, height: int) -> Camera:
 
 
 def assumed_camera(width: int, height: int, hfov_deg: float) -> Camera:
-    """A camera without distortion and with this horizontal field of view, marked as assumed."""
+    """Camera without distortion and with this horizontal field of view, marked as assumed."""
     focal = 0.5 * width / math.tan(math.radians(hfov_deg) / 2)
     centre = (width - 1) / 2, (height - 1) / 2
     return Camera(width, height, focal, focal, *centre, assumed=True)
@@ -142,7 +142,7 @@ def _coefficients(path: Path, content: Mapping[str, Any], model: Distortion) -> 
 
 
 def body_from_camera_of(path: Path, given: Any) -> Pose | None:
-    """The transform that a 4 x 4 matrix is, None for None; FlightError where it is none."""
+    """Transform of a 4 x 4 matrix, None for None; FlightError if invalid."""
     if given is None:
         return None
     try:

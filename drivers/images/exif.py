@@ -1,4 +1,4 @@
-"""What a photograph says of itself: when, where and through what lens (EXIF, and DJI's XMP)."""
+"""Metadata of a still image: time, position and lens (EXIF, and DJI's XMP)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DAMAGE = (
     UnidentifiedImageError, OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError,
     ArithmeticError, AttributeError, EOFError, MemoryError, RuntimeError, struct.error,
 )  # fmt: skip
-"""What Pillow raises on files that are not as they should be."""
+"""Exceptions of Pillow on damaged files."""
 FILM_DIAGONAL_MM = 43.2666
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 XMP_NUMBER = re.compile(
@@ -28,10 +28,10 @@ MAX_XMP = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Photo:
-    """Facts of one photograph; what it does not tell is None.
+    """Metadata of one still; unknown values are None.
 
-    `local_ns` is by the camera's clock, whose zone is unknown, `utc_ns` by satellites, whole
-    seconds both; `subsecond_ns` belongs to the first. `focal_px` is for the picture as it is.
+    `local_ns` is by the camera's clock, of unknown zone, `utc_ns` by satellites, both whole
+    seconds; `subsecond_ns` belongs to the first. `focal_px` is for the image size as it is.
     `gimbal_deg` is roll, pitch and yaw of the camera, where a pitch of 0 looks at the horizon.
     """
 
@@ -51,7 +51,7 @@ class Photo:
 
 
 def read_photo(path: Path) -> Photo | None:
-    """The facts of a photograph; None where the file is none."""
+    """Metadata of a still; None where the file is no image."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of damage in parts that are not looked at
@@ -87,7 +87,7 @@ def _photo(path: Path, image: Image.Image) -> Photo:
 
 
 def _camera(make: str, model: str) -> str:
-    """Both, unless the model says who made it."""
+    """Make and model, unless the model contains the make."""
     return model if model.startswith(make) else f"{make} {model}".strip()
 
 
@@ -104,7 +104,7 @@ def _xmp(image: Image.Image) -> dict[str, float]:
 
 
 def _focal_px(shot: Mapping[int, Any], width: int, height: int) -> float | None:
-    """By the sensor's pitch where that is told, else by what it is for 35 mm film."""
+    """Focal length by the sensor's pixel pitch if given, else by its 35 mm equivalent."""
     base = ExifTags.Base
     focal_mm = _number(shot.get(base.FocalLength))
     per_unit = _number(shot.get(base.FocalPlaneXResolution))

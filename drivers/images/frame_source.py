@@ -1,7 +1,7 @@
-"""Where a flight's pictures lie: a video or a folder of numbered images, decoded one by one.
+"""Source of a flight's images: a video or a folder of numbered images, decoded one by one.
 
-A picture keeps the number it has in its file, whatever becomes of its neighbours: one that cannot
-be decoded leaves a hole and shifts nothing.
+An image keeps its number in the file, whatever becomes of its neighbours: one that cannot be
+decoded leaves a gap and shifts nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
 
 
 class FrameSource(Protocol):
-    """Pictures by number; what cannot be decoded comes as None."""
+    """Images by number; one that cannot be decoded comes as None."""
 
     path: Path
     width: int
@@ -32,16 +32,16 @@ class FrameSource(Protocol):
 
     @property
     def n_frames(self) -> int:
-        """How many there are."""
+        """Number of images."""
 
     def own_times_ns(self) -> list[int]:
-        """Times of the pictures in their file, which begin about zero."""
+        """Times of the images in their file, which begin about zero."""
 
     def epoch(self) -> tuple[int, str]:
-        """Unix time in ns of zero of these, as far as the file knows, and that in words."""
+        """Unix time in ns of zero of these, as far as the file knows, and its source in words."""
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
-        """Number and RGB image (H, W, 3) of pictures first..last, both included."""
+        """Number and RGB image (H, W, 3) of images first..last, both included."""
 
 
 def find_frames(folder: Path) -> FrameSource:
@@ -67,7 +67,7 @@ def _natural(path: Path) -> list[tuple[bool, int, str]]:
 
 
 class Video:
-    """A video file; its pictures are numbered in the order in which they are shown."""
+    """Video file; its images are numbered in presentation order."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -89,7 +89,7 @@ class Video:
 
     @property
     def n_frames(self) -> int:
-        """How many pictures the file holds, decodable or not."""
+        """Number of images in the file, decodable or not."""
         return len(self._pts)
 
     def own_times_ns(self) -> list[int]:
@@ -99,11 +99,11 @@ class Video:
         return [round(pts * unit_ns) for pts in self._pts]
 
     def epoch(self) -> tuple[int, str]:
-        """The time of creation that the file states, else zero."""
+        """Creation time of the file, else zero."""
         return self._created_ns, "the file's time of creation" if self._created_ns else "zero"
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
-        """Number and RGB image of pictures first..last; None where one cannot be decoded."""
+        """Number and RGB image of images first..last; None where one cannot be decoded."""
         expected = first
         with av.open(str(self.path)) as container:
             stream = container.streams.video[0]
@@ -190,15 +190,15 @@ class ImageFolder:
 
     @property
     def n_frames(self) -> int:
-        """How many image files there are."""
+        """Number of image files."""
         return len(self._files)
 
     def file(self, number: int) -> Path:
-        """Where image `number` lies, if it does."""
+        """Path of image `number`, if it exists."""
         return self._files[number]
 
     def own_times_ns(self) -> list[int]:
-        """Ten images a second: image files say nothing of time."""
+        """Times of a nominal rate of ten images a second: image files have none."""
         return [number * 100_000_000 for number in range(self.n_frames)]
 
     def epoch(self) -> tuple[int, str]:

@@ -1,4 +1,4 @@
-"""When each frame was taken: the list `frames.csv`, lines of `index,unix_ns`."""
+"""Exposure times of frames: `frames.csv`, lines of `index,unix_ns`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ HEADER = "index,unix_ns"
 
 
 def read_frame_times(path: Path) -> tuple[list[int], list[int], list[Warned]]:
-    """Indices and times, both increasing, and what was wrong; FlightError if it is no such list.
+    """Indices and times, both increasing, and warnings; FlightError for no such list.
 
-    A last line that was cut off is left out, and so is a frame stamped no later than the last.
+    An incomplete last line is ignored, and so is a frame stamped no later than the last.
     """
     try:
         lines = path.read_text("utf-8").splitlines()

@@ -1,4 +1,4 @@
-"""Images that a list names with the time of each, as most data sets have them."""
+"""Images listed with their times, as in most data sets."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from drivers.images.frame_source import ImageFolder
 def listed_images(
     listing: Path, stamped: Sequence[tuple[int, Path]]
 ) -> tuple[ImageFolder, list[int], list[int], list[Warned]]:
-    """Images with their numbers, times and what was amiss; FlightError where there are none.
+    """Images with their numbers, times and warnings; FlightError where there are none.
 
     `stamped` is in order of the list. Those stamped no later than the one before are left out;
-    those whose file is missing keep their number and come as pictures that cannot be decoded.
+    those whose file is missing keep their number and come as images that cannot be decoded.
     """
     numbers: list[int] = []
     times_ns: list[int] = []

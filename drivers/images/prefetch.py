@@ -1,4 +1,4 @@
-"""Work done ahead in a thread: the next few items are ready when they are asked for."""
+"""Prefetch of an iterator's next items in a thread."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class _Ended:
         self.error = error
 
 
-class Ahead(Generic[T]):
+class Prefetch(Generic[T]):
     """Iterates over `source` in a thread of its own, at most `depth` items ahead of the consumer.
 
-    An error in the source is raised where its item would have come. The thread ends when the
-    source does, on `close()`, and when a consumer's loop over a generator made from this is left.
+    An error in the source is raised where its item would have come. The thread ends when the source
+    does, on `close()`, and when a consumer's loop over a generator made from this is left.
     """
 
     def __init__(self, source: Iterable[T], depth: int) -> None:
@@ -39,7 +39,7 @@ class Ahead(Generic[T]):
             yield item
 
     def close(self) -> None:
-        """Stop the thread and wait for it; the item in hand is finished first."""
+        """Stop the thread and wait for it; the present item is finished first."""
         self._stop.set()
         self._thread.join()
 

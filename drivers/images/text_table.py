@@ -1,4 +1,4 @@
-"""Tables as text, as data sets have them: words between blanks or commas, `#` before a comment."""
+"""Text tables of data sets: words separated by blanks or commas, `#` before a comment."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from companion.geometry.transforms import Pose, rotation_from_quaternion
 
 MAX_BYTES = 200_000_000
 MAX_S = 9e9
-"""Unix seconds that fit in nanoseconds of 64 bits."""
+"""Largest Unix seconds whose nanoseconds fit in 64 bits."""
 
 
 def read_rows(path: Path, n_words: int) -> list[list[str]]:
-    """The words of every line; FlightError where a line has too few, or there is none at all."""
+    """Words of each line; FlightError for a line with too few, or no line at all."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise FlightError(f"{path}: longer than {MAX_BYTES // 10**6} MB; that is no such list")
@@ -44,7 +44,7 @@ def read_rows(path: Path, n_words: int) -> list[list[str]]:
 
 
 def numbers_of(path: Path, words: Sequence[str]) -> list[float]:
-    """Words as numbers; FlightError where they are none, or not finite."""
+    """Words as numbers; FlightError unless finite."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
@@ -55,7 +55,7 @@ def numbers_of(path: Path, words: Sequence[str]) -> list[float]:
 
 
 def ns_of_seconds(path: Path, word: str) -> int:
-    """Nanoseconds of decimal seconds, exact; FlightError where it is no such number."""
+    """Nanoseconds of decimal seconds, exact; FlightError if invalid."""
     try:
         seconds = Decimal(word)
     except InvalidOperation:
@@ -66,14 +66,14 @@ def ns_of_seconds(path: Path, word: str) -> int:
 
 
 def ns_of_whole(path: Path, word: str) -> int:
-    """A whole number of nanoseconds; FlightError where it is none."""
+    """Integer nanoseconds; FlightError if invalid."""
     if not (word.isascii() and word.isdigit() and int(word) < 2**63):
         raise FlightError(f"{path}: {word[:30]!r} is not a time in whole nanoseconds")
     return int(word)
 
 
 def pose_of(path: Path, place: Sequence[float], turn_wxyz: Sequence[float]) -> Pose:
-    """A pose of position and quaternion; FlightError where the latter has no direction."""
+    """Pose of position and quaternion; FlightError for a zero quaternion."""
     length = sum(q * q for q in turn_wxyz) ** 0.5
     if length < 1e-6:
         raise FlightError(f"{path}: a quaternion of zeros")

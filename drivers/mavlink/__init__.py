@@ -1,1 +1,1 @@
-"""The autopilot and the ground over MAVLink: link, requests, parameters, commands, messages out."""
+"""MAVLink to the autopilot and the ground: link, requests, parameters, commands, messages out."""

@@ -1,6 +1,6 @@
-"""A link for a program that asks an autopilot something and goes: it says that it is there only.
+"""Link of a command that queries an autopilot: sends heartbeats only.
 
-Beside a running daemon it must not compare clocks nor ask for rates, which are the daemon's to do.
+Beside a running daemon it must not synchronise clocks or request rates; that is the daemon's.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ COMPONENT = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 HEARTBEAT_S = 1.0
 OPEN_S = 2.0
-"""What cannot be opened for so long is not waited for."""
+"""Longest wait for a port to open."""
 LOOK_S = 0.02
 
 
 class AskingLink:
-    """One vehicle's autopilot, as long as one asks it."""
+    """Link to one vehicle's autopilot for the duration of a query."""
 
     def __init__(self, port: MavlinkPort, system_id: int) -> None:
         self.port = port
@@ -52,12 +52,12 @@ class AskingLink:
         self.port.send(message)
 
     def listen(self, message_id: int, take: OnMessage) -> Callable[[], None]:
-        """Have every message of a kind that the autopilot sends; what is returned ends that."""
+        """Call back with every message of a type from the autopilot; call the result to stop."""
         self._takers[message_id].append(take)
         return lambda: self._takers[message_id].remove(take)
 
     async def found(self, patience_s: float) -> Vehicle:
-        """The vehicle, when it has been heard. SourceError if it is not heard in time."""
+        """The vehicle, once a heartbeat has come. SourceError if none comes in time."""
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
         while self.vehicle is None:
@@ -104,9 +104,9 @@ class AskingLink:
 async def asking_link(
     config: LinkConfig, patience_s: float
 ) -> AsyncIterator[tuple[AskingLink, Vehicle, int]]:
-    """A link to ask on, with its vehicle and its baud rate, 0 where it has none.
+    """A query link, its vehicle and its baud rate, 0 where it has none.
 
-    ConfigError if `link.url` names nothing; SourceError if no autopilot is heard in time.
+    ConfigError if `link.url` is invalid; SourceError if no autopilot is heard in time.
     """
     wire = link_wire(link_endpoint(config.url))
     asking = replace(config, component_id=COMPONENT)

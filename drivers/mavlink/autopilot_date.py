@@ -1,4 +1,4 @@
-"""The date as the autopilot has it, mostly from its GPS: SYSTEM_TIME."""
+"""Date by the autopilot's SYSTEM_TIME, mostly from its GPS."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drivers.mavlink.autopilot_link import AutopilotLink
 
 N_ALIKE, ALIKE_NS = 3, 1_000_000_000
-"""One message may be damaged or late; so many in a row that agree are not."""
+"""Number of consecutive messages that must agree: a single one may be damaged or late."""
 
 
 class AutopilotDate:
@@ -17,7 +17,7 @@ class AutopilotDate:
 
     def __init__(self, link: AutopilotLink) -> None:
         self.ahead_ns: int | None = None
-        """What is to be added to the flight's clock; None while the autopilot has no date."""
+        """Correction of the flight's clock; None while the autopilot has no date."""
         self._n_alike, self._latest_ns = 0, 0
         link.listen(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, self._take)
 

@@ -1,10 +1,11 @@
-"""The autopilot's own place along the down axis of its local frame.
+"""The autopilot's position along the down axis of its local frame.
 
-ArduPilot's EKF3 takes the height of the first external pose for its own, so poses begin where it
-already takes itself to be. LOCAL_POSITION_NED tells that. ArduCopter withholds this message until
-it knows where it is horizontally, which without satellites is by our pose: there the height above
-home of GLOBAL_POSITION_INT goes on from what it was on the ground, or when both were last told.
-(GLOBAL_POSITION_INT's altitude above sea level then stands still: seen with ArduCopter 4.7-dev.)
+ArduPilot's EKF3 takes the height of the first external pose for its own, so poses begin at the
+height that it already has. LOCAL_POSITION_NED has that. ArduCopter withholds this message until it
+has a horizontal position, which without satellites comes from our pose: there the height above home
+of GLOBAL_POSITION_INT is continued from its value on the ground, or from when both were last
+received. (GLOBAL_POSITION_INT's altitude above sea level then stands still: seen with ArduCopter
+4.7-dev.)
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drivers.mavlink.autopilot_link import AutopilotLink
 
 MAX_AGE_NS = 500_000_000
-"""A height is carried on by its rate of change for so long: both messages come at 10 Hz, and a
+"""Longest extrapolation of a height by its rate of change: both messages come at 10 Hz, and a
 multicopter that accelerates by 2 m/s2 is 0.25 m elsewhere after this."""
 LANDED_AGE_NS = 2_000_000_000
-"""EXTENDED_SYS_STATE holds for so long; autopilots that send it do so each second."""
+"""Validity of EXTENDED_SYS_STATE; autopilots that send it do so each second."""
 MOST_AWAY_M = 1e5
 
 
@@ -40,9 +41,9 @@ class AutopilotHeight:
         self._local: _Height | None = None
         self._below_home: _Height | None = None
         self.home_down_m: float | None = None
-        """Where home is along the local frame's down axis; None until that is known."""
+        """Position of home on the local frame's down axis; None while unknown."""
         self._landed_ns: int | None = None
-        """When the autopilot last said that it stands on the ground."""
+        """Time of the last report that it is on the ground."""
         link.listen(mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, self._take_local)
         link.listen(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, self._take_global)
         link.listen(mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, self._take_state)
@@ -52,12 +53,12 @@ class AutopilotHeight:
         self._local = self._below_home = self.home_down_m = self._landed_ns = None
 
     def resume(self, home_down_m: float | None) -> None:
-        """Go on with what a process before this one knew of the same boot."""
+        """Continue with the state of a process before this one in the same boot."""
         if self.home_down_m is None:
             self.home_down_m = home_down_m
 
     def down_m(self, t_ns: int) -> float | None:
-        """At a time of the flight's clock; 0 on the ground, None in the air, where none is told."""
+        """Position at a time of the flight's clock; 0 on the ground, None in the air if unknown."""
         local = _at(self._local, t_ns)
         if local is not None:
             return local

@@ -1,8 +1,8 @@
-"""The autopilot: found on a port, kept in step with, asked for what is wanted, and listened to.
+"""Link to the autopilot: discovery, clock synchronisation, message rates, samples.
 
-Which vehicle it is its HEARTBEAT tells; from then on we are a component of that system. What it
-measures goes out as samples on the flight's clock. Whatever goes wrong on the link is named once
-and taken up again when it is over.
+Its HEARTBEAT identifies the vehicle; from then on we are a component of that system. Its
+measurements are passed on as samples on the flight's clock. Every failure of the link is reported
+once and handled when it is over.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from drivers.telemetry.live_samples import LiveSamples
 from drivers.telemetry.mavlink_samples import SAMPLE_OF
 
 FIRST_SYSTEM = 1
-"""Whose component we say we are until the vehicle is heard: on UDP it may answer only then."""
+"""System id that we use until the vehicle is heard: on UDP it may send only then."""
 HEARTBEAT_NS, HEARTBEAT_TICK_S = 1_000_000_000, 0.05
 WATCH_S, ORIGIN_S = 0.1, 5.0
 ANSWER_S, REQUEST_S = 1.0, 0.4
 MAX_ROUND_TRIP_NS = 2_000_000_000
 MAX_QUESTIONS = 64
-"""TIMESYNC without an answer that are remembered."""
+"""TIMESYNC requests without an answer that are remembered."""
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 REFUSALS = (
     mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
@@ -66,7 +66,7 @@ class AutopilotLink:
         self.vehicle: Vehicle | None = None
         """None until its first HEARTBEAT; kept while it is silent."""
         self.alive = False
-        """Whether the autopilot has said something lately."""
+        """Whether the autopilot has been heard recently."""
         self.clock_filter = ClockFilter()
         self.samples = LiveSamples(self.clock_filter, deliver, warn)
         self._meter = SourceMeter("autopilot")
@@ -75,9 +75,9 @@ class AutopilotLink:
         self._commands = Commands(self.send)
         self._text_limit = TextLimit()
         self.system_status: int = mavlink.MAV_STATE_BOOT
-        """What our HEARTBEAT states: a MAV_STATE."""
+        """MAV_STATE of our HEARTBEAT."""
         self.on_request: Take | None = None
-        """Takes what anybody sends, for who answers what is asked of us."""
+        """Handler of all messages, for requests to our component."""
         self._takers: defaultdict[int, list[Take]] = defaultdict(list)
         self._heard_ns = 0
         self._armed: bool | None = None
@@ -107,24 +107,24 @@ class AutopilotLink:
 
     @property
     def n_reboots(self) -> int:
-        """Times that the autopilot began anew while we listened."""
+        """Reboots of the autopilot seen."""
         return self._n_reboots
 
     @property
     def rates_hz(self) -> dict[str, float]:
-        """Messages that make samples, by name: how often they really came in the last seconds."""
+        """Measured rates of messages that make samples, by name, over the last seconds."""
         now_ns = self._clock.now_ns()
         found = {name: round(meter.hz(now_ns), 1) for name, meter in sorted(self._rates.items())}
         return {name: rate_hz for name, rate_hz in found.items() if rate_hz}
 
     @property
     def origin(self) -> GeoOrigin | None:
-        """Where the positions handed on are counted from; None while no place is known."""
-        return self.samples.places.home
+        """Origin of the positions passed on; None while unknown."""
+        return self.samples.positions.home
 
     @property
     def health(self) -> SourceHealth:
-        """As it stands now."""
+        """Health now."""
         self._meter.n_dropped = sum(self.samples.n_dropped.values())
         self._meter.detail = self._detail()
         if self.alive:
@@ -136,7 +136,7 @@ class AutopilotLink:
         return self._meter.health(self._clock.now_ns())
 
     def listen(self, message_id: int, take: Take) -> Callable[[], None]:
-        """Have every message of a kind that the autopilot sends; what is returned ends that."""
+        """Call back with every message of a type from the autopilot; call the result to stop."""
         self._takers[message_id].append(take)
 
         def end() -> None:
@@ -152,14 +152,14 @@ class AutopilotLink:
         self.port.send(message)
 
     def heartbeat(self) -> Any:
-        """Our HEARTBEAT as it is now."""
+        """Our HEARTBEAT now."""
         return mavlink.MAVLink_heartbeat_message(
             mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
             self.system_status, 3,
         )  # fmt: skip
 
     def say(self, text: PilotText) -> bool:
-        """Tell the pilot, by STATUSTEXT. False for what comes too soon: not told."""
+        """Send a STATUSTEXT to the pilot. False where the rate limit held it back."""
         said = self._text_limit.passed(text, self._clock.now_ns())
         for each in said:
             self.send(status_text(each))
@@ -168,7 +168,7 @@ class AutopilotLink:
     async def command(
         self, command: int, *params: float, timeout_s: float = ANSWER_S, tries: int = TRIES
     ) -> int:
-        """Send a COMMAND_LONG until it is answered: a MAV_RESULT, or NO_ANSWER (-1)."""
+        """Send a COMMAND_LONG until acknowledged: a MAV_RESULT, or NO_ANSWER (-1)."""
         values = [*params, *[0.0] * (7 - len(params))]
         system = self._target()
 
@@ -183,7 +183,7 @@ class AutopilotLink:
         self, command: int, place: GeoOrigin, *params: float, timeout_s: float = ANSWER_S,
         tries: int = TRIES,
     ) -> int:  # fmt: skip
-        """Send a COMMAND_INT about a place on Earth, altitude above mean sea level; likewise."""
+        """Send a COMMAND_INT for a geodetic position, altitude above mean sea level; likewise."""
         values = [*params, *[0.0] * (4 - len(params))]
         system = self._target()
 
@@ -197,7 +197,7 @@ class AutopilotLink:
         return await self._commands.ask(command, make, timeout_s, tries)
 
     async def request_message(self, message_id: int, timeout_s: float = ANSWER_S) -> Any | None:
-        """A message of the autopilot that it does not send by itself; None if it does not come."""
+        """Request a message that is not streamed; None if it does not come."""
         came: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def take(message: Any, _receive_ns: int) -> None:
@@ -305,7 +305,7 @@ class AutopilotLink:
     # -- what is done in turn --------------------------------------------------------------------
 
     async def _say_heartbeats(self) -> None:
-        """Once a second, and at once where nobody has heard us under this name on this wire."""
+        """Send once a second, and at once under a new name or on a new wire."""
         said_as: tuple[int, int] | None = None
         due_ns = 0
         while True:
@@ -364,10 +364,10 @@ class AutopilotLink:
             await asyncio.sleep(WATCH_S)
 
     async def _ask_for_origin(self) -> None:
-        """A local frame's zero is told once, and we may not have been there."""
+        """Request the origin: it is sent once, possibly before we listened."""
         while True:
             await asyncio.sleep(ORIGIN_S if self.alive else WATCH_S)
-            if self.alive and self.samples.places.origin is None:
+            if self.alive and self.samples.positions.origin is None:
                 await self.request_message(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
 
     def _target(self) -> int:

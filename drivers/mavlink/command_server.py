@@ -1,6 +1,6 @@
-"""Commands that others give our component: each answered, carried out once, told how it goes.
+"""Command protocol, server side: each command acknowledged, executed once, progress reported.
 
-Messages in, messages out: nothing here asks a clock or touches a wire. How commands are answered:
+Messages in, messages out: no clock, no wire. The protocol:
 https://mavlink.io/en/services/command.html.
 """
 
@@ -22,9 +22,9 @@ FAILED: int = mavlink.MAV_RESULT_FAILED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 IN_PROGRESS: int = mavlink.MAV_RESULT_IN_PROGRESS
 REPEAT_NS = 30_000_000_000
-"""A command whose `confirmation` counts up is the one before for so long."""
+"""Time within which a command whose `confirmation` counts up is a retransmission."""
 SAME_INT_NS = 5_000_000_000
-"""COMMAND_INT does not count its repeats: the same within so long is one."""
+"""COMMAND_INT does not count its repeats: an equal one within this time is a retransmission."""
 PROGRESS_NS = 500_000_000
 MOST_JOB_NS = 120_000_000_000
 MOST_REMEMBERED = 64
@@ -34,7 +34,7 @@ Asker = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of a command at once: its MAV_RESULT, and messages that it asked for."""
+    """Result of an immediate command: its MAV_RESULT, and messages that it requested."""
 
     result: int
     messages: Sequence[Any] = ()
@@ -42,20 +42,20 @@ class Done:
 
 @dataclass(slots=True)
 class Job:
-    """A command that takes longer; whoever carries it out says here how far it is."""
+    """A command that takes longer, with its progress."""
 
     percent: int = 0
     result: int | None = None
-    """A MAV_RESULT once it is over."""
+    """A MAV_RESULT when it is finished."""
 
 
 Handler = Callable[[Sequence[float]], Done | Job]
-"""Carries out a command with its seven parameters; those not given are NaN or 0."""
+"""Executes a command with its seven parameters; those not given are NaN or 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """How a command is carried out. One that only asks may be for all, and is never a repeat."""
+    """Handler of a command; one that `only_asks` may be broadcast, and is never a repeat."""
 
     handler: Handler
     only_asks: bool = False
@@ -63,7 +63,7 @@ class Command:
 
 @dataclass(slots=True)
 class _Given:
-    """What one asker was last answered to one command."""
+    """Last answer to one command of one sender."""
 
     parameters: bytes
     t_ns: int
@@ -77,7 +77,7 @@ class _Running:
     given: _Given
     job: Job
     began_ns: int
-    told_ns: int
+    reported_ns: int
 
 
 class CommandServer:
@@ -89,7 +89,7 @@ class CommandServer:
         self._running: dict[int, _Running] = {}
 
     def take(self, message: Any, to_all: bool, now_ns: int) -> list[Any]:
-        """Carry out a command, and answer; what is for all is answered only where it asks."""
+        """Execute a command, and acknowledge it; broadcasts are answered only for requests."""
         asker = message.get_srcSystem(), message.get_srcComponent()
         number, parameters = message.command, _parameters(message)
         command = self._commands.get(number)
@@ -119,7 +119,7 @@ class CommandServer:
         return answers
 
     def step(self, now_ns: int) -> list[Any]:
-        """What is to be said of commands that still run, or are over."""
+        """Acknowledgements due for commands that still run, or are finished."""
         out = []
         for number, running in list(self._running.items()):
             job = running.job
@@ -129,8 +129,8 @@ class CommandServer:
                 del self._running[number]
                 running.given.result, running.given.t_ns = job.result, now_ns
                 out.append(_answer(running.asker, number, job.result))
-            elif now_ns - running.told_ns >= PROGRESS_NS:
-                running.told_ns = now_ns
+            elif now_ns - running.reported_ns >= PROGRESS_NS:
+                running.reported_ns = now_ns
                 out.append(_answer(running.asker, number, IN_PROGRESS, job.percent))
         return out
 
@@ -152,7 +152,7 @@ def _is_repeat(message: Any, packed: bytes, last: _Given, now_ns: int) -> bool:
 
 
 def _parameters(message: Any) -> tuple[float, ...]:
-    """All seven; NaN where COMMAND_INT says that one is not given."""
+    """All seven; NaN where COMMAND_INT marks one as not given."""
     first = message.param1, message.param2, message.param3, message.param4
     if message.get_msgId() == mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
         return (*first, message.param5, message.param6, message.param7)

@@ -1,4 +1,4 @@
-"""Commands to the autopilot: sent again until they are answered, one of a kind at a time."""
+"""Command protocol, client side: retransmitted until acknowledged, one of a kind at a time."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drivers.system.within import within
 
 NO_ANSWER = -1
-"""In the place of a MAV_RESULT: it did not answer, however often it was asked."""
+"""Result of a command that was never acknowledged."""
 TRIES = 3
 MOST_PATIENCE_S = 30.0
-"""An answer "in progress" is waited on for so long."""
+"""Longest wait after an acknowledgement "in progress"."""
 
 MakeCommand = Callable[[int], Any]
-"""A message for the so-manieth try, counted from 0."""
+"""Makes the message of a try, counted from 0."""
 
 
 class Commands:
-    """What was asked and not answered yet."""
+    """Commands not acknowledged yet."""
 
     def __init__(self, send: Callable[[Any], None]) -> None:
         self._send = send
@@ -29,7 +29,7 @@ class Commands:
         self._answers: dict[int, asyncio.Queue[int]] = {}
 
     async def ask(self, command: int, make: MakeCommand, timeout_s: float, tries: int) -> int:
-        """The MAV_RESULT of a command, or NO_ANSWER."""
+        """MAV_RESULT of a command, or NO_ANSWER."""
         async with self._turns.setdefault(command, asyncio.Lock()):
             answers: asyncio.Queue[int] = asyncio.Queue(maxsize=8)
             self._answers[command] = answers

@@ -1,4 +1,4 @@
-"""What our component says of itself when it is asked: versions, abilities, rates.
+"""Identity of our component on request: versions, capabilities, rates.
 
 PROTOCOL_VERSION and COMPONENT_INFORMATION_BASIC are not in pymavlink's dialect and are packed here,
 by https://mavlink.io/en/messages/common.html.
@@ -23,13 +23,13 @@ CAPABILITIES = (
 MAVLINK_2, MAVLINK_1 = 200, 100
 """Versions of the protocol, times a hundred."""
 OFFICIAL = 255
-"""The lowest byte of a version that is a release."""
+"""Lowest byte of a release's version."""
 NOT_SENT, NOT_OURS = -1, 0
 """Intervals of MESSAGE_INTERVAL."""
 
 
 class _Packed(mavlink.MAVLink_message):  # type: ignore[misc]
-    """A message of MAVLink 2 that the dialect lacks."""
+    """MAVLink 2 message that the dialect lacks."""
 
     def __init__(self, number: int, name: str, crc_extra: int, payload: bytes) -> None:
         super().__init__(number, name)
@@ -49,13 +49,13 @@ def autopilot_version() -> Any:
 
 
 def protocol_version() -> Any:
-    """PROTOCOL_VERSION; the hashes of definition and library are not told."""
+    """PROTOCOL_VERSION; without the hashes of specification and library."""
     payload = struct.pack("<HHH16x", MAVLINK_2, MAVLINK_1, MAVLINK_2)
     return _Packed(PROTOCOL_VERSION, "PROTOCOL_VERSION", 217, payload)
 
 
 def component_information(boot_ms: int) -> Any:
-    """COMPONENT_INFORMATION_BASIC: who made it and which version it is."""
+    """COMPONENT_INFORMATION_BASIC: manufacturer and version."""
     texts = [
         (b"companion", 32), (b"companion", 32), (__version__.encode(), 24),
         (platform.machine().encode(), 24), (b"", 32),
@@ -66,7 +66,7 @@ def component_information(boot_ms: int) -> Any:
 
 
 def message_interval(message_id: int, rate_hz: float | None) -> Any:
-    """MESSAGE_INTERVAL of one of our messages: None is none of ours, a rate of 0 is not sent."""
+    """MESSAGE_INTERVAL of a message: None if not ours, a rate of 0 if not streamed."""
     interval_us = NOT_OURS
     if rate_hz is not None:
         interval_us = round(1e6 / rate_hz) if rate_hz > 0 else NOT_SENT

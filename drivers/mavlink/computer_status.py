@@ -1,4 +1,4 @@
-"""The computer's load as ONBOARD_COMPUTER_STATUS."""
+"""Load of the computer as ONBOARD_COMPUTER_STATUS."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DISK_FULL_MIB = 100.0
 
 @dataclass(frozen=True, slots=True)
 class LinkLoad:
-    """What goes over a link, KiB/s; `capacity_kib_s` is None where it is not known."""
+    """Data rate of a link, KiB/s; `capacity_kib_s` is None where unknown."""
 
     kind: Literal["serial", "network"]
     sent_kib_s: float
@@ -35,7 +35,7 @@ class LinkLoad:
 def computer_status(
     t_ns: int, load: ComputerLoad, links: Sequence[LinkLoad] = (), *, too_hot: bool = False
 ) -> Any:
-    """The message. `too_hot` says that work is left out because of the temperature."""
+    """The message. `too_hot` marks a load level reduced because of the temperature."""
     unknown_slices = [UNKNOWN_U8] * 10  # of the last second: not measured so finely
     full = load.disk_free_mib is not None and load.disk_free_mib < DISK_FULL_MIB
     return mavlink.MAVLink_onboard_computer_status_message(
@@ -80,7 +80,7 @@ def _whole(value: float | None) -> int:
 
 
 def _celsius(load: ComputerLoad, words: tuple[str, ...]) -> list[int]:
-    """Of the sensors whose name begins with one of these words."""
+    """Temperatures of the sensors whose name begins with one of these words."""
     return [
         min(max(round(celsius), -128), UNKNOWN_I8 - 1)
         for name, celsius in load.temperatures_c.items()

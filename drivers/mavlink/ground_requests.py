@@ -1,7 +1,7 @@
-"""Requests to our component from whoever may speak on the link or through the router.
+"""Requests to our component over the link or through the router.
 
-Who that is the link's signing and the router decide; what is here has passed them. Requests beyond
-a rate are not listened to, and answers go out at a rate that leaves the link to the poses.
+Signing and the router decide who may send them; these have passed. Requests beyond a rate are
+ignored, and answers go out at a rate that leaves the link to the poses.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from drivers.mavlink.request_limit import RequestLimit
 from drivers.mavlink.wire.message_port import MavlinkPort
 
 TICK_S = 0.025
-"""A parameter goes out in each: 1.5 kB/s."""
-TELL_NS = 10_000_000_000
+"""Interval of parameter messages: 1.5 kB/s."""
+WARN_EVERY_NS = 10_000_000_000
 TOO_MANY = "more is asked of the companion over MAVLink than it answers"
 COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
 PARAMETERS = (
@@ -34,7 +34,7 @@ EVERYBODY = (0, 0)
 
 
 class GroundRequests:
-    """Takes what is addressed to us, or to all; to be used in the event loop."""
+    """Handles messages addressed to us, or broadcast; to be used in the event loop."""
 
     def __init__(
         self,
@@ -47,10 +47,10 @@ class GroundRequests:
         self._port, self._clock, self._warn = port, clock, warn
         self._commands, self._parameters = commands, parameters
         self._limit = RequestLimit()
-        self._told_ns: int | None = None
+        self._warned_ns: int | None = None
 
     def take(self, message: Any, now_ns: int) -> None:
-        """Take any message; most are none of ours."""
+        """Take any message; most are not for us."""
         kind = message.get_msgId()
         if kind not in KINDS:
             return
@@ -61,8 +61,8 @@ class GroundRequests:
             return  # an answer, and we have asked nothing
         asker = message.get_srcSystem(), message.get_srcComponent()
         if not self._limit.allows(asker, now_ns):
-            if self._told_ns is None or now_ns - self._told_ns > TELL_NS:
-                self._told_ns = now_ns
+            if self._warned_ns is None or now_ns - self._warned_ns > WARN_EVERY_NS:
+                self._warned_ns = now_ns
                 detail = f"by component {asker[1]} of system {asker[0]}"
                 self._warn(Warned(now_ns, TOO_MANY, detail))
             return
@@ -77,7 +77,7 @@ class GroundRequests:
             self._port.send(answer)
 
     async def run(self) -> None:
-        """Say what waits to be said, until cancelled."""
+        """Send answers that wait, until cancelled."""
         while True:
             await asyncio.sleep(TICK_S)
             for answer in self._commands.step(self._clock.now_ns()):

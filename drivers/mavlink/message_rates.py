@@ -1,4 +1,4 @@
-"""How often the autopilot is asked to send what, what really comes, and when to ask again."""
+"""Message rates: requested from the autopilot, measured, and requested again if missing."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import LinkConfig
 
 CHECK_NS = 3_000_000_000
-"""So long a rate is counted before it is judged."""
+"""Window in which a rate is measured."""
 SHORT = 0.5
-"""A rate of less than this share of what was asked for falls short."""
+"""Share of the requested rate below which it counts as missing."""
 FIRST_AGAIN_NS, MOST_AGAIN_NS = 3_000_000_000, 60_000_000_000
-"""Between asking and asking again, doubling."""
+"""Backoff of repeated requests, doubling."""
 GPS_HZ, TIME_HZ = 5.0, 1.0
-"""More than receivers give, and often enough to tell GPS time from boot time."""
+"""More than receivers give, and enough to map GPS time to boot time."""
 NEVER_NS = 2**62
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A quantity: messages that state it, best first, and how often it is wanted."""
+    """A quantity: message types that carry it, best first, and the rate needed."""
 
     ids: tuple[int, ...]
     rate_hz: float
     always: bool = True
-    """Whether there is always something to send; a position or a range may not be known."""
+    """Whether it is always sent; a position or a range may be unknown."""
 
 
 def wanted(config: LinkConfig) -> list[Wanted]:
-    """What the samples of a flight are made of."""
+    """Quantities that the samples of a flight need."""
     # both firmwares have all of these; ArduPilot's older versions lack the first of some
     rates = [
         Wanted(
@@ -65,7 +65,7 @@ class _Stream:
     due_ns: int = 0
     again_ns: int = FIRST_AGAIN_NS
     begun_ns: int | None = None
-    """When counting began; None while it has not been asked for."""
+    """Begin of the measurement; None before the first request."""
     n: int = 0
 
     @property
@@ -74,16 +74,16 @@ class _Stream:
 
 
 class MessageRates:
-    """The state of every quantity; asks no clock and sends nothing itself."""
+    """State of every quantity; asks no clock and sends nothing itself."""
 
     def __init__(self, wants: Sequence[Wanted]) -> None:
         self._streams = [_Stream(want) for want in wants]
         self.n_asked = 0
         self.missing: list[int] = []
-        """Messages that this autopilot has said it does not have."""
+        """Messages that this autopilot has reported as unsupported."""
 
     def restart(self) -> None:
-        """Ask for everything anew: the autopilot has forgotten."""
+        """Request everything anew: the autopilot has rebooted."""
         self._streams = [_Stream(stream.want) for stream in self._streams]
         self.missing = []
 
@@ -94,7 +94,7 @@ class MessageRates:
                 stream.n += 1
 
     def due(self, now_ns: int) -> tuple[int, float] | None:
-        """A message that is to be asked for now, and its rate; `asked` is to follow."""
+        """A message to be requested now, and its rate; call `asked` afterwards."""
         for stream in self._streams:
             if stream.begun_ns is not None and now_ns - stream.begun_ns >= CHECK_NS:
                 self._judge(stream, now_ns)
@@ -103,7 +103,7 @@ class MessageRates:
         return None
 
     def asked(self, message_id: int, refused: bool, now_ns: int) -> None:
-        """It was asked for, and refused for good or not."""
+        """A request was sent, and refused for good or not."""
         self.n_asked += 1
         for stream in self._streams:
             if stream.message_id != message_id:
@@ -114,7 +114,7 @@ class MessageRates:
                 self._refused(stream, now_ns)
 
     def skip(self, now_ns: int) -> None:
-        """What came or did not come until now says nothing: the autopilot was silent."""
+        """Ignore rates measured until now: the autopilot was silent."""
         for stream in self._streams:
             if stream.begun_ns is not None:
                 stream.begun_ns, stream.n = now_ns, 0

@@ -1,7 +1,7 @@
-"""Messages that ground stations ask our component for, once or at a rate.
+"""Messages of our component on request of ground stations, once or at a rate.
 
-https://mavlink.io/en/services/command.html has the commands; what is asked for and is none of ours
-is UNSUPPORTED, a number that is no message's DENIED.
+The commands: https://mavlink.io/en/services/command.html. A message that is not ours is
+UNSUPPORTED, an id of no message DENIED.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from drivers.mavlink.component_messages import (
 LAST_MESSAGE = 2**24 - 1
 DEFAULT_RATE = 0
 MOST_HZ = 5.0
-"""What is sent at a rate of choice is sent no more often."""
+"""Highest rate of a message with an adjustable rate."""
 HEARTBEAT: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 COMPUTER_STATUS: int = mavlink.MAVLINK_MSG_ID_ONBOARD_COMPUTER_STATUS
 OBSTACLES: int = mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE
@@ -35,9 +35,9 @@ INTERVAL = mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL
 
 
 class MessageRequests:
-    """`now` makes messages of this moment; `rates_hz` are those of all that is sent by itself.
+    """`now` makes messages of this moment; `rates_hz` are the rates of all streamed messages.
 
-    `set_rate` is told of one that may be changed, None for its default.
+    `set_rate` changes the rate of one that is adjustable, None for its default.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class MessageRequests:
 
 
 def _whole(value: float) -> int | None:
-    """The number of a message; None where it is none."""
+    """Id of a message; None where invalid."""
     if not math.isfinite(value) or not value.is_integer() or not 0 <= value <= LAST_MESSAGE:
         return None
     return int(value)

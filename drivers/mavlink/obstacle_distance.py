@@ -10,7 +10,7 @@ from companion.dense.obstacles import SECTOR_DEG, Obstacles
 
 
 def obstacle_distance(obstacles: Obstacles) -> Any:
-    """The message; the first of its sectors is centred on straight ahead, clockwise from there."""
+    """The message; the first of its sectors is centred on forward, then clockwise."""
     return mavlink.MAVLink_obstacle_distance_message(
         time_usec=obstacles.t_ns // 1000,
         sensor_type=mavlink.MAV_DISTANCE_SENSOR_UNKNOWN,  # none of its kinds is a camera

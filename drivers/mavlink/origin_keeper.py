@@ -1,6 +1,6 @@
-"""An origin for an autopilot that has none: without one ArduPilot does not use a pose.
+"""Sets an origin on an autopilot that has none: without one ArduPilot does not use a pose.
 
-One that has an origin, from its own GPS or from anybody else, keeps it.
+An autopilot that has an origin, from its own GPS or from anybody else, keeps it.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from drivers.mavlink.autopilot_link import AutopilotLink
 
 LOOK_EVERY_S = 0.5
 PATIENCE = 12
-"""Looks in a row at an autopilot without an origin, whose own GPS may still find one."""
+"""Consecutive checks without an origin before one is set: its own GPS may still find one."""
 AGAIN_AFTER_S = 10.0
-"""After it was given one, and still has none."""
+"""Time after which an origin that was not accepted is set again."""
 DO_SET_GLOBAL_ORIGIN = 611
 NOWHERE_DEG = 1e-7
-"""Autopilots take a place of all zeros for none at all."""
+"""Autopilots take a position of all zeros for none."""
 
 
 class OriginKeeper:
-    """Sees to it that the autopilot has an origin; the link itself asks for the one it has."""
+    """Ensures that the autopilot has an origin; the link itself requests the present one."""
 
     def __init__(
         self, config: FeedbackConfig, link: AutopilotLink, say: Callable[[str], None],
@@ -37,14 +37,14 @@ class OriginKeeper:
         )
 
     async def run(self) -> None:
-        """Look, and set where need be; ends by cancellation."""
+        """Check, and set where needed; ends by cancellation."""
         n_without = 0
         while True:
             await asyncio.sleep(LOOK_EVERY_S)
             without = (
                 self._is_wanted()
                 and self._link.alive
-                and self._link.samples.places.origin is None
+                and self._link.samples.positions.origin is None
             )
             n_without = n_without + 1 if without else 0
             if n_without >= PATIENCE:
@@ -52,7 +52,7 @@ class OriginKeeper:
                 await asyncio.sleep(AGAIN_AFTER_S)
 
     async def _set(self) -> None:
-        """By the command, and by the message that older firmware knows."""
+        """Set it by the command, and by the message that older firmware has."""
         place = self._link.origin or self._place
         if place.latitude_deg == 0 and place.longitude_deg == 0:
             place = GeoOrigin(NOWHERE_DEG, NOWHERE_DEG, place.altitude_m)

@@ -1,9 +1,8 @@
-"""Our component's parameters, as ground stations read and set them.
+"""Parameter protocol, server side: parameters of our component for ground stations.
 
-Messages in, messages out: nothing here asks a clock or touches a wire. Every parameter is a REAL32,
-since ground stations put the bytes of an integer into the message as the autopilot's firmware does,
-whatever component it is for (ArduPilot its value, PX4 its bytes); of a float both are the same.
-https://mavlink.io/en/services/parameter.html.
+Messages in, messages out: no clock, no wire. Every parameter is a REAL32, since ground stations
+encode integers as the autopilot's firmware does, whatever component they are for (ArduPilot by
+value, PX4 by bytes); for a float both are the same. https://mavlink.io/en/services/parameter.html.
 """
 
 from __future__ import annotations
@@ -21,28 +20,28 @@ OUT_OF_RANGE: int = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
 NOT_NOW: int = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
 LONGEST_NAME = 16
 MOST_ERRORS = 16
-"""What waits to be said of requests that failed; all else that waits is one of each name."""
+"""Limit of waiting errors; of values only one waits for each name."""
 
 
 class Table(Protocol):
-    """What can be read and set."""
+    """Parameters that can be read and set."""
 
     @property
     def names(self) -> Sequence[str]:
-        """Always the same, in the order of their numbers; at most 16 ASCII characters each."""
+        """Always the same, in order of their indices; at most 16 ASCII characters each."""
 
     def value(self, name: str) -> float:
-        """As it is now."""
+        """Value now."""
 
     def set(self, name: str, value: float) -> int:
-        """Change it; SET, or the MAV_PARAM_ERROR for which it is left as it was."""
+        """Set it; SET, or the MAV_PARAM_ERROR for which it is unchanged."""
 
 
 class ParameterServer:
     """PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET in; PARAM_VALUE and PARAM_ERROR out.
 
-    What is to be said waits to be taken by `next_message`, so that a storm of requests costs the
-    link no more than whoever takes it allows.
+    Answers wait for `next_message`, so that a storm of requests costs the link no more than its
+    caller allows.
     """
 
     def __init__(self, table: Table) -> None:
@@ -53,7 +52,7 @@ class ParameterServer:
         self._errors: deque[Any] = deque(maxlen=MOST_ERRORS)
 
     def take(self, message: Any, to_all: bool) -> None:
-        """Take a request; of what was asked of all components only what we have is answered."""
+        """Take a request; broadcasts are answered only for parameters that exist."""
         kind = message.get_msgId()
         if kind == mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST:
             for name in self._table.names:
@@ -75,7 +74,7 @@ class ParameterServer:
             self._soon[name] = None
 
     def next_message(self) -> Any | None:
-        """What is to be said next; None where nothing is."""
+        """Next answer; None without one."""
         if self._soon:
             return self._value(self._soon)
         if self._errors:

@@ -1,4 +1,4 @@
-"""The autopilot's parameters over MAVLink: read by name or all, written, and read back.
+"""Parameter protocol, client side: the autopilot's parameters read by name or all, and written.
 
 ArduPilot puts an integer's value into the message's float, PX4 its bytes.
 """
@@ -23,14 +23,13 @@ from drivers.system.within import within
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAVLINK_2 = 0xFD
 WINDOW = 10
-"""Requests under way at once; ArduPilot queues no more than 20, of everybody's."""
+"""Requests in flight at once; ArduPilot queues no more than 20, of all senders."""
 ANSWER_S, LEAST_ANSWER_S = 0.5, 0.1
 SLACK = 4
-"""What is not there is not answered for: it is waited for as long as the slowest answer, so many
-times over."""
+"""A missing parameter is not answered: the timeout is the slowest answer, times this."""
 TRIES = 3
 QUIET_S = 1.0
-"""A list that has paused for so long has ended, or has lost its end."""
+"""Pause that ends a list, whether complete or not."""
 MOST_ANSWERS_S, MOST_LIST_S = 3.0, 180.0
 MOST_KNOWN = 10_000
 NO_INDEX = 65535
@@ -44,7 +43,7 @@ LETTERS = {
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter as the autopilot last said it; `kind` is a MAV_PARAM_TYPE."""
+    """One parameter as last received; `kind` is a MAV_PARAM_TYPE."""
 
     name: str
     value: float
@@ -52,7 +51,7 @@ class Parameter:
 
 
 class VehicleLink(Protocol):
-    """What is needed of a link: an AutopilotLink, or an AskingLink."""
+    """Interface of a link: an AutopilotLink, or an AskingLink."""
 
     vehicle: Vehicle | None
 
@@ -60,11 +59,11 @@ class VehicleLink(Protocol):
         """Send a message as our component."""
 
     def listen(self, message_id: int, take: OnMessage) -> Callable[[], None]:
-        """Have every message of a kind that the autopilot sends; what is returned ends that."""
+        """Call back with every message of a type from the autopilot; call the result to stop."""
 
 
 class Parameters:
-    """Those of the vehicle that a link has found. SourceError where it has found none yet."""
+    """Parameters of the vehicle that a link has found. SourceError before it has found one."""
 
     def __init__(self, link: VehicleLink) -> None:
         if link.vehicle is None:
@@ -85,12 +84,12 @@ class Parameters:
         )
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         for end in self._ends:
             end()
 
     async def read(self, names: Iterable[str]) -> dict[str, Parameter]:
-        """Those of the named that the autopilot has. SourceError if it answers for none of them."""
+        """Read those of the named that exist. SourceError if the autopilot answers for none."""
         wanted = list(dict.fromkeys(names))
         self._answered.clear()
         self._unknown.clear()
@@ -106,7 +105,7 @@ class Parameters:
         return {name: self.known[name] for name in wanted if name in self._answered}
 
     async def read_all(self) -> dict[str, Parameter]:
-        """All that the autopilot lists. SourceError if some of them do not come."""
+        """All listed parameters. SourceError if some of them do not come."""
         self._listed.clear()
         self._n_listed = None
         for _ in range(TRIES):
@@ -130,7 +129,7 @@ class Parameters:
         return {name: self.known[name] for name in sorted(self._listed.values())}
 
     async def write(self, name: str, value: float) -> Parameter:
-        """Set one that has been read, and read it back. SourceError if it has not come to be so."""
+        """Set one that has been read, and read it back. SourceError if the value differs."""
         kind = self.known[name].kind
         for _ in range(TRIES):
             self._answered.discard(name)
@@ -179,7 +178,7 @@ class Parameters:
         patience_s: float | None = None,
         most_s: float = MOST_ANSWERS_S,
     ) -> None:
-        """Wait for something to come true, while each message comes in time; others' come too."""
+        """Wait for a condition, while each message comes in time; others' come too."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + most_s
         while not true() and (begin_s := loop.time()) < end_s:
@@ -213,7 +212,7 @@ class Parameters:
         return self._n_listed is not None and len(self._listed) >= self._n_listed
 
     def _value(self, message: Any) -> float | None:
-        """None for a type that is none."""
+        """Value of the message; None for an unknown type."""
         letter = LETTERS.get(message.param_type)
         if letter is None:
             return None

@@ -1,11 +1,11 @@
-"""Poses as MAVLink: the one place where they leave our frames and units.
+"""Pose messages: the one place where poses leave our frames and units.
 
 The world of a pose is NED-aligned and metric. MAV_FRAME_LOCAL_FRD is that with a heading of its
 own, which both ArduPilot and PX4 take; MAV_FRAME_BODY_FRD is our body.
 
-Covariances are of the axes of a message's frame. Positions and velocities are as uncertain along
-each axis, so theirs are the same in any; of the attitude, tilt about the level axes stands in the
-places of roll and pitch, heading about the down axis in that of yaw.
+Covariances are of the axes of a message's frame. Those of positions and velocities are isotropic,
+and so the same in any frame; of the attitude, tilt about the level axes stands for roll and pitch,
+heading about the down axis for yaw.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from companion.geometry.transforms import Array, quaternion_from_rotation
 
 N_COVARIANCE = 21
 ROW_STARTS = (0, 6, 11, 15, 18, 20)
-"""Places of the diagonal of a 6 x 6 matrix in its upper triangle, row by row."""
+"""Indices of the diagonal of a 6 x 6 matrix in its upper triangle, row by row."""
 UNKNOWN = [math.nan] * N_COVARIANCE
 
 
@@ -69,7 +69,7 @@ def vision_messages(pose: PoseToSend) -> tuple[Any, Any]:
 
 
 def euler_of(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw (rad) of `ned_from_body`: yaw first, then pitch, then roll."""
+    """Roll, pitch, yaw (rad) of `ned_from_body`, order yaw, pitch, roll."""
     pitch = -math.asin(float(np.clip(rotation[2, 0], -1.0, 1.0)))
     roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
     return roll, pitch, math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
@@ -82,7 +82,7 @@ def _pose_covariance(pose: PoseToSend) -> list[float]:
 def _covariance(sigma_linear: float, sigma_level: float, sigma_down: float) -> list[float]:
     """Upper triangle (21,) of a diagonal matrix; m^2 or (m/s)^2, and rad^2 about the axes.
 
-    nan for an angle that is not known, and for everything where the first is not.
+    nan for an unknown angle, and for everything where the first is unknown.
     """
     if not math.isfinite(sigma_linear):
         return list(UNKNOWN)

@@ -1,6 +1,6 @@
-"""STATUSTEXT: what the pilot reads at the ground station, and how much of it.
+"""STATUSTEXT to the pilot, rate-limited.
 
-What there is to be read is in `companion.pilot_messages`, and each text fits into one message.
+The texts are in `companion.pilot_messages`; each fits into one message.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from drivers.mavlink.wire.send_queue import RateLimit
 
 TEXTS_PER_S, TEXTS_AT_ONCE = 1.0, 12
 WARNINGS_ONLY = 4
-"""The last so many of those at once are for warnings."""
+"""Part of the burst that is reserved for warnings."""
 MOST_KEPT_BACK = 100
 
 
 def status_text(text: PilotText) -> Any:
-    """The message that says it."""
+    """The message of a text."""
     return mavlink.MAVLink_statustext_message(text.severity, text.text.encode("ascii"))
 
 
 class TextLimit:
-    """How much a pilot is told: some texts at once, then one a second."""
+    """Rate limit of texts: a burst at once, then one a second."""
 
     def __init__(self) -> None:
         self._limit = RateLimit(TEXTS_PER_S, TEXTS_AT_ONCE)
         self._kept_back: set[str] = set()
 
     def passed(self, text: PilotText, now_ns: int) -> list[PilotText]:
-        """The text, and how many others were kept back before; nothing if this one is."""
+        """The text, and the number held back before; nothing if this one is held back."""
         self._limit.refill(now_ns)
         wanted = 1.0 if text.severity <= mavlink.MAV_SEVERITY_WARNING else 1.0 + WARNINGS_ONLY
         if self._limit.left < wanted:

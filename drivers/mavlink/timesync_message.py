@@ -1,7 +1,7 @@
-"""TIMESYNC with the extension that names whom it is for, which pymavlink's dialect lacks.
+"""TIMESYNC with the target extension, which pymavlink's dialect lacks.
 
-https://mavlink.io/en/services/timesync.html. Who does not know the extension passes over it, and
-answers all at once.
+https://mavlink.io/en/services/timesync.html. Receivers without the extension ignore it, and answer
+all requests.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 _LAYOUT = struct.Struct("<qqBB")
 _MAVLINK_2 = 0xFD
 _PAYLOAD = 10
-"""Where the payload begins in a packet of MAVLink 2."""
+"""Offset of the payload in a MAVLink 2 packet."""
 
 
 class TimesyncMessage(mavlink.MAVLink_timesync_message):  # type: ignore[misc]
-    """A question (`tc1` 0) or an answer, in ns, to a system's component; 0, 0 for all."""
+    """A request (`tc1` 0) or a response, in ns, to a system's component; 0, 0 for all."""
 
     def __init__(self, tc1: int, ts1: int, target: tuple[int, int]) -> None:
         super().__init__(tc1, ts1)
@@ -33,7 +33,7 @@ class TimesyncMessage(mavlink.MAVLink_timesync_message):  # type: ignore[misc]
 
 
 def timesync_target(message: Any) -> tuple[int, int]:
-    """System and component that a received TIMESYNC is for; 0, 0 for all, or where it says none."""
+    """Target system and component of a received TIMESYNC; 0, 0 for all or none stated."""
     packet = bytes(message.get_msgbuf())
     if not packet or packet[0] != _MAVLINK_2:
         return 0, 0

@@ -1,4 +1,4 @@
-"""Whose autopilot is at the other end: told from its HEARTBEAT."""
+"""The vehicle at the other end of the link, by its HEARTBEAT."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ COPTERS = (
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """The vehicle that we are aboard of, as its last HEARTBEAT had it."""
+    """The vehicle we are on, by its last HEARTBEAT."""
 
     system_id: int
     firmware: Firmware
     armed: bool
     mode: str
-    """In words; the number where no word is known for it."""
+    """In words; the number of an unknown mode."""
 
     def __str__(self) -> str:
         names = {"ardupilot": "ArduPilot", "px4": "PX4", "other": "autopilot"}
@@ -46,7 +46,7 @@ class Vehicle:
 
 
 def is_autopilot(heartbeat: Any) -> bool:
-    """Whether a HEARTBEAT is of something that flies, not of a ground station or a camera."""
+    """Whether a HEARTBEAT is of an autopilot, not of a ground station or a camera."""
     return bool(
         heartbeat.get_srcComponent() == mavlink.MAV_COMP_ID_AUTOPILOT1
         and heartbeat.autopilot != mavlink.MAV_AUTOPILOT_INVALID
@@ -55,7 +55,7 @@ def is_autopilot(heartbeat: Any) -> bool:
 
 
 def vehicle_of(heartbeat: Any) -> Vehicle:
-    """What a HEARTBEAT of an autopilot says."""
+    """Vehicle by the HEARTBEAT of an autopilot."""
     firmwares: dict[int, Firmware] = {
         mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
         mavlink.MAV_AUTOPILOT_PX4: "px4",

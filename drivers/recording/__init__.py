@@ -1,1 +1,1 @@
-"""The recording of a flight: an MCAP file that survives whatever ends its writer."""
+"""Recording of a flight: an MCAP file that survives any end of its writer."""

@@ -1,4 +1,4 @@
-"""A camera as JSON, exactly, in the layout of a flight folder's camera.json; and for Foxglove."""
+"""Camera model as JSON, exact, in the layout of a flight folder's camera.json; and for Foxglove."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FOXGLOVE = {
 
 
 def camera_document(camera: Camera) -> bytes:
-    """All of it; numbers are read back as they are."""
+    """JSON of a camera; numbers are read back unchanged."""
     document: dict[str, Any] = {
         "width": camera.width, "height": camera.height,
         "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
@@ -37,7 +37,7 @@ def camera_document(camera: Camera) -> bytes:
 
 
 def camera_of(document: bytes) -> Camera:
-    """The camera as it was; ValueError where the bytes are no such document."""
+    """Camera of such a document; ValueError if invalid."""
     given = json.loads(document)
     try:
         width, height = int(given["width"]), int(given["height"])
@@ -56,7 +56,7 @@ def camera_of(document: bytes) -> Camera:
 
 
 def calibration_bytes(camera: Camera, t_ns: int) -> bytes:
-    """As Foxglove's CameraCalibration."""
+    """Camera as Foxglove's CameraCalibration."""
     matrix = camera.matrix()
     message = CameraCalibration(
         frame_id="camera", width=camera.width, height=camera.height,

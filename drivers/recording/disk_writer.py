@@ -1,7 +1,7 @@
-"""The thread that has to do with the disk, and may wait for it as long as the disk likes.
+"""Writer thread of a recording, which may block on the disk.
 
-What is to be written waits in memory, up to a limit; beyond it what comes is turned away, pictures
-first. Twice in a second or so all of it is written as a chunk and synced.
+Messages wait in memory, up to a limit; beyond it new ones are dropped, images first. Twice a second
+or so all of them are written as a chunk and synced.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
 
 CHUNK_BYTES = 4 << 20
-"""A chunk is written before its time when it has grown to this."""
+"""Size at which a chunk is written early."""
 PICTURES_SHARE = 0.8
-"""Of the buffer, so that there is room for what is small and matters more."""
+"""Share of the buffer for images, so that small messages always fit."""
 LOOK_S = 2.0
-"""The room on the disk is looked at so often."""
+"""Interval of checks of the free space."""
 RESERVE_BYTES = 1 << 20
-"""For the end of the file: a disk may fill up between two looks."""
+"""Space reserved for the end of the file: a disk may fill up between two checks."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 FULL, PRUNED = "the disk is full: the flight is no longer recorded", "an old flight was deleted"
@@ -40,7 +40,7 @@ FAILED = "the recording cannot be written"
 
 
 class Entry(NamedTuple):
-    """One message that waits for the disk."""
+    """One message to be written."""
 
     channel: int
     t_ns: int
@@ -66,30 +66,30 @@ class DiskWriter:
         self._ended = False
         self._fault: BaseException | None = None
         self._looked_s = -LOOK_S
-        self._told: set[str] = set()
+        self._warned_kinds: set[str] = set()
         self.n_dropped: Counter[str] = Counter()
-        """Messages turned away, by what they are."""
+        """Dropped messages, by kind."""
         self.slowest_s = 0.0
-        """What the disk took for one chunk at most."""
+        """Longest time to write a chunk."""
         self._reserve = _reserved(flight)
         self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
         self._thread.start()
 
     @property
     def recording(self) -> bool:
-        """Whether what comes is still written."""
+        """Whether new messages are still written."""
         return not self._ended
 
     def put(self, entry: Entry, kind: str, is_picture: bool = False) -> bool:
-        """Have a message written; never waits. False where there is no room for it.
+        """Queue a message; never waits. False where there is no capacity for it.
 
-        Raises what has ended the thread, should it have a bug.
+        Raises the exception of the thread, if it had a bug.
         """
         if self._fault is not None:
             raise self._fault
         with self._changed:
-            room = self._most * (PICTURES_SHARE if is_picture else 1.0)
-            if self._ended or self._n_waiting + len(entry.data) > room:
+            capacity = self._most * (PICTURES_SHARE if is_picture else 1.0)
+            if self._ended or self._n_waiting + len(entry.data) > capacity:
                 self.n_dropped[kind] += 1
                 too_slow = not self._ended
             else:
@@ -102,7 +102,7 @@ class DiskWriter:
         return False
 
     def put_packet(self, packet: bytes) -> None:
-        """Have a packet written to the .tlog; never waits."""
+        """Queue a packet for the .tlog; never waits."""
         with self._changed:
             if not self._ended and self._n_waiting + len(packet) <= self._most:
                 self._packets.append(packet)
@@ -157,7 +157,7 @@ class DiskWriter:
         return self._closing or self._n_waiting > CHUNK_BYTES
 
     def _do(self, step: Callable[[], None]) -> None:
-        """Do what may find the disk full: make room and try again, or end."""
+        """Call; on a full disk make space and try again, or end."""
         while not self._ended:
             try:
                 step()
@@ -169,7 +169,7 @@ class DiskWriter:
                     self._end(FULL, str(self._flight))
 
     def _make_room(self) -> None:
-        """Look whether the disk is nearly full, and do what is configured then."""
+        """Check the free space, and apply `when_full` where it is short."""
         now_s = time.monotonic()
         if now_s - self._looked_s < LOOK_S:
             return
@@ -184,7 +184,7 @@ class DiskWriter:
             self._end(FAILED, str(error))
 
     def _delete_oldest(self) -> bool:
-        """Whether some room was made."""
+        """Delete the oldest flight; whether space was made."""
         if self._config.when_full != "prune":
             return False
         for flight in may_go(flights_in(self._flight.parent), but=self._flight):
@@ -198,7 +198,7 @@ class DiskWriter:
         return False
 
     def _end(self, what: str = "", detail: str = "") -> None:
-        """No more is written; what is there becomes whole, in the room that was kept for that."""
+        """End writing; completes the file in the reserved space."""
         with self._changed:
             self._ended = True
             self.n_dropped["messages"] += len(self._entries)
@@ -214,13 +214,13 @@ class DiskWriter:
             pass  # it will be repaired when it is opened
 
     def _tell_once(self, what: str, detail: str) -> None:
-        if what not in self._told:
-            self._told.add(what)
+        if what not in self._warned_kinds:
+            self._warned_kinds.add(what)
             self._warn(Warned(self._now_ns(), what, detail))
 
 
 def _reserved(folder: Path) -> IO[bytes]:
-    """A file without a name that takes up room; closed, the room is free."""
+    """Unlinked file that reserves space; closing it frees the space."""
     reserve = tempfile.TemporaryFile(dir=folder)
     with contextlib.suppress(OSError):  # the disk is full now: the first look says so
         os.posix_fallocate(reserve.fileno(), 0, RESERVE_BYTES)

@@ -1,8 +1,8 @@
-"""A recording as a flight folder: pictures, their times, camera and telemetry, for other programs.
+"""Exports a recording as a flight folder: images, their times, camera and telemetry.
 
-Pictures are not encoded again: JPEG and PNG become files as they are, a video a video. What was
-recorded raw becomes PNG. Telemetry is what came over the link; where none of that was recorded, as
-of an import, it is the samples.
+Images are not encoded again: JPEG and PNG become files as they are, a video a video. Raw images
+become PNG. Telemetry is the link's packets; where none were recorded, as of an import, it is the
+samples.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ MICROSECONDS = Fraction(1, 1_000_000)
 NAMES = {"jpeg": "jpg", "png": "png"}
 
 
-def export(recording: Recording, out: Path, told: Callable[[int], None]) -> None:
-    """Write one that has pictures as the folder `out`; `told` hears of pictures done.
+def export(recording: Recording, out: Path, on_progress: Callable[[int], None]) -> None:
+    """Write a recording with images as the folder `out`; `on_progress` takes the images done.
 
-    FlightError where it cannot be written, or holds anything already.
+    FlightError where it cannot be written, or is not empty.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FlightError(f"{out}: is there already; give a folder that is not, or empty")
@@ -53,9 +53,9 @@ def export(recording: Recording, out: Path, told: Callable[[int], None]) -> None
             table = "".join(telemetry_csv(telemetry_of(recording, TelemetryConfig())))
             (out / NAME).write_text(table, encoding="utf-8")
         if recording.picture_data(places[0])[0] == VIDEO:
-            places = _video(recording, out / "camera.mp4", told)
+            places = _video(recording, out / "camera.mp4", on_progress)
         else:
-            _images(recording, out / "images", told)
+            _images(recording, out / "images", on_progress)
     except OSError as error:
         raise FlightError(f"{out}: cannot be written: {error.strerror}") from error
     lines = ["index,unix_ns", *(f"{number},{place.t_ns}" for number, place in enumerate(places))]
@@ -63,7 +63,7 @@ def export(recording: Recording, out: Path, told: Callable[[int], None]) -> None
 
 
 def tlog(recording: Recording) -> bytes:
-    """All packets of the link, both ways, as ground stations write them."""
+    """All packets of the link, in both directions, in the format of ground stations."""
     streams = {RECEIVED: MavlinkStream(), SENT: MavlinkStream()}
     out = []
     for number in range(len(recording.found.chunks)):
@@ -82,7 +82,7 @@ def tlog(recording: Recording) -> bytes:
     return b"".join(out)
 
 
-def _images(recording: Recording, folder: Path, told: Callable[[int], None]) -> None:
+def _images(recording: Recording, folder: Path, on_progress: Callable[[int], None]) -> None:
     folder.mkdir()
     for number, place in enumerate(recording.pictures):
         topic, data = recording.picture_data(place)
@@ -94,13 +94,15 @@ def _images(recording: Recording, folder: Path, told: Callable[[int], None]) -> 
             if rgb is not None:
                 _, png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
                 (folder / f"{number:06d}.png").write_bytes(png.tobytes())
-        told(number + 1)
+        on_progress(number + 1)
 
 
-def _video(recording: Recording, path: Path, told: Callable[[int], None]) -> list[PicturePlace]:
-    """Put the pictures of a video, from the first that stands alone, into an MP4 file."""
+def _video(
+    recording: Recording, path: Path, on_progress: Callable[[int], None]
+) -> list[PicturePlace]:
+    """Remux the images of a video, from the first intra picture on, into an MP4 file."""
     places = recording.pictures
-    places = places[next((k for k, p in enumerate(places) if p.alone), len(places)) :]
+    places = places[next((k for k, p in enumerate(places) if p.intra), len(places)) :]
     stream = b"".join(CompressedVideo.FromString(recording.picture_data(p)[1]).data for p in places)
     if not stream:
         raise FlightError(f"{recording.path}: none of its pictures stands alone")
@@ -119,7 +121,7 @@ def _video(recording: Recording, path: Path, told: Callable[[int], None]) -> lis
                 packet.pts = packet.dts = us
                 made.mux(packet)
                 number += 1
-                told(number)
+                on_progress(number)
     except (av.error.FFmpegError, ValueError) as error:
         raise FlightError(f"{path}: the video cannot be written: {error}") from error
     return places[:number]

@@ -1,8 +1,8 @@
-"""When a flight really was, where the computer's clock was wrong at its beginning.
+"""Corrected date of a flight, where the computer's clock was wrong at its beginning.
 
-`date.json` in the flight's folder has what is to be added to all times of its recording, which stay
-as they are. The folder is named by it when nobody writes there any more; one step that a power cut
-leaves done or not done, and that is made up for later.
+`date.json` in the flight's folder has the correction for all times of its recording, which stay
+unchanged. The folder is renamed by the date when nobody writes there any more; a single step, which
+after a power cut is done or not done, and is made up for later.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ FILE = "date.json"
 
 @dataclass(frozen=True, slots=True)
 class FlightDate:
-    """When a flight began, Unix time, and what is to be added to the times in its recording."""
+    """Begin of a flight, Unix time, and the correction for the times in its recording."""
 
     began_unix_s: float
     correction_s: float
     by: str
-    """Who told it."""
+    """Source of the date."""
 
 
 def write_date(flight: Path, date: FlightDate) -> None:
-    """Put it into a flight's folder, whole or not at all; OSError where that cannot be."""
+    """Write it into a flight's folder, atomically; OSError where impossible."""
     document = {
         "began_unix_s": date.began_unix_s, "correction_s": date.correction_s, "by": date.by,
     }  # fmt: skip
@@ -46,7 +46,7 @@ def write_date(flight: Path, date: FlightDate) -> None:
 
 
 def read_date(flight: Path) -> FlightDate | None:
-    """What there is of it; None where the computer's clock was right, as far as is known."""
+    """Date of a flight's folder; None where the clock was right, as far as is known."""
     try:
         document = json.loads((flight / FILE).read_bytes())
         return FlightDate(
@@ -57,10 +57,10 @@ def read_date(flight: Path) -> FlightDate | None:
 
 
 def named_by_date(flight: Path) -> Path:
-    """Name a flight's folder for when it really was; where it lies now.
+    """Rename a flight's folder by its date; returns its path.
 
-    Nothing is done while it is recorded, nor to a folder that has no number, by which flights are
-    in order whatever their names say.
+    Nothing is done while it is recorded, nor to a folder without a number, by which flights are
+    ordered whatever their names say.
     """
     date, number = read_date(flight), number_of(flight.name)
     if date is None or number is None or not STAMPED.fullmatch(flight.name):

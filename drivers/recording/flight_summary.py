@@ -1,4 +1,4 @@
-"""What a recording says of itself, without all of it being read where it is whole."""
+"""Summary of a recording; of a whole file only its end is read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ State = Literal["whole", "repaired", "cut short", "damaged", "being recorded"]
 
 @dataclass(frozen=True, slots=True)
 class FlightSummary:
-    """Of one recording; times in ns of the flight's clock, 0 where there is nothing in it."""
+    """Summary of one recording; times in ns of the flight's clock, 0 where it is empty."""
 
     path: Path
     state: State
@@ -34,23 +34,23 @@ class FlightSummary:
 
     @property
     def n_pictures(self) -> int:
-        """Pictures in it."""
+        """Number of images."""
         return sum(n for topic, n in self.counts.items() if topic in PICTURES)
 
     @property
     def duration_s(self) -> float:
-        """From its first message to its last."""
+        """Seconds from its first message to its last."""
         return (self.stop_ns - self.start_ns) * 1e-9
 
 
-def summarise(path: Path, told: Callable[[int], None] | None = None) -> FlightSummary:
-    """What there is in a recording; changes nothing.
+def summarise(path: Path, on_progress: Callable[[int], None] | None = None) -> FlightSummary:
+    """Summary of a recording; changes nothing.
 
-    With `told`, which hears of bytes read, every chunk is read and its checksum looked at.
+    With `on_progress`, which takes the bytes read, every chunk is read and its checksum verified.
     FlightError where it is no MCAP file.
     """
     with McapFile(path) as file:
-        found = (None if told is not None else summary(file)) or scan(file, told)
+        found = (None if on_progress is not None else summary(file)) or scan(file, on_progress)
         growing = is_growing(file.fd)
         n_bytes = file.size
     contents = found.contents

@@ -1,7 +1,7 @@
-"""The folder of all flights: which there are, in what order, and which may go to make room.
+"""The folder of flights: list, order, and flights that may be deleted.
 
-Flights are numbered, and the number is what orders them: a computer without a battery clock names
-them by whatever time it has. Those without a number are older than numbered ones.
+Flights are ordered by their numbers: a computer without a battery clock names them by whatever time
+it has. Those without a number are older than numbered ones.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from drivers.recording.growing_file import is_growing
 
 RECORDING, TLOG = "flight.mcap", "flight.tlog"
 KEEP = "keep"
-"""A file of this name in a flight's folder keeps it from being deleted."""
+"""A file of this name in a flight's folder protects it from deletion."""
 COUNTER = ".last-number"
-"""Has the number of the newest flight, which may have been deleted or taken elsewhere since."""
+"""Holds the number of the newest flight, which may have been deleted or moved since."""
 STAMPED = re.compile(r"(?:(\d{5,})-)?(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-\d+)?")
-"""What the daemon calls a flight; nothing else is ever deleted."""
+"""Names of flights by the daemon; nothing else is ever deleted."""
 STAMP = "%Y-%m-%dT%H-%M-%SZ"
 PROGRAM_UNIX_S = 1767225600.0
 """2026-01-01: no flight was recorded before; an earlier date is of a clock that was not set."""
 
 
 class FlightPlace(NamedTuple):
-    """A flight's folder, which has a recording or once had."""
+    """Folder of a flight, which has a recording or once had."""
 
     path: Path
     n_bytes: int
@@ -38,8 +38,8 @@ class FlightPlace(NamedTuple):
     growing: bool
     """Whether it is still being recorded."""
     not_before_s: float | None = None
-    """Unix time before which it cannot have begun, by its name and those before it in order; None
-    where no clock was ever right."""
+    """Lower bound of its begin, Unix time, by its name and those before it in order; None where no
+    clock was ever right."""
 
 
 def flights_in(folder: Path) -> list[FlightPlace]:
@@ -62,19 +62,19 @@ def flights_in(folder: Path) -> list[FlightPlace]:
 
 
 def flight_name(number: int, unix_s: float) -> str:
-    """What a flight is called."""
+    """Name of a flight's folder."""
     when = datetime.fromtimestamp(unix_s, tz=timezone.utc).strftime(STAMP)
     return f"{number:05d}-{when}"
 
 
 def number_of(name: str) -> int | None:
-    """The number in a flight's name; None in one of an older version, or of something else."""
+    """Number in a flight's name; None in one of an older version, or of something else."""
     found = STAMPED.fullmatch(name)
     return int(found[1]) if found is not None and found[1] else None
 
 
 def began_unix_s(name: str) -> float | None:
-    """When a flight began, by its name; None where the clock was not set then."""
+    """Begin of a flight by its name; None where the clock was not set then."""
     found = STAMPED.fullmatch(name)
     if found is None:
         return None
@@ -86,7 +86,7 @@ def began_unix_s(name: str) -> float | None:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Names of flights, the oldest first; what else there is is left out."""
+    """Names of flights, the oldest first; other names are left out."""
     return sorted(
         (name for name in names if STAMPED.fullmatch(name)),
         key=lambda name: (number_of(name) or 0, name),
@@ -94,7 +94,7 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def next_number(folder: Path) -> int:
-    """A number higher than that of any flight that there is or was."""
+    """A number higher than that of any flight, past or present."""
     numbers = [0]
     try:
         numbers += [number_of(each.name) or 0 for each in os.scandir(folder)]
@@ -105,29 +105,29 @@ def next_number(folder: Path) -> int:
 
 
 def recordings_in(flight: Path) -> list[Path]:
-    """The recording of a flight, and those begun anew within it, in order."""
+    """Recordings of a flight, its later parts included, in order."""
     parts = sorted(flight.glob("part-*/" + RECORDING), key=lambda p: (len(p.parent.name), p))
     return [path for path in (flight / RECORDING, *parts) if path.is_file()]
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk, as far as it is for us."""
+    """Free bytes of the disk available to us."""
     found = os.statvfs(folder)
     return found.f_bavail * found.f_frsize
 
 
 def may_go(flights: list[FlightPlace], but: Path | None = None) -> Iterator[FlightPlace]:
-    """Those that may be deleted, the oldest first: finished, not kept, and not `but`."""
+    """Flights that may be deleted, the oldest first: finished, not kept, and not `but`."""
     return (f for f in flights if not (f.kept or f.growing) and f.path.name != (but and but.name))
 
 
 def delete(flight: FlightPlace) -> None:
-    """Delete a flight with all its results; OSError where that cannot be."""
+    """Delete a flight with all its results; OSError where impossible."""
     shutil.rmtree(flight.path)
 
 
 def is_recorded_now(flight: Path) -> bool:
-    """Whether somebody still writes a recording in a flight's folder."""
+    """Whether a recording in a flight's folder is still being written."""
     return any(map(_is_growing, recordings_in(flight)))
 
 

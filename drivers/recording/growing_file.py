@@ -1,4 +1,4 @@
-"""A file that grows by whole pieces, and that nobody takes for finished while it grows."""
+"""Append-only file with a lock that marks it as unfinished."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 
 
 class GrowingFile:
-    """A new file; OSError where it cannot be made, or is there already.
+    """A new file; OSError where it exists or cannot be made.
 
-    Its lock goes with the process, however that ends: see `is_growing`.
+    Its lock ends with the process, however that ends: see `is_growing`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -22,7 +22,7 @@ class GrowingFile:
             _sync_folder(folder)  # else a power cut could leave a file without a name
 
     def append(self, data: bytes) -> None:
-        """Put all of it at the end; OSError, and none of it stays, where there is no room."""
+        """Append all of it; OSError, and none of it stays, where there is no space."""
         rest = memoryview(data)
         try:
             while rest:
@@ -34,7 +34,7 @@ class GrowingFile:
         self._size += len(data)
 
     def sync(self) -> None:
-        """Wait until the disk has it."""
+        """Wait until the data is on disk."""
         os.fdatasync(self._fd)
 
     def discard(self) -> None:
@@ -58,7 +58,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def is_growing(fd: int) -> bool:
-    """Whether somebody else still writes to the file that is open as `fd`."""
+    """Whether another process still writes to the file that is open as `fd`."""
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:

@@ -1,4 +1,4 @@
-"""Any flight as a recording: the frames and samples that were read, without loss."""
+"""Imports any flight as a recording: its frames and samples, without loss."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from drivers.recording.recording_topics import CALIBRATION, EVENTS, HEALTH, PROF
 
 CHUNK_BYTES = 4_000_000
 RATE_HZ = 30.0
-"""Told to the encoder, which for still pictures does not matter."""
+"""Frame rate given to the encoder; irrelevant for still images."""
 
 
-def write_recording(flight: Flight, out: Path, told: Callable[[int], None]) -> int:
-    """Write a flight as the recording `out`, which must not be there; return how many frames.
+def write_recording(flight: Flight, out: Path, on_progress: Callable[[int], None]) -> int:
+    """Write a flight as the recording `out`, which must not exist; return the number of frames.
 
-    `told` hears of them on the way. FlightError where it cannot be written, and then nothing is.
+    `on_progress` takes the number of frames done. FlightError where it cannot be written; then
+    nothing is left.
     """
     if out.exists():
         raise FlightError(f"{out}: is there already; give another name")
@@ -37,7 +38,7 @@ def write_recording(flight: Flight, out: Path, told: Callable[[int], None]) -> i
         part.unlink(missing_ok=True)
         file = GrowingFile(part)
         try:
-            n = _write(flight, file, told)
+            n = _write(flight, file, on_progress)
             file.sync()
             part.rename(out)
         except BaseException:
@@ -49,7 +50,7 @@ def write_recording(flight: Flight, out: Path, told: Callable[[int], None]) -> i
     return n
 
 
-def _write(flight: Flight, file: GrowingFile, told: Callable[[int], None]) -> int:
+def _write(flight: Flight, file: GrowingFile, on_progress: Callable[[int], None]) -> int:
     log = flight.telemetry()
     camera, start_ns = flight.camera, flight.start_ns
     encoder = picture_encoder(RecorderConfig(codec="png"), camera.width, camera.height, RATE_HZ)
@@ -81,7 +82,7 @@ def _write(flight: Flight, file: GrowingFile, told: Callable[[int], None]) -> in
             for picture in encoder.encode(message):
                 put(picture.topic, message.t_ns, picture.data, message.seq)
             n += 1
-            told(n)
+            on_progress(n)
         elif isinstance(message, Warned):
             put(EVENTS, message.t_ns, event_bytes(message))
         else:

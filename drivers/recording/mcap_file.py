@@ -1,4 +1,4 @@
-"""An MCAP file as bytes, records and chunks, none of which is believed before it is looked at."""
+"""MCAP file: bytes, records and chunks, validated before use."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ MOST_IN_CHUNK = 256 << 20
 FOOTER_SIZE = 9 + 20 + len(MAGIC)
 OPCODES = frozenset(map(int, Opcode))
 DAMAGED = (struct.error, ValueError, McapError, RuntimeError, zstandard.ZstdError)
-"""What the libraries, and what is here, raise on bytes that are not what they should be."""
+"""Exceptions of the libraries, and of this module, on damaged data."""
 
 
 class McapMessage(NamedTuple):
-    """One message; `data` is only good until the next chunk is read."""
+    """One message; `data` is valid until the next chunk is read."""
 
     channel: Channel
     sequence: int
@@ -40,7 +40,7 @@ class McapMessage(NamedTuple):
 
 
 class ChunkPlace(NamedTuple):
-    """Where a chunk lies, and what its head says of it."""
+    """Offset of a chunk, and the fields of its header."""
 
     at: int
     end: int
@@ -51,13 +51,13 @@ class ChunkPlace(NamedTuple):
     compression: str
     data_at: int
     after_loss: bool = False
-    """Whether something that lay before it could not be read."""
+    """Whether data before it could not be read."""
 
 
 class McapFile:
-    """An open file; FlightError where it is no MCAP file at all. To be closed, or used by `with`.
+    """An open file; FlightError where it is no MCAP file. Close it, or use it with `with`.
 
-    Safe on a file that grows meanwhile: what came after opening is not there.
+    Safe on a file that grows meanwhile: later data is ignored.
     """
 
     def __init__(self, path: Path) -> None:
@@ -93,7 +93,7 @@ class McapFile:
             raise FlightError(f"{self.path}: cannot be read: {error.strerror}") from error
 
     def profile(self) -> str:
-        """What the header says that this is; "" where there is none."""
+        """Profile in the header; "" without one."""
         record = self.record_at(len(MAGIC))
         if record is None or record[0] != Opcode.HEADER:
             return ""
@@ -115,7 +115,7 @@ class McapFile:
         return opcode, at, end
 
     def end_of_data(self) -> int | None:
-        """Where the index begins that the footer names, if its checksum is right."""
+        """Begin of the index that the footer names, if its checksum is right."""
         tail = self.bytes_at(self.size - FOOTER_SIZE, self.size)
         if len(tail) < FOOTER_SIZE or not tail.endswith(MAGIC):
             return None
@@ -130,7 +130,7 @@ class McapFile:
         return begin if right or not footer.summary_crc else None
 
     def chunk_at(self, at: int) -> ChunkPlace:
-        """The chunk that begins there, by its head; one of DAMAGED where none is."""
+        """Chunk that begins there, by its header; one of DAMAGED where there is none."""
         head = self.bytes_at(at, at + RECORD.size + CHUNK_HEAD.size + 16)
         opcode, length = RECORD.unpack_from(head)
         start_ns, stop_ns, size, crc, n_name = CHUNK_HEAD.unpack_from(head, RECORD.size)
@@ -146,7 +146,7 @@ class McapFile:
         return ChunkPlace(at, end, start_ns, stop_ns, size, crc, compression.decode(), data_at)
 
     def content(self, chunk: ChunkPlace) -> bytes:
-        """What a chunk holds; one of DAMAGED where its checksum says that it is not that."""
+        """Content of a chunk; one of DAMAGED where its checksum is wrong."""
         data = self.bytes_at(chunk.data_at, chunk.end)
         if chunk.compression == "zstd":
             if zstandard.get_frame_parameters(data).content_size > chunk.size:
@@ -157,9 +157,9 @@ class McapFile:
         return data
 
     def messages(self, chunk: ChunkPlace, channels: dict[int, Channel]) -> list[McapMessage]:
-        """All messages of a chunk whose channel is known, or told by the chunk itself.
+        """All messages of a chunk whose channel is known, or defined in the chunk.
 
-        One of DAMAGED where the chunk is not what was written.
+        One of DAMAGED where the chunk is damaged.
         """
         out = []
         for kind, body in records(memoryview(self.content(chunk))):
@@ -187,5 +187,5 @@ def records(block: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def as_stream(body: bytes | memoryview) -> ReadDataStream:
-    """What the mcap library reads records from."""
+    """Stream from which the mcap library reads records."""
     return ReadDataStream(BytesIO(body))

@@ -1,7 +1,7 @@
-"""Reads MCAP as it really is: cut short, or with bytes that are not what was written.
+"""Scan of an MCAP file that may be cut short or damaged.
 
-Records are believed as far as they fit into the file and into each other, chunks by their checksum;
-where that fails the next whole chunk is looked for. Nothing is read into memory but one chunk.
+Records are accepted as far as they fit into the file and into each other, chunks by their checksum;
+after damage the next whole chunk is searched. Only one chunk at a time is in memory.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from drivers.recording.mcap_file import (
 from drivers.recording.mcap_writer import MAGIC, Contents
 
 MOST_OF_SMALL = 64 << 20
-"""Bytes of an attachment or another record that is read whole."""
+"""Size limit of an attachment or another record that is read whole."""
 WINDOW = 1 << 20
 # opcode, length below 4 GB, times, size, checksum, then one of the two compressions
 CHUNK_BEGIN = re.compile(rb"\x06.{4}\x00{4}.{28}(?:\x04\x00{3}zstd|\x00{4})", re.DOTALL)
@@ -49,29 +49,29 @@ NOTES = frozenset(
 
 @dataclass(slots=True)
 class Scan:
-    """What there is in a file."""
+    """Content of a file."""
 
     profile: str = ""
     whole: bool = False
-    """Whether it ends as it should."""
+    """Whether it has a valid end."""
     contents: Contents = field(default_factory=Contents)
     chunks: list[ChunkPlace] = field(default_factory=list)
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     n_lost_bytes: int = 0
-    """Bytes of data that could not be read."""
+    """Bytes of unreadable data."""
     n_lost_places: int = 0
-    """Places between whole chunks where they lay."""
+    """Number of gaps between whole chunks."""
     n_cut_bytes: int = 0
-    """Those of them after the last whole record, where the file was cut."""
+    """Unreadable bytes after the last whole record, where the file was cut."""
     good_end: int = 0
-    """Where the data end that can be read."""
+    """End of the readable data."""
     n_bytes: int = 0
-    """Of the file, as it was scanned."""
+    """Size of the file when scanned."""
 
 
 def summary(file: McapFile) -> Scan | None:
-    """What the file's own end says of it, quickly; None where that is not to be believed."""
+    """Content by the file's own index, quickly; None where that is invalid."""
     found = Scan()
     begin = file.end_of_data()
     if begin is None:
@@ -88,10 +88,10 @@ def summary(file: McapFile) -> Scan | None:
     return found
 
 
-def scan(file: McapFile, told: Callable[[int], None] | None = None) -> Scan:
-    """Go through all of it; `told` hears how many bytes are done.
+def scan(file: McapFile, on_progress: Callable[[int], None] | None = None) -> Scan:
+    """Scan the whole file; `on_progress` takes the bytes done.
 
-    Chunks whose checksum is wrong are left out and counted.
+    Chunks with a wrong checksum are left out and counted.
     """
     found = Scan(good_end=len(MAGIC), n_bytes=file.size)
     at, in_data, lost = len(MAGIC), True, False
@@ -118,8 +118,8 @@ def scan(file: McapFile, told: Callable[[int], None] | None = None) -> Scan:
             found.n_lost_bytes += chunk - at
             found.n_lost_places += 1
             at, lost = chunk, True
-        if told is not None:
-            told(at)
+        if on_progress is not None:
+            on_progress(at)
     if in_data:
         found.n_cut_bytes = file.size - found.good_end
         found.n_lost_bytes += found.n_cut_bytes
@@ -127,7 +127,7 @@ def scan(file: McapFile, told: Callable[[int], None] | None = None) -> Scan:
 
 
 def _take_record(file: McapFile, found: Scan, opcode: int, at: int, end: int) -> bool:
-    """Take what a record says; whether it can be believed."""
+    """Take a record; whether it is valid."""
     begin, contents = at + RECORD.size, found.contents
     try:
         if opcode == Opcode.CHUNK:
@@ -193,7 +193,7 @@ def _take_chunk(file: McapFile, found: Scan, at: int) -> None:
 
 
 def _next_chunk(file: McapFile, at: int) -> int | None:
-    """Where the next chunk begins that is whole."""
+    """Offset of the next whole chunk."""
     while at < file.size:
         window = file.bytes_at(at, at + WINDOW)
         for match in CHUNK_BEGIN.finditer(window):

@@ -1,8 +1,8 @@
-"""Writes MCAP: chunks that stand for themselves, and an index of them at the end.
+"""MCAP writer: self-contained chunks, and an index at the end.
 
-The mcap library's own writer decides by size when a chunk is full; here whoever records decides, so
-that what is old enough is on the disk. Each chunk repeats the channels that it uses: a file whose
-beginning is damaged still tells what is in the rest. https://mcap.dev/spec
+The mcap library's own writer ends a chunk by size; here the recorder decides, so that data older
+than a limit is on disk. Each chunk repeats the channels that it uses: a file whose beginning is
+damaged can still be read. https://mcap.dev/spec
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from mcap.records import (
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "companion"
 LEVEL = 1
-"""Of zstd: pictures do not grow smaller, and the rest does at the lowest."""
+"""Level of zstd: the lowest, as images do not compress any further."""
 
 
 @dataclass(slots=True)
 class Contents:
-    """What the end of a file says of all that stands before it."""
+    """Summary of a file's data, for its end."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -67,7 +67,7 @@ class Contents:
 class McapWriter:
     """One file; `append` puts bytes at its end, whole, or raises and leaves it as it was.
 
-    Messages wait until `flush`. Where that raises they go on waiting, and the file is as before.
+    Messages wait until `flush`. Where that raises they still wait, and the file is unchanged.
     """
 
     def __init__(self, append: Callable[[bytes], None], profile: str) -> None:
@@ -77,31 +77,31 @@ class McapWriter:
         self._sequences: Counter[int] = Counter()
         self._waiting: list[Message] = []
         self.n_waiting_bytes = 0
-        """Of messages that no chunk has yet."""
+        """Size of messages that are in no chunk yet."""
         self._compressor = zstandard.ZstdCompressor(level=LEVEL, write_content_size=True)
         self._put(MAGIC + _bytes_of(Header(profile, LIBRARY)))
 
     @property
     def n_bytes(self) -> int:
-        """Of the file so far."""
+        """Size of the file so far."""
         return self._at
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Add a schema; its number."""
+        """Add a schema; its id."""
         schema = Schema(len(self._contents.schemas) + 1, data, encoding, name)
         self._put(_bytes_of(schema))
         self._contents.schemas[schema.id] = schema
         return schema.id
 
     def channel(self, topic: str, encoding: str, schema_id: int) -> int:
-        """Add a channel; its number."""
+        """Add a channel; its id."""
         channel = Channel(len(self._contents.channels) + 1, topic, encoding, {}, schema_id)
         self._put(_bytes_of(channel))
         self._contents.channels[channel.id] = channel
         return channel.id
 
     def attach(self, name: str, media_type: str, data: bytes, t_ns: int) -> None:
-        """Add a small file; it is written at once."""
+        """Write an attachment at once."""
         record = _bytes_of(Attachment(t_ns, t_ns, name, media_type, data))
         place = self._put(record)
         self._contents.attachments.append(
@@ -109,7 +109,7 @@ class McapWriter:
         )
 
     def note(self, name: str, words: Mapping[str, str]) -> None:
-        """Add metadata; they are written at once."""
+        """Write metadata at once."""
         record, index = note_record(name, words, self._at)
         self._put(record)
         self._contents.metadata.append(index)
@@ -117,7 +117,7 @@ class McapWriter:
     def add(
         self, channel: int, t_ns: int, data: bytes, publish_ns: int, sequence: int | None = None
     ) -> None:
-        """Add a message to the chunk that waits; without a `sequence` they are counted."""
+        """Add a message to the present chunk; without a `sequence` it is numbered."""
         if sequence is None:
             sequence = self._sequences[channel]
         self._sequences[channel] = sequence + 1
@@ -125,7 +125,7 @@ class McapWriter:
         self.n_waiting_bytes += len(data)
 
     def flush(self) -> None:
-        """Write what waits as a chunk."""
+        """Write the waiting messages as a chunk."""
         if not self._waiting:
             return
         chunk, offsets, times = self._chunk()
@@ -146,14 +146,14 @@ class McapWriter:
         self.drop_waiting()
 
     def drop_waiting(self) -> int:
-        """Forget what waits; how many messages that were."""
+        """Drop the waiting messages; their number."""
         n_dropped = len(self._waiting)
         self._waiting = []
         self.n_waiting_bytes = 0
         return n_dropped
 
     def finish(self) -> None:
-        """Write what waits, and the index: the file is whole."""
+        """Write the waiting messages and the index."""
         self.flush()
         self._put(ending(self._contents, self._at))
 
@@ -178,7 +178,7 @@ class McapWriter:
 
 
 def ending(contents: Contents, at: int) -> bytes:
-    """The end of a file that is `at` bytes long: what its data hold, the index, the footer."""
+    """End of a file that is `at` bytes long: end of data, index, footer."""
     end_of_data = _bytes_of(DataEnd(0))
     summary_at = at + len(end_of_data)
     groups: list[tuple[Opcode, list[Any]]] = [
@@ -203,7 +203,7 @@ def ending(contents: Contents, at: int) -> bytes:
 
 
 def note_record(name: str, words: Mapping[str, str], at: int) -> tuple[bytes, MetadataIndex]:
-    """Metadata that are to stand at `at`, as a record, and what the index says of them."""
+    """Metadata record for offset `at`, and its index entry."""
     record = _bytes_of(Metadata(name, dict(words)))
     return record, MetadataIndex(at, len(record), name)
 

@@ -1,4 +1,4 @@
-"""Pictures on their way into a recording and out of it."""
+"""Encoding and decoding of a recording's images."""
 
 from __future__ import annotations
 
@@ -25,45 +25,45 @@ from drivers.recording.recording_topics import GREY, IMAGE, RAW, VIDEO
 FRAME_ID = "camera"
 PNG_LEVEL = 1
 MOST_INSIDE = 64
-"""Pictures that an encoder may hold."""
+"""Most images held by an encoder."""
 SOFTWARE = "libx264"
 HARDWARE = ("h264_v4l2m2m", "h264_nvenc")
-"""What of FFmpeg's encoders is tried before the processor has to do it."""
+"""FFmpeg encoders in hardware, tried first."""
 OPTIONS = {SOFTWARE: {"preset": "ultrafast", "tune": "zerolatency"}}
-_BEGINS = re.compile(rb"\x00\x00\x01(?:[\x25\x45\x65\x05]|[\x27\x47\x67\x07])")
-"""An IDR slice or a sequence parameter set in H.264's byte stream (ITU-T H.264, annex B)."""
+_IDR_OR_SPS = re.compile(rb"\x00\x00\x01(?:[\x25\x45\x65\x05]|[\x27\x47\x67\x07])")
+"""IDR slice or sequence parameter set in an H.264 byte stream (ITU-T H.264, annex B)."""
 
 
-class Recorded(NamedTuple):
-    """One message of the picture of a frame; unless `alone` it needs the picture before it."""
+class EncodedPicture(NamedTuple):
+    """One message with the image of a frame; unless `intra` it needs the image before it."""
 
     topic: str
     seq: int
     t_ns: int
     data: bytes
-    alone: bool = True
+    intra: bool = True
 
 
 class PictureEncoder(Protocol):
-    """Pictures to messages; one for each flight."""
+    """Encoder of images to messages; one for each flight."""
 
     name: str
     """For people."""
 
-    def encode(self, frame: Frame) -> list[Recorded]:
-        """Take a frame; what is ready, of this one or of one before it."""
+    def encode(self, frame: Frame) -> list[EncodedPicture]:
+        """Encode a frame; finished messages, of this frame or of earlier ones."""
 
-    def begin_anew(self) -> None:
-        """Something was lost: the next picture is to need none before it."""
+    def request_intra(self) -> None:
+        """Make the next image independent of those before it, after a loss."""
 
-    def finish(self) -> list[Recorded]:
-        """No more frames come; what is left."""
+    def finish(self) -> list[EncodedPicture]:
+        """Finish; messages that are left."""
 
 
 def picture_encoder(config: RecorderConfig, width: int, height: int, rate_hz: float) -> (
     PictureEncoder
 ):  # fmt: skip
-    """What is configured; ConfigError where an encoder that is asked for does not work."""
+    """The configured encoder; ConfigError where it does not work."""
     if config.codec == "h264":
         return H264(config, width, height, rate_hz)
     if config.codec == "mjpeg":
@@ -74,55 +74,55 @@ def picture_encoder(config: RecorderConfig, width: int, height: int, rate_hz: fl
 
 
 class Stills:
-    """Each picture by itself: as JPEG, or without loss as PNG, grey ones beside if need be."""
+    """Each image by itself: as JPEG, or lossless as PNG, with a separate grey image if needed."""
 
     def __init__(self, form: str, parameters: list[int]) -> None:
         self.name = form
         self._parameters = parameters
 
-    def encode(self, frame: Frame) -> list[Recorded]:
+    def encode(self, frame: Frame) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         bgr = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
         _, data = cv2.imencode(f".{self.name}", bgr, self._parameters)
         image = CompressedImage(frame_id=FRAME_ID, format=self.name, data=data.tobytes())
         set_time(image.timestamp, frame.t_ns)
-        out = [Recorded(IMAGE, frame.seq, frame.t_ns, serialised(image))]
-        return out + _grey_beside(frame) if self.name == "png" else out
+        out = [EncodedPicture(IMAGE, frame.seq, frame.t_ns, serialised(image))]
+        return out + _lossless_grey(frame) if self.name == "png" else out
 
-    def begin_anew(self) -> None:
+    def request_intra(self) -> None:
         """See `PictureEncoder`."""
 
-    def finish(self) -> list[Recorded]:
+    def finish(self) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         return []
 
 
 class Raw:
-    """Pictures as they are; the chunk's compression makes them a little smaller."""
+    """Uncompressed images; the chunk's compression makes them a little smaller."""
 
     name = "raw"
 
-    def encode(self, frame: Frame) -> list[Recorded]:
+    def encode(self, frame: Frame) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
-        return [_raw(RAW, frame, frame.rgb, "rgb8"), *_grey_beside(frame)]
+        return [_raw(RAW, frame, frame.rgb, "rgb8"), *_lossless_grey(frame)]
 
-    def begin_anew(self) -> None:
+    def request_intra(self) -> None:
         """See `PictureEncoder`."""
 
-    def finish(self) -> list[Recorded]:
+    def finish(self) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         return []
 
 
 class H264:
-    """A video whose pictures come out one by one, as they go in: no picture waits for a later."""
+    """Video without reordering: each image comes out as it goes in."""
 
     def __init__(self, config: RecorderConfig, width: int, height: int, rate_hz: float) -> None:
         self._config, self._size, self._rate_hz = config, (width, height), rate_hz
         self._inside: dict[int, tuple[int, int]] = {}
-        """By presentation stamp: number and time of the frames in the encoder."""
+        """Number and time of the frames in the encoder, by presentation stamp."""
         self._number = 0
-        self._anew = False
+        self._intra_requested = False
         wanted = config.h264_encoder
         names = (*HARDWARE, SOFTWARE) if wanted == "auto" else (wanted,)
         for name in names:
@@ -137,15 +137,15 @@ class H264:
             "set it to auto, or recorder.codec to mjpeg"
         )
 
-    def encode(self, frame: Frame) -> list[Recorded]:
+    def encode(self, frame: Frame) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         return self._encode(self._codec, frame.seq, frame.t_ns, frame.rgb)
 
-    def begin_anew(self) -> None:
+    def request_intra(self) -> None:
         """See `PictureEncoder`."""
-        self._anew = True
+        self._intra_requested = True
 
-    def finish(self) -> list[Recorded]:
+    def finish(self) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         try:
             return self._messages(self._codec, self._codec.encode(None))
@@ -153,7 +153,7 @@ class H264:
             return []
 
     def _opened(self, name: str) -> Any:
-        """An encoder that has shown that it works."""
+        """An encoder that has been tested."""
         width, height = self._size
         blank = np.zeros((height, width, 3), np.uint8)
         with av.logging.Capture():
@@ -176,42 +176,42 @@ class H264:
         codec.options = OPTIONS.get(name, {})
         return codec
 
-    def _encode(self, codec: Any, seq: int, t_ns: int, rgb: Bytes) -> list[Recorded]:
+    def _encode(self, codec: Any, seq: int, t_ns: int, rgb: Bytes) -> list[EncodedPicture]:
         picture = av.VideoFrame.from_ndarray(rgb, "rgb24").reformat(format="yuv420p")
         self._number += 1
         picture.pts = self._number
         picture.time_base = codec.time_base
-        if self._anew:
+        if self._intra_requested:
             picture.pict_type = av.video.frame.PictureType.I
-            self._anew = False
+            self._intra_requested = False
         self._inside[self._number] = seq, t_ns
         if len(self._inside) > MOST_INSIDE:  # it has dropped that one
             del self._inside[next(iter(self._inside))]
         return self._messages(codec, codec.encode(picture))
 
-    def _messages(self, codec: Any, packets: Iterable[Any]) -> list[Recorded]:
+    def _messages(self, codec: Any, packets: Iterable[Any]) -> list[EncodedPicture]:
         out = []
         for packet in packets:
             if packet.pts not in self._inside:
                 continue
             seq, t_ns = self._inside.pop(packet.pts)
             data = bytes(packet)
-            alone = stands_alone(data)
-            if alone and codec.extradata and b"\x00\x00\x01\x67" not in data[:64]:
+            intra = is_intra(data)
+            if intra and codec.extradata and b"\x00\x00\x01\x67" not in data[:64]:
                 data = codec.extradata + data
             video = CompressedVideo(frame_id=FRAME_ID, format="h264", data=data)
             set_time(video.timestamp, t_ns)
-            out.append(Recorded(VIDEO, seq, t_ns, serialised(video), alone))
+            out.append(EncodedPicture(VIDEO, seq, t_ns, serialised(video), intra))
         return out
 
 
-def stands_alone(h264: bytes | memoryview) -> bool:
-    """Whether a picture of H.264 in its byte stream can be decoded without those before it."""
-    return _BEGINS.search(bytes(h264[:256])) is not None
+def is_intra(h264: bytes | memoryview) -> bool:
+    """Whether an image of an H.264 byte stream can be decoded without those before it."""
+    return _IDR_OR_SPS.search(bytes(h264[:256])) is not None
 
 
 def still(topic: str, data: bytes | memoryview) -> Bytes | None:
-    """RGB (or grey, of the grey topic) of a picture that stands alone; None if it is damaged."""
+    """RGB (or grey, of the grey topic) of an independent image; None if it is damaged."""
     try:
         if topic == IMAGE:
             image = CompressedImage.FromString(bytes(data))
@@ -232,7 +232,7 @@ def still(topic: str, data: bytes | memoryview) -> Bytes | None:
 
 
 class VideoDecoder:
-    """Pictures of a video one by one; to be begun with one that stands alone."""
+    """Decoder of a video, image by image; starts with an intra picture."""
 
     def __init__(self) -> None:
         self._codec: Any = av.CodecContext.create("h264", "r")
@@ -242,7 +242,7 @@ class VideoDecoder:
     def pictures(
         self, messages: Iterable[tuple[int, bytes, bool]]
     ) -> Iterator[tuple[int, Bytes | None]]:
-        """Number and RGB of each; None where one cannot be decoded, or needs one that could not.
+        """Number and RGB of each; None where it, or one that it needs, cannot be decoded.
 
         Each message is a number, the bytes, and whether something before it is missing.
         """
@@ -250,7 +250,7 @@ class VideoDecoder:
         broken = False
         for number, data, lost in messages:
             video = _video(data)
-            broken = (broken or lost or video is None) and not stands_alone(video or b"")
+            broken = (broken or lost or video is None) and not is_intra(video or b"")
             waiting.append(number)
             if broken or video is None:
                 continue  # it would be smeared with what it lacks
@@ -283,18 +283,18 @@ def _video(data: bytes) -> bytes | None:
 
 
 def grey_of(rgb: Bytes) -> Bytes:
-    """Grey of a colour picture, as all recorded flights have it."""
+    """Grey of a colour image, as in all recorded flights."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _grey_beside(frame: Frame) -> list[Recorded]:
-    """The grey picture, where it is not what the colours give (of a camera that gives Y, say)."""
+def _lossless_grey(frame: Frame) -> list[EncodedPicture]:
+    """The grey image, where it differs from that of the colours (of a camera that gives Y, say)."""
     if np.array_equal(frame.grey, grey_of(frame.rgb)):
         return []
     return [_raw(GREY, frame, frame.grey, "mono8")]
 
 
-def _raw(topic: str, frame: Frame, pixels: Bytes, encoding: str) -> Recorded:
+def _raw(topic: str, frame: Frame, pixels: Bytes, encoding: str) -> EncodedPicture:
     height, width = pixels.shape[:2]
     step = width * (3 if encoding == "rgb8" else 1)
     image = RawImage(
@@ -302,4 +302,4 @@ def _raw(topic: str, frame: Frame, pixels: Bytes, encoding: str) -> Recorded:
         data=pixels.tobytes(),
     )  # fmt: skip
     set_time(image.timestamp, frame.t_ns)
-    return Recorded(topic, frame.seq, frame.t_ns, serialised(image))
+    return EncodedPicture(topic, frame.seq, frame.t_ns, serialised(image))

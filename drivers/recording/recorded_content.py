@@ -1,6 +1,6 @@
-"""What is recorded beside the messages of the pipeline, and all of it as bytes and back.
+"""Recorded messages as bytes, and back.
 
-Numbers in JSON are written so that they are read back exactly; nan, which JSON lacks, as null.
+Numbers in JSON are read back exactly; nan, which JSON has not, is null.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from companion.messages import (
 from drivers.recording.recording_topics import MavlinkBytes
 
 WORLD, MAP = "local_ned", "map"
-"""Frames of what Foxglove shows."""
+"""Coordinate frames for Foxglove."""
 _SAMPLES: dict[str, type[Any]] = {
     "/telemetry/attitude": AttitudeSample,
     "/telemetry/imu": ImuSample,
@@ -56,7 +56,7 @@ _MAY_LACK = {
 
 @dataclass(frozen=True, slots=True)
 class LinkBytes:
-    """Bytes as they were on the autopilot's wire; `outgoing` are those sent, ours or clients'."""
+    """Bytes of the autopilot's wire; `outgoing` are those sent, ours or clients'."""
 
     t_ns: int
     monotonic_ns: int
@@ -66,19 +66,19 @@ class LinkBytes:
 
 @dataclass(frozen=True, slots=True)
 class HealthNote:
-    """How the daemon is: what companion status shows, the clock's state, the origin if known."""
+    """Health of the daemon: status document, state of the clock filter, origin if known."""
 
     t_ns: int
     document: Mapping[str, Any]
 
 
 def json_bytes(values: Mapping[str, Any]) -> bytes:
-    """A JSON object without nan and infinities, which become null."""
+    """JSON object, in which nan and infinities are null."""
     return json.dumps(_plain(values), allow_nan=False, separators=(",", ":")).encode()
 
 
 def sample_topic(sample: Telemetry) -> str:
-    """Where samples of its kind are recorded."""
+    """Topic of a sample."""
     return _TOPIC_OF[type(sample)]
 
 
@@ -90,12 +90,12 @@ def sample_bytes(sample: Telemetry) -> bytes:
 
 
 def is_sample_topic(topic: str) -> bool:
-    """Whether telemetry is recorded there."""
+    """Whether a topic holds telemetry."""
     return topic in _SAMPLES
 
 
 def sample_of(topic: str, t_ns: int, data: bytes) -> Telemetry:
-    """A sample as it was; ValueError where the bytes are none."""
+    """Decoded sample; ValueError if invalid."""
     given = json.loads(data)
     if not isinstance(given, dict):
         raise ValueError("no object")
@@ -110,7 +110,7 @@ def sample_of(topic: str, t_ns: int, data: bytes) -> Telemetry:
 
 
 def link_bytes(taken: LinkBytes) -> bytes:
-    """As a MavlinkBytes."""
+    """Link bytes as a MavlinkBytes."""
     message = MavlinkBytes(
         monotonic_ns=taken.monotonic_ns, epoch_ns=taken.t_ns, data=taken.data
     )  # fmt: skip
@@ -118,7 +118,7 @@ def link_bytes(taken: LinkBytes) -> bytes:
 
 
 def odometry_bytes(odometry: Odometry) -> bytes:
-    """All of it."""
+    """All fields of an odometry."""
     pose = odometry.world_from_body
     return json_bytes(
         {
@@ -138,7 +138,7 @@ def odometry_bytes(odometry: Odometry) -> bytes:
 
 
 def pose_bytes(odometry: Odometry) -> bytes | None:
-    """As a PoseInFrame; None while it is not known."""
+    """Pose as a PoseInFrame; None while unknown."""
     pose = odometry.world_from_body
     if pose is None:
         return None
@@ -149,7 +149,7 @@ def pose_bytes(odometry: Odometry) -> bytes | None:
 
 
 def event_bytes(warning: Warned) -> bytes:
-    """As a Log."""
+    """Warning as a Log."""
     text = f"{warning.what}: {warning.detail}" if warning.detail else warning.what
     message = Log(level=Log.INFO if warning.good else Log.WARNING, message=text, name="companion")
     set_time(message.timestamp, warning.t_ns)
@@ -157,7 +157,7 @@ def event_bytes(warning: Warned) -> bytes:
 
 
 def cloud_bytes(chunk: PointChunk, world_from_keyframe: Similarity, metric: bool) -> bytes:
-    """As a PointCloud, packed x y z, r g b a; the pose has no scale, so that the points have it."""
+    """Cloud as a PointCloud, packed x y z, r g b a; points are scaled, as poses have no scale."""
     message = PointCloud(frame_id=WORLD if metric else MAP, point_stride=16)
     set_time(message.timestamp, chunk.t_ns)
     _set_pose(message.pose, world_from_keyframe)
@@ -175,7 +175,7 @@ def cloud_bytes(chunk: PointChunk, world_from_keyframe: Similarity, metric: bool
 
 
 def serialised(message: Any) -> bytes:
-    """A protobuf message as bytes."""
+    """Serialised protobuf message."""
     out: bytes = message.SerializeToString()
     return out
 

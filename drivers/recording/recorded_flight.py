@@ -1,4 +1,4 @@
-"""A recording read back: the frames and samples that the flight had, at the times it gave them."""
+"""A recording as a flight: its frames and samples, with their recorded times."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LOST = "a picture could not be decoded"
 
 
 class RecordedPictures:
-    """The pictures of a recording as a `FrameSource`; their numbers are those of the flight."""
+    """Images of a recording as a `FrameSource`; their numbers are those of the flight."""
 
     def __init__(self, recording: Recording, camera: Camera) -> None:
         self.path = recording.path
@@ -38,11 +38,11 @@ class RecordedPictures:
 
     @property
     def n_frames(self) -> int:
-        """How many there are."""
+        """Number of images."""
         return len(self.recording.pictures)
 
     def own_times_ns(self) -> list[int]:
-        """The flight's."""
+        """Times of the flight."""
         return [place.t_ns for place in self.recording.pictures]
 
     def epoch(self) -> tuple[int, str]:
@@ -50,14 +50,14 @@ class RecordedPictures:
         return 0, "the flight's own clock"
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
-        """Number and RGB image of pictures first..last; None where one cannot be decoded."""
+        """Number and RGB image of images first..last; None where one cannot be decoded."""
         places = [p for p in self.recording.pictures if first <= p.seq <= last]
         for place, rgb in self.decoded(places):
             right = rgb is not None and rgb.shape == (self.height, self.width, 3)
             yield place.seq, rgb if right else None
 
     def decoded(self, places: list[PicturePlace]) -> Iterator[tuple[PicturePlace, Bytes | None]]:
-        """Each of these, which follow each other; None where one cannot be decoded."""
+        """Consecutive images; None where one cannot be decoded."""
         if not places:
             return
         if self.recording.picture_data(places[0])[0] != VIDEO:
@@ -66,7 +66,7 @@ class RecordedPictures:
             return
         every = self.recording.pictures
         first = every.index(places[0])
-        begin = max((k for k in range(first + 1) if every[k].alone), default=first)
+        begin = max((k for k in range(first + 1) if every[k].intra), default=first)
         run = every[begin : first + len(places)]
         wanted = set(places)
         for number, rgb in VideoDecoder().pictures(self._packets(run)):
@@ -82,7 +82,7 @@ class RecordedPictures:
 
 
 class RecordedFlight(Flight):
-    """A flight of which there is our own recording."""
+    """A flight read from our own recording."""
 
     def __init__(self, recording: Recording, camera: Camera, log: TelemetryLog) -> None:
         places = recording.pictures
@@ -108,7 +108,7 @@ class RecordedFlight(Flight):
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is MCAP and was recorded by us, whole or not."""
+    """Whether a file is an MCAP of ours, whole or not."""
     try:
         with McapFile(path) as file:
             return file.profile() == PROFILE
@@ -117,7 +117,7 @@ def is_recording(path: Path) -> bool:
 
 
 def open_recording(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> RecordedFlight:
-    """Open a recording, repaired if need be; FlightError where there is no flight in it."""
+    """Open a recording, repaired if needed; FlightError where there is no flight in it."""
     recording = Recording(path)
     if not recording.pictures:
         recording.close()
@@ -128,7 +128,7 @@ def open_recording(path: Path, config: CameraConfig, telemetry: TelemetryConfig)
 
 
 def is_recorded_folder(path: Path) -> bool:
-    """Whether a folder is one of a live flight that was recorded."""
+    """Whether a folder is that of a recorded live flight."""
     return (path / RECORDING).is_file()
 
 
@@ -140,7 +140,7 @@ def open_recorded_folder(
 
 
 def clock_of(health: dict[str, Any]) -> ClockReport | None:
-    """The state of the autopilot's clock in a health document."""
+    """Clock report in a health document."""
     given = health.get("clock")
     if not isinstance(given, dict):
         return None
@@ -154,7 +154,7 @@ def clock_of(health: dict[str, Any]) -> ClockReport | None:
 
 
 def origin_of(health: dict[str, Any]) -> GeoOrigin | None:
-    """Where local NED has its zero, in a health document."""
+    """Geodetic origin of local NED in a health document."""
     given = health.get("origin")
     if not isinstance(given, dict):
         return None
@@ -166,7 +166,7 @@ def origin_of(health: dict[str, Any]) -> GeoOrigin | None:
 
 
 def warnings_of(health: dict[str, Any]) -> tuple[Warned, ...]:
-    """What was amiss with what a recording was imported from, in a health document."""
+    """Warnings of an import's source, in a health document."""
     given = health.get("warnings")
     out = []
     for each in given if isinstance(given, list) else ():
@@ -200,7 +200,7 @@ def _camera(
 def telemetry_of(
     recording: Recording, config: TelemetryConfig, warnings: tuple[Warned, ...] = ()
 ) -> TelemetryLog:
-    """The samples of a recording, with these warnings and its own; it must have pictures."""
+    """Samples of a recording, with these warnings and its own; it must have images."""
     shift_ns = round(config.offset_s * 1e9)
     samples = recording.samples
     if shift_ns:

@@ -1,4 +1,4 @@
-"""Writes all that a flight took in and gave out, as it comes: flight.mcap, and flight.tlog."""
+"""Recorder: writes the input and output of a flight as they come: flight.mcap, and flight.tlog."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from drivers.recording.disk_writer import DiskWriter, Entry
 from drivers.recording.flights_folder import RECORDING, TLOG
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
-from drivers.recording.picture_codec import Recorded, picture_encoder
+from drivers.recording.picture_codec import EncodedPicture, picture_encoder
 from drivers.recording.recorded_content import (
     HealthNote,
     LinkBytes,
@@ -62,7 +62,7 @@ from drivers.recording.recording_topics import (
 
 CAMERA_JSON, CONFIG_TOML = "camera.json", "config.toml"
 NOTES = "companion"
-"""Metadata: versions and what else is known at the beginning."""
+"""Metadata: versions and other facts known at the beginning."""
 TELEMETRY = (
     AttitudeSample, ImuSample, PositionSample, RangeSample, HeightSample, ArmedSample,
 )  # fmt: skip
@@ -71,7 +71,7 @@ MOST_ROUND_TRIP_NS = 2_000_000_000
 
 
 class Recorder:
-    """The recording of one flight, in a folder that is there. Used from one thread.
+    """Recording of one flight, in an existing folder. Used from one thread.
 
     StageError where it cannot be begun. Nothing waits for the disk but `close`.
     """
@@ -86,9 +86,9 @@ class Recorder:
         self._streams = {False: MavlinkStream(), True: MavlinkStream()}
         self._map: MapUpdate | None = None
         self._camera: Camera | None = camera
-        self._skips_until_alone = False
+        self._skips_until_intra = False
         self.n_frames = 0
-        """Pictures taken in, written or not."""
+        """Images received, written or not."""
         self._encoder = picture_encoder(
             self._config, camera.width, camera.height, config.camera.rate_hz
         )
@@ -111,16 +111,16 @@ class Recorder:
 
     @property
     def n_dropped(self) -> Counter[str]:
-        """What there was no room for, by what it is."""
+        """Number of dropped messages, by kind."""
         return self._disk.n_dropped
 
     @property
     def slowest_s(self) -> float:
-        """What the disk took at most, from a chunk's beginning until it was safe."""
+        """Longest time to write and sync a chunk."""
         return self._disk.slowest_s
 
     def take(self, message: Message | LinkBytes | HealthNote) -> None:
-        """Record a message; of messages of the map only the points, and those if configured."""
+        """Record a message; of the map only the points, and those if configured."""
         self._newest_ns = max(self._newest_ns, message.t_ns)
         if isinstance(message, LinkBytes):
             self._link(message)
@@ -143,13 +143,13 @@ class Recorder:
             self._cloud(message)
 
     def warnings(self) -> list[Warned]:
-        """What has gone wrong since this was last asked."""
+        """Warnings since the last call."""
         with self._lock:
             out, self._warnings = self._warnings, []
         return out
 
     def close(self) -> None:
-        """Make the files whole."""
+        """Complete the files."""
         self._put_pictures(self._encoder.finish())
         self._disk.close()
 
@@ -163,15 +163,15 @@ class Recorder:
             return
         self._put_pictures(self._encoder.encode(frame))
 
-    def _put_pictures(self, messages: list[Recorded]) -> None:
-        for topic, seq, t_ns, data, alone in messages:
-            if self._skips_until_alone and not alone:
+    def _put_pictures(self, messages: list[EncodedPicture]) -> None:
+        for topic, seq, t_ns, data, intra in messages:
+            if self._skips_until_intra and not intra:
                 self._disk.n_dropped["pictures"] += 1
                 continue
             entry = Entry(self._channels[topic], t_ns, data, seq)
-            self._skips_until_alone = not self._disk.put(entry, "pictures", is_picture=True)
-            if self._skips_until_alone:
-                self._encoder.begin_anew()
+            self._skips_until_intra = not self._disk.put(entry, "pictures", is_picture=True)
+            if self._skips_until_intra:
+                self._encoder.request_intra()
                 return
 
     def _link(self, taken: LinkBytes) -> None:

@@ -1,4 +1,4 @@
-"""An open recording: where its pictures lie, its samples, and what of it is missing."""
+"""An open recording: index of its images, its samples, and its gaps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from companion.errors import FlightError
 from companion.messages import Bytes, Telemetry, Warned
 from drivers.recording.mcap_file import DAMAGED, ChunkPlace, McapMessage
-from drivers.recording.picture_codec import stands_alone, still
+from drivers.recording.picture_codec import is_intra, still
 from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recording_topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
 from drivers.recording.repair import n_cut_bytes, opened, was_cut
@@ -19,34 +19,34 @@ CUT, DAMAGE = "the recording was cut short", "the recording is damaged"
 
 
 class PicturePlace(NamedTuple):
-    """Where a picture lies: which chunk, and which message in it."""
+    """Place of an image: its chunk, and the message in it."""
 
     seq: int
     t_ns: int
     chunk: int
     message: int
-    alone: bool
+    intra: bool
 
 
 class Recording:
-    """An open recording and what is in it; FlightError where it is none.
+    """An open recording and its content; FlightError if invalid.
 
-    `told` hears, chunk by chunk, how many bytes have been read.
+    `on_progress` takes, chunk by chunk, the bytes read.
     """
 
-    def __init__(self, path: Path, told: Callable[[int], None] = lambda _: None) -> None:
+    def __init__(self, path: Path, on_progress: Callable[[int], None] = lambda _: None) -> None:
         self.path = path
         self.file, self.found = opened(path)
         self.pictures: list[PicturePlace] = []
-        """In order of their times, each number once."""
+        """In order of time, each number once."""
         self.greys: dict[int, tuple[int, int]] = {}
-        """By the time of the picture: chunk and message of a grey one beside it."""
+        """Chunk and message of a separate grey image, by the time of the image."""
         self.samples: list[Telemetry] = []
         self.health: dict[str, Any] = {}
-        """The newest document."""
+        """Newest health document."""
         self.n_bad_messages = 0
         self.counts: dict[str, int] = {}
-        """Messages that can be read, by topic."""
+        """Number of readable messages, by topic."""
         self._bad: set[int] = set()
         self._held: tuple[int, list[McapMessage]] = (-1, [])
         if self.found.profile not in ("", PROFILE):
@@ -54,7 +54,7 @@ class Recording:
             raise FlightError(f"{path}: an MCAP file, but not a recording of companion")
         for number, chunk in enumerate(self.found.chunks):
             self._index(number, chunk)
-            told(chunk.end)
+            on_progress(chunk.end)
         self.pictures = _once_in_order(self.pictures)
         self.samples.sort(key=lambda sample: sample.t_ns)
 
@@ -64,7 +64,7 @@ class Recording:
 
     @property
     def warnings(self) -> tuple[Warned, ...]:
-        """What of it is missing."""
+        """Warnings about missing data."""
         t_ns = self.pictures[0].t_ns if self.pictures else 0
         out = []
         n_cut, found = n_cut_bytes(self.found), self.found
@@ -79,7 +79,7 @@ class Recording:
         return tuple(out)
 
     def messages(self, number: int) -> list[McapMessage]:
-        """All messages of a chunk; none of one that is damaged."""
+        """All messages of a chunk; none of a damaged one."""
         if self._held[0] != number:
             self._held = -1, []
             try:
@@ -90,12 +90,12 @@ class Recording:
         return self._held[1]
 
     def picture_data(self, place: PicturePlace) -> tuple[str, bytes]:
-        """Topic and bytes of a picture."""
+        """Topic and bytes of an image."""
         message = self.messages(place.chunk)[place.message]
         return message.channel.topic, bytes(message.data)
 
     def grey(self, t_ns: int) -> Bytes | None:
-        """The grey picture recorded beside the one of this time, if there is one."""
+        """Grey image recorded with the one of this time, if any."""
         place = self.greys.get(t_ns)
         if place is None:
             return None
@@ -119,8 +119,8 @@ class Recording:
 
     def _take(self, topic: str, number: int, at: int, message: McapMessage) -> None:
         if topic in PICTURES:
-            alone = topic != VIDEO or stands_alone(message.data[:512])
-            self.pictures.append(PicturePlace(message.sequence, message.t_ns, number, at, alone))
+            intra = topic != VIDEO or is_intra(message.data[:512])
+            self.pictures.append(PicturePlace(message.sequence, message.t_ns, number, at, intra))
         elif topic == GREY:
             self.greys[message.t_ns] = number, at
         elif is_sample_topic(topic):
@@ -131,12 +131,12 @@ class Recording:
                 self.health = document
 
     def lost_before(self, number: int) -> bool:
-        """Whether something is missing just before a chunk."""
+        """Whether data is missing just before a chunk."""
         return self.found.chunks[number].after_loss or number - 1 in self._bad
 
 
 def _once_in_order(pictures: list[PicturePlace]) -> list[PicturePlace]:
-    """Pictures whose number and time are both larger than those of the one before."""
+    """Images whose number and time are both larger than those of the one before."""
     out: list[PicturePlace] = []
     for place in sorted(pictures, key=lambda each: each.seq):
         if not out or (place.seq > out[-1].seq and place.t_ns > out[-1].t_ns):

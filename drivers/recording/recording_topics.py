@@ -1,7 +1,7 @@
-"""What a recording holds, by topic, and the schema of each; docs/recording.md says it for people.
+"""Topics of a recording, and their schemas; for users in docs/recording.md.
 
-Pictures, poses, clouds and events are in Foxglove's schemas, as protobuf; bytes of the link in our
-own, as protobuf; all else as JSON with a JSON schema.
+Images, poses, clouds and events have Foxglove's schemas, as protobuf; link bytes our own, as
+protobuf; all else is JSON with a JSON schema.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from drivers.recording.mcap_writer import McapWriter
 
 PROFILE = "companion"
-"""What the header of a recording says; a number after it would tell a later layout."""
+"""Profile in the header of a recording; a number after it would mark a later layout."""
 
 IMAGE, VIDEO, RAW, GREY = "/camera/image", "/camera/video", "/camera/raw", "/camera/grey"
 CALIBRATION = "/camera/calibration"
@@ -32,10 +32,10 @@ TIMESYNC = "/mavlink/timesync"
 POSE, ODOMETRY, CLOUD = "/pose", "/odometry", "/cloud"
 EVENTS, HEALTH = "/events", "/health"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
-"""One of them has the pictures of a flight."""
+"""Topics of images, of which a flight has one."""
 ARMED = "/telemetry/armed"
 LASTING = frozenset({CALIBRATION, HEALTH, ARMED})
-"""What is said there holds until it is said otherwise, which may be never."""
+"""Topics whose messages hold until the next one, which may never come."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 
@@ -67,7 +67,7 @@ MavlinkBytes: Any = message_factory.GetMessageClass(
 
 @dataclass(frozen=True, slots=True)
 class _Json:
-    """A JSON object: its name, what it says, and its numbers, lists of numbers and words."""
+    """JSON object: its name, description, and properties."""
 
     name: str
     says: str
@@ -143,11 +143,11 @@ TOPICS: dict[str, Any] = {
         {"health": OBJECT, "clock": OBJECT, "origin": OBJECT, "warnings": OBJECTS},
     ),
 }  # fmt: skip
-"""In the order of their channels."""
+"""In order of their channels."""
 
 
 def open_channels(writer: McapWriter) -> dict[str, int]:
-    """Have a channel for each topic; their numbers."""
+    """Add a channel for each topic; their ids."""
     schemas: dict[str, int] = {}
     channels = {}
     for topic, kind in TOPICS.items():
@@ -174,7 +174,7 @@ def _json_schema(kind: _Json) -> bytes:
 
 
 def _descriptors(kind: Any) -> bytes:
-    """The message's file and all that it imports, those first that others need."""
+    """The message's file and all its imports, dependencies first."""
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
     def take(file: Any) -> None:

@@ -1,4 +1,4 @@
-"""Gives a recording that was cut short the end that it lacks, where it lies."""
+"""Repair of a recording that was cut short, in place."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from drivers.recording.mcap_scan import Scan, scan, summary
 from drivers.recording.mcap_writer import ending, note_record
 
 NOTE = "repaired"
-"""Metadata that a repair leaves: how many bytes were cut off."""
+"""Metadata of a repair: the number of bytes cut off."""
 
 
 def repair(path: Path, found: Scan) -> bool:
-    """Cut a file where its data end, and write the index; whether that could be done.
+    """Truncate a file at the end of its valid data, and write the index; whether that was possible.
 
-    Not where it is still being written, may not be written, there is no room, or another has
-    repaired it meanwhile. `found` is what a scan of it found. Whatever ends this half way leaves a
-    file that can be repaired again.
+    Not while it is being written, where it may not be written, without free space, or where another
+    process has repaired it. `found` is the scan of it. A repair that is interrupted leaves a file
+    that can be repaired again.
     """
     try:
         fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -45,7 +45,7 @@ def repair(path: Path, found: Scan) -> bool:
 
 
 def unfinished(path: Path) -> bool:
-    """Whether its writer is gone and did not end it; looks at its end only.
+    """Whether its writer has gone without ending it; reads its end only.
 
     FlightError where it is no MCAP file.
     """
@@ -53,18 +53,18 @@ def unfinished(path: Path) -> bool:
         return file.end_of_data() is None and not is_growing(file.fd)
 
 
-def in_place(path: Path, told: Callable[[int], None] | None = None) -> int | None:
-    """Repair a file; how many bytes were cut off, None where that could not be done.
+def in_place(path: Path, on_progress: Callable[[int], None] | None = None) -> int | None:
+    """Repair a file; bytes cut off, None where that was impossible.
 
-    `told` hears of bytes read. FlightError where it is no MCAP file.
+    `on_progress` takes the bytes read. FlightError where it is no MCAP file.
     """
     with McapFile(path) as file:
-        found = scan(file, told)
+        found = scan(file, on_progress)
     return found.n_cut_bytes if found.whole or repair(path, found) else None
 
 
 def n_cut_bytes(found: Scan) -> int:
-    """Bytes that an earlier repair has cut off, or that are to be cut off."""
+    """Bytes cut off by an earlier repair, or to be cut off."""
     noted = found.metadata.get(NOTE, {}).get("cut_bytes", "0")
     return found.n_cut_bytes + (int(noted) if noted.isdigit() else 0)
 
@@ -75,10 +75,10 @@ def was_cut(found: Scan) -> bool:
 
 
 def opened(path: Path) -> tuple[McapFile, Scan]:
-    """A file and what is in it, repaired where it is cut short and that is possible.
+    """A file and its content, repaired where it is cut short and that is possible.
 
-    Of a whole file only its end is read: whether a chunk is whole shows when it is. FlightError
-    where it is no MCAP file.
+    Of a whole file only its end is read: damage of a chunk shows when it is read. FlightError where
+    it is no MCAP file.
     """
     file = McapFile(path)
     found = summary(file) or scan(file)

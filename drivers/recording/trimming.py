@@ -1,4 +1,4 @@
-"""A part of a recording as a recording of its own."""
+"""Time span of a recording as a recording of its own."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from drivers.recording.recording import Recording
 from drivers.recording.recording_topics import GREY, LASTING, PICTURES, PROFILE, open_channels
 
 LEAD_NS = 10_000_000_000
-"""Of what is no picture so much from before the first is kept, as a replay uses it."""
+"""Messages other than images are kept from this long before the first, as a replay uses them."""
 CHUNK_BYTES = 4 << 20
 
 
 def trim(
-    recording: Recording, start_ns: int, stop_ns: int, out: Path, told: Callable[[int], None]
+    recording: Recording, start_ns: int, stop_ns: int, out: Path, on_progress: Callable[[int], None]
 ) -> int:
-    """Write start_ns <= time < stop_ns to a new file; how many pictures that are.
+    """Write start_ns <= time < stop_ns to a new file; the number of images in it.
 
-    A video begins with the last picture before that needs no other. What held when the part began
-    (LASTING) is said at its begin. FlightError where nothing is left, or the file cannot be written
-    or is there already. `told` hears of bytes read.
+    A video begins with the last intra picture before the span. State that holds at its begin
+    (LASTING) is repeated there. FlightError where nothing is left, or the file exists or cannot be
+    written. `on_progress` takes the bytes read.
     """
     first_ns = max(
-        (p.t_ns for p in recording.pictures if p.alone and p.t_ns <= start_ns), default=start_ns
+        (p.t_ns for p in recording.pictures if p.intra and p.t_ns <= start_ns), default=start_ns
     )
     wanted = {(p.chunk, p.message) for p in recording.pictures if first_ns <= p.t_ns < stop_ns}
     if not any(start_ns <= p.t_ns < stop_ns for p in recording.pictures):
@@ -37,7 +37,7 @@ def trim(
     except OSError as error:
         raise FlightError(f"{out}: cannot be written: {error.strerror}") from error
     try:
-        _copy(recording, wanted, (first_ns, stop_ns), McapWriter(file.append, PROFILE), told)
+        _copy(recording, wanted, (first_ns, stop_ns), McapWriter(file.append, PROFILE), on_progress)
         file.sync()
     except BaseException as error:
         file.discard()
@@ -50,7 +50,7 @@ def trim(
 
 def _copy(
     recording: Recording, pictures: set[tuple[int, int]], span_ns: tuple[int, int],
-    writer: McapWriter, told: Callable[[int], None],
+    writer: McapWriter, on_progress: Callable[[int], None],
 ) -> None:  # fmt: skip
     channels = open_channels(writer)
     found = recording.found
@@ -84,5 +84,5 @@ def _copy(
                 put(message, message.t_ns, message.publish_ns)
         if writer.n_waiting_bytes > CHUNK_BYTES:
             writer.flush()
-        told(chunk.end)
+        on_progress(chunk.end)
     writer.finish()

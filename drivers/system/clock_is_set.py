@@ -1,4 +1,4 @@
-"""Whether the computer's clock is the time of day, or what it happened to have when it started."""
+"""Whether the computer's clock is synchronised."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import ctypes
 from pathlib import Path
 
 TIMEX_BYTES = 512
-"""More than struct timex has anywhere (adjtimex(2))."""
+"""Larger than struct timex anywhere (adjtimex(2))."""
 TIME_ERROR = 5
-"""What adjtimex answers for a clock that nobody keeps in step."""
+"""Result of adjtimex for an unsynchronised clock."""
 SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
-"""Made by systemd-timesyncd when it has set the clock (systemd-timesyncd.service(8))."""
+"""Written by systemd-timesyncd when it has set the clock (systemd-timesyncd.service(8))."""
 
 
 def clock_is_set() -> bool:
-    """Whether the clock is kept in step with the network's; False too where nobody can tell.
+    """Whether the clock is synchronised by the network; False too where unknown.
 
-    Within a service that may not touch the clock the kernel is not to be asked (ProtectClock=).
+    In a service that may not set the clock the kernel does not tell (ProtectClock=).
     """
     if SYNCHRONISED.exists():
         return True

@@ -1,4 +1,4 @@
-"""Names this computer's present boot, as Linux does: monotonic clocks of two processes compare."""
+"""Boot id of the computer: monotonic clocks of processes with the same id are comparable."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 def computer_boot() -> str:
-    """A name that no other boot has; "" where the system tells none."""
+    """Boot id; "" where unknown."""
     try:
         return BOOT_ID.read_text().strip()
     except OSError:

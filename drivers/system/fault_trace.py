@@ -1,7 +1,7 @@
-"""Where a bug of a driver lies: its traceback in the journal, once for each place.
+"""Tracebacks of drivers' bugs in the journal, once per place.
 
-For loops that have to go on whatever is wrong in what they call. Failures that are to be expected
-are named where they happen and never come here.
+For loops that must continue whatever is wrong in what they call. Expected failures are handled
+where they happen and never come here.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import traceback
 from collections.abc import Mapping
 
 PRIORITY = "<3>"
-"""Before each line that systemd reads: an error (sd-daemon(3))."""
+"""Prefix of lines for systemd: an error (sd-daemon(3))."""
 MOST_PLACES = 64
-"""A driver that fails in more places than this fills no disk with them."""
+"""Limit of places, so that a driver cannot fill the disk with tracebacks."""
 
 
 class FaultTraces:
@@ -23,18 +23,18 @@ class FaultTraces:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._told: set[tuple[str, str, int]] = set()
+        self._seen_places: set[tuple[str, str, int]] = set()
 
     def tell(self, error: BaseException, secrets: Mapping[str, str] | None = None) -> bool:
-        """Write the traceback, unless it was of this kind at this place before; whether it was new.
+        """Write the traceback, unless this exception came from here before; whether it was new.
 
         `secrets` is what may not be printed, and what to print instead.
         """
         place = _place_of(error)
         with self._lock:
-            if place in self._told or len(self._told) >= MOST_PLACES:
+            if place in self._seen_places or len(self._seen_places) >= MOST_PLACES:
                 return False
-            self._told.add(place)
+            self._seen_places.add(place)
         text = "".join(traceback.format_exception(error))
         for secret, instead in (secrets or {}).items():
             text = text.replace(secret, instead) if secret else text

@@ -1,4 +1,4 @@
-"""Lines for the journal: on standard error, with a priority where systemd reads them."""
+"""Journal lines: on standard error, with a priority where systemd reads them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from companion.messages import Warned
 ERROR, WARNING, INFO = 3, 4, 6
 MAX_SAME_IN_A_ROW = 5
 EVERY = 100
-"""A thing that is warned of again and again is told of each so many times only."""
+"""Of a repeated warning only every so many are written."""
 
 
 class Journal:
-    """Where the daemon says what happens; may be used from any thread."""
+    """Writer of the journal; may be used from any thread."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._with_priority = "JOURNAL_STREAM" in environment
@@ -25,7 +25,7 @@ class Journal:
         self.n_warnings: Counter[str] = Counter()
 
     def say(self, text: str, priority: int = INFO) -> None:
-        """One line."""
+        """Write one line."""
         prefix = f"<{priority}>" if self._with_priority else "companion: "
         line = " ".join(text.split())
         with self._lock:
@@ -35,14 +35,14 @@ class Journal:
                 pass  # nobody listens any more, which must not end a flight
 
     def warn(self, warning: Warned) -> bool:
-        """Count a warning, and tell of it unless it comes too often; whether it was told."""
+        """Count a warning, and write it unless it comes too often; whether it was written."""
         with self._lock:
             self.n_warnings[warning.what] += 1
             n = self.n_warnings[warning.what]
-        told = n <= MAX_SAME_IN_A_ROW or n % EVERY == 0
-        if told:
+        written = n <= MAX_SAME_IN_A_ROW or n % EVERY == 0
+        if written:
             often = f" (for the {n}th time)" if n > MAX_SAME_IN_A_ROW else ""
             detail = f": {warning.detail}" if warning.detail else ""
             kind, priority = ("", INFO) if warning.good else ("warning: ", WARNING)
             self.say(f"{kind}{warning.what}{detail}{often}", priority)
-        return told
+        return written

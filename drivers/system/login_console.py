@@ -1,7 +1,7 @@
-"""Login consoles on serial ports, which answer the autopilot and eat what it says.
+"""Login consoles on serial ports, which disturb the autopilot's link.
 
-Found in the file system alone, so that it can be asked at any time without rights: consoles of the
-kernel, getty services of systemd, and nvgetty, with which a Jetson comes on its header's port.
+Found in the file system alone, without privileges: consoles of the kernel, getty services of
+systemd, and nvgetty, which a Jetson runs on its header's port.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ NVGETTY = "nvgetty.service"
 
 @dataclass(frozen=True, slots=True)
 class LoginConsole:
-    """`port` is as in /dev; on a Jetson it is ttyTHS* for nvgetty, which takes what there is."""
+    """`port` is as in /dev; on a Jetson it is ttyTHS* for nvgetty, which takes any of them."""
 
     port: str
     remedy: str
 
     @property
     def what(self) -> str:
-        """In words."""
+        """Description."""
         return f"a login console sits on /dev/{self.port}: {self.remedy}"
 
 
 def login_consoles(root: Path = Path("/")) -> list[LoginConsole]:
-    """All there are, by port."""
+    """All login consoles, by port."""
     found: dict[str, LoginConsole] = {}
     for name in _kernel_consoles(root):
         found[name] = LoginConsole(name, "take console= for it from the kernel's command line")
@@ -46,7 +46,7 @@ def login_consoles(root: Path = Path("/")) -> list[LoginConsole]:
 
 
 def login_console_on(device: str, root: Path = Path("/")) -> LoginConsole | None:
-    """That on the port which a path leads to."""
+    """Login console on the port that a path leads to."""
     name = Path(os.path.realpath(device)).name
     return next((each for each in login_consoles(root) if each.port == name), None)
 

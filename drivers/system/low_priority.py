@@ -1,4 +1,4 @@
-"""A process of which nobody notices that it runs."""
+"""Lowest priority of a process for processor and disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import psutil
 
 
 def give_way(pid: int) -> None:
-    """From now on it gets what no other process wants of processors and disk."""
+    """Give a process the lowest priority for processor and disk."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
     with contextlib.suppress(OSError, psutil.Error):

@@ -49,7 +49,7 @@ TEXT = "text/plain; charset=utf-8"
 
 
 class Metrics:
-    """Answers scrapes on a loopback port; `warn` hears of faults in making an answer."""
+    """HTTP server of the metrics on a loopback port; `warn` takes faults in making an answer."""
 
     def __init__(
         self, port: int, health: Callable[[], Health], warn: Callable[[str], None]
@@ -61,7 +61,7 @@ class Metrics:
         self._answers: ShortAnswers | None = None
 
     async def start(self) -> None:
-        """Answer from now on. ConfigError where the port cannot be had."""
+        """Listen. ConfigError where the port is unavailable."""
         listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -76,14 +76,14 @@ class Metrics:
         await self._answers.start()
 
     async def stop(self) -> None:
-        """Answer no more."""
+        """Stop listening."""
         if self._answers is not None:
             await self._answers.stop()
             self._answers = None
 
     @property
     def port(self) -> int:
-        """Where it listens; the one given, or, where that was 0, the one found."""
+        """Port in use; the one given, or, for 0, the one found."""
         return self._port
 
     async def _answer(self, reader: asyncio.StreamReader) -> bytes:

@@ -1,4 +1,4 @@
-"""The serial ports of this machine on which an autopilot may be."""
+"""Serial ports of this machine that may have an autopilot."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from drivers.system.login_console import login_consoles
 
 BY_ID = Path("/dev/serial/by-id")
 JETSON = "ttyTHS*"
-"""Ports of a Jetson's own, which pyserial does not list."""
+"""Serial ports of a Jetson, which pyserial does not list."""
 
 
 @dataclass(frozen=True, slots=True)
 class SerialDevice:
-    """A port; `stable_path` stays the same when it is plugged in anew, "" where there is none."""
+    """A port; `stable_path` survives replugging, "" without one."""
 
     path: str
     stable_path: str = ""
@@ -26,11 +26,11 @@ class SerialDevice:
     """Vendor and product in hexadecimal."""
     serial_number: str = ""
     problem: str = ""
-    """What else uses it, and how that is ended."""
+    """Other user of the port, and the remedy."""
 
 
 def serial_devices() -> list[SerialDevice]:
-    """All ports that have hardware behind them."""
+    """All ports with hardware behind them."""
     links = {os.path.realpath(link): str(link) for link in sorted(BY_ID.glob("*"))}
     consoles = {f"/dev/{console.port}": console.what for console in login_consoles()}
     found = [

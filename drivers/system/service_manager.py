@@ -1,4 +1,4 @@
-"""What systemd is told: ready, still alive, stopping (the sd_notify protocol of Type=notify).
+"""sd_notify protocol (Type=notify): ready, watchdog, reloading, stopping.
 
 Without $NOTIFY_SOCKET there is no service manager and nothing is sent. Sending never blocks and
 never raises: a service manager that does not listen must not stop a flight.
@@ -19,11 +19,11 @@ class ServiceManager:
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self.watchdog_s = _watchdog_s(environment)
-        """It must hear `alive` at least this often (half of what it allows); None: it need not."""
+        """Interval for `alive` (half of the watchdog's); None without a watchdog."""
         self.n_lost = 0
-        """Notices that could not be handed over."""
+        """Notifications that could not be sent."""
         self.problem = ""
-        """Why nothing can be sent although it should, in words."""
+        """Reason why nothing can be sent although it should, in words."""
         self._address = ""
         self._socket: socket.socket | None = None
         address = environment.get("NOTIFY_SOCKET", "")
@@ -39,11 +39,11 @@ class ServiceManager:
 
     @property
     def present(self) -> bool:
-        """Whether there is one to be told anything."""
+        """Whether there is one."""
         return self._socket is not None
 
     def ready(self, status: str = "") -> None:
-        """All is up; also said when a reload is over."""
+        """READY=1; also at the end of a reload."""
         self._send("READY=1", _status(status))
 
     def status(self, text: str) -> None:
@@ -51,23 +51,23 @@ class ServiceManager:
         self._send(_status(text))
 
     def alive(self) -> None:
-        """To be said at least every `watchdog_s`, and only while the work goes on."""
+        """WATCHDOG=1; to be sent at least every `watchdog_s`, only while the work goes on."""
         self._send("WATCHDOG=1")
 
     def reloading(self) -> None:
-        """The configuration is read again; `ready` ends it."""
+        """RELOADING=1; `ready` ends it."""
         self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self, status: str = "") -> None:
-        """The end has begun."""
+        """STOPPING=1."""
         self._send("STOPPING=1", _status(status))
 
     def extend_timeout(self, seconds: float) -> None:
-        """Starting or stopping goes on and takes so much longer from now on."""
+        """Extend the start or stop timeout by this much from now on."""
         self._send(f"EXTEND_TIMEOUT_USEC={round(seconds * 1e6)}")
 
     def close(self) -> None:
-        """Say nothing more."""
+        """Close the socket."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -89,7 +89,7 @@ def _status(text: str) -> str:
 
 
 def _watchdog_s(environment: Mapping[str, str]) -> float | None:
-    """Half the time after which the service counts as hung; None where nothing is watched."""
+    """Half the watchdog interval; None without a watchdog."""
     try:
         interval_us = int(environment.get("WATCHDOG_USEC", "0"))
         pid = int(environment.get("WATCHDOG_PID", "0"))

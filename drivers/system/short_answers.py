@@ -1,7 +1,7 @@
-"""A server whose clients get one short answer each, whatever they do.
+"""Server that gives each client one short answer.
 
-Few clients at a time, each for a short time: one that never reads, never asks or never leaves costs
-no more than its place until its time is over.
+Few clients at a time, each with a timeout: one that never reads, never asks or never leaves costs
+no more than its slot until then.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ MAX_REQUEST = 8192
 TIMEOUT_S = 2.0
 
 Answer = Callable[[asyncio.StreamReader], Awaitable[bytes]]
-"""Reads what it needs of a question, and says what to send."""
+"""Reads the request as far as needed, and returns the answer."""
 
 
 class ShortAnswers:
-    """Answers on a socket that is bound already; runs in the event loop, where `answer` is called.
+    """Answers on a bound socket; runs in the event loop, where `answer` is called.
 
-    `warn` is told what went wrong within `answer` itself; what clients do wrong is only counted.
+    `warn` takes faults within `answer` itself; errors of clients are only counted.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class ShortAnswers:
         self.n_refused = 0
 
     async def start(self) -> None:
-        """Answer from now on."""
+        """Listen."""
         start = (
             asyncio.start_unix_server
             if self._listening.family == socket.AF_UNIX
@@ -51,7 +51,7 @@ class ShortAnswers:
         )
 
     async def stop(self) -> None:
-        """Answer no more; who is being answered is cut off."""
+        """Stop listening; closes open connections."""
         if self._server is not None:
             self._server.close()
         self._listening.close()

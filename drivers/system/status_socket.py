@@ -1,8 +1,8 @@
-"""The unix socket at which the running daemon says how it is: one JSON document a connection.
+"""Unix socket of the daemon's status: one JSON document per connection.
 
 It lies in a folder that only its owner's group can enter. A lock beside it is held as long as the
-daemon lives, so that a second daemon is refused, and a socket that is found without the lock held
-is what a killed one left behind.
+daemon lives, so that a second daemon is refused, and a socket without a held lock was left behind
+by a killed one.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from drivers.system.short_answers import ShortAnswers
 
 NAME = "status.sock"
 SERVICE_FOLDER = Path("/run/companion")
-"""What systemd makes for the service: its RuntimeDirectory."""
+"""RuntimeDirectory of the service."""
 MAX_PATH = 107
-"""Longer names do not fit a unix socket's address."""
+"""Length limit of a unix socket's address."""
 MAX_DOCUMENT = 4 << 20
 
 
 def own_socket_path(setting: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """Where a daemon puts its socket; `setting` is `daemon.socket`."""
+    """Path of a daemon's socket; `setting` is `daemon.socket`."""
     return Path(setting) if setting != "auto" else _own_folders(environment)[0] / NAME
 
 
 def found_socket_path(setting: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """Where a running daemon's socket is to be found; the service's own first."""
+    """Path of a running daemon's socket; the service's own first."""
     if setting != "auto":
         return Path(setting)
     places = [folder / NAME for folder in (SERVICE_FOLDER, *_own_folders(environment))]
@@ -63,7 +63,7 @@ def _exists(path: Path) -> bool:
 
 
 class StatusSocket:
-    """Answers each connection with a document; `warn` hears of faults in making one."""
+    """Answers each connection with a document; `warn` takes faults in making one."""
 
     def __init__(
         self, path: Path, document: Callable[[], Mapping[str, Any]], warn: Callable[[str], None]
@@ -75,7 +75,7 @@ class StatusSocket:
         self._answers: ShortAnswers | None = None
 
     async def start(self) -> None:
-        """Take the place and answer. ConfigError where it cannot be had."""
+        """Lock and listen. ConfigError where impossible."""
         try:
             _private_folder(self.path.parent)
             self._lock_fd = _lock(self.path)
@@ -90,7 +90,7 @@ class StatusSocket:
         await self._answers.start()
 
     async def stop(self) -> None:
-        """Answer no more and leave nothing behind but the lock's file."""
+        """Stop listening and leave nothing behind but the lock file."""
         if self._answers is None:
             return
         self.path.unlink(missing_ok=True)
@@ -108,7 +108,7 @@ class StatusSocket:
 
 
 def _private_folder(folder: Path) -> None:
-    """Make it for its owner alone; one that others could have put there is refused."""
+    """Create a folder for its owner alone; one that others could have made is refused."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     state = folder.stat()
     if state.st_uid not in (os.getuid(), 0):
@@ -152,7 +152,7 @@ def _bind(path: Path) -> socket.socket:
 
 
 def ask_status(path: Path, timeout_s: float = 3.0) -> dict[str, Any]:
-    """What the running daemon says of itself. SourceError where none does."""
+    """Status document of the running daemon. SourceError without one."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
             asking.settimeout(timeout_s)

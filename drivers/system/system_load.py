@@ -1,7 +1,7 @@
-"""How busy, how hot and how full this computer is.
+"""Load of this computer: processor, memory, temperatures, disk.
 
-What a computer does not tell is None or missing, never a guess. Reading takes some milliseconds,
-longer where temperature sensors are slow: not to be done in the event loop.
+Unknown values are None or missing, never a guess. Reading takes some milliseconds, longer where
+temperature sensors are slow: not for the event loop.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from companion.health import ComputerLoad, ProcessLoad
 
 MIB = 1 << 20
 NOT_A_TEMPERATURE = ("pmic-die",)
-"""Jetsons report a constant there."""
+"""Constant that Jetsons report."""
 PLAUSIBLE_C = (-60.0, 150.0)
 GPU_LOADS = (  # per mille, of Jetsons by age
     "devices/platform/gpu.0/load",
@@ -29,9 +29,9 @@ FANS = ("class/hwmon/hwmon*/fan*_input", "class/hwmon/hwmon*/rpm")
 
 
 class SystemLoad:
-    """Reads the load; shares of the processor are those since the reading before.
+    """Reads the load; processor shares are those since the last reading.
 
-    `folder` is what is written to; what it is on counts as the disk.
+    `folder` is on the disk that is measured.
     """
 
     def __init__(self, folder: Path, sys: Path = Path("/sys")) -> None:
@@ -43,7 +43,7 @@ class SystemLoad:
         self.read({})
 
     def read(self, processes: Mapping[str, int]) -> ComputerLoad:
-        """The load now, and that of our processes, by name and process id; 0 is this one."""
+        """Load now, and that of our processes, by name and process id; 0 is this one."""
         shares = self._core_shares()
         memory = psutil.virtual_memory()
         used, total, free = _disk(self._folder)
@@ -66,7 +66,7 @@ class SystemLoad:
         )
 
     def _core_shares(self) -> tuple[float, ...]:
-        """Busy share of each core since the reading before; empty at the first."""
+        """Busy share of each core since the last reading; empty at the first."""
         now = []
         for core in psutil.cpu_times(percpu=True):
             idle = core.idle + core.iowait
@@ -121,7 +121,7 @@ class SystemLoad:
 
 
 def _disk(folder: Path) -> tuple[float, float, float] | tuple[None, None, None]:
-    """MiB used, in all, and free for us, of the disk that a folder is or will be on."""
+    """MiB used, total, and free for us, of the disk that a folder is or will be on."""
     try:
         usage = psutil.disk_usage(str(_that_exists(folder)))
     except OSError:

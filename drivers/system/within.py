@@ -1,4 +1,4 @@
-"""Waiting with a limit, in a way that a cancellation always gets through."""
+"""Timeouts that never swallow a cancellation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 async def within(awaitable: Awaitable[T], timeout_s: float) -> T:
-    """What is awaited; asyncio.TimeoutError if it takes longer, it being cancelled then.
+    """Result of an awaitable; asyncio.TimeoutError if it takes longer, and it is cancelled then.
 
     Up to Python 3.11 asyncio.wait_for loses a cancellation that comes together with the result.
     """

@@ -1,7 +1,7 @@
-"""Topics over Zenoh: the only place that knows it. Reached by what is configured, and nobody else.
+"""Zenoh session: the only module that knows it. Connects to configured endpoints only.
 
-No multicast, no gossip: a node listens and connects where it is told to. Each node routes, so that
-what two others tell each other may pass through it, and connects again by itself.
+No multicast, no gossip: a node listens and connects as configured. Each node routes, so that the
+traffic of two others may pass through it, and reconnects by itself.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from companion.errors import InputError
 LOOPBACK = "tcp/127.0.0.1:7447"
 MOST_MESSAGE_BYTES = 64 << 20
 LISTEN_MS = 15_000
-"""A port that the process before still holds is waited for."""
+"""Timeout for a port that the process before still holds."""
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/\S+:\d{1,5}(#\S*|\?\S*)?")
 PRIORITIES = ("INTERACTIVE_HIGH", "DATA", "BACKGROUND")
@@ -25,7 +25,7 @@ URGENT, USUAL, LAST = PRIORITIES
 
 
 class ZenohBus:
-    """A session. Raises InputError where it cannot be had as configured."""
+    """A session. Raises InputError where it is impossible as configured."""
 
     def __init__(self, config: DistributedConfig) -> None:
         self._prefix = key_prefix(config)
@@ -42,24 +42,24 @@ class ZenohBus:
             where = ", ".join([*settings["listen/endpoints"], *settings["connect/endpoints"]])
             raise InputError(f"[distributed]: {where}: {_brief(error)}") from error
 
-    def announce(self, topic: str, priority: str) -> None:
-        """Be about to publish on a topic."""
+    def declare_publisher(self, topic: str, priority: str) -> None:
+        """Declare a publisher of a topic."""
         self._publishers[topic] = self._session.declare_publisher(
             f"{self._prefix}/{topic}",
             priority=getattr(self._zenoh.Priority, priority),
             congestion_control=self._zenoh.CongestionControl.DROP,
         )
 
-    def is_wanted(self, topic: str) -> bool:
-        """Whether anybody has subscribed to a topic that was announced."""
+    def has_subscribers(self, topic: str) -> bool:
+        """Whether a declared topic has subscribers."""
         return bool(self._publishers[topic].matching_status.matching)
 
     def publish(self, topic: str, data: bytes) -> None:
-        """Send to all who have subscribed; what the network does not take is given up."""
+        """Send to all subscribers; dropped where the network does not take it."""
         self._publishers[topic].put(data)
 
     def serve(self, topic: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Answer whoever asks; called in a thread of its own, None for no answer."""
+        """Answer queries of a topic; called in a thread of its own, None for no answer."""
         key = f"{self._prefix}/{topic}"
 
         def take(query: Any) -> None:
@@ -72,7 +72,7 @@ class ZenohBus:
         self._declared.append(self._session.declare_queryable(key, take))
 
     def subscribe(self, topic: str, take: Callable[[bytes], None]) -> None:
-        """Have what is published on a topic; called in a thread of its own."""
+        """Subscribe to a topic; called back in a thread of its own."""
         self._declared.append(
             self._session.declare_subscriber(
                 f"{self._prefix}/{topic}", lambda sample: take(sample.payload.to_bytes())
@@ -80,7 +80,7 @@ class ZenohBus:
         )
 
     def ask(self, topic: str, data: bytes, timeout_s: float) -> bytes | None:
-        """The first answer; None where nobody is there who gives one."""
+        """First answer to a query; None without one."""
         replies = self._session.get(
             f"{self._prefix}/{topic}", payload=data, timeout=timeout_s,
             priority=self._zenoh.Priority.BACKGROUND,
@@ -93,12 +93,12 @@ class ZenohBus:
         return None
 
     def close(self) -> None:
-        """Leave."""
+        """Close the session."""
         self._session.close()
 
 
 def key_prefix(config: DistributedConfig) -> str:
-    """What all keys of a vehicle begin with; InputError for a name that cannot be in one."""
+    """Prefix of all keys of a vehicle; InputError for an invalid name."""
     if not NAME.fullmatch(config.vehicle):
         raise InputError(
             f"distributed.vehicle = {config.vehicle!r}: wanted letters, digits, _ . - only"
@@ -144,5 +144,5 @@ def _library() -> Any:
 
 
 def _brief(error: Exception) -> str:
-    """What Zenoh says, without where in its source it says so."""
+    """Error message of Zenoh, without places in its source."""
     return re.sub(r" at /\S+", "", str(error)).split("\n")[0].rstrip(".")

@@ -1,1 +1,1 @@
-"""The autopilot's telemetry as samples: readers of logs, and of live messages."""
+"""Telemetry of the autopilot as samples: readers of logs, and of live messages."""

@@ -1,7 +1,7 @@
-"""The records of an ArduPilot DataFlash log (.BIN): self-described by FMT records at its head.
+"""Records of an ArduPilot DataFlash log (.BIN): self-described by FMT records at its head.
 
-pymavlink's DFFormat serves as codec; the file is walked here, so that damage costs the records that
-it hit and no more (pymavlink's own index ends at the first kind that it does not know).
+pymavlink's DFFormat decodes; the file is parsed here, so that damage costs only the records that it
+hits (pymavlink's own index ends at the first unknown kind).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from pymavlink.DFReader import FORMAT_TO_STRUCT, DFFormat
 HEAD = b"\xa3\x95"
 FMT, FMT_LENGTH = 0x80, 89
 PADDING = 528
-"""So many bytes at the end of a log may be what was in memory before: no damage."""
+"""Bytes at the end of a log that may be old memory: no damage."""
 
 
 @dataclass(slots=True)
 class DataflashRecords:
-    """Iterates over records of the kinds named; `n_damaged` bytes were passed over so far."""
+    """Iterates over records of the kinds named; `n_damaged` bytes were skipped so far."""
 
     log: bytes
     kinds: Collection[str]

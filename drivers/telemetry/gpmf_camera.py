@@ -1,6 +1,6 @@
-"""A GoPro camera's own receiver: where it was, in the same track as an autopilot's telemetry.
+"""Positions of a GoPro camera's own GPS receiver, from the same track as an autopilot's telemetry.
 
-A block of the track holds what came in its span of the video, evenly spread (GPS5: latitude,
+A block of the track holds the samples of its span of the video, evenly spread (GPS5: latitude,
 longitude, height, speeds; with GPSF, the kind of fix, and GPSP, its dilution. GPS9, of later
 cameras: the same with these two in each row).
 """
@@ -18,13 +18,13 @@ from drivers.telemetry.telemetry_log import GeodeticFix, TelemetryCollector
 
 FIX_3D = 3.0
 METRES_PER_DILUTION = 3.0
-"""A usual receiver's error for a dilution of one."""
+"""Typical error of a receiver at dilution 1."""
 MAX_DILUTION = 10.0
 HEIGHTS = Warned(0, "heights of the camera's receiver", "may be above the ellipsoid, not the sea")
 
 
 def camera_fixes(name: str, payloads: Sequence[tuple[int, int, bytes]]) -> TelemetryCollector:
-    """Places on the video's own time; `payloads` are begin and end in ns, and content."""
+    """Positions with times of the video; `payloads` are begin and end in ns, and content."""
     collected = TelemetryCollector(name)
     for begin_ns, end_ns, payload in payloads:
         try:
@@ -46,7 +46,7 @@ def camera_fixes(name: str, payloads: Sequence[tuple[int, int, bytes]]) -> Telem
 
 
 def _rows(streams: Mapping[str, Array]) -> tuple[Array, Array, Array]:
-    """Rows, and for each the kind of fix and its dilution of precision."""
+    """Rows, the kind of fix of each, and its dilution of precision."""
     rows = streams.get("GPS9", np.zeros((0, 9)))
     if rows.ndim == 2 and len(rows) and rows.shape[1] == 9:
         return rows, rows[:, 8], rows[:, 7]

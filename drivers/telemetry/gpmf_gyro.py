@@ -1,9 +1,9 @@
-"""A GoPro camera's own gyro: how the camera itself turned, by the clock of its video.
+"""Rotation of a GoPro camera by its own gyroscope, on the clock of its video.
 
-A block holds what came in its span of the video, evenly spread (GYRO, rad/s). Which way the axes
-point differs from model to model. It is told by ORIN, a letter for each, small where it points the
-other way, or by the name of the stream, as in "Gyroscope (z,x,y)"; X is left, Y back, Z up (found
-on a HERO5's video by comparison with its pictures, not tried on others).
+A block holds the samples of its span of the video, evenly spread (GYRO, rad/s). The axes differ
+from model to model. They are given by ORIN, a letter for each, lower case where it points the other
+way, or by the name of the stream, as in "Gyroscope (z,x,y)"; X is left, Y back, Z up (found on a
+HERO5's video by comparison with its images, not tried on others).
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from companion.geometry.transforms import Array
 from drivers.telemetry.gpmf_records import GpmfError, read_streams
 
 STEP_S = 0.02
-"""Of the turns that are given."""
+"""Sampling interval of the result."""
 LONGEST_STEP_S = 0.1
-"""Longer ones are gaps, over which nobody knows how it turned."""
+"""Longer intervals are gaps, over which the rotation is unknown."""
 LEAST = 100
 CAMERA_FROM_GOPRO = np.array([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
 NAMED = re.compile(r"\(([xyzXYZ]),([xyzXYZ]),([xyzXYZ])\)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GyroTurns:
-    """Turns `angle_rad` (N, 3), summed up from the first of `t_ns` (N,) of the video's own time.
+class GyroRotation:
+    """Rotation `angle_rad` (N, 3), integrated from the first of `t_ns` (N,) of the video's time.
 
-    About the camera's axes where `axes_known`, else about three that stand on one another.
+    About the camera's axes where `axes_known`, else about three orthogonal ones.
     """
 
     t_ns: Array
@@ -38,8 +38,8 @@ class GyroTurns:
     axes_known: bool
 
 
-def gyro_turns(blocks: Sequence[tuple[int, int, bytes]]) -> GyroTurns | None:
-    """What the gyro says; `blocks` are begin and end in ns, and content. None where there is none.
+def gyro_rotation(blocks: Sequence[tuple[int, int, bytes]]) -> GyroRotation | None:
+    """Rotation by the gyroscope; `blocks` are begin and end in ns, and content. None without data.
 
     Damaged blocks are gaps.
     """
@@ -68,7 +68,7 @@ def gyro_turns(blocks: Sequence[tuple[int, int, bytes]]) -> GyroTurns | None:
     turns = 0.5 * (gyro[1:] + gyro[:-1]) * np.where(steps_s > LONGEST_STEP_S, 0, steps_s)[:, None]
     angle = np.vstack([np.zeros(3), np.cumsum(turns, axis=0)])
     even_ns = np.arange(t_ns[0], t_ns[-1], STEP_S * 1e9)
-    return GyroTurns(
+    return GyroRotation(
         even_ns, np.stack([np.interp(even_ns, t_ns, a) for a in angle.T], 1),
         camera_from_rows is not None,
     )  # fmt: skip
@@ -80,7 +80,7 @@ def _in_name(name: str) -> str:
 
 
 def _camera_from_rows(letters: str) -> Array | None:
-    """Rotation (3, 3) by the letters of the three fields; None where they do not tell."""
+    """Rotation (3, 3) by the letters of the three fields; None where unknown."""
     if sorted(letters.upper()) != ["X", "Y", "Z"]:
         return None
     gopro_from_rows = np.zeros((3, 3))

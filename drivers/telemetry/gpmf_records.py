@@ -26,18 +26,18 @@ TEXT = frozenset("cFGU")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpmfStream:
-    """The samples of one stream in one payload: rows (N, fields), in the units that it states."""
+    """Samples of one stream in one payload: rows (N, fields), in the units that it states."""
 
     key: str
     rows: Array
     name: str = ""
-    """What the stream calls itself."""
+    """Name in the stream."""
     orientation: str = ""
-    """A letter for the axis of each field, small where it points the other way; "" if not told."""
+    """A letter for the axis of each field, lower case if it points the other way; "" if unknown."""
 
 
 class GpmfError(ValueError):
-    """A payload is not what the format allows."""
+    """Payload that violates the format."""
 
 
 def read_streams(payload: bytes) -> list[GpmfStream]:

@@ -1,4 +1,4 @@
-"""The track of a GoPro video that holds GPMF: blocks, each of a span of the video."""
+"""GPMF track of a GoPro video: blocks, each of a span of the video."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ HANDLER = "GoPro MET"
 
 
 def blocks_of(video: Path) -> list[tuple[int, int, bytes]]:
-    """Begin and end in ns of the video's own time, and content of each; none where it has none."""
+    """Begin and end in ns of the video's time, and content of each; none without a track."""
     out = []
     try:
         with av.open(str(video)) as container:

@@ -1,9 +1,9 @@
 """Positions of a live autopilot about one origin, as they come.
 
-It is what `TelemetryCollector.finish` does for a log, without knowing what comes later: the origin
-is where the autopilot's local frame has its zero, if it says so or if positions in both frames
-tell, and otherwise the first place there is. Once known it stays; after a reboot, which gives the
-autopilot another zero, local positions are moved to the old one.
+The live counterpart of `TelemetryCollector.finish`, without knowledge of later samples: the origin
+is that of the autopilot's local frame, if stated or if positions in both frames give it, and
+otherwise the first geodetic position. Once known it stays; after a reboot, which gives the
+autopilot another origin, local positions are moved to the old one.
 """
 
 from __future__ import annotations
@@ -16,34 +16,34 @@ from companion.messages import PositionSample, PositionSource
 from drivers.telemetry.telemetry_log import PAIR_NS, GeodeticFix
 
 WAIT_NS = 2_000_000_000
-"""A fix without an origin waits so long for one before it becomes the origin itself."""
+"""Time that a fix waits for an origin before it becomes the origin itself."""
 SAME_M = 0.5
-"""Origins nearer than this to each other are the same, seen with different rounding."""
+"""Origins closer than this are the same, with different rounding."""
 
 
-class LivePlaces:
+class LivePositions:
     """Takes positions in order of time; `remote_ns` is the autopilot's, within one boot."""
 
     def __init__(self) -> None:
         self.home: GeoOrigin | None = None
-        """Where all positions are counted from; None while no place on Earth is known."""
+        """Origin of all positions; None while no geodetic position is known."""
         self.origin: GeoOrigin | None = None
-        """Where the autopilot's local frame has its zero just now."""
+        """Present origin of the autopilot's local frame."""
         self._local: tuple[int, Array, Array | None] | None = None
         self._first_fix_ns: int | None = None
 
     def restart(self) -> None:
-        """The autopilot has begun anew."""
+        """The autopilot has rebooted."""
         self.origin = self._local = self._first_fix_ns = None
 
-    def told(self, origin: GeoOrigin) -> None:
-        """The autopilot states where its local frame has its zero."""
-        if self.origin is not None and _apart_m(self.origin, origin) < SAME_M:
+    def set_origin(self, origin: GeoOrigin) -> None:
+        """Take the origin of its local frame, as stated by the autopilot."""
+        if self.origin is not None and _distance_m(self.origin, origin) < SAME_M:
             return
         self._set_origin(origin)
 
     def local(self, sample: PositionSample, remote_ns: int) -> PositionSample | None:
-        """A local position; None while it is not known how its frame lies to the one before."""
+        """A local position; None while the offset of its frame to the one before is unknown."""
         self._local = remote_ns, sample.position_ned_m, sample.velocity_ned_m_s
         if self.home is None or self.home is self.origin:
             return sample
@@ -54,7 +54,7 @@ class LivePlaces:
         return dataclasses.replace(sample, position_ned_m=sample.position_ned_m + moved)
 
     def fix(self, fix: GeodeticFix, remote_ns: int) -> PositionSample | None:
-        """A place on Earth; None while there is no origin to count it from."""
+        """A geodetic position; None while there is no origin."""
         if self._first_fix_ns is None:
             self._first_fix_ns = remote_ns
         waited = remote_ns - self._first_fix_ns >= WAIT_NS
@@ -75,14 +75,14 @@ class LivePlaces:
         )  # fmt: skip
 
     def _set_origin(self, origin: GeoOrigin) -> None:
-        if self.home is not None and _apart_m(self.home, origin) < SAME_M:
+        if self.home is not None and _distance_m(self.home, origin) < SAME_M:
             origin = self.home
         self.origin = origin
         if self.home is None:
             self.home = origin
 
     def _local_at(self, remote_ns: int) -> Array | None:
-        """The newest local position, brought to a time near it."""
+        """Newest local position, extrapolated to a time near it."""
         if self._local is None or abs(remote_ns - self._local[0]) > PAIR_NS:
             return None
         at_ns, position, velocity = self._local
@@ -92,6 +92,6 @@ class LivePlaces:
         return moved
 
 
-def _apart_m(a: GeoOrigin, b: GeoOrigin) -> float:
+def _distance_m(a: GeoOrigin, b: GeoOrigin) -> float:
     x, y, z = ned_from_geodetic(b.latitude_deg, b.longitude_deg, b.altitude_m, a)
     return float((x * x + y * y + z * z) ** 0.5)

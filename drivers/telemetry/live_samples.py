@@ -1,8 +1,8 @@
-"""Messages of a live autopilot to samples on the flight's clock: what a log's reader does, at once.
+"""Messages of a live autopilot as samples on the flight's clock: live counterpart of log readers.
 
-Of several messages that state one quantity one kind is taken, as from a log: of attitudes the more
-frequent, of the others the first that there is. Stamps that are not of the running clock, or not
-later than the one before, are dropped and counted.
+Of several messages for one quantity one type is taken, as from a log: of attitudes the more
+frequent, of the others the first available. Stamps that are not of the present boot, or not later
+than the one before, are dropped and counted.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.messages import PositionSample, PositionSource, Telemetry, Warned
 from companion.timing.link_clock import ClockFilter
 from companion.timing.stamp_filter import MAX_BOOT_NS
-from drivers.telemetry.live_positions import LivePlaces
+from drivers.telemetry.live_positions import LivePositions
 from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, SAMPLE_OF, boot_ns
 from drivers.telemetry.telemetry_log import GeodeticFix, is_finite
 
 LATE_NS, AHEAD_NS = 2_000_000_000, 100_000_000
-"""A delay that is named; a stamp that is further in the future than this cannot be true."""
-NAME_AGAIN_NS = 10_000_000_000
+"""Delay that is reported; a stamp further in the future than the second is invalid."""
+WARN_AGAIN_NS = 10_000_000_000
 CHOOSE_NS = 1_000_000_000
-"""Which of several messages is the more frequent is looked at so often."""
+"""Interval at which the more frequent of several messages is chosen."""
 ABOUT = 1.25
-"""Messages that come at rates within this ratio are about as frequent."""
+"""Ratio of rates within which messages count as equally frequent."""
 MOST_AWAY_M = 1e6
 
 OUT_OF_ORDER, WILD, LATE = "telemetry out of order", "telemetry stamped wildly", "telemetry late"
@@ -37,7 +37,7 @@ AHEAD, UNUSABLE = "telemetry from the future", "telemetry that is not usable"
 
 
 class LiveSamples:
-    """Stamps, places and passes on what the vehicle's autopilot measures."""
+    """Stamps, georeferences and passes on the measurements of the vehicle's autopilot."""
 
     def __init__(
         self,
@@ -46,19 +46,19 @@ class LiveSamples:
         warn: Callable[[Warned], None],
     ) -> None:
         self._clock, self._deliver, self._warn = clock, deliver, warn
-        self.places = LivePlaces()
+        self.positions = LivePositions()
         self.n_dropped: Counter[str] = Counter()
-        """By the reason."""
+        """By reason."""
         self.gps_fix_type = 0
-        """GPS_FIX_TYPE of the newest GPS_RAW_INT; 0 where there is no GPS."""
+        """GPS_FIX_TYPE of the newest GPS_RAW_INT; 0 without a GPS."""
         self._unix_minus_boot_ns: int | None = None
         self._segment = clock.n_segments
         self._stamps: dict[int, int] = {}
         self._latest: dict[str, tuple[int, int]] = {}
-        """By quantity: the newest stamp, and the time that it was given."""
+        """Newest stamp by quantity, and the time that it was given."""
         self._choices = (_Choice(ATTITUDE_IDS, frequent=True), _Choice(IMU_IDS, frequent=False))
         self._wild = ""
-        self._named_ns: dict[str, int] = {}
+        self._warned_ns: dict[str, int] = {}
 
     def take(self, message: Any, receive_ns: int) -> None:
         """Take any message of the autopilot."""
@@ -94,7 +94,7 @@ class LiveSamples:
         if self._segment != self._clock.n_segments:
             self._begin()
         if self._wild:
-            self._name(WILD, receive_ns, self._wild)
+            self._warn_once(WILD, receive_ns, self._wild)
             self._wild = ""
         sample = SAMPLE_OF[kind](message) if kind in SAMPLE_OF else None
         if sample is None:
@@ -121,7 +121,7 @@ class LiveSamples:
             self._drop(AHEAD, receive_ns, f"{name} by {(t_ns - receive_ns) * 1e-9:.2f} s")
             return
         if receive_ns - t_ns > LATE_NS:
-            self._name(LATE, receive_ns, f"{name} by {(receive_ns - t_ns) * 1e-9:.1f} s")
+            self._warn_once(LATE, receive_ns, f"{name} by {(receive_ns - t_ns) * 1e-9:.1f} s")
         self._latest[quantity] = remote_ns, t_ns
         sample = self._placed(content, remote_ns)
         if sample is None:
@@ -131,9 +131,9 @@ class LiveSamples:
 
     def _placed(self, content: Telemetry | GeodeticFix, remote_ns: int) -> Telemetry | None:
         if isinstance(content, GeodeticFix):
-            return self.places.fix(content, remote_ns)
+            return self.positions.fix(content, remote_ns)
         if isinstance(content, PositionSample) and content.source is PositionSource.LOCAL:
-            return self.places.local(content, remote_ns)
+            return self.positions.local(content, remote_ns)
         return content
 
     def _take_origin(self, message: Any, receive_ns: int) -> None:
@@ -141,29 +141,31 @@ class LiveSamples:
         if not _is_place(latitude_deg, longitude_deg):
             self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
         elif message.latitude or message.longitude:  # both 0 is what is not set
-            self.places.told(GeoOrigin(latitude_deg, longitude_deg, message.altitude * 1e-3))
+            self.positions.set_origin(
+                GeoOrigin(latitude_deg, longitude_deg, message.altitude * 1e-3)
+            )
 
     def _begin(self) -> None:
-        """Another clock runs: the autopilot has begun anew."""
+        """The autopilot has rebooted: its clock is another."""
         self._segment = self._clock.n_segments
         self._latest = {quantity: (-1, t_ns) for quantity, (_, t_ns) in self._latest.items()}
         self._stamps.clear()
         self._wild = ""
-        self.places.restart()
+        self.positions.restart()
 
     def _drop(self, what: str, now_ns: int, detail: str) -> None:
         self.n_dropped[what] += 1
-        self._name(what, now_ns, detail)
+        self._warn_once(what, now_ns, detail)
 
-    def _name(self, what: str, now_ns: int, detail: str) -> None:
-        """Say it, but not for every message of a stream."""
-        if now_ns - self._named_ns.get(what, -NAME_AGAIN_NS) >= NAME_AGAIN_NS:
-            self._named_ns[what] = now_ns
+    def _warn_once(self, what: str, now_ns: int, detail: str) -> None:
+        """Warn, rate-limited."""
+        if now_ns - self._warned_ns.get(what, -WARN_AGAIN_NS) >= WARN_AGAIN_NS:
+            self._warned_ns[what] = now_ns
             self._warn(Warned(now_ns, what, detail))
 
 
 class _Choice:
-    """Which of several messages that state the same is taken."""
+    """Selection among messages for the same quantity."""
 
     def __init__(self, ids: tuple[int, ...], frequent: bool) -> None:
         self._ids, self._frequent = ids, frequent
@@ -173,7 +175,7 @@ class _Choice:
         self._chosen: int | None = None
 
     def takes(self, kind: int, now_ns: int) -> bool:
-        """Count a message; whether it is to be taken, as it is if it states something else."""
+        """Count a message; whether to use it, as always for another quantity."""
         if kind not in self._ids:
             return True
         if now_ns - self._since_ns >= CHOOSE_NS:

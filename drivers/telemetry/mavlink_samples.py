@@ -1,4 +1,4 @@
-"""MAVLink messages to samples: units, axes and what marks a field as not known."""
+"""MAVLink messages as samples: units, axes and markers of invalid fields."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GPS_RANGE_ERROR_M = 1.5
 UNKNOWN_16 = 65535
 FIX_3D = 3
 UNIX_SINCE_NS = 10**17
-"""Stamps larger than this count from 1970, smaller ones from boot."""
+"""Larger stamps count from 1970, smaller ones from boot."""
 ACCEL_AND_GYRO = 0x3F
 PRESSURE_ALTITUDE = 0x800
 
@@ -43,7 +43,7 @@ RANGE_IDS = (mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,)
 
 
 def boot_ns(message: Any, unix_minus_boot_ns: int | None) -> int | None:
-    """Autopilot time since boot of a message; None where it has none that can be told."""
+    """Autopilot time since boot of a message; None where it has none."""
     boot_ms = getattr(message, "time_boot_ms", None)
     if boot_ms is not None:
         return int(boot_ms) * 1_000_000
@@ -56,7 +56,7 @@ def boot_ns(message: Any, unix_minus_boot_ns: int | None) -> int | None:
 
 
 def height_from_pressure(pressure_pa: float) -> float:
-    """Height in metres above the level of 1013.25 hPa in the standard atmosphere (ISO 2533)."""
+    """Height in metres above 1013.25 hPa in the standard atmosphere (ISO 2533)."""
     return float(44330.77 * (1 - (pressure_pa / 101325.0) ** 0.1902632))
 
 
@@ -124,7 +124,7 @@ def _gps(message: Any) -> GeodeticFix | None:
 
 
 def _gps_velocity(message: Any) -> Array | None:
-    """Over ground; the vertical part is nan, since the message has none."""
+    """Velocity over ground; the vertical component is nan, since the message has none."""
     if UNKNOWN_16 in (message.vel, message.cog):
         return None
     course, speed = math.radians(message.cog * 1e-2), message.vel * 1e-2
@@ -164,4 +164,4 @@ SAMPLE_OF: dict[int, Callable[[Any], Telemetry | GeodeticFix | None]] = {
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: _range,
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: _pressure,
 }
-"""What each message says; samples bear no time yet, None where a message says nothing usable."""
+"""Sample of each message type; samples have no time yet, None without a valid value."""

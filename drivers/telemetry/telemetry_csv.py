@@ -1,7 +1,7 @@
-"""Telemetry as a table, `telemetry.csv`: on the flight's clock, about one origin, nothing rounded.
+"""Telemetry table `telemetry.csv`: on the flight's clock, about one origin, nothing rounded.
 
 A line is `unix_ns,kind,values`; what a sample does not have is empty. Comments before hold the
-origin, how the clocks were put together, and what was amiss where the samples come from.
+origin, how the clocks were put together, and warnings about the source of the samples.
 
 | kind | values |
 |---|---|
@@ -45,15 +45,15 @@ WIDTHS = {"attitude": 7, "imu": 6, "range": 1, "height": 1, "armed": 1, **dict.f
 MAX_BYTES = 4_000_000_000
 
 
-def telemetry_csv(log: TelemetryLog, amiss: Sequence[Warned] = ()) -> Iterator[str]:
-    """The lines of the table; `amiss` is said in it beside the log's own warnings."""
+def telemetry_csv(log: TelemetryLog, warnings: Sequence[Warned] = ()) -> Iterator[str]:
+    """Lines of the table; `warnings` are added to the log's own."""
     if log.origin is not None:
         yield "# origin," + ",".join(map(repr, dataclasses.astuple(log.origin))) + "\n"
     if log.clock is not None:
         c = log.clock
         numbers = f"{c.offset_s!r},{c.drift_ppm!r},{c.sigma_ms!r},{c.n_reboots}"
         yield f"# clock,{c.method.replace(',', ' ')},{numbers}\n"
-    for warned in (*amiss, *log.warnings):
+    for warned in (*warnings, *log.warnings):
         yield f"{WARNING},{warned.t_ns},{json.dumps([warned.what, warned.detail])}\n"
     yield HEADER + "\n"
     for sample in log.samples:
@@ -62,10 +62,10 @@ def telemetry_csv(log: TelemetryLog, amiss: Sequence[Warned] = ()) -> Iterator[s
 
 
 def read_telemetry_csv(path: Path) -> LogContent:
-    """Read such a table; FlightError where it is none. Lines that are damaged are counted."""
+    """Read such a table; FlightError for any other. Damaged lines are counted."""
     collected = TelemetryCollector(path.name)
     clock: ClockReport | None = None
-    amiss: list[Warned] = []
+    warnings: list[Warned] = []
     with path.open(encoding="utf-8", errors="replace") as lines:
         begun = False
         for line in lines:
@@ -76,7 +76,7 @@ def read_telemetry_csv(path: Path) -> LogContent:
                 if origin is not None:
                     collected.origin[0] = origin
                 clock = _clock(words) or clock
-                amiss += _warning(line)
+                warnings += _warning(line)
                 if not begun and not line.startswith("#"):
                     break
                 continue
@@ -87,7 +87,7 @@ def read_telemetry_csv(path: Path) -> LogContent:
                 collected.add(read.t_ns, 0, read)
     if not begun:
         raise FlightError(f'{path}: wanted a line "{HEADER}" after the comments')
-    return LogContent(collected, lambda remote_ns, segment: remote_ns, clock, tuple(amiss))
+    return LogContent(collected, lambda remote_ns, segment: remote_ns, clock, tuple(warnings))
 
 
 def _values(sample: Telemetry) -> list[float | None]:
@@ -148,7 +148,7 @@ def _origin(words: list[str]) -> GeoOrigin | None:
 
 
 def _warning(line: str) -> list[Warned]:
-    """The warning of such a line; none of another."""
+    """Warning of such a line; none of another."""
     name, _, rest = line.partition(",")
     t_ns, _, said = rest.partition(",")
     if name != WARNING or not (t_ns.isascii() and t_ns.isdigit() and len(t_ns) < 20):

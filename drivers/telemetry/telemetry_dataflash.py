@@ -1,4 +1,4 @@
-"""Telemetry as an ArduPilot autopilot logged it itself: DataFlash .BIN, of version 3.2 and later.
+"""Telemetry of an ArduPilot DataFlash log .BIN, version 3.2 and later.
 
 The simulator's truth in simulated logs (SIM, SIM2) is not read.
 """
@@ -49,7 +49,7 @@ Values = Mapping[str, Any]
 
 
 def read_dataflash(path: Path) -> LogContent:
-    """All of a log that can be read; without absolute time where it holds no GPS fix."""
+    """All readable records; without absolute time where there is no GPS fix."""
     log = path.read_bytes()
     records = DataflashRecords(log, KINDS)
     rows = list(records)
@@ -116,7 +116,7 @@ def _utc_ns(values: Values) -> int | None:
 
 
 def _chosen(counts: Counter[str]) -> frozenset[str]:
-    """Which record gives the attitude and which the local position, of those that several do."""
+    """Records to use for attitude and local position, of those that several carry."""
     filtered = next((name for name in FILTERS if counts[name]), None)
     attitude = "ATT" if filtered is None or counts["ATT"] >= counts[filtered] else filtered
     return frozenset({f"{attitude} attitude", f"{filtered} position"})

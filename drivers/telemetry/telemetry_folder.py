@@ -1,4 +1,4 @@
-"""Which log a flight has, and whether it is of the same flight as the pictures."""
+"""Logs of a flight, and whether they overlap the images in time."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ Times = NDArray[np.int64]
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """The telemetry logs of a folder."""
+    """Telemetry logs of a folder."""
     found = (p for p in folder.iterdir() if p.suffix.lower() in READERS)
     return sorted(p for p in found if p.suffix.lower() != ".csv" or p.name == NAME)
 
 
 def logs_beside(video: Path) -> list[Path]:
-    """The telemetry logs that have a video's name."""
+    """Telemetry logs with a video's name."""
     return [path for path in logs_in(video.parent) if path.stem == video.stem]
 
 
 def logs_asked_for(config: TelemetryConfig, beside: Sequence[Path]) -> list[Path]:
-    """The log that is configured, else those that lie there; FlightError where it is none."""
+    """The configured log, else those found there; FlightError where it is none."""
     if not config.log:
         return list(beside)
     path = Path(config.log)
@@ -58,7 +58,7 @@ def logs_asked_for(config: TelemetryConfig, beside: Sequence[Path]) -> list[Path
 
 
 def read_log_file(path: Path) -> LogContent:
-    """What is in a log; FlightError where it cannot be read."""
+    """Content of a log; FlightError where it cannot be read."""
     try:
         return READERS[path.suffix.lower()](path)
     except OSError as error:
@@ -68,10 +68,10 @@ def read_log_file(path: Path) -> LogContent:
 def read_telemetry(
     paths: Sequence[Path], pictures: Pictures, config: TelemetryConfig
 ) -> TelemetryLog:
-    """What these logs say, or without any the video itself, on the flight's clock.
+    """Telemetry of these logs, or without any of the video itself, on the flight's clock.
 
-    Of several logs the one that has most of the pictures' time. FlightError where there are logs
-    and none is of that time.
+    Of several logs the one that covers most of the images' time. FlightError where there are logs
+    and none covers it.
     """
     found = [(path, aligned(read_log_file(path), pictures, config)) for path in paths]
     if not paths:
@@ -100,7 +100,7 @@ def read_telemetry(
 
 
 def aligned(content: LogContent, pictures: Pictures, config: TelemetryConfig) -> TelemetryLog:
-    """What a reader found, on the flight's clock, with what is configured of that applied."""
+    """Content of a log on the flight's clock, with the configured shift applied."""
     shift_ns = round(config.offset_s * 1e9)
     host_ns = content.host_ns
     # a reader that knows the autopilot's clock only cannot say when

@@ -1,7 +1,7 @@
-"""Telemetry inside a GoPro video (GPMF): what a Karma drone's autopilot told its camera.
+"""Telemetry inside a GoPro video (GPMF): that of a Karma drone's autopilot.
 
-Where there was none, the places of the camera's own receiver. Its gyro tells elsewhere when a log
-was made (`gpmf_gyro`); its accelerometer is not read.
+Without an autopilot, the positions of the camera's own receiver. Its gyroscope is used elsewhere
+for time alignment (`gpmf_gyro`); its accelerometer is not read.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ Times = NDArray[np.int64]
 
 
 def read_gpmf(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogContent | None:
-    """The telemetry in a video; None where there is none.
+    """Telemetry in a video; None without any.
 
-    Autopilot time is put on the video's by the payloads, each of which holds what came in its span
-    of the video, then on the flight's clock by `host_from_file_ns`, given times after the first
-    frame's.
+    Autopilot time is mapped to the video's by the payloads, each of which holds the samples of its
+    span of the video, then to the flight's clock by `host_from_file_ns`, given times after the
+    first frame's.
     """
     payloads = blocks_of(video) if video.is_file() else []
     if not payloads:

@@ -1,6 +1,6 @@
-"""What a reader of any log format hands on, and how its times and places are made one.
+"""Output of log readers, with times and positions brought to one clock and origin.
 
-A reader collects samples on the autopilot's clock and places as the autopilot gives them;
+A reader collects samples on the autopilot's clock and positions as given;
 `TelemetryCollector.finish` puts all of them on the flight's clock and about one origin.
 """
 
@@ -30,14 +30,14 @@ from companion.messages import (
 )
 
 PAIR_NS = 100_000_000
-"""Local and global positions so near in time tell where the local origin lies."""
+"""Largest time difference of local and global positions that give the local origin."""
 MAX_PAIRS = 200
 HostTimes = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]
 
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """When the pictures of a flight were taken, and their file with its times by its own clock."""
+    """Time span of a flight's images, and their file with its own clock."""
 
     path: Path
     start_ns: int
@@ -50,7 +50,7 @@ class TelemetryLog:
     """All samples of a flight, sorted by time on the flight's clock.
 
     `rates_hz` is by kind of sample, positions by source. `clock` is None where the log needs none
-    or says nothing; `origin` is None where no place on Earth is known.
+    or states nothing; `origin` is None where unknown.
     """
 
     source: str
@@ -60,18 +60,18 @@ class TelemetryLog:
     warnings: tuple[Warned, ...] = ()
     rates_hz: Mapping[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-    """What the user should be told of how it was read."""
+    """Remarks for the user on how it was read."""
 
 
 def no_telemetry(pictures: Pictures) -> TelemetryLog:
-    """The log of a flight that has none."""
+    """Log of a flight that has none."""
     missing = Warned(pictures.start_ns, "no telemetry", "neither scale nor level will be known")
     return TelemetryLog("", (), warnings=(missing,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeodeticFix:
-    """A place on Earth as a log gives it; its stamp is kept beside it."""
+    """Geodetic position of a log; its stamp is kept beside it."""
 
     source: PositionSource
     latitude_deg: float
@@ -84,7 +84,7 @@ class GeodeticFix:
 
 @dataclass(slots=True)
 class TelemetryCollector:
-    """Takes samples with stamps of the autopilot; their own `t_ns` is not looked at."""
+    """Takes samples with stamps of the autopilot; their own `t_ns` is ignored."""
 
     source: str
     origin: dict[int, GeoOrigin] = field(default_factory=dict)
@@ -94,7 +94,7 @@ class TelemetryCollector:
     _unusable: Counter[str] = field(default_factory=Counter)
 
     def add(self, remote_ns: int, segment: int, content: Telemetry | GeodeticFix) -> None:
-        """Take a sample, unless numbers in it are not finite."""
+        """Add a sample, unless a number in it is not finite."""
         if not is_finite(content):
             self.count("telemetry with values that are no numbers left out")
             return
@@ -102,7 +102,7 @@ class TelemetryCollector:
         self._content.append(content)
 
     def count(self, what: str) -> None:
-        """Count something that was wrong in the log."""
+        """Count an error in the log."""
         self._unusable[what] += 1
 
     def __len__(self) -> int:
@@ -120,7 +120,7 @@ class TelemetryCollector:
         warnings: Sequence[Warned] = (),
         on_host_clock: Sequence[ArmedSample] = (),
     ) -> TelemetryLog:
-        """Everything on the flight's clock and about one origin; `on_host_clock` already was."""
+        """Log on the flight's clock and about one origin; `on_host_clock` already was."""
         times = host_ns(*self.stamps())
         order = np.argsort(times, kind="stable")
         stamped = [(int(times[i]), self._stamps[i][1], self._content[i]) for i in order]
@@ -149,14 +149,14 @@ def rates_hz(samples: Sequence[Telemetry]) -> dict[str, float]:
 
 
 def kind_of(sample: Telemetry) -> str:
-    """What a sample is, in words."""
+    """Kind of a sample, in words."""
     if isinstance(sample, PositionSample):
         return sample.source.value
     return type(sample).__name__.removesuffix("Sample").lower()
 
 
 def is_finite(content: Telemetry | GeodeticFix) -> bool:
-    """Whether all its numbers are."""
+    """Whether all its numbers are finite."""
     # written out, since this runs for every sample of a flight
     if isinstance(content, AttitudeSample):
         return bool(np.isfinite(content.ned_from_body).all())
@@ -233,7 +233,7 @@ def _placed(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogContent:
-    """What a reader found in a log: samples, and how to put them on the flight's clock.
+    """Content of a log: samples, and the mapping of their times to the flight's clock.
 
     `host_ns` is None where the log has no absolute time. `on_host_clock` are samples that are on
     the flight's clock already.

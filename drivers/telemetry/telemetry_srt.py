@@ -1,4 +1,4 @@
-"""Telemetry in the subtitles of DJI's videos, beside a video or inside it.
+"""Telemetry in the subtitles of DJI videos, beside a video or inside it.
 
 Of the forms that DJI has used these are read: words in brackets (`[latitude: 48.1] [rel_alt: 30.5
 abs_alt: 520.1] [gb_pitch: -90.0 …]`), `GPS(lon,lat,n) BAROMETER:30.5`, and `GPS (lon, lat, n), …
@@ -46,14 +46,14 @@ SIMPLE_NAMES = ("latitude", "longitude")
 
 @dataclass(frozen=True, slots=True)
 class Cue:
-    """One subtitle: when it is shown, by the video's own time, and the numbers in it by name."""
+    """One subtitle: its time in the video, and the numbers in it by name."""
 
     t_ns: int
     said: dict[str, float]
 
 
 def read_srt(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogContent | None:
-    """What the subtitles of a video tell; None where there are none of this kind."""
+    """Telemetry of a video's subtitles; None without any."""
     cues = list(cues_of(video))
     if not any("latitude" in cue.said or "pitch" in cue.said for cue in cues):
         return None
@@ -86,7 +86,7 @@ def read_srt(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogCon
 
 
 def srt_camera(video: Path, width: int, height: int) -> tuple[Camera, str] | None:
-    """The camera as far as the subtitles tell it, and that in words; None where they do not."""
+    """Camera as far as the subtitles give it, and a remark; None where they do not."""
     for cue in cues_of(video):
         film_mm = cue.said.get("focal", 0.0)
         film_mm = film_mm / 10 if film_mm > 100 else film_mm  # some write tenths
@@ -104,7 +104,7 @@ def srt_camera(video: Path, width: int, height: int) -> tuple[Camera, str] | Non
 
 
 def cues_of(video: Path) -> Iterator[Cue]:
-    """The subtitles of a video that tell something, in order: beside it, else inside it."""
+    """Subtitles with data of a video, in order: beside it, else inside it."""
     beside = _file_beside(video)
     for t_ns, text in _in_file(beside) if beside is not None else _inside(video):
         said = _numbers(text[:MAX_CUE])

@@ -1,4 +1,4 @@
-"""Telemetry as a companion or a ground station received it: MAVLink in a .tlog.
+"""Telemetry of a .tlog, as recorded by a companion or a ground station.
 
 Only the autopilot's own messages are taken, and of those never a simulator's truth (SIM_STATE,
 SIMSTATE, SIM2, HIL_STATE_QUATERNION): a program in flight has none.
@@ -33,7 +33,7 @@ MAX_ROUND_TRIP_NS = 2_000_000_000
 
 
 def read_tlog(path: Path) -> LogContent:
-    """All that the autopilot of one vehicle said; an empty log where there is nothing to read."""
+    """Telemetry of one vehicle's autopilot; an empty log where there is none."""
     log = path.read_bytes()
     packets = TlogRecords(log)
     found = list(packets)
@@ -56,7 +56,7 @@ def read_tlog(path: Path) -> LogContent:
 
 
 def _vehicle(records: Iterable[Record]) -> tuple[int | None, int]:
-    """The system whose autopilot says most of its attitude, and how many do."""
+    """System whose autopilot sends most attitudes, and the number of such systems."""
     counts: Counter[int] = Counter()
     for record in records:
         if record.component == AUTOPILOT_COMPONENT:
@@ -147,7 +147,7 @@ class _Reader:
 
 
 def _chosen(counts: Counter[int]) -> set[int]:
-    """Ids of the messages to read: one kind for each quantity that several state."""
+    """Ids of the messages to read: one type for each quantity that several carry."""
     chosen = {
         mavlink.MAVLINK_MSG_ID_TIMESYNC,
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,

@@ -1,4 +1,4 @@
-"""Telemetry as a PX4 autopilot logged it itself: .ulg, read by pyulog."""
+"""Telemetry of a PX4 log: .ulg, read by pyulog."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ LATEST_NS = 4_102_444_800 * 10**9  # the year 2100
 MAX_SHORT_READS = 100
 MAX_LATENCY_US = 1_000_000
 DAMAGE = (ULogException, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error)
-"""What pyulog raises for a file that is none, or for definitions that are damaged."""
+"""Exceptions of pyulog for invalid files or damaged definitions."""
 
 Columns = Mapping[str, NDArray[Any]]
 
 
 def read_ulog(path: Path) -> LogContent:
-    """All of a log that can be read; without absolute time where it holds no UTC by GPS."""
+    """All readable data; without absolute time where there is no UTC by GPS."""
     collected = TelemetryCollector(path.name)
-    told = io.StringIO()
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(told):  # pyulog prints what it thinks of the file
+        with contextlib.redirect_stdout(printed):  # pyulog prints what it thinks of the file
             log = ULog(_Bytes(path.read_bytes()), TOPICS, True)
     except DAMAGE as error:
         warned = Warned(0, "damaged telemetry", f"{path.name} cannot be read: {error}")
@@ -82,7 +82,7 @@ def read_ulog(path: Path) -> LogContent:
 
 
 class _Bytes(io.BytesIO):
-    """A log that ends: with damaged definitions pyulog can seek back from the end without end."""
+    """File that limits reads at its end: on damaged definitions pyulog can seek without end."""
 
     _n_short = 0
 
@@ -121,7 +121,7 @@ def _host_times(collected: TelemetryCollector, gps: Columns | None) -> tuple[Hos
 
 
 def _stamps_ns(columns: Columns) -> list[int]:
-    """When the sensor measured, where that is told apart from when it was published.
+    """Times of measurement, where distinct from those of publication.
 
     A stamp that damage made wild is -1, which `_add` leaves out.
     """
@@ -185,7 +185,7 @@ def _take_local_position(collected: TelemetryCollector, columns: Columns) -> Non
 
 
 def _origins(collected: TelemetryCollector, columns: Columns) -> NDArray[np.int64]:
-    """A number for each origin that the estimator had in turn; where it is on Earth is noted."""
+    """Number of the estimator's origin for each sample; geodetic origins are stored."""
     known = (columns["xy_global"] > 0) & (columns["z_global"] > 0)
     where = _stacked(columns, "ref_lat", "ref_lon", "ref_alt")
     if np.abs(where[known]).max(initial=0.0) > 1e6:  # 1e-7 degrees and millimetres

@@ -1,7 +1,7 @@
-"""A .tlog as ground stations write it: each packet behind eight bytes of big-endian Unix time.
+"""Packets of a .tlog: each behind eight bytes of big-endian Unix time.
 
-pymavlink serves as codec of single packets; the file is read here, so that damage costs the packets
-that it hit and no more.
+pymavlink decodes single packets; the file is parsed here, so that damage costs only the packets
+that it hits.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SIGNED = 1
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One packet with the time of its arrival; `begin` and `end` say where it lies in the log."""
+    """One packet with its arrival time; `begin` and `end` are its offsets in the log."""
 
     unix_us: int
     system: int
@@ -31,7 +31,7 @@ class Record:
 
 
 class TlogRecords:
-    """Iterates over the packets of a log; `n_damaged` bytes were passed over so far."""
+    """Iterates over the packets of a log; `n_damaged` bytes were skipped so far."""
 
     def __init__(self, log: bytes) -> None:
         self._log = log
@@ -55,7 +55,7 @@ class TlogRecords:
         self.n_damaged += end - at
 
     def decode(self, record: Record) -> Any | None:
-        """The message of a packet; None where its checksum says that it is damaged."""
+        """Message of a packet; None for a wrong checksum."""
         try:
             return self._codec.decode(bytearray(self._log[record.begin : record.end]))
         except (ardupilotmega.MAVError, struct.error, ValueError, IndexError, TypeError):

@@ -1,6 +1,6 @@
-"""A log put on the time of a video by the turns that both saw, where no clock does it.
+"""Time alignment of a log and a video by rotation, where no clock gives it.
 
-What the camera saw is told by its own gyro, where the video has that, else by the pictures.
+The camera's rotation comes from its own gyroscope, where the video has that, else from the images.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from companion.geometry.transforms import Array, rotation_from_quaternion, vecto
 from companion.messages import AttitudeSample, ClockReport, Frame, ImuSample, Telemetry, Warned
 from companion.timing.image_rotation import RotationMeter
 from companion.timing.turn_alignment import TimeAlignment, TurnRecord, align_turns
-from drivers.telemetry.gpmf_gyro import gyro_turns
+from drivers.telemetry.gpmf_gyro import gyro_rotation
 from drivers.telemetry.gpmf_track import blocks_of
 from drivers.telemetry.telemetry_folder import aligned, read_log_file, read_telemetry
 from drivers.telemetry.telemetry_log import Pictures, TelemetryLog
@@ -34,16 +34,16 @@ def read_unaligned(
     paths: Sequence[Path], pictures: Pictures, config: TelemetryConfig, camera: Camera,
     frames: Frames,
 ) -> TelemetryLog:  # fmt: skip
-    """The log of a video whose times are its own; of several the one whose turns agree best.
+    """Log of a video with times of its own; of several the one whose rotation correlates best.
 
-    As `telemetry.align` says. FlightError where no log agrees so well that it must be the one.
+    As `telemetry.align` says. FlightError where no log correlates well enough.
     """
     if not paths or config.align == "never" or config.offset_s:
         return read_telemetry(paths, pictures, config)
     free = dataclasses.replace(config, starts_with_video=True)
     logs = [(path, aligned(read_log_file(path), pictures, free)) for path in paths]
     reasons: list[str] = []
-    for see in (_felt, _seen):
+    for see in (_from_gyro, _from_images):
         seen = see(camera, frames, pictures)
         found = None if seen is None else _best(seen, logs, pictures.start_ns, reasons)
         if seen is not None and found is not None:
@@ -56,19 +56,19 @@ def read_unaligned(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Turns:
+class _Rotation:
     by_what: str
     record: TurnRecord
     body_from_camera: Array | None
-    """Rotation (3, 3), where it is known and so are the axes."""
+    """Rotation (3, 3), if it and the axes are known."""
 
 
 def _best(
-    seen: _Turns, logs: Sequence[tuple[Path, TelemetryLog]], start_ns: int, reasons: list[str]
+    seen: _Rotation, logs: Sequence[tuple[Path, TelemetryLog]], start_ns: int, reasons: list[str]
 ) -> tuple[TelemetryLog, TimeAlignment, Path] | None:
     found = []
     for path, log in logs:
-        logged = _logged(log.samples, start_ns)
+        logged = _from_log(log.samples, start_ns)
         if logged is None:
             reasons.append(f"{path.name} has neither rates nor attitude")
             continue
@@ -107,19 +107,19 @@ def _mount(camera: Camera) -> Array | None:
     return None if camera.body_from_camera is None else camera.body_from_camera.rotation
 
 
-def _felt(camera: Camera, frames: Frames, pictures: Pictures) -> _Turns | None:
-    """By the camera's gyro; None where the video has nothing of it."""
-    turns = gyro_turns(blocks_of(pictures.path)) if pictures.path.is_file() else None
+def _from_gyro(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotation | None:
+    """Rotation by the camera's gyroscope; None where the video has no such data."""
+    turns = gyro_rotation(blocks_of(pictures.path)) if pictures.path.is_file() else None
     if turns is None:
         return None
     host_ns = pictures.host_from_file_ns(np.rint(turns.t_ns).astype(np.int64))
     t_s = np.asarray((host_ns - pictures.start_ns) * 1e-9, np.float64)
     mount = _mount(camera) if turns.axes_known else None
-    return _Turns("the camera's gyro", TurnRecord(t_s, turns.angle_rad), mount)
+    return _Rotation("the camera's gyro", TurnRecord(t_s, turns.angle_rad), mount)
 
 
-def _seen(camera: Camera, frames: Frames, pictures: Pictures) -> _Turns:
-    """By the pictures."""
+def _from_images(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotation:
+    """Rotation by the images."""
     meter = RotationMeter(camera)
     times_s: list[float] = []
     angles: list[Array] = []
@@ -134,11 +134,11 @@ def _seen(camera: Camera, frames: Frames, pictures: Pictures) -> _Turns:
         if len(times_s) == MAX_FRAMES:
             break
     record = TurnRecord(np.array(times_s), np.array(angles).reshape(-1, 3))
-    return _Turns("the pictures", record, _mount(camera))
+    return _Rotation("the pictures", record, _mount(camera))
 
 
-def _logged(samples: Sequence[Telemetry], start_ns: int) -> TurnRecord | None:
-    """The turns of the kind of sample that there is most of; times after `start_ns`."""
+def _from_log(samples: Sequence[Telemetry], start_ns: int) -> TurnRecord | None:
+    """Rotation by the most frequent kind of sample; times after `start_ns`."""
     rates = [(s.t_ns, s.gyro_rad_s) for s in samples if isinstance(s, ImuSample)]
     attitudes = [s for s in samples if isinstance(s, AttitudeSample)]
     if max(len(rates), len(attitudes)) < LEAST_SAMPLES:

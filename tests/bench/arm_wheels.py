@@ -1,4 +1,4 @@
-"""Tells whether all that companion depends on can be installed on a 64-bit ARM computer.
+"""Checks that all dependencies can be installed on a 64-bit ARM computer.
 
     python -m tests.bench.arm_wheels [--uv PROGRAM] [--python 3.10 …] [--extras survey …]
 

@@ -1,4 +1,4 @@
-"""Reads damaged copies of logs and flights, and tells whether any crashes, hangs or eats memory.
+"""Fuzzing of log and flight readers with damaged files: crashes, hangs, memory.
 
     python -m tests.bench.damaged_files SOURCE… [--seeds 100] [--limit-s 60] [--memory-mb 3000]
 

@@ -1,4 +1,4 @@
-"""What each way of listening to an autopilot costs: time from sending to callback, and processor.
+"""Cost of the MAVLink backends: time from sending to callback, and processor time.
 
     python -m tests.bench.link_backends [--seconds 20] [--busy] [WAY ...]
 

@@ -1,6 +1,6 @@
-"""The drone of the link table: a flight's tape told to an exporter. TAPE LISTEN KBIT_S SECONDS OUT.
+"""The drone of the link table: plays a message log to an exporter. LOG LISTEN KBIT_S SECONDS OUT.
 
-OUT gets when each chunk of points was told and how much memory the exporter has, as JSON.
+OUT: JSON with the time at which each chunk of points was given and the memory of the exporter.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ import psutil
 from companion.config import StreamConfig, ViewerConfig
 from companion.messages import PointChunk
 from companion.streaming.viewer import LiveViewer
-from tests.support.flights.flight_tape import Tape
+from tests.support.flights.message_log import MessageLog
 
 
 def main() -> None:
-    tape, listen, kbit_s, seconds, out = sys.argv[1:6]
-    flight = Tape(Path(tape))
+    log, listen, kbit_s, seconds, out = sys.argv[1:6]
+    flight = MessageLog(Path(log))
     stream = StreamConfig(listen=listen, budget_kbit_s=float(kbit_s))
-    told: dict[str, float] = {}
+    given: dict[str, float] = {}
     memory: list[tuple[float, float]] = []
     slowest_ms = 0.0
     with LiveViewer(
         ViewerConfig(), flight.camera, name="orbit", stream=stream, origin=flight.origin
     ) as viewer:
         process = psutil.Process(viewer.pid)
-        for message in flight.told(float(seconds)):
+        for message in flight.messages(float(seconds)):
             began = time.perf_counter()
             viewer.take(message)
             slowest_ms = max(slowest_ms, 1e3 * (time.perf_counter() - began))
             now_s = time.time()
             if isinstance(message, PointChunk) and len(message.points_camera):
-                told.setdefault(str(message.keyframe_id), now_s)
+                given.setdefault(str(message.keyframe_id), now_s)
             if not memory or now_s - memory[-1][0] > 1.0:
                 memory.append((now_s, process.memory_info().rss / 2**20))
         document = {
-            "told": told, "memory_mib": memory, "dropped": viewer.n_dropped,
+            "given": given, "memory_mib": memory, "dropped": viewer.n_dropped,
             "slowest_take_ms": slowest_ms, "report": dict(viewer.report),
             "processor_s": sum(process.cpu_times()[:2]),
         }  # fmt: skip

@@ -1,4 +1,4 @@
-"""The ground of the link table: what `companion view` does, into a file. HOST:PORT OUT RRD.
+"""The ground of the link table: `companion view` into a file. HOST:PORT OUT RRD.
 
 OUT gets when each pose and each chunk of points was drawn, as JSON, when it is told to end.
 """

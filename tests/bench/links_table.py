@@ -1,14 +1,14 @@
-"""What a viewer on the ground gets over bad links, beside what is asked of it. Needs root.
+"""Link table: viewers on the ground over bad links, against the requirements. Needs root.
 
-    python -m tests.bench.links_table --flight FOLDER [--tape FILE] [--only NAME] [--json FILE]
+    python -m tests.bench.links_table --flight FOLDER [--log FILE] [--only NAME] [--json FILE]
 
-It takes 14 minutes, and two more where there is no tape yet, on a machine that does nothing
+It takes 14 minutes, and two more where there is no message log yet, on a machine that does nothing
 else; the short form, of half a minute, is tests/live/test_thin_link.py.
 
-A flight is replayed once and kept as a tape; then it is told to the exporter at its own pace, in a
+A flight is replayed once into a message log, which is played to an exporter in real time, in a
 network namespace, and watched from another over a thin link: rate by `tc tbf`, loss by nftables,
 delay by a relay between two TUN devices. Delay and loss are those of either direction. Ages count
-from when the exporter was told: what the tracker takes comes on top.
+from when the exporter was given a message: what the tracker takes comes on top.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 
 from companion.config import Config
 from tests.bench import viewers_and_pose
-from tests.support.flights.flight_tape import make_tape
+from tests.support.flights.message_log import write_message_log
 from tests.support.processes.link_trial import Trial, fly
 from tests.support.processes.two_namespaces import TwoNamespaces, why_not
 
@@ -77,7 +77,7 @@ def fair(trial: Trial) -> list[Row]:
 def poor(trial: Trial) -> list[Row]:
     at = sorted(t for t in trial.coarse.values() if t > trial.began_s + SETTLE_S)
     gap_s = float(np.diff([*at, trial.ended_s]).max()) if at else float("inf")
-    told_gap_s = float(np.diff(sorted(trial.told.values())).max())
+    told_gap_s = float(np.diff(sorted(trial.given.values())).max())
     most = max(rate for _, rate in trial.bytes_per_s[2:]) / 125
     return [
         pose_row(trial, 1.5),
@@ -90,7 +90,7 @@ def poor(trial: Trial) -> list[Row]:
 def outage(trial: Trial) -> list[Row]:
     back_s = trial.began_s + CUT[1]
     fresh = [at - back_s for at, t in trial.poses if at > back_s and t > back_s - 1.0]
-    missing = [k for k, t in trial.told.items() if t < back_s]
+    missing = [k for k, t in trial.given.items() if t < back_s]
     coarse_s = max((trial.coarse.get(k, np.inf) for k in missing), default=back_s) - back_s
     before, after = memory_mib(trial, CUT[0] - 10, CUT[0]), memory_mib(trial, CUT[1], CUT[1] + 15)
     first = fresh[0] if fresh else np.inf
@@ -114,7 +114,7 @@ def stopped(trial: Trial) -> list[Row]:
 
 
 def late(trial: Trial) -> list[Row]:
-    before = [k for k, t in trial.told.items() if t < trial.joined_s]
+    before = [k for k, t in trial.given.items() if t < trial.joined_s]
     took_s = max((trial.coarse.get(k, np.inf) for k in before), default=np.inf) - trial.joined_s
     asked_s = 5.0
     return [(f"coarse map of {len(before)} views there", f"{took_s:.1f} s", f"{asked_s:g} s",
@@ -124,10 +124,10 @@ def late(trial: Trial) -> list[Row]:
 def late_and_thin(trial: Trial) -> list[Row]:
     """Newest first: what is made meanwhile does not wait for all that was before."""
     asked_s = 5.0
-    fresh = [trial.coarse.get(k, np.inf) - t for k, t in trial.told.items()
+    fresh = [trial.coarse.get(k, np.inf) - t for k, t in trial.given.items()
              if trial.joined_s + 1.0 < t < trial.ended_s - asked_s]  # fmt: skip
     worst = max(fresh, default=np.inf)
-    before = [k for k, t in trial.told.items() if t < trial.joined_s]
+    before = [k for k, t in trial.given.items() if t < trial.joined_s]
     there = [k for k in before if k in trial.coarse]
     return [
         ("new views there", f"{worst:.1f} s", f"{asked_s:g} s", worst <= asked_s),
@@ -162,7 +162,7 @@ def pose_row(trial: Trial, asked_s: float) -> Row:
 def behind_row(trial: Trial, level: str, asked_s: float) -> Row:
     p95 = float(np.percentile(trial.behind_s(level, *span(trial)), 95))
     drawn = len(getattr(trial, level))
-    text = f"{p95:.1f} s ({drawn} of {len(trial.told)} views)"
+    text = f"{p95:.1f} s ({drawn} of {len(trial.given)} views)"
     return f"{level} cloud behind, p95", text, f"{asked_s:g} s", p95 <= asked_s
 
 
@@ -171,7 +171,7 @@ def memory_mib(trial: Trial, since_s: float, until_s: float) -> float:
     return max(m for at, m in trial.exporter_mib if since_s <= at - trial.began_s <= until_s)
 
 
-def measured(link: Link, tape: Path) -> list[Row]:
+def measured(link: Link, log: Path) -> list[Row]:
     """The rows of one link."""
 
     def meanwhile(now_s: float, ground: subprocess.Popen[bytes]) -> None:
@@ -186,7 +186,7 @@ def measured(link: Link, tape: Path) -> list[Row]:
         tempfile.TemporaryDirectory() as folder,
     ):
         trial = fly(
-            air, tape, Path(folder), link.seconds, link.budget_kbit_s, meanwhile, link.joins_s
+            air, log, Path(folder), link.seconds, link.budget_kbit_s, meanwhile, link.joins_s
         )
     rate = sum(n for _, n in trial.bytes_per_s) / len(trial.bytes_per_s) / 125
     return [*link.rows(trial), ("on the air, mean", f"{rate:.0f} kbit/s", "-", True)]
@@ -195,7 +195,7 @@ def measured(link: Link, tape: Path) -> list[Row]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--flight", type=Path, help="folder of the flight")
-    parser.add_argument("--tape", type=Path, help="where it is, or is to be, kept")
+    parser.add_argument("--log", type=Path, help="the message log; made where it is missing")
     parser.add_argument("--only", help="links whose name has this in it")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--rounds", type=int, default=3, help="of the pose beside viewers")
@@ -204,16 +204,16 @@ def main() -> int:
     if reason:
         print(f"links_table: {reason}", file=sys.stderr)
         return 2
-    tape = arguments.tape or Path(tempfile.mkdtemp()) / "flight.tape"
-    if not tape.exists():
+    log = arguments.log or Path(tempfile.mkdtemp()) / "flight.log"
+    if not log.exists():
         if arguments.flight is None:
-            parser.error("--flight is missing: there is no tape yet")
-        make_tape(arguments.flight, tape, Config())
+            parser.error("--flight is missing: there is no message log yet")
+        write_message_log(arguments.flight, log, Config())
     table: dict[str, list[Row]] = {}
     print(HEAD)
     for link in LINKS:
         if not arguments.only or arguments.only in link.name:
-            table[link.name] = measured(link, tape)
+            table[link.name] = measured(link, log)
             print(as_text(link.name, table[link.name]), flush=True)
     if not arguments.only or arguments.only in VIEWERS:
         found = viewers_and_pose.measured(None, arguments.rounds)

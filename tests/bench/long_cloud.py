@@ -1,4 +1,4 @@
-"""An hour of points through what keeps them: memory on the way, disk, and what the end takes.
+"""An hour of points through the cloud's store: peak memory, disk, and time at the end.
 
     python -m tests.bench.long_cloud [--keyframes N] [--points N] [--memory-mb N]
 

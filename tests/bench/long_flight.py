@@ -1,10 +1,11 @@
-"""Ten minutes of hovering and flying to and fro: does a frame cost ever more, does memory grow?
+"""Ten minutes of hovering and return passes: growth of the time per frame and of memory.
 
     python -m tests.bench.long_flight FLIGHT [--minutes 10] [--hover-s 4] [--rate-hz 10] [--out DIR]
 
-The first half is spent to and fro over a few seconds of the flight, the second over all of it; in
-lockstep, without dense depth. Prints a row for each half minute of flight, and writes long.csv and
-long.svg if asked. Times are of the processor, tracking and mapping together and of tracking alone.
+The first half is spent in return passes over a few seconds of the flight, the second over all of
+it; in lockstep, without dense depth. Prints a row for each half minute of flight, and writes
+long.csv and long.svg if asked. Times are of the processor: tracking with mapping, and tracking
+alone.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, MapUpdate
 from companion.timing.clock import StageTimes, cpu_s
 from drivers.open_flight import open_flight
-from tests.support.flights.to_and_fro import flown_again, walk
+from tests.support.flights.return_pass import back_and_forth, reordered
 
 ROW_S = 30.0
 PARTS = ("features", "tracking", "initialising")
@@ -49,8 +50,8 @@ def main() -> None:
     each_s = (frames[-1].t_ns - frames[0].t_ns) * 1e-9 / (len(frames) - 1)
     n = int(arguments.minutes * 60 / each_s)
     lead, held = (int(s / each_s) for s in (arguments.hover_at_s, arguments.hover_s))
-    order = [*range(lead), *walk(lead, lead + held, n // 2 - lead)]
-    order += walk(lead, len(frames) - 1, n - len(order))
+    order = [*range(lead), *back_and_forth(lead, lead + held, n // 2 - lead)]
+    order += back_and_forth(lead, len(frames) - 1, n - len(order))
 
     times = StageTimes()
     stage = LocalisationStage(Config(), flight.camera, times)
@@ -61,7 +62,7 @@ def main() -> None:
     update: MapUpdate | None = None
     start_ns, due_s = frames[0].t_ns, ROW_S
     print(" ".join(f"{k:>10}" for k in KEYS))
-    for message in flown_again(frames, flight.telemetry().samples, order):
+    for message in reordered(frames, flight.telemetry().samples, order):
         began_s, before_ms = cpu_s(), sum(times.total_ms(p) for p in PARTS)
         for told in stage.step(message):
             update = told if isinstance(told, MapUpdate) else update

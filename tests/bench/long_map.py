@@ -1,4 +1,4 @@
-"""An hour of map, ten million points, to a viewer that is there and to one that comes at the end.
+"""An hour of map, ten million points, to a viewer connected throughout and to one at the end.
 
     python -m tests.bench.long_map [--keyframes N]
 
@@ -26,7 +26,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from companion.messages import SPANS_REACH, KeyframeAdded, MapUpdate, Track, TrackState
 from companion.streaming.viewer import LiveViewer
-from companion.streaming.viewer.web_gate import free_ports
+from companion.streaming.viewer.web_proxy import free_ports
 from tests.support.flights import flown
 
 POINTS = 2800

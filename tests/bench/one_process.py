@@ -1,13 +1,13 @@
-"""Two hours of one flight in one process for each stage: does a pose cost more, does memory grow?
+"""Two hours of one flight with a process per stage: growth of the pose's cost and of memory.
 
     python -m tests.bench.one_process [--flight sample/survey] [--minutes 120] [--rate-hz 10]
         [--part-s 20] [--shrink 2] [--out FOLDER] [--set SECTION.KEY=VALUE ...]
 
-`soak` flies laps, each of which has processes of its own. Here a short flight goes to and fro as
-one long one, with time stamps that only grow, as fast as localisation answers: the next frame is
-given when the pose of the last has come. All else is as in flight: LiveFlight with localisation,
-recorder, tape and exporter as processes, its health asked each second of the flight. Depth is off
-unless set.
+`soak` flies laps, each of which has processes of its own. Here a short flight is flown in forward
+and return passes as one long one, with rising time stamps, as fast as localisation answers: the
+next frame is given when the pose of the last has come. All else is as in flight: LiveFlight with
+localisation, results, recorder and exporter as processes; health is read once a second of flight.
+Depth is off unless set.
 
 A row for every minute of flight: processor time of localisation's main thread for a frame (50 and
 99 %), which other programs on the machine hardly touch, and memory of every process
@@ -47,7 +47,7 @@ from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_registry import camera_source
 from drivers.open_flight import open_flight
 from drivers.system.journal import Journal
-from tests.support.flights.to_and_fro import flown_again, walk
+from tests.support.flights.return_pass import back_and_forth, reordered
 
 ROW_NS, SECOND_NS = 60_000_000_000, 1_000_000_000
 ANSWER_S, START_S = 60.0, 180.0
@@ -195,7 +195,7 @@ def messages_of(arguments: argparse.Namespace, config: Config) -> Iterator[Frame
             frames.append(shrunk(f, arguments.shrink))
     each_s = (frames[-1].t_ns - frames[0].t_ns) * 1e-9 / (len(frames) - 1)
     n = int(arguments.minutes * 60 / each_s)
-    return flown_again(frames, flight.telemetry().samples, walk(0, len(frames) - 1, n))
+    return reordered(frames, flight.telemetry().samples, back_and_forth(0, len(frames) - 1, n))
 
 
 def fly(arguments: argparse.Namespace, config: Config, seen: Seen, rows_file: Path) -> None:
@@ -221,7 +221,7 @@ def fly(arguments: argparse.Namespace, config: Config, seen: Seen, rows_file: Pa
             line = flown.watch.line_due()
             if line:
                 flown.journal.say(line)
-            flown.flight.tell(flown.watch.health(), None)
+            flown.flight.publish_health(flown.watch.health(), None)
         if message.t_ns >= row_ns:
             row_ns += ROW_NS
             seen.rows.append(row_of(flown, seen, (message.t_ns - start_ns) * 1e-9))

@@ -1,4 +1,4 @@
-"""What recording costs: megabytes a minute, share of a core, and what the disk is waited for.
+"""Cost of recording: megabytes a minute, share of a core, and waiting for the disk.
 
     python -m tests.bench.recorder_cost [--flight sample/survey] [--seconds 20] [--out DIR]
 

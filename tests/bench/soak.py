@@ -1,4 +1,4 @@
-"""A recorded flight flown again and again by one daemon at real speed: what grows, what is lost?
+"""Soak test: a recorded flight flown repeatedly by one daemon in real time; growth and losses.
 
     python -m tests.bench.soak [--flight sample/survey] [--seconds 3600] [--out soak] [--set …]
 

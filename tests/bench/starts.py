@@ -1,4 +1,4 @@
-"""How well maps begin: two views from many places of flights with truth.
+"""Success of map initialisation: two views from many places of flights with ground truth.
 
     python -m tests.bench.starts FLIGHT… [--every 25] [--json FILE]
 

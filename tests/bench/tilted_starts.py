@@ -1,4 +1,4 @@
-"""How soon poses are level again after maps that were made to begin tilted, on recorded flights.
+"""Time until poses are level after maps initialised with a tilt, on recorded flights.
 
     python -m tests.bench.tilted_starts FLIGHT… [--tilts 10,20,40] [--seconds 20] [--maps 1]
 

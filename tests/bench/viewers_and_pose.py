@@ -1,4 +1,4 @@
-"""Whether viewers touch the pose: rate and delay of poses with none, with two, and with hung ones.
+"""Effect of viewers on the pose: rate and delay with none, with two, and with hung ones.
 
     python -m tests.bench.viewers_and_pose [--flight FOLDER] [--rounds N]
 

@@ -1,4 +1,4 @@
-"""What holds until disarming holds over a daemon that is killed in the air, and over SIGHUP."""
+"""Settings held while armed survive a daemon that is killed in the air, and SIGHUP."""
 
 from __future__ import annotations
 
@@ -99,6 +99,6 @@ def test_limits_wait_for_disarming(tmp_path: Path) -> None:
             daemon.until(lambda health: health["flight"], 60, "armed")
             assert limits() == (30.0, 0.5, 1.0)
             flying.autopilot.disarm()
-            daemon.line("what has waited for that counts now", 15)
+            daemon.line("held changes take effect", 15)
             assert limits() == (5.0, 0.5, 9.0)
             assert not daemon.said("Traceback")

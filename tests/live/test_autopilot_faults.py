@@ -1,4 +1,4 @@
-"""Whatever becomes of the autopilot's link in flight: no bad pose, named, and taken up again.
+"""Faults of the autopilot's link in flight: no bad pose, a warning, and recovery.
 
 The link is a serial port (a pty). The flight lasts as long as the daemon runs, so that one serves
 all of these.

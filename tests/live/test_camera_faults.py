@@ -1,4 +1,4 @@
-"""Whatever becomes of the camera in flight: no bad pose leaves, it is named, and taken up again."""
+"""Faults of the camera in flight: no bad pose is sent, a warning, and recovery."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def resize(flying: Flying, is_so: bool) -> None:
         (resize, ("silent",), "pictures of another size are refused"),
     ],
 )
-def test_amiss_and_right_again(
+def test_invalid_images_and_valid_again(
     flying: Flying, fault: Callable[[Flying, bool], None], states: tuple[str, ...], named: str
 ) -> None:
     flying.until_sending()

@@ -1,4 +1,4 @@
-"""What the daemon cannot do without, and what it does then; how it is told things, and how it ends.
+"""Missing prerequisites of the daemon, reload of its configuration, and its end.
 
 Each of these needs a daemon of its own, most of them not for long.
 """
@@ -103,10 +103,10 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
         flying.until_source("autopilot", "running")
         flying.until_source("camera", "running")
         flying.take_off()
-        assert "a_file" in flying.daemon.line("is started again: recorder: ", 40).text
+        assert "a_file" in flying.daemon.line("is started again: results: ", 40).text
         flying.until_told(" restarted", 0)
         went_on_ns = time.monotonic_ns()
-        flying.until_stage("recorder", lambda found: found["n_restarted"] >= 2)
+        flying.until_stage("results", lambda found: found["n_restarted"] >= 2)
         flying.until_sending()
         flying.assert_went_on(went_on_ns)
         flying.assert_true_poses()
@@ -122,14 +122,14 @@ def test_a_disk_that_is_full(tmp_path: Path) -> None:
         flying.until_source("autopilot", "running")
         flying.until_source("camera", "running")
         flying.take_off()
-        flying.until_stage("recorder", lambda found: found["detail"] != "starting")
-        full_ns = flying.daemon.fill_disk_of("recorder")
+        flying.until_stage("results", lambda found: found["detail"] != "starting")
+        full_ns = flying.daemon.fill_disk_of("results")
         time.sleep(2.0)
         flying.assert_went_on(full_ns)
         disarmed_ns = time.monotonic_ns()
         flying.autopilot.disarm()
         flying.daemon.line("disarmed", 10)
         flying.assert_stops()
-        flying.daemon.line("recorder", 5, disarmed_ns)
+        flying.daemon.line("results", 5, disarmed_ns)
         flying.assert_true_poses()
         assert not flying.daemon.said("Traceback")

@@ -1,4 +1,4 @@
-"""The daemon is killed in flight and started again: the autopilot is told that poses begin anew."""
+"""The daemon is killed in flight and restarted: the autopilot gets another reset counter."""
 
 from __future__ import annotations
 

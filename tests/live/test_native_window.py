@@ -1,4 +1,4 @@
-"""`companion view` opens a window in which the map is to be seen."""
+"""`companion view` opens a window that shows the map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.streaming.viewer import LiveViewer
 from companion.streaming.viewer.drawing import COLOUR_AUTOPILOT, COLOUR_PATH
 from companion.streaming.viewer.layout import BACKGROUND
 from companion.streaming.viewer.screen import GRPC_PORT, listens
-from companion.streaming.viewer.web_gate import LOOPBACK, free_ports
+from companion.streaming.viewer.web_proxy import LOOPBACK, free_ports
 from tests.support.flights import flown
 from tests.support.processes.virtual_display import VirtualDisplay, why_not
 from tests.unit.streaming.test_viewer_recording import CAMERA

@@ -1,4 +1,4 @@
-"""What a live flight leaves behind, however the daemon ends, and what a replay makes of it."""
+"""Recordings of live flights, however the daemon ends, and their replay."""
 
 from __future__ import annotations
 
@@ -131,8 +131,8 @@ def test_two_replays_of_a_live_flight_give_the_same_bytes(tmp_path: Path) -> Non
 def test_a_recorder_that_dies_goes_on_in_another_part(tmp_path: Path) -> None:
     daemon = fly(tmp_path, 1)
     try:
-        daemon.signal_stage("tape", signal.SIGKILL)
-        daemon.line("a stage has died and is started again: tape", 10)
+        daemon.signal_stage("recorder", signal.SIGKILL)
+        daemon.line("a stage has died and is started again: recorder", 10)
         time.sleep(3)
         daemon.stop()
     finally:
@@ -147,7 +147,7 @@ def test_a_recorder_that_dies_goes_on_in_another_part(tmp_path: Path) -> None:
 def test_a_disk_that_takes_nothing_ends_the_recording_not_the_flight(tmp_path: Path) -> None:
     daemon = fly(tmp_path, 2)
     try:
-        full_ns = daemon.fill_disk_of("tape")
+        full_ns = daemon.fill_disk_of("recorder")
         daemon.line(FAILED, 10, full_ns)
         n_before = done(daemon.status())
         daemon.until(lambda health: done(health) > n_before + 15, 20, "frames are tracked")

@@ -1,4 +1,4 @@
-"""What takes the pose away in the air, daemon or localisation, and is started again.
+"""Restart of daemon or localisation in the air: the map is resumed.
 
 The vehicle circles until its pose is sent, and hovers from then on: nothing would ever tell a new
 map its scale. What the killed one kept is taken up.

@@ -1,4 +1,4 @@
-"""What systemd hears of the daemon: ready when its stages are, alive only while poses come."""
+"""sd_notify messages of the daemon: ready when its stages are, alive only while poses come."""
 
 from __future__ import annotations
 

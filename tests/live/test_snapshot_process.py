@@ -1,4 +1,4 @@
-"""The recorder's own process writes the cloud in mid-flight, and goes on."""
+"""The results stage writes the cloud in mid-flight, and goes on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATIENCE_S = 60.0
 def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> None:
     told: queue.Queue[Any] = queue.Queue()
     ring = FrameRing(CAMERA.width, CAMERA.height)
-    stage = StageProcess("recorder", 0, ring, told.put, lambda why: told.put(why))
+    stage = StageProcess("results", 0, ring, told.put, lambda why: told.put(why))
     stage.offer(TakeSnapshot(0))  # before it knows what to do: passed over
     stage.begin(Setup(Config(), CAMERA, tmp_path))
     try:

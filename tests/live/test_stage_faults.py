@@ -1,4 +1,4 @@
-"""A stage that dies or hangs in flight takes nothing with it; nor does a viewer."""
+"""A stage that dies or hangs in flight affects no other; nor does a viewer."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def flying(tmp_path_factory: pytest.TempPathFactory, viewer_url: str) -> Iterato
     ("kind", "number", "named"),
     [
         ("depth", signal.SIGKILL, "killed by SIGKILL"),
-        ("recorder", signal.SIGKILL, "killed by SIGKILL"),
+        ("results", signal.SIGKILL, "killed by SIGKILL"),
     ],
 )
 def test_what_is_killed_begins_again(
@@ -59,15 +59,15 @@ def test_what_is_killed_begins_again(
 
 
 def test_what_hangs_is_named_and_goes_on_when_it_can(flying: Flying) -> None:
-    """Depth and recorder are stopped; what is meant for them waits, and frames give way."""
+    """Depth and results are stopped; what is meant for them waits, and frames give way."""
     flying.until_sending()
-    kinds = ("depth", "recorder")
+    kinds = ("depth", "results")
     stopped_ns = [flying.daemon.signal_stage(kind, signal.SIGSTOP) for kind in kinds]
     try:
         for kind in kinds:
             seen = flying.until_stage(kind, lambda found: not found["alive"], 3 * NO_SIGN_S)
             assert "no sign of it" in seen["detail"]
-        flying.daemon.line("recorder down (no sign of it", 5, min(stopped_ns))
+        flying.daemon.line("results down (no sign of it", 5, min(stopped_ns))
     finally:
         for kind in kinds:
             continued_ns = flying.daemon.signal_stage(kind, signal.SIGCONT)
@@ -135,10 +135,10 @@ def test_another_localisation_takes_over(
 
 
 def test_it_still_ends_in_time_and_leaves_nothing_behind(flying: Flying) -> None:
-    """Even where recorder and viewer hang."""
+    """Even where results and viewer hang."""
     flying.until_sending()
     children = psutil.Process(flying.daemon.pid).children(recursive=True)
-    flying.daemon.signal_stage("recorder", signal.SIGSTOP)
+    flying.daemon.signal_stage("results", signal.SIGSTOP)
     viewer = viewer_of(flying)
     if viewer is not None:
         viewer.suspend()
@@ -149,7 +149,7 @@ def test_it_still_ends_in_time_and_leaves_nothing_behind(flying: Flying) -> None
 
 
 def test_every_part_of_the_flights_was_recorded(flying: Flying) -> None:
-    """A recorder that began anew writes beside what it wrote before."""
+    """A results stage that began anew writes beside what it wrote before."""
     first = flying.daemon.flown()[0]
     assert (first / "flight.rrd").exists()
     assert (first / "part-2" / "flight.rrd").exists()

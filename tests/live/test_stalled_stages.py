@@ -1,4 +1,4 @@
-"""A stage that hangs holds no more than its room, is ended, and another takes its place."""
+"""A stage that hangs stays within its queue's capacity, is ended, and is restarted."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ import sys
 from companion.runtime.governor import Governor
 from companion.daemon.flights import live_flight
 Governor.step = lambda self, t_ns, pressure: False
-for kind in ("recorder", "tape"):
+for kind in ("results", "recorder"):
     live_flight.ANSWER_S[kind] = {ANSWER_S}
 from companion.__main__ import main
 sys.exit(main())
@@ -49,10 +49,10 @@ def depth_map(number: int) -> DepthMap:
 
 
 @pytest.fixture
-def recorder(tmp_path: Path) -> Iterator[StageProcess]:
+def results(tmp_path: Path) -> Iterator[StageProcess]:
     ring = FrameRing(CAMERA.width, CAMERA.height)
     ended: list[str] = []
-    stage = StageProcess("recorder", 0, ring, lambda message: None, ended.append)
+    stage = StageProcess("results", 0, ring, lambda message: None, ended.append)
     stage.begin(Setup(Config(), CAMERA, tmp_path))
     try:
         until(lambda: stage.progress is not None)
@@ -69,26 +69,26 @@ def until(such: object, timeout_s: float = 60.0) -> None:
         threading.Event().wait(0.02)
 
 
-def test_depth_maps_for_a_stage_that_is_stopped(recorder: StageProcess) -> None:
-    psutil.Process(recorder.pid).suspend()
+def test_depth_maps_for_a_stage_that_is_stopped(results: StageProcess) -> None:
+    psutil.Process(results.pid).suspend()
     before = psutil.Process().memory_info().rss
     for number in range(100):
-        recorder.offer(depth_map(number))
-    assert recorder.waiting_bytes <= OUT_BYTES
+        results.offer(depth_map(number))
+    assert results.waiting_bytes <= OUT_BYTES
     assert psutil.Process().memory_info().rss - before < 2 * OUT_BYTES
-    assert recorder.n_dropped >= 100 - OUT_BYTES // 5_000_000 - 2
-    until(lambda: recorder.stalled_s(monotonic_s()) > 1.5)
+    assert results.n_dropped >= 100 - OUT_BYTES // 5_000_000 - 2
+    until(lambda: results.stalled_s(monotonic_s()) > 1.5)
 
 
-def test_a_stage_that_has_nothing_to_do_does_not_hang(recorder: StageProcess) -> None:
+def test_a_stage_that_has_nothing_to_do_does_not_hang(results: StageProcess) -> None:
     """It says so by itself, and what it is offered it takes."""
-    until(lambda: recorder.progress is not None and recorder.stalled_s(monotonic_s()) == 0.0)
-    first = recorder.progress
-    until(lambda: recorder.progress is not first)
-    assert recorder.stalled_s(monotonic_s()) == 0.0
-    recorder.offer(Frame(1, 1, np.zeros((96, 128), np.uint8), np.zeros((96, 128, 3), np.uint8)))
-    until(lambda: recorder.progress is not None and recorder.progress.n_done == 1)
-    until(lambda: recorder.stalled_s(monotonic_s()) == 0.0)
+    until(lambda: results.progress is not None and results.stalled_s(monotonic_s()) == 0.0)
+    first = results.progress
+    until(lambda: results.progress is not first)
+    assert results.stalled_s(monotonic_s()) == 0.0
+    results.offer(Frame(1, 1, np.zeros((96, 128), np.uint8), np.zeros((96, 128, 3), np.uint8)))
+    until(lambda: results.progress is not None and results.progress.n_done == 1)
+    until(lambda: results.stalled_s(monotonic_s()) == 0.0)
 
 
 def stage_of(health: dict[str, Any], kind: str) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def is_up(health: dict[str, Any], kind: str, n_restarted: int) -> bool:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["recorder", "tape"])
+@pytest.mark.parametrize("kind", ["results", "recorder"])
 def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path, kind: str) -> None:
     settings = "camera.source=pattern", "camera.rate_hz=10", "depth.enabled=false", "link.url="
     with Daemon(tmp_path, *settings, program=("-c", IMPATIENT)) as daemon:
@@ -120,10 +120,10 @@ def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path, kind: st
         assert not daemon.said("Traceback")
         (folder,) = daemon.flown()
     first, second = folder, folder / "part-2"
-    if kind == "recorder":
+    if kind == "results":
         for part in (first, second):
-            assert (part / "live_flight.rrd").stat().st_size > 10_000
+            assert (part / "flight.rrd").stat().st_size > 10_000
         return
     for part in (first, second):  # the first is mended, which it was not closed for
-        with closing(Recording(part / "live_flight.mcap")) as recording:
+        with closing(Recording(part / "flight.mcap")) as recording:
             assert recording.pictures

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.support.flights import flown
-from tests.support.flights.flight_tape import Keeper
+from tests.support.flights.message_log import MessageLogWriter
 from tests.support.processes.link_trial import Trial, fly
 from tests.support.processes.two_namespaces import TwoNamespaces, why_not
 from tests.unit.streaming.test_viewer_recording import CAMERA
@@ -26,16 +26,16 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Trial:
     if reason:
         pytest.skip(reason)
     folder = tmp_path_factory.mktemp("link")
-    with Keeper(folder / "tape", CAMERA, None) as keeper:
-        keeper.take(flown.update())
+    with MessageLogWriter(folder / "log", CAMERA, None) as writer:
+        writer.take(flown.update())
         for message in flown.messages()[:-1]:
-            keeper.take(message)
+            writer.take(message)
 
     def meanwhile(now_s: float, ground: subprocess.Popen[bytes]) -> None:
         air.cut(CUT_S <= now_s < BACK_S)
 
     with TwoNamespaces(KBIT_S, DELAY_MS, LOSS) as air:
-        return fly(air, folder / "tape", folder, SECONDS, BUDGET_KBIT_S, meanwhile)
+        return fly(air, folder / "log", folder, SECONDS, BUDGET_KBIT_S, meanwhile)
 
 
 def test_the_pose_is_fresh(trial: Trial) -> None:
@@ -47,9 +47,9 @@ def test_after_an_outage_state_and_map_are_there_again(trial: Trial) -> None:
     back_s = trial.began_s + BACK_S
     first = min(at for at, t in trial.poses if t > back_s - 1.0)
     assert first - back_s < 4.0
-    told = {k for k, t in trial.told.items() if t < trial.ended_s - 5}
+    told = {k for k, t in trial.given.items() if t < trial.ended_s - 5}
     assert len(told) > 12 and told <= set(trial.coarse)
-    late_s = max(trial.coarse[k] - back_s for k in told if trial.told[k] < back_s)
+    late_s = max(trial.coarse[k] - back_s for k in told if trial.given[k] < back_s)
     assert late_s < 10
 
 

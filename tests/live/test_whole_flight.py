@@ -178,7 +178,7 @@ def test_health_while_flying(flown: Flown) -> None:
     assert (camera["state"], autopilot["state"]) == ("running", "running")
     assert camera["rate_hz"] == pytest.approx(10, abs=1.0)
     assert {stage["name"]: stage["alive"] for stage in health["stages"]} == {
-        "localisation": True, "depth": True, "recorder": True, "tape": True,
+        "localisation": True, "depth": True, "results": True, "recorder": True,
     }  # fmt: skip
     assert "ArduPilot" in autopilot["detail"]
     for row in ("localisation", "camera", "autopilot", "event loop"):

@@ -1,4 +1,4 @@
-"""Whether the smooth pose is off by as much as it says, on a flight whose truth is known."""
+"""Consistency of the smooth pose's covariance, on a flight with ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map that another node makes of what it fetches, beside the one that is made on board."""
+"""Dense map of a depth node, compared to the one made on board."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One flight, and what can go wrong in flight: it goes on, and the report shows it."""
+"""Faults injected into one flight: it goes on, and the report shows them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A map that a process left behind is taken up by the next, where it is what the camera sees.
+"""Resumption of a map left by another process, where the camera relocalises in it.
 
 The sample flight is flown for a while; then another localisation hangs over the same ground, whose
 telemetry has no more than attitude: nothing that tells a scale.
@@ -31,7 +31,7 @@ from companion.stages.localisation_work import work
 from companion.stages.map_keeper import MapKeeper
 from drivers.open_flight import open_flight
 from tests.support.autopilot.received_poses import TrueFlight
-from tests.support.flights.to_and_fro import flown_again, walk
+from tests.support.flights.return_pass import back_and_forth, reordered
 
 SAMPLE = Path("sample/survey")
 CONFIG = Config()
@@ -65,7 +65,7 @@ def left() -> Left:
     stage = LocalisationStage(CONFIG, flight.camera, lambda _: nullcontext())
     last = next(i for i, f in enumerate(frames) if f.t_ns > flight.start_ns + FLOWN_S * 1e9)
     poses: list[Odometry] = []
-    for message in flown_again(frames, telemetry, range(last + 1)):
+    for message in reordered(frames, telemetry, range(last + 1)):
         poses += [out for out in stage.step(message) if isinstance(out, Odometry)]
     checkpoint = stage.checkpoint()
     assert checkpoint is not None
@@ -98,7 +98,7 @@ def hovering(left: Left, places: slice, change: Change) -> Iterator[Message]:
     attitudes = [s for s in left.telemetry if isinstance(s, AttitudeSample)]
     yield from (
         message if isinstance(message, Frame) else change(message)
-        for message in flown_again(left.frames, attitudes, walk(first, end, n))
+        for message in reordered(left.frames, attitudes, back_and_forth(first, end, n))
     )
 
 
@@ -118,7 +118,7 @@ def resumed(
 ) -> Resumed:
     stage = LocalisationStage(CONFIG, left.camera, lambda _: nullcontext())
     out = Resumed(stage, [], [], 0)
-    shown = list(walk(places.start, places.stop - 1, 1000))
+    shown = list(back_and_forth(places.start, places.stop - 1, 1000))
     for message in hovering(left, places, change):
         if isinstance(message, Frame) and not out.first_ns:
             out.first_ns = message.t_ns

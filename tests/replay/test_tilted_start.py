@@ -1,4 +1,4 @@
-"""A map that begins tilted, or that the autopilot's vertical leaves, is level again in seconds."""
+"""A map initialised with a tilt, or off the autopilot's vertical, is level again in seconds."""
 
 from __future__ import annotations
 

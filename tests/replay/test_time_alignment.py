@@ -1,4 +1,4 @@
-"""The sample's video without its list of times: its log is put on its time by rotation."""
+"""Time alignment by rotation: the sample's video without its list of times."""
 
 from __future__ import annotations
 

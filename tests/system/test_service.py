@@ -1,4 +1,4 @@
-"""The package on a booted Debian: what systemd makes of it, from installation to removal.
+"""The package on a booted Debian, from installation to removal.
 
 `make deb system-test`. It needs root, debootstrap, systemd-container (systemd-nspawn), Debian's
 packages, 5 GB of disk, and some minutes; without these, and without a package, it is skipped. The

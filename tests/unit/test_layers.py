@@ -1,4 +1,4 @@
-"""The import contracts name every module: one that is new and unnamed would be free of them."""
+"""The import contracts name every module; a new one would otherwise be free of them."""
 
 from __future__ import annotations
 

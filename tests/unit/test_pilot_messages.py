@@ -1,4 +1,4 @@
-"""Whatever the pilot reads fits into one message, is in the table, and is explained."""
+"""Pilot messages: each fits into one message, is in the table, and is explained."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The dense engine on a data set with truth, beside REMODE's filter on one core.
+"""Depth engine on a data set with ground truth, beside REMODE's filter on one core.
 
 One reference is measured with its range of depths taken from the truth, as REMODE's filter has it;
 then all that `companion depth` makes of the data set by itself.
@@ -36,7 +36,7 @@ THRESHOLDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 @dataclass(frozen=True, slots=True)
 class AfterFrames:
-    """How it stands after some frames; `ms_per_frame` is wall time of updates and result."""
+    """State after some frames; `ms_per_frame` is wall time of updates and result."""
 
     frames: int
     still_updated: float
@@ -48,7 +48,7 @@ class AfterFrames:
 
 @dataclass(frozen=True, slots=True)
 class AtThreshold:
-    """The result where an image must correlate so well to be said to fit."""
+    """Result for one least correlation of a matching image."""
 
     min_zncc: float
     converged: Accuracy
@@ -67,13 +67,13 @@ class Timed:
 
     @property
     def wall_s(self) -> float:
-        """Both."""
+        """Seconds for updates and result."""
         return self.update_s + self.finish_s
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceAsUsed:
-    """One reference, its range of depths found by itself: before and after others were asked."""
+    """One reference with its own depth range, before and after the consensus with others."""
 
     reference: int
     alone_converged: Accuracy
@@ -84,10 +84,11 @@ class ReferenceAsUsed:
 
 @dataclass(frozen=True, slots=True)
 class AsUsed:
-    """What `companion depth` makes of the data set: ranges found by itself, all references.
+    """Result of `companion depth`: own depth ranges, all references.
 
-    `rows` are of those of the `n_references` that have truth; times are of all, for each, reading
-    of images and search for ranges included. `refused` says why there is nothing, else is empty.
+    `rows` are the references that have truth, `n_references` is the number of all. Times are per
+    reference, over all, with reading of images and search for ranges. `refused` is the reason where
+    there is no result, else empty.
     """
 
     n_references: int
@@ -99,7 +100,7 @@ class AsUsed:
 
 @dataclass(frozen=True, slots=True)
 class DepthBench:
-    """All that was measured; `searched` of `frames` images were searched for one reference."""
+    """All measurements; `searched` of `frames` images were searched for one reference."""
 
     dataset: str
     device: str
@@ -122,7 +123,7 @@ class DepthBench:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """What both are given: undistorted images, poses current_from_reference, truth, its range."""
+    """Common input: undistorted images, poses current_from_reference, true depth and its range."""
 
     grey: Bytes
     others: list[tuple[Bytes, Pose]]
@@ -223,7 +224,7 @@ def _as_used(
 
 
 def _judged(depth_map: DepthMap, truth: Floats) -> tuple[Accuracy, Accuracy]:
-    """Of what has converged, and of all."""
+    """Accuracy of converged pixels, and of all."""
     converged = depth_map.state == PixelState.CONVERGED.value
     return (
         accuracy(depth_map.depth, truth, converged),

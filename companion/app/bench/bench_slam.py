@@ -1,7 +1,7 @@
-"""How well recorded flights are tracked, measured against their truth; dense mapping left off.
+"""Tracking of recorded flights measured against ground truth, without dense mapping.
 
 A flight's truth is `truth/world_from_camera.tum` in its folder. Everything runs in lockstep, so
-that the errors of two runs are the same; times are what they are.
+that errors are the same in each run; times are not.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from drivers.open_flight import open_flight
 
 LEAD_NS = 10_000_000_000
 FRAME_PARTS = ("features", "tracking", "initialising")
-"""What a frame waits for; the rest is done beside it in flight."""
+"""Work that a frame waits for; the rest runs in the background in flight."""
 NEES_NS = 10_000_000_000
 STEP_NS = 500_000_000
-"""Poses of odometry further apart than this are not one step."""
+"""Longest interval between consecutive odometry poses."""
 
 
 @dataclass(frozen=True, slots=True)
 class BenchRow:
-    """What one flight under one fault came to; lengths in metres, times in milliseconds.
+    """Measurements of one flight under one fault; lengths in metres, times in milliseconds.
 
-    `tracked_share` is of the frames in which there is something to see, above the asked height.
-    `live_ate_m` is of the poses as they were first given, aligned by similarity; `worst_step_m`
-    is the largest error of the motion between two consecutive poses of smooth odometry; `nees` is
-    the mean square of its position's error since its last reset over the variance that it states,
-    1 where that is true; `nees_yaw` likewise of its heading against north, which errs slowly, so
-    that a flight is one or a few throws of the dice.
-    `longest_gap_s` is the longest time without a pose beyond what could not be seen; `cost_growth`
-    is the ratio of the median work per frame in the last fifth of the flight to the second fifth.
+    `tracked_share` is the share of frames tracked, of those that show something above the given
+    height. `live_ate_m` is the ATE of poses as first published, aligned by similarity.
+    `worst_step_m` is the largest error of the motion between consecutive poses of smooth odometry.
+    `nees` is the normalised estimation error squared of its position since its last reset, 1 where
+    its covariance is true; `nees_yaw` likewise of its heading against north, which errs slowly, so
+    that one flight gives few independent samples. `longest_gap_s` is the longest time without a
+    pose beyond image dropouts; `cost_growth` is the ratio of the median work per frame in the last
+    fifth of the flight to the second fifth.
     """
 
     flight: str
@@ -77,7 +77,7 @@ class BenchRow:
 
 @dataclass(frozen=True, slots=True)
 class _Cost:
-    """Work for each frame, and the usual one for a keyframe, in milliseconds."""
+    """Work per frame, and the median per keyframe, milliseconds."""
 
     frame_ms: Array
     mapping_ms_median: float
@@ -89,7 +89,7 @@ class _Cost:
 
 
 class _Listener:
-    """Keeps what a bench wants of a run."""
+    """Sink that keeps the tracks and odometry of a run."""
 
     def __init__(self) -> None:
         self.result = FlightResult()
@@ -114,7 +114,7 @@ def bench_slam(
 ) -> list[BenchRow]:
     """Track each flight, or each under every fault; FlightError where one has no truth.
 
-    With `above_m` only frames truly higher than that over the world's origin count as to be
+    With `above_m` only frames truly higher than that above the world's origin are expected to be
     tracked.
     """
     rows = []
@@ -181,7 +181,7 @@ def _row(
         [p.t_ns for p in poses],
         [(p.world_from_camera.rotation, p.world_from_camera.translation) for p in poses],
     )
-    due = _due(np.array(frame_t_ns), truth, fault.blind_ns(span), above_m)
+    due = _due(np.array(frame_t_ns), truth, fault.dropout_ns(span), above_m)
     known = np.asarray(np.isin(due, estimate.t_ns), bool)
     live = [(t, k.map_from_camera) for t, k in listener.live if k.map_from_camera is not None]
     live_errors = path_errors(
@@ -196,7 +196,7 @@ def _row(
         _nees_yaw(listener.odometry, truth, stage),
         max((o.reset_counter for o in listener.odometry), default=0),
         _longest_gap_s(due, known),
-        sum(o.state is TrackState.COASTING for o in listener.odometry),
+        sum(o.state is TrackState.DEAD_RECKONING for o in listener.odometry),
         update.n_keyframes if update is not None else 0, stage.n_segments, stage.n_loops,
         found.method if found is not None else "none",
         round(float(np.median(cost.frame_ms)), 2),
@@ -215,12 +215,12 @@ def _path_of(t_ns: Sequence[int], poses: Sequence[tuple[Array, Array]]) -> Path:
 
 
 def _due(
-    t_ns: Array, truth: Path, blind_ns: tuple[int, int] | None, above_m: float | None
+    t_ns: Array, truth: Path, dropout_ns: tuple[int, int] | None, above_m: float | None
 ) -> Array:
-    """Times of the frames that ought to be tracked."""
+    """Times of the frames that should be tracked."""
     keep = np.ones(len(t_ns), bool)
-    if blind_ns is not None:
-        keep &= (t_ns < blind_ns[0]) | (t_ns >= blind_ns[1])
+    if dropout_ns is not None:
+        keep &= (t_ns < dropout_ns[0]) | (t_ns >= dropout_ns[1])
     if above_m is not None:
         height_m = -np.interp(t_ns, truth.t_ns, truth.centres[:, 2])
         keep &= height_m > above_m
@@ -228,7 +228,7 @@ def _due(
 
 
 def _longest_gap_s(due_ns: Array, known: NDArray[np.bool_]) -> float:
-    """Longest run of frames that should have a pose and have none, from its first to its end."""
+    """Longest run of expected frames without a pose, from its first to its end."""
     longest, since = 0.0, None
     for t_ns, there in zip(due_ns, known, strict=True):
         if there:
@@ -240,7 +240,7 @@ def _longest_gap_s(due_ns: Array, known: NDArray[np.bool_]) -> float:
 
 
 def _nees(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
-    """Of the way over ten seconds, in the true attitude's frame at its start."""
+    """NEES of the displacement over ten seconds, in the true attitude's frame at its start."""
     body_from_camera = stage.camera_from_body.inverse()
     known = [o for o in odometry if o.world_from_body is not None]
     times = np.array([o.t_ns for o in known])
@@ -262,7 +262,7 @@ def _nees(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> fl
 
 
 def _nees_yaw(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
-    """Of the heading of every pose against the truth's."""
+    """NEES of the heading of every pose against the truth."""
     body_from_camera = stage.camera_from_body.inverse()
     ratios = []
     for o in odometry:
@@ -275,7 +275,7 @@ def _nees_yaw(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -
 
 
 def _worst_step(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
-    """Of consecutive odometry poses without a reset between them."""
+    """Largest RPE between consecutive odometry poses without a reset between them, metres."""
     camera = stage.camera_from_body
     worst: float | None = None
     before: Odometry | None = None

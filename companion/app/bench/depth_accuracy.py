@@ -1,4 +1,4 @@
-"""How near depths are to the truth."""
+"""Accuracy of depth maps against ground truth."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 RIM_PX = 20
-"""Pixels about the border that are not counted."""
+"""Border pixels that are ignored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Shares: of pixels whose truth is known those estimated, of these those within 1, 2, 5 %.
+    """Shares 0..1: pixels estimated, of those with truth; and of these within 1, 2 and 5 %.
 
-    `median` is of the relative error. All but `estimated` are nan where nothing is estimated.
+    `median` is the median relative error. All but `estimated` are nan where nothing is estimated.
     """
 
     estimated: float
@@ -28,7 +28,7 @@ class Accuracy:
 
 
 def accuracy(depth: Floats, truth: Floats, counted: NDArray[np.bool_]) -> Accuracy:
-    """Of depths (H, W) where `counted`, but for the rim; the truth is 0 where it is not known."""
+    """Accuracy of depths (H, W) where `counted`, without the border; truth 0 is unknown."""
     known = truth > 0
     known[:RIM_PX] = known[-RIM_PX:] = False
     known[:, :RIM_PX] = known[:, -RIM_PX:] = False

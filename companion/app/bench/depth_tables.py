@@ -1,4 +1,4 @@
-"""The results of `companion bench depth`: tables, JSON, and a picture of the curves."""
+"""Results of `companion bench depth`: tables, JSON, and a plot of the curves."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ class Run(Protocol):
 
     @property
     def name(self) -> str:
-        """Whose."""
+        """Name of the implementation."""
 
     @property
     def wall_s(self) -> float:
-        """All of it."""
+        """Wall time, seconds."""
 
     @property
     def cpu_s(self) -> float:
-        """Of all cores."""
+        """Processor time over all cores, seconds."""
 
     @property
     def converged(self) -> Accuracy:
-        """Of what has converged."""
+        """Accuracy of converged pixels."""
 
     @property
     def all_pixels(self) -> Accuracy:
-        """Of the regularised result."""
+        """Accuracy of the regularised result."""
 
 
 class Stand(Protocol):
-    """How it stands after some frames."""
+    """Result after some frames."""
 
     @property
     def frames(self) -> int:
-        """So many."""
+        """Number of frames."""
 
     @property
     def still_updated(self) -> float:
@@ -57,51 +57,51 @@ class Stand(Protocol):
 
     @property
     def converged(self) -> Accuracy:
-        """Of what has converged."""
+        """Accuracy of converged pixels."""
 
     @property
     def all_pixels(self) -> Accuracy:
-        """Of all."""
+        """Accuracy of all pixels."""
 
 
 class Threshold(Protocol):
-    """The result at one threshold."""
+    """Result at one threshold."""
 
     @property
     def min_zncc(self) -> float:
-        """Least correlation."""
+        """Least normalised correlation."""
 
     @property
     def converged(self) -> Accuracy:
-        """Of what has converged."""
+        """Accuracy of converged pixels."""
 
 
 class Reference(Protocol):
-    """One reference of all, its range of depths found by itself."""
+    """One reference with its own depth range."""
 
     @property
     def reference(self) -> int:
-        """Its frame's number."""
+        """Number of its frame."""
 
     @property
     def alone_converged(self) -> Accuracy:
-        """Of what has converged, before other references were asked."""
+        """Accuracy of converged pixels before the consensus with other references."""
 
     @property
     def alone_all(self) -> Accuracy:
-        """Of all pixels, before."""
+        """Accuracy of all pixels before it."""
 
     @property
     def converged(self) -> Accuracy:
-        """Of what has converged in the end."""
+        """Accuracy of converged pixels in the end."""
 
     @property
     def all_pixels(self) -> Accuracy:
-        """Of all pixels in the end."""
+        """Accuracy of all pixels in the end."""
 
 
 class Used(Protocol):
-    """All references, as `companion depth` makes them."""
+    """All references, as `companion depth` computes them."""
 
     @property
     def n_references(self) -> int:
@@ -109,39 +109,39 @@ class Used(Protocol):
 
     @property
     def wall_s(self) -> float:
-        """For each."""
+        """Seconds per reference."""
 
     @property
     def cpu_s(self) -> float:
-        """Of all cores, for each."""
+        """Processor seconds per reference, over all cores."""
 
     @property
     def rows(self) -> Sequence[Reference]:
-        """Of those with truth."""
+        """References with truth."""
 
     @property
     def refused(self) -> str:
-        """Why there is nothing, or nothing."""
+        """Reason why there is no result, or ""."""
 
 
 class Bench(Protocol):
-    """All that was measured; any dataclass with these."""
+    """All measurements; any dataclass with these."""
 
     @property
     def dataset(self) -> str:
-        """Where it lies."""
+        """Path of the data set."""
 
     @property
     def device(self) -> str:
-        """Where the kernels ran."""
+        """OpenCL device."""
 
     @property
     def frames(self) -> int:
-        """Images but for the reference."""
+        """Number of images without the reference."""
 
     @property
     def searched(self) -> int:
-        """Of them worth keeping."""
+        """Number of images searched."""
 
     @property
     def runs(self) -> Sequence[Run]:
@@ -149,11 +149,11 @@ class Bench(Protocol):
 
     @property
     def speed_up(self) -> float | None:
-        """Of wall time."""
+        """Ratio of wall times."""
 
     @property
     def kernel_ms(self) -> dict[str, float]:
-        """Of each kernel on the device."""
+        """Milliseconds of each kernel on the device."""
 
     @property
     def after_frames(self) -> Sequence[Stand]:
@@ -169,11 +169,11 @@ class Bench(Protocol):
 
     @property
     def as_used(self) -> Used:
-        """As a user runs it."""
+        """Result of `companion depth`."""
 
 
 def tables(bench: Bench) -> str:
-    """All of it for people; shares in percent, of the pixels whose truth is known."""
+    """Text tables; shares in percent of the pixels whose truth is known."""
     parts = [
         f"{bench.dataset}: {bench.frames} images taken, {bench.searched} of them searched\n"
         f"{bench.device}",
@@ -234,7 +234,7 @@ def _as_used(used: Used) -> str:
 
 
 def as_json(bench: Bench) -> str:
-    """All of it; null for what is not known."""
+    """JSON of all results; null for unknown values."""
     content = asdict(bench)  # type: ignore[call-overload]
     return json.dumps({**_finite(content), "speed_up": bench.speed_up}, indent=1, allow_nan=False)
 

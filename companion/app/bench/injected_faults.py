@@ -1,4 +1,4 @@
-"""What goes wrong in flight, put into a recorded one: known faults for a bench to measure.
+"""Known faults injected into a recorded flight for benchmarks.
 
 Each fault changes telemetry (a sorted list), images, or both, and nothing else.
 """
@@ -26,9 +26,9 @@ from companion.messages import (
 Samples = list[Telemetry]
 Pictures = Iterable[Frame | Warned]
 
-BLIND_S, SILENT_S = 2.0, 3.0
+DROPOUT_S, SILENT_S = 2.0, 3.0
 AT_SHARE = 0.5
-"""Where in the flight the short ones come."""
+"""Begin of short faults, as a share of the flight."""
 SHIFT_NS = 60_000_000
 OFFSET_AXIS = np.array([0.6, 0.64, 0.48])
 OFFSET_RAD = np.radians(5.0)
@@ -36,37 +36,37 @@ DROPPED_SHARE = 0.3
 EXPOSURE_GAINS = (1.0, 0.45, 1.5, 0.7)
 EXPOSURE_STEP_S = 2.0
 BLUR_PX = 9
-FAINT_SHARE, FAINT_NOISE = 0.15, 1.5
+LOW_CONTRAST_GAIN, LOW_CONTRAST_NOISE = 0.15, 1.5
 VELOCITY_SCALE, VELOCITY_TURN_RAD = 1.1, np.radians(8.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """When a flight begins and ends."""
+    """Begin and end of a flight."""
 
     start_ns: int
     stop_ns: int
 
     @property
     def fault_ns(self) -> int:
-        """When the short faults come."""
+        """Time at which short faults begin."""
         return self.start_ns + int(AT_SHARE * (self.stop_ns - self.start_ns))
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that goes wrong; `blind` says in which part of the flight nothing can be seen."""
+    """One fault; the images show nothing for `dropout_s` seconds from the middle of the flight."""
 
     name: str
     telemetry: Callable[[Samples, Span], Samples] = lambda samples, span: samples
     pictures: Callable[[Pictures, Span], Pictures] = lambda pictures, span: pictures
-    blind_s: float = 0.0
+    dropout_s: float = 0.0
 
-    def blind_ns(self, span: Span) -> tuple[int, int] | None:
-        """From when to when nothing can be seen."""
-        if not self.blind_s:
+    def dropout_ns(self, span: Span) -> tuple[int, int] | None:
+        """Begin and end of the image dropout; None without one."""
+        if not self.dropout_s:
             return None
-        return span.fault_ns, span.fault_ns + int(self.blind_s * 1e9)
+        return span.fault_ns, span.fault_ns + int(self.dropout_s * 1e9)
 
 
 def _without_attitude(samples: Samples, span: Span) -> Samples:
@@ -74,7 +74,7 @@ def _without_attitude(samples: Samples, span: Span) -> Samples:
 
 
 def _offset_attitude(samples: Samples, span: Span) -> Samples:
-    """The autopilot sits askew on the body."""
+    """Autopilot mounted at an angle to the body."""
     turn = turn_by(OFFSET_RAD * OFFSET_AXIS / np.linalg.norm(OFFSET_AXIS))
 
     def askew(sample: AttitudeSample) -> AttitudeSample:
@@ -98,7 +98,7 @@ def _silent(samples: Samples, span: Span) -> Samples:
 
 
 def _wrong_velocity(samples: Samples, span: Span) -> Samples:
-    """The autopilot's compass is off, and its velocity too large."""
+    """Compass offset, and velocity too large."""
     turn = VELOCITY_SCALE * turn_by(np.array([0.0, 0.0, VELOCITY_TURN_RAD]))
 
     def wrong(sample: PositionSample) -> PositionSample:
@@ -111,7 +111,7 @@ def _wrong_velocity(samples: Samples, span: Span) -> Samples:
 def _edited(
     edit: Callable[[Bytes, int], Bytes],
 ) -> Callable[[Pictures, Span], Iterator[Frame | Warned]]:
-    """Change images by a function of the grey image and the time since the start, ns."""
+    """Fault that edits images: a function of the grey image and the time since the start, ns."""
 
     def edited(pictures: Pictures, span: Span) -> Iterator[Frame | Warned]:
         for frame in pictures:
@@ -123,8 +123,8 @@ def _edited(
     return edited
 
 
-def _blinded(pictures: Pictures, span: Span) -> Iterator[Frame | Warned]:
-    until_ns = span.fault_ns + int(BLIND_S * 1e9)
+def _image_dropout(pictures: Pictures, span: Span) -> Iterator[Frame | Warned]:
+    until_ns = span.fault_ns + int(DROPOUT_S * 1e9)
     for frame in pictures:
         if isinstance(frame, Frame) and span.fault_ns <= frame.t_ns < until_ns:
             frame = replace(
@@ -151,15 +151,15 @@ def _exposed(grey: Bytes, since_ns: int) -> Bytes:
     return np.asarray(np.clip(grey * EXPOSURE_GAINS[step], 0, 255), np.uint8)
 
 
-def _faint(grey: Bytes, since_ns: int) -> Bytes:
-    """Hardly any contrast, and the camera's own noise on it."""
+def _low_contrast(grey: Bytes, since_ns: int) -> Bytes:
+    """Hardly any contrast, and the noise of the camera on it."""
     rng = np.random.default_rng(since_ns)
-    noise = rng.normal(scale=FAINT_NOISE, size=grey.shape)
-    return np.asarray(np.clip(128 + FAINT_SHARE * (grey - 128.0) + noise, 0, 255), np.uint8)
+    noise = rng.normal(scale=LOW_CONTRAST_NOISE, size=grey.shape)
+    return np.asarray(np.clip(128 + LOW_CONTRAST_GAIN * (grey - 128.0) + noise, 0, 255), np.uint8)
 
 
 def _blurred(grey: Bytes, since_ns: int) -> Bytes:
-    """Smeared along a direction that turns, for half a second in every two."""
+    """Motion blur along a direction that turns, for half a second in every two."""
     if (since_ns * 1e-9) % 2.0 > 0.5:
         return grey
     angle = since_ns * 1e-9
@@ -179,12 +179,12 @@ FAULTS = (
     Fault("attitude off by 5 degrees", telemetry=_offset_attitude),
     Fault("telemetry 60 ms late", telemetry=_late),
     Fault("telemetry silent for 3 s", telemetry=_silent),
-    Fault("blind for 2 s", pictures=_blinded, blind_s=BLIND_S),
-    Fault("blind for 2 s, telemetry silent for 3 s", _silent, _blinded, BLIND_S),
+    Fault("blind for 2 s", pictures=_image_dropout, dropout_s=DROPOUT_S),
+    Fault("blind for 2 s, telemetry silent for 3 s", _silent, _image_dropout, DROPOUT_S),
     Fault("velocity 10 % and 8 degrees off", telemetry=_wrong_velocity),
     Fault("30 % of frames dropped", pictures=_dropped),
     Fault("two of three frames dropped", pictures=_every_third),
     Fault("exposure steps", pictures=_edited(_exposed)),
     Fault("motion blur", pictures=_edited(_blurred)),
-    Fault("faint pictures", pictures=_edited(_faint)),
+    Fault("faint pictures", pictures=_edited(_low_contrast)),
 )

@@ -1,4 +1,4 @@
-"""REMODE's depth filter on one core: C, compiled when it is asked for by the system's compiler."""
+"""REMODE's depth filter on one core, in C; compiled on demand by the system's compiler."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class RemodeSerial:
         self._library.remode_update(self._filter, _at(_unit(grey)), _at(forth), _at(back))
 
     def state(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """Distances (H, W), and which pixels have converged."""
+        """Distances (H, W), and the mask (H, W) of converged pixels."""
         distance, state = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint8)
         self._library.remode_state(self._filter, _at(distance), _at(state))
         return distance, state == CONVERGED
@@ -67,7 +67,7 @@ class RemodeSerial:
         return smooth
 
     def close(self) -> None:
-        """Give its memory back."""
+        """Free its memory."""
         self._library.remode_free(self._filter)
         self._folder.cleanup()
 

@@ -1,4 +1,4 @@
-"""The results of `companion bench slam`: a table, JSON, and pictures of the paths."""
+"""Results of `companion bench slam`: a table, JSON, and pictures of the paths."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ COLUMNS = (
 
 
 class Row(Protocol):
-    """What is shown of a row; any dataclass with the fields that `COLUMNS` name."""
+    """Fields of a row; any dataclass with the fields that `COLUMNS` names."""
 
     @property
     def flight(self) -> str:
@@ -49,7 +49,7 @@ class Row(Protocol):
 
 
 def numbers(row: Row) -> dict[str, Any]:
-    """One row as JSON has it: errors among the rest, no paths, null for what is not known."""
+    """Fields of one row for JSON: errors inlined, no paths, null for unknown values."""
     out = {f.name: getattr(row, f.name) for f in fields(row)}  # type: ignore[arg-type]
     out.pop("paths"), out.pop("errors")
     errors = asdict(row.errors) if row.errors is not None else {}
@@ -58,7 +58,7 @@ def numbers(row: Row) -> dict[str, Any]:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """All rows, aligned; lengths in metres, times in milliseconds."""
+    """Text table of all rows; lengths in metres, times in milliseconds."""
     cells = [[title for title, _ in COLUMNS]]
     for row in rows:
         values = numbers(row)
@@ -74,7 +74,7 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def as_json(rows: Sequence[Row]) -> str:
-    """All rows; raises ValueError on nan, which JSON has not."""
+    """JSON of all rows; ValueError on nan, which JSON has not."""
     return json.dumps([numbers(row) for row in rows], indent=2, allow_nan=False)
 
 
@@ -89,7 +89,7 @@ def write_bench(out: FilePath, rows: Sequence[Row]) -> None:
 
 
 def picture(row: Row) -> bytes:
-    """SVG of both paths from above and the error over time, after alignment by similarity."""
+    """SVG: plan view of both paths and the error over time, after alignment by similarity."""
     assert row.paths is not None
     found, wanted = paired(*row.paths)
     aligned = align(found.centres, wanted.centres, True).apply(found.centres)

@@ -1,4 +1,4 @@
-"""The command line: what was asked, handed on; what came of it, as an exit status.
+"""The command line: dispatch to a command, and its exit status.
 
 0 done; 1 a fault; 2 bad input or usage; 130 and 143 stopped by Ctrl-C and SIGTERM; 141 nobody reads
 its output any more, as behind `| head -1`. An error that the program raises on purpose is one line;

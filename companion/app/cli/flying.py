@@ -1,4 +1,4 @@
-"""The commands for a flight that is under way: the daemon, and who looks at it."""
+"""Commands for a flight in progress: the daemon, its status, the viewer."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
 def _view(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.view_command import view
 
-    def told(text: str) -> None:
+    def notify(text: str) -> None:
         print(f"companion: {text}", file=sys.stderr, flush=True)
 
     where = "web" if arguments.web else arguments.viewer
-    return view(arguments.host, where, arguments.bind, arguments.colours, told)
+    return view(arguments.host, where, arguments.bind, arguments.colours, notify)
 
 
 def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:

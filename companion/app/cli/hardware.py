@@ -1,4 +1,4 @@
-"""The commands for what the computer is connected with: camera, autopilot, OpenCL devices."""
+"""Commands for connected hardware: camera, autopilot, OpenCL devices."""
 
 from __future__ import annotations
 

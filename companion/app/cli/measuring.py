@@ -1,4 +1,4 @@
-"""The commands for depth from known poses, and for errors and times against truth."""
+"""Commands for depth from known poses, and for benchmarks against ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, and what a value given on the command line may be."""
+"""Options that several commands share, and parsers of their values."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from companion.app.stopping import StopSignals
 
 Command = Callable[[argparse.Namespace, StopSignals], int]
-"""What does it: the arguments in, the exit status out."""
+"""Implementation of a command: arguments in, exit status out."""
 
 
 def configuration() -> argparse.ArgumentParser:
@@ -34,7 +34,7 @@ def json_option() -> argparse.ArgumentParser:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Some names, separated by commas."""
+    """Comma-separated names."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
@@ -55,7 +55,7 @@ def seconds(text: str) -> float:
 
 
 def number(text: str) -> int:
-    """How many, from none on."""
+    """A whole number, 0 or more."""
     value = int(text) if text.isascii() and text.isdigit() else -1
     if value < 0:
         raise argparse.ArgumentTypeError(f"wanted a number from 0 on, given is {text}")
@@ -63,7 +63,7 @@ def number(text: str) -> int:
 
 
 def amount(text: str) -> float:
-    """How much, from nothing on."""
+    """A number, 0 or more."""
     try:
         value = float(text)
     except ValueError:
@@ -74,7 +74,7 @@ def amount(text: str) -> float:
 
 
 def frames(text: str) -> tuple[int | None, int | None]:
-    """From the first up to, not including, the second; None where it is open."""
+    """First and last frame, the last not included; None where open."""
     first, colon, beyond = text.partition(":")
     try:
         out = (int(first) if first else None, int(beyond) if beyond else None)
@@ -86,7 +86,7 @@ def frames(text: str) -> tuple[int | None, int | None]:
 
 
 def depths(text: str) -> tuple[float, float]:
-    """The nearer and the farther, metres."""
+    """Least and greatest depth, metres."""
     near, _, far = text.partition(":")
     try:
         out = float(near), float(far)
@@ -98,7 +98,7 @@ def depths(text: str) -> tuple[float, float]:
 
 
 def viewer(text: str) -> str:
-    """Where to show."""
+    """Viewer to use."""
     if text in ("none", "web", "native") or text.startswith(("rerun+http://", "rerun+https://")):
         return text
     raise argparse.ArgumentTypeError(

@@ -1,4 +1,4 @@
-"""The part of the command line that has to do with recordings and runs that are there already."""
+"""Commands for recordings and finished runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands that take a logged flight: replay, import, export."""
+"""Commands that take a recorded flight: replay, import, export."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from companion.errors import InputError
 
 
 def _with_telemetry(arguments: argparse.Namespace) -> Config:
-    """The configuration, with what the options say of the log."""
+    """The configuration, with the options about the log."""
     config = load_config(arguments.config, arguments.set)
     telemetry = config.telemetry
     if arguments.log is not None:
@@ -51,7 +51,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         viewer=arguments.viewer,
         paced=arguments.paced,
         progress=signals.between_frames(progress_on(sys.stderr)),
-        told=print,
+        notify=print,
     )
     if config.export.formats:
         _export_into(arguments.out, arguments.out, config.export)

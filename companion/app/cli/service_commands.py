@@ -1,4 +1,4 @@
-"""The part of the command line that sets the program up as a service of this computer."""
+"""Commands that install the program as a service, and remove it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def _install(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.service.install import install
 
     install(
-        arguments.config, _told, user=arguments.user, venv=arguments.venv, now=arguments.now,
+        arguments.config, _notify, user=arguments.user, venv=arguments.venv, now=arguments.now,
         dry_run=arguments.dry_run,
     )  # fmt: skip
     return 0
@@ -23,11 +23,11 @@ def _install(arguments: argparse.Namespace, signals: StopSignals) -> int:
 def _uninstall(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.service.install import uninstall
 
-    uninstall(_told, user=arguments.user, purge=arguments.purge, dry_run=arguments.dry_run)
+    uninstall(_notify, user=arguments.user, purge=arguments.purge, dry_run=arguments.dry_run)
     return 0
 
 
-def _told(text: str) -> None:
+def _notify(text: str) -> None:
     print(text, flush=True)
 
 

@@ -1,1 +1,1 @@
-"""Ground commands and parameters, arming, and what may change while the motors are armed."""
+"""Ground commands and parameters, arming, and changes allowed while armed."""

@@ -1,8 +1,8 @@
-"""What counts while the motors are armed, in a file: a daemon that ends in the air begins with it.
+"""Settings in force while armed, kept in a file for a restart in the air.
 
-The file is there from arming to disarming. Without it a crash would undo what the pilot has
-switched off or made stricter, and would bring limits into force that were loosened in the
-configuration meanwhile.
+The file exists from arming to disarming. Without it a crash would undo what the pilot has switched
+off or made stricter, and would bring limits into force that were loosened in the configuration
+meanwhile.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from companion.daemon.control.tightening import WHILE_ARMED, tightened, value_of
 from companion.errors import ConfigError
 
 FILE = ".armed.json"
-"""In the folder of flights, the one place that the daemon is sure to be able to write to."""
+"""In the folder of flights, the one place that the daemon can certainly write to."""
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-"""Another each time that the computer starts (random(4))."""
+"""Random id of each boot of the computer (random(4))."""
 ANOTHER_BOOT = "unknown"
-"""Of the computer: what is held is let go as soon as the autopilot says that it is disarmed."""
+"""Boot id unknown: held changes are applied as soon as the autopilot reports disarmed."""
 NOT_KEPT = "settings cannot be kept"
 MODE = "feedback.mode"
 
 
 @dataclass(frozen=True, slots=True)
 class ArmedSettings:
-    """As the file has it; times are CLOCK_MONOTONIC of the start of the computer that it names."""
+    """Content of the file; times are CLOCK_MONOTONIC of the boot that it names."""
 
     values: Mapping[str, Any]
-    """Of each key of `WHILE_ARMED`."""
+    """Value of each key of `WHILE_ARMED`."""
     by_ground: Mapping[str, Any]
-    """Those that the ground has set, and to what."""
+    """Values set by the ground, by key."""
     computer_boot: str
     autopilot_boot_s: float | None
-    """When the autopilot was started; None while that is not known."""
+    """Boot time of the autopilot; None while unknown."""
     written_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
-    """The configuration of a daemon that begins in the air, and what of it waits for disarming."""
+    """Configuration of a daemon that starts in the air, and changes held until disarming."""
 
     config: Config
     waiting: dict[str, Any]
@@ -54,7 +54,7 @@ class Resumed:
 def settings_of(
     config: Config, by_ground: Mapping[str, Any], autopilot_boot_s: float | None, now_s: float
 ) -> ArmedSettings:
-    """What is to be kept of the configuration that counts while armed."""
+    """Settings to keep while armed."""
     return ArmedSettings(
         {name: value_of_key(config, name) for name in WHILE_ARMED},
         {name: value for name, value in by_ground.items() if name in WHILE_ARMED},
@@ -63,9 +63,9 @@ def settings_of(
 
 
 def resumed(read: Config, before: ArmedSettings) -> Resumed:
-    """A configuration just read, as it may count in the air.
+    """A configuration just read, restricted to what may change in the air.
 
-    What the ground had set goes over it, and it may only be tighter than what counted before.
+    Settings from the ground override it, and limits may only be tighter than before.
     """
     by_ground = dict(before.by_ground)
     running, wanted = with_values(read, before.values), with_values(read, by_ground)
@@ -76,12 +76,12 @@ def resumed(read: Config, before: ArmedSettings) -> Resumed:
 
 
 def encoded(settings: ArmedSettings) -> bytes:
-    """As the file has it."""
+    """Content of the file."""
     return json.dumps(asdict(settings)).encode()
 
 
 def computer_boot() -> str:
-    """Which start of the computer this is; "" where it does not say."""
+    """Boot id of the computer; "" where unknown."""
     try:
         return BOOT_ID.read_text("ascii").strip()
     except OSError:
@@ -89,10 +89,10 @@ def computer_boot() -> str:
 
 
 def read_settings(flights: Path, config: Config) -> tuple[ArmedSettings | None, str]:
-    """What a daemon before has left, None if it ended disarmed; and what is wrong with it, if.
+    """Settings left by the daemon before, None if it ended disarmed; and what is wrong with them.
 
-    Of a file that cannot be read it is known that something was switched off or made stricter just
-    as the computer lost its power: nothing is sent then as long as the motors are armed.
+    An unreadable file means that something was switched off or made stricter just as the computer
+    lost its power: nothing is sent then as long as the motors are armed.
     """
     path = flights / FILE
     try:

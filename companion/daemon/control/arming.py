@@ -1,7 +1,7 @@
-"""Whether the motors are armed, as far as is known, and what has to wait until they are not.
+"""Arming state, and changes held until the motors are disarmed.
 
-A link that falls silent disarms nobody, nor does an autopilot that is started anew in the air,
-which says that it is disarmed: what is held until disarming is held on.
+A silent link disarms nobody, nor does an autopilot that reboots in the air and reports disarmed:
+held changes stay held.
 """
 
 from __future__ import annotations
@@ -22,18 +22,17 @@ from companion.daemon.control.armed_settings import (
 from companion.products.newest_file import NewestFile
 
 CERTAIN_S = 2.5
-"""An autopilot that says it is disarmed is believed after so long with the same clock: of another
-clock a ClockFilter is sure a second after stamps of it come."""
+"""Time with the same clock after which a report of disarmed is believed: a ClockFilter detects
+another clock a second after its first stamps."""
 SAME_BOOT_S, SAME_BOOT_SHARE = 5.0, 0.02
-"""A clock that is so far from where it was expected was started anew: what links delay, and what
-clocks may drift (companion.timing.link_clock.PRIOR_DRIFT)."""
+"""Largest deviation of the autopilot's clock within one boot: link delays, and clock drift
+(companion.timing.link_clock.PRIOR_DRIFT)."""
 
 
 class Arming:
-    """Used in the event loop. `boot_s` says when the autopilot was started (CLOCK_MONOTONIC).
+    """Used in the event loop. `boot_s` is the boot time of the autopilot (CLOCK_MONOTONIC).
 
-    `before` is what a daemon has left that ended while armed. `heard` says whether the autopilot
-    is heard.
+    `before` is left by a daemon that ended while armed. `heard` is whether the autopilot is heard.
     """
 
     def __init__(
@@ -44,20 +43,20 @@ class Arming:
         self._said: bool | None = None
         self._disarmed_s: float | None = None
         self.waiting: dict[str, Any] = {}
-        """By key: what the configuration says that counts after disarming only."""
+        """Changes that wait for disarming, by key."""
 
     @property
     def armed(self) -> bool:
-        """Whether they are; where nothing has been heard yet, whether they last were."""
+        """Whether the motors are armed; before the first report, whether they last were."""
         return self._held is not None if self._said is None else self._said
 
     @property
     def holds(self) -> bool:
-        """Whether something is held until disarming."""
+        """Whether a change is held until disarming."""
         return self._held is not None
 
     def resume(self, read: Config) -> Resumed:
-        """The configuration to begin with."""
+        """Initial configuration."""
         if self._held is None:
             return Resumed(read, {}, {})
         found = resumed(read, self._held)
@@ -65,9 +64,9 @@ class Arming:
         return found
 
     def take(self, armed: bool, now_s: float) -> bool:
-        """The autopilot says whether they are; True if what was held is to be let go before that.
+        """Take a report of the autopilot; True if held changes are to be applied before it.
 
-        Which is only so where they were disarmed and are armed anew before that was certain.
+        That is only so where the motors were disarmed and are armed again before that was certain.
         """
         again = armed and self._disarmed_s is not None and self._is_same_boot(now_s)
         if armed:
@@ -78,7 +77,7 @@ class Arming:
         return again
 
     def step(self, now_s: float) -> bool:
-        """True once it is certain that the motors were disarmed: what was held may be let go."""
+        """True once disarming is certain: held changes may be applied."""
         held = self._held
         if held is None:
             return False
@@ -90,14 +89,14 @@ class Arming:
         return held.computer_boot != computer_boot() or self._is_same_boot(now_s)
 
     def hold(self, config: Config, by_ground: Mapping[str, Any], now_s: float) -> None:
-        """Take what counts now and shall if the daemon ends; while armed, or as long as held."""
+        """Keep the settings in force for a restart in the air; while armed, or as long as held."""
         settings = settings_of(config, by_ground, self._boot_s(), now_s)
         if not self._said and self._held is not None:  # it stays that of when they were armed
             settings = replace(self._held, values=settings.values, by_ground=settings.by_ground)
         self._put(settings)
 
     def let_go(self) -> dict[str, Any]:
-        """Disarmed: nothing is held any more; what has waited for that."""
+        """Disarmed: end holding; returns the changes that were waiting."""
         waiting, self.waiting = self.waiting, {}
         self._held = self._disarmed_s = None
         self._file.put(None)
@@ -108,7 +107,7 @@ class Arming:
         self._file.put(encoded(settings))
 
     def _is_same_boot(self, now_s: float) -> bool:
-        """Whether the autopilot's clock runs on that ran while it was armed."""
+        """Whether the autopilot still runs in the boot in which it was armed."""
         held, boot_s = self._held, self._boot_s()
         if held is None or held.autopilot_boot_s is None or boot_s is None:
             return False

@@ -1,6 +1,6 @@
-"""Which keys of the configuration are parameters that a ground station can read and set.
+"""Configuration keys that a ground station can read and set as parameters.
 
-As MAVLink has it every value is a float: true is 1, one of a few words is its place among them.
+As in MAVLink every value is a float: true is 1, an enumerated word is its index.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from companion.config_file import words_of
 from companion.errors import ConfigError
 
 DIGITS = 7
-"""More a float of four bytes does not hold."""
+"""Precision of a 32-bit float."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlightParameter:
-    """A key under a name of at most 16 characters."""
+    """A configuration key under a name of at most 16 characters."""
 
     name: str
     section: str
     key: str
     at_once: bool = False
-    """Else it counts from the next map on."""
+    """Whether it takes effect at once; else with the next map."""
 
     @property
     def full_key(self) -> str:
-        """As the configuration names it."""
+        """Name of the key in the configuration."""
         return f"{self.section}.{self.key}"
 
 
@@ -71,7 +71,7 @@ PARAMETERS = _table()
 
 
 def number_of(config: Config, parameter: FlightParameter) -> float:
-    """A key's value as a parameter's."""
+    """Parameter value of a key's value."""
     value: Any = getattr(getattr(config, parameter.section), parameter.key)
     if isinstance(value, str):
         return float(words_of(parameter.section, parameter.key).index(value))
@@ -79,9 +79,9 @@ def number_of(config: Config, parameter: FlightParameter) -> float:
 
 
 def value_of(config: Config, parameter: FlightParameter, number: float) -> Any:
-    """A parameter's value as the key's; ConfigError where it is none of its kind.
+    """Key's value of a parameter value; ConfigError for a wrong type.
 
-    Whether it is in the key's range is not looked at here.
+    The range is not checked here.
     """
     now: Any = getattr(getattr(config, parameter.section), parameter.key)
     wants = ""

@@ -1,6 +1,6 @@
-"""What a ground station may have the companion do, and when not; docs/control.md tells it to users.
+"""Ground commands and parameters: what is allowed, and when; users' guide in docs/control.md.
 
-Everything here runs in the event loop. How MAVLink asks and is answered the drivers know.
+Everything here runs in the event loop. The MAVLink protocol is in the drivers.
 """
 
 from __future__ import annotations
@@ -55,41 +55,41 @@ MAPPING, NEW_MAP, SNAPSHOT, BUDGET = 31010, 31011, 31012, 31013
 """MAV_CMD_USER_1 to MAV_CMD_USER_4."""
 STEP_S = 0.05
 TEXTS_HZ, TEXTS_AT_ONCE = 0.3, 5.0
-"""What comes of requests must not keep back what a pilot has to know."""
+"""Rate limit of answers to requests, so that they cannot suppress important texts."""
 CHANGES_HZ, CHANGES_AT_ONCE = 2.0, 40.0
-"""As many as there are parameters may be set in a row; afterwards so many a second."""
+"""Rate limit of parameter changes: a burst of as many as there are parameters, then this rate."""
 NO_FLIGHT = "there is no flight"
 POSES_SENT = "the autopilot may fly on these poses; param1 = 1 does it all the same"
 NOT_ARMED = "while armed it can be switched off only", REFUSED_ARMED
 ELSEWHERE = "another machine makes the dense map", REFUSED_ELSEWHERE
 TOO_OFTEN = "it is set too often", REFUSED_OFTEN
 NOT_LOOSER = "while armed it can be made stricter only", REFUSED_ARMED
-"""Why a parameter is refused: for the journal, and for the pilot."""
+"""Reason of a refusal: for the journal, and for the pilot."""
 
 
 class Controlled(Protocol):
-    """The daemon, as far as the ground has a say."""
+    """The daemon, as the ground controls it."""
 
     @property
     def config(self) -> Config:
-        """What counts now."""
+        """Configuration in force."""
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are; as they last were where nothing is heard."""
+        """Whether the motors are armed; the last known state where nothing is heard."""
 
     def take_over(self, config: Config) -> None:
-        """Go on with another configuration."""
+        """Continue with another configuration."""
 
     def prepare(self) -> None:
-        """Have a flight at hand beside the one that goes on."""
+        """Start the processes of a standby flight."""
 
     def begin_flight(self) -> None:
-        """Begin one, where one is due."""
+        """Begin a flight, where one is due."""
 
 
 class GroundControl:
-    """Commands and parameters of our component; `changed` is by key what the ground has set."""
+    """Commands and parameters of our component; `changed` are values set by the ground, by key."""
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class GroundControl:
         link.on_request = self._requests.take
 
     async def run(self) -> None:
-        """Answer, and carry out what takes long; until cancelled."""
+        """Answer requests and execute long commands, until cancelled."""
         answering = asyncio.ensure_future(self._requests.run())
         try:
             while not answering.done():
@@ -134,22 +134,22 @@ class GroundControl:
             answering.cancel()
 
     def snapshot_told(self, snapshot: Snapshot) -> None:
-        """The recorder says how far a snapshot is."""
+        """Take the progress of a snapshot from the results stage."""
         self._snapshots.take(snapshot)
 
     # -- parameters, as drivers.mavlink.parameter_server wants them ------------------------------
 
     @property
     def names(self) -> Sequence[str]:
-        """Of all parameters, in the order of their numbers."""
+        """Names of all parameters, by index."""
         return tuple(PARAMETERS)
 
     def value(self, name: str) -> float:
-        """As it counts now."""
+        """Value in force."""
         return number_of(self._daemon.config, PARAMETERS[name])
 
     def set(self, name: str, value: float) -> int:
-        """Set one, if it may be now; SET or a MAV_PARAM_ERROR."""
+        """Set one, if allowed now; SET or a MAV_PARAM_ERROR."""
         parameter, config = PARAMETERS[name], self._daemon.config
         try:
             wanted = value_of(config, parameter, value)
@@ -164,9 +164,9 @@ class GroundControl:
             self._tell(why_not[1](name=name), f"not set: {name}: {why_not[0]}", False)
             return NOT_NOW
         when = "" if parameter.at_once else ", from the next map on"
-        told = PARAMETER_SET if parameter.at_once else PARAMETER_NEXT_MAP
+        pilot_text = PARAMETER_SET if parameter.at_once else PARAMETER_NEXT_MAP
         self._tell(
-            told(name=name, value=_shown(wanted, brief=True)),
+            pilot_text(name=name, value=_shown(wanted, brief=True)),
             f"{parameter.full_key} = {_shown(wanted)}{when}", True,
         )  # fmt: skip
         self._take_over(parameter, wanted, changed)
@@ -175,7 +175,7 @@ class GroundControl:
     def _forbidden(
         self, parameter: FlightParameter, wanted: Any
     ) -> tuple[str, PilotMessage] | None:
-        """Why it must not be so now; None if it may."""
+        """Reason why it is refused now; None if allowed."""
         self._changes.refill(self._clock.now_ns())
         if self._changes.left < 1.0:
             return TOO_OFTEN
@@ -202,7 +202,7 @@ class GroundControl:
         return self._kept
 
     def close(self, seconds: float = 0.0) -> None:
-        """Keep what is still to be kept; waits for the disk at most so long."""
+        """Write settings still to be kept; waits for the disk at most this long."""
         if self._kept is not None:
             self._kept.close(seconds)
 
@@ -239,17 +239,17 @@ class GroundControl:
         self._snapshots.start(flight, self._link.origin, job)
         return job
 
-    def _refused(self, told: PilotText, what: str, result: int) -> Done:
-        self._tell(told, what, False)
+    def _refused(self, pilot_text: PilotText, what: str, result: int) -> Done:
+        self._tell(pilot_text, what, False)
         return Done(result)
 
-    def _tell(self, told: PilotText, text: str, good: bool) -> None:
-        """Answer the pilot, unless that comes too often, and say it at length in the journal."""
+    def _tell(self, pilot_text: PilotText, text: str, good: bool) -> None:
+        """Answer the pilot, rate-limited, and write the details to the journal."""
         self._texts.refill(self._clock.now_ns())
         in_time = self._texts.left >= 1.0
         if in_time:
             self._texts.take(1.0)
-            self._link.say(told)
+            self._link.say(pilot_text)
         if in_time or good:
             self._journal.say(f"ground: {text}", INFO if good else WARNING)
 

@@ -1,4 +1,4 @@
-"""What the ground has set: how it differs from the configuration, and the file that keeps it."""
+"""Settings from the ground: differences from the configuration, and the file that keeps them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ KEYS = [(parameter.section, parameter.key) for parameter in PARAMETERS.values()]
 
 
 def kept_over(load: Callable[[], Config]) -> tuple[Config, dict[str, Any]]:
-    """The configuration with what a file keeps, and that by key.
+    """The configuration with kept settings applied, and these by key.
 
-    ConfigError where it cannot be read, or names what no ground station can set.
+    ConfigError where the file cannot be read, or names keys that no ground station can set.
     """
     config = load()
     if not config.control.keep or not Path(config.control.keep).exists():
@@ -32,7 +32,7 @@ def kept_over(load: Callable[[], Config]) -> tuple[Config, dict[str, Any]]:
 
 
 def differences(config: Config, other: Config) -> dict[str, Any]:
-    """What the other has for each key in which they differ."""
+    """Values of the other for each key in which they differ."""
     before, after = dump(config), dump(other)
     return {
         f"{section}.{key}": value
@@ -43,11 +43,11 @@ def differences(config: Config, other: Config) -> dict[str, Any]:
 
 
 def encoded(changed: Mapping[str, Any]) -> bytes:
-    """The file that keeps this."""
+    """Content of the file."""
     lines = [f"{name} = {toml_value(value)}" for name, value in sorted(changed.items())]
     return (HEAD + "\n".join(lines) + "\n").encode()
 
 
 def checked(config: Config, parameter: FlightParameter, value: Any) -> Config:
-    """The configuration with a value from the ground, checked as one of a file."""
+    """The configuration with a value from the ground, validated as one of a file."""
     return with_value(config, parameter.section, parameter.key, value, parameter.name)

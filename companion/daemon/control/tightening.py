@@ -1,8 +1,8 @@
-"""What may change, while the motors are armed, of what decides which poses the autopilot gets.
+"""Changes allowed while armed to settings that decide which poses the autopilot gets.
 
-Limits become tighter, feedback is switched off; anything else waits for disarming. That holds
-however a change comes: by parameter, by command, with a configuration that is read again, or with
-one that is read by a daemon that starts in the air.
+Limits may become tighter, feedback may be switched off; anything else waits for disarming. That
+holds for a parameter, a command, a reloaded configuration, and the configuration read by a daemon
+that starts in the air.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 from companion.config import Config
 
 MayChange = Callable[[Any, Any], bool]
-"""Whether a value may give way to another while armed."""
+"""Whether a value may be replaced by another while armed."""
 
 
 def _to_less(now: float, wanted: float) -> bool:
@@ -52,24 +52,24 @@ WHILE_ARMED: Mapping[str, MayChange] = {
     "feedback.origin_latitude_deg": _not_at_all,
     "feedback.origin_longitude_deg": _not_at_all,
     "feedback.origin_altitude_m": _not_at_all,
-    # an autopilot that avoids obstacles counts on being told of them
+    # obstacle avoidance of the autopilot relies on these messages
     "feedback.obstacle_distance": _not_at_all,
-    # a map that is begun in the air believes its scale, and its frames, by these
+    # a map begun in the air accepts its scale, and its frames, by these
     "georeference.min_travel_m": _to_more,
     "georeference.max_sigma_scale": _to_less,
     "tracking.min_inliers": _to_more,
 }
-"""Every key of [feedback], and those of other sections that poses are believed by."""
+"""Every key of [feedback], and those of other sections that decide which poses are sent."""
 
 
 def value_of_key(config: Config, name: str) -> Any:
-    """The value of `section.key`."""
+    """Value of `section.key`."""
     section, key = name.split(".")
     return getattr(getattr(config, section), key)
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
-    """The configuration with other values for keys `section.key`; they are taken as they are."""
+    """The configuration with other values for keys `section.key`, not validated."""
     for name, value in values.items():
         section, key = name.split(".")
         part = dataclasses.replace(getattr(config, section), **{key: value})
@@ -78,12 +78,12 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
 
 
 def may_change(name: str, now: Any, wanted: Any) -> bool:
-    """Whether a key may have another value while armed; keys that have no say in it always may."""
+    """Whether a key may change to a value while armed; always for keys without influence."""
     return WHILE_ARMED.get(name, _freely)(now, wanted)
 
 
 def tightened(running: Config, wanted: Config) -> tuple[Config, dict[str, Any]]:
-    """The configuration to go on with while armed, and by key what has to wait for disarming."""
+    """The configuration in force while armed, and by key the changes that wait for disarming."""
     waiting = {
         name: value_of_key(wanted, name)
         for name in WHILE_ARMED

@@ -1,1 +1,1 @@
-"""One live flight after another: its processes, its date, its recording, its results."""
+"""Live flights: processes, date, recording, results."""

@@ -1,8 +1,8 @@
-"""Dates of flights, where the computer learns what time it is only when it has begun.
+"""Dates of flights on a computer that gets the time only after it has started.
 
 A computer without a battery clock starts with the time at which it was switched off, or with 1970.
-Its flights are in order by their numbers all the same; when the time comes, from the network or the
-autopilot's GPS, those of this run of the daemon get their dates.
+Its flights are ordered by their numbers all the same; when the time comes, from the network or the
+autopilot's GPS, flights of this run of the daemon get their dates.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from drivers.recording.flight_date import FlightDate, named_by_date, write_date
 from drivers.recording.flights_folder import PROGRAM_UNIX_S
 
 WRONG_NS = 2_000_000_000
-"""Names have seconds; less than this between two clocks is not worth another name."""
+"""Names have seconds; a smaller clock error needs no new name."""
 LOOK_NS = 1_000_000_000
 MOST_FLIGHTS = 1000
-"""Of which the date is still awaited; more no run of a daemon has."""
+"""Most flights whose date is still unknown."""
 
 
 @dataclass(slots=True)
 class _Flight:
     began_ns: int
-    """By the flight's clock."""
+    """Flight's clock."""
     over: bool = False
     corrected_ns: int = 0
-    """What its file says that is to be added to that."""
+    """Correction in its date file."""
 
 
 class FlightDates:
-    """`ahead_ns` says what the autopilot's date would add to the flight's clock, None without one.
+    """`ahead_ns` is the autopilot's date minus the flight's clock, None without one.
 
-    `is_set` says whether the system's clock is kept in step. For the event loop, but for `ended`
-    and `write`, which wait for the disk.
+    `is_set` is whether the system's clock is synchronised. For the event loop, except `ended` and
+    `write`, which wait for the disk.
     """
 
     def __init__(
@@ -50,18 +50,18 @@ class FlightDates:
         """By folder; those of this run."""
 
     def unix_s(self, t_ns: int) -> float:
-        """A time of the flight's clock, as well as it is known now."""
+        """Unix time of a time of the flight's clock, by the best correction known."""
         found = self._found
         return (t_ns + (found[0] if found is not None else 0)) * 1e-9
 
     def begun(self, folder: Path, t_ns: int) -> None:
-        """A flight has begun."""
+        """A flight has begun in this folder."""
         with self._lock:
             if len(self._flights) < MOST_FLIGHTS:
                 self._flights[folder] = _Flight(t_ns)
 
     def ended(self, folder: Path) -> Path:
-        """Nobody writes there any more; where the flight lies now."""
+        """A flight's folder is complete; returns its new path."""
         with self._lock:
             flight = self._flights.get(folder)
             if flight is None:
@@ -70,7 +70,7 @@ class FlightDates:
         return self.write().get(folder, folder)
 
     def step(self) -> bool:
-        """Look what time it is, once a second; True if there is something to `write`."""
+        """Check the clock, once a second; True if there is something to `write`."""
         now_ns = self._clock.now_ns()
         if now_ns - self._looked_ns < LOOK_NS:
             return False
@@ -82,7 +82,7 @@ class FlightDates:
             return any(self._is_due(flight) for flight in self._flights.values())
 
     def write(self) -> dict[Path, Path]:
-        """Write dates down, and name the folders of flights that are over; which are now where."""
+        """Write dates, and rename folders of finished flights; new paths by old path."""
         moved: dict[Path, Path] = {}
         with self._writing:
             with self._lock:
@@ -119,7 +119,7 @@ class FlightDates:
         return found is not None and abs(found[0] - flight.corrected_ns) >= WRONG_NS
 
     def _look(self, now_ns: int) -> tuple[int, str] | None:
-        """What is to be added to the flight's clock, and by whom; None while nobody knows."""
+        """Correction of the flight's clock and its source; None while unknown."""
         set_ns, autopilot_ns = self._clock.behind_ns(), self._ahead_ns()
         if self._is_set():
             return _plausible(now_ns, set_ns, "the network")

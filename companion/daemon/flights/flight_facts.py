@@ -1,4 +1,4 @@
-"""What the report of a live flight states beside what the flight itself has shown."""
+"""Facts of a live flight for its report, beside its messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivers.mavlink.autopilot_link import AutopilotLink
 
 
 def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> RunFacts:
-    """All that is known when its stages have given their last results."""
+    """Facts of a flight whose stages have given their last results."""
     times: dict[str, Mapping[str, float]] = {}
     device = "none"
     for stage in flight.stages.values():

@@ -1,4 +1,4 @@
-"""Which flight there is: one that waits, one that goes on, and those whose results are written."""
+"""The flights: one on standby, the current one, and those whose results are being written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drivers.system.journal import WARNING, Journal
 
 
 class Flights:
-    """Begins and ends flights. To be used in the event loop, but for `frame`."""
+    """Begins and ends flights. To be used in the event loop, except `frame`."""
 
     def __init__(
         self,
@@ -38,33 +38,33 @@ class Flights:
         self._last_number = 0
         self._clock, self._journal, self._listener, self._facts = clock, journal, listener, facts
         self.current: LiveFlight | None = None
-        self._spare: LiveFlight | None = None
+        self._standby: LiveFlight | None = None
         self._ending: dict[LiveFlight, threading.Thread] = {}
 
     @property
     def stages_up(self) -> bool:
-        """Whether the flight that goes on, or else the one that waits, can take frames."""
-        flight = self.current or self._spare
+        """Whether the current flight, or else the one on standby, can take frames."""
+        flight = self.current or self._standby
         return flight is not None and flight.stages_up
 
     @property
-    def spare(self) -> LiveFlight | None:
-        """The one that waits for its beginning, if any."""
-        return self._spare
+    def standby(self) -> LiveFlight | None:
+        """Flight whose processes wait for its beginning; None without one."""
+        return self._standby
 
     def prepare(self, config: Config, camera: Camera) -> None:
-        """Have processes at hand for the next flight."""
-        if self._spare is None:
-            self._spare = LiveFlight(config, camera, self._clock, self._listener)
+        """Start the processes of the next flight."""
+        if self._standby is None:
+            self._standby = LiveFlight(config, camera, self._clock, self._listener)
 
     def begin(self, config: Config, camera: Camera, take_up: bool = True) -> LiveFlight:
-        """A flight begins; the one before must have been ended.
+        """Begin a flight; the one before must have been ended.
 
-        With `take_up` it goes on with the map of a process that died in the air, if there is one
-        and it is recognised.
+        With `take_up` it continues the map of a process that died in the air, if there is one and
+        it relocalises.
         """
         self.prepare(config, camera)
-        flight, self._spare = self._spare, None
+        flight, self._standby = self._standby, None
         assert flight is not None and self.current is None
         folder = self._named(Path(config.daemon.flights))
         flight.begin(folder, KeepMap(kept_map_path(config.daemon.socket), take_up))
@@ -73,7 +73,7 @@ class Flights:
         return flight
 
     def end(self) -> None:
-        """The flight is over; its results are written while other things go on."""
+        """End the current flight; its results are written in the background."""
         flight, self.current = self.current, None
         if flight is None:
             return
@@ -81,15 +81,15 @@ class Flights:
         self._ending[flight] = thread
         thread.start()
 
-    def is_spare(self, flight: LiveFlight) -> bool:
-        """Whether this is the one that waits for its beginning."""
-        return self._spare is flight
+    def is_standby(self, flight: LiveFlight) -> bool:
+        """Whether a flight is the one on standby."""
+        return self._standby is flight
 
-    def discard_spare(self) -> None:
-        """The next flight is to be prepared anew."""
-        spare, self._spare = self._spare, None
-        if spare is not None:
-            threading.Thread(target=spare.finish, args=(self._facts,), daemon=True).start()
+    def discard_standby(self) -> None:
+        """End the standby flight; the next one is prepared anew."""
+        standby, self._standby = self._standby, None
+        if standby is not None:
+            threading.Thread(target=standby.finish, args=(self._facts,), daemon=True).start()
 
     def frame(self, frame: Frame) -> None:
         """Take a frame; from the camera's thread."""
@@ -102,19 +102,19 @@ class Flights:
         if self.current is not None:
             self.current.take(message)
 
-    def keep(self, message: LinkBytes | HealthNote) -> None:
-        """Have something in the recording."""
+    def record(self, message: LinkBytes | HealthNote) -> None:
+        """Record link bytes or health."""
         if self.current is not None:
-            self.current.keep(message)
+            self.current.record(message)
 
     async def close(self, patience_s: float, keep_map: bool) -> None:
-        """End all flights in a hurry; with `keep_map` the next daemon may go on with the map."""
+        """End all flights quickly; with `keep_map` the next daemon may continue the map."""
         if self.current is not None:
             self.current.keep_map = keep_map
         self.end()
         for flight in list(self._ending):
             flight.hurry()
-        self.discard_spare()
+        self.discard_standby()
         rounds = round(patience_s / 0.02)
         while rounds and any(thread.is_alive() for thread in self._ending.values()):
             await asyncio.sleep(0.02)
@@ -127,7 +127,7 @@ class Flights:
         self._journal.say(f"flight over: {folder} ({flight.n_frames} frames)")
 
     def _named(self, parent: Path) -> Path:
-        """The next flight's folder, with a number that none had before, and the time, UTC."""
+        """Folder of the next flight: a number never used before, and the time, UTC."""
         if self._counter is None or self._counter.path.parent != parent:
             if self._counter is not None:
                 self._counter.close()

@@ -1,4 +1,4 @@
-"""Where a flight's map is kept for who takes over in the air: in memory, if there is a place.
+"""Path of the map checkpoint for a restart in the air: in memory where possible.
 
 Some megabytes each second would wear out an SD card.
 """
@@ -13,11 +13,11 @@ from drivers.system.status_socket import own_socket_path
 
 NAME = "map.checkpoint"
 SHARED_MEMORY = Path("/dev/shm")
-"""A file system in memory that Linux always has (tmpfs); anyone may write there."""
+"""File system in memory that Linux always has (tmpfs), writable for all."""
 
 
 def kept_map_path(setting: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """Beside the socket; `setting` is `daemon.socket`.
+    """Path beside the socket; `setting` is `daemon.socket`.
 
     systemd's RuntimeDirectory and a user's XDG_RUNTIME_DIR are in memory. Where there is neither,
     the socket lies in /tmp, which may be on a disk: then a folder in shared memory is used.

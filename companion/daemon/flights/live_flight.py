@@ -1,11 +1,11 @@
-"""One live flight: its stages, each in a process, joined from the first frame to the report.
+"""One live flight: its stages, each in a process, from the first frame to the report.
 
-    frames, telemetry -> localisation -> depth -> recorder, viewer
-    all that comes in, poses, warnings -> tape
-    frames, all that stages give -> topics, if nodes elsewhere are to have it
+    frames, telemetry -> localisation -> depth -> results, viewer
+    all input, poses, warnings -> recorder
+    frames, all stage output -> topics, if other nodes need it
 
 Whoever calls `frame` or `telemetry` never waits. A stage that dies takes nothing with it but its
-own state: depth and recorder begin again within the flight, localisation ends it.
+own state: every other stage begins again within the flight, localisation ends it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import (
     Finish,
     KeepMap,
-    SetShare,
+    SetLoadLevel,
     Setup,
     Snapshot,
     TakeSnapshot,
@@ -49,48 +49,48 @@ from companion.streaming.viewer import Watched
 from companion.timing.clock import FlightClock, monotonic_s
 from drivers.recording.recorded_content import HealthNote, LinkBytes
 
-NICE = {"localisation": 0, "tape": 5, "topics": 10, "recorder": 10, "depth": 20}
-"""The pose comes first; the others take what is left over."""
+NICE = {"localisation": 0, "recorder": 5, "topics": 10, "results": 10, "depth": 20}
+"""The pose has priority; the others get the remaining processor time."""
 PATIENCE_S = {
-    "localisation": 120.0, "depth": 60.0, "tape": 60.0, "recorder": 180.0, "topics": 15.0,
+    "localisation": 120.0, "depth": 60.0, "recorder": 60.0, "results": 180.0, "topics": 15.0,
 }  # fmt: skip
-HURRIED_S = {"localisation": 0.7, "depth": 0.2, "tape": 0.3, "recorder": 1.6, "topics": 0.2}
+HURRIED_S = {"localisation": 0.7, "depth": 0.2, "recorder": 0.3, "results": 1.6, "topics": 0.2}
 START_S = 300.0
-"""Who has not begun its work by then never will. On a computer with far too much to do the imports
-alone take a minute and more, and the first start of all compiles loops or kernels."""
-ANSWER_S = {"depth": 120.0, "tape": 60.0, "recorder": 60.0, "topics": 30.0}
-"""Who is at one step for longer hangs, and is ended and started again: depth may wait for a driver
-that compiles and has the least right to the processor, the others for a slow disk or network."""
-IN_FOLDER = ("tape", "recorder")
-"""Stages that leave something in the flight's folder."""
+"""Longest start of a stage. On an overloaded computer the imports alone take a minute and more, and
+the first start of all compiles loops or kernels."""
+ANSWER_S = {"depth": 120.0, "recorder": 60.0, "results": 60.0, "topics": 30.0}
+"""Longest step of a stage before it is restarted: depth may wait for a driver that compiles, and
+has the lowest priority; the others for a slow disk or network."""
+IN_FOLDER = ("recorder", "results")
+"""Stages that write into the flight's folder."""
 WITH_FLIGHT = (*IN_FOLDER, "topics")
-"""Stages that cannot begin before the flight does."""
+"""Stages that start with the flight."""
 PUBLISHED = (Odometry, Track, KeyframeAdded, MapUpdate, DepthMap, PointChunk)
-"""What the topics are told, beside frames."""
+"""Messages for the topics, beside frames."""
 RESTARTED = "a stage has died and is started again"
 STALLED = "it hung for {:.0f} s and was ended"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 LONGEST_WAIT_S = 30.0
-"""Between two starts of a stage that dies again and again."""
-TELL_NS = 1_000_000_000
+"""Longest pause between two starts of a stage that dies repeatedly."""
+HEALTH_EVERY_NS = 1_000_000_000
 NOT_FINISHED = "a stage did not give its last results in time"
 
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """Who hears of a flight; all are called from its threads and must not block."""
+    """Callbacks for the output of a flight; called from its threads, must not block."""
 
     odometry: Callable[[Odometry], None]
     mapped: Callable[[Track | MapUpdate | PointChunk], None]
     warned: Callable[[Warned], None]
     localisation_died: Callable[[], None]
     unusable: Callable[[str], None]
-    """A stage has never come up, since what the user gave cannot be used."""
+    """A stage could never start because of the user's input."""
     snapshot: Callable[[Snapshot], None] = lambda _: None
 
 
 class LiveFlight:
-    """Processes that wait for a flight to begin, then the flight."""
+    """Processes of one flight: on standby before `begin`, then flying."""
 
     def __init__(
         self,
@@ -103,29 +103,29 @@ class LiveFlight:
         self._began_s = monotonic_s()
         self._listener = listener(self)
         self.folder: Path | None = None
-        """Where the results go; None until it has begun."""
-        self.n_restarted = {"depth": 0, "recorder": 0, "tape": 0, "topics": 0}
+        """Folder of the results; None before the begin."""
+        self.n_restarted = {"depth": 0, "results": 0, "recorder": 0, "topics": 0}
         self._ring = FrameRing(camera.width, camera.height)
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._hurry_s: float | None = None
         self.keep_map = False
-        """Whether the vehicle flies on without it, and what comes next may go on with its map."""
+        """Whether the vehicle flies on without it, and the next process may continue its map."""
         self.n_frames = 0
         self._viewing: Viewing | None = None
         self._last_map: MapUpdate | None = None
-        self._told_ns = 0
+        self._health_ns = 0
         self._origin: GeoOrigin | None = None
         self._dense = makes_depth(config)
         self._dense_share = 1.0
         self._failed_devices: dict[str, str] = {}
         """OpenCL devices that have ended the depth stage in this flight, by identity, and how."""
         self._interrupted_at: set[str] = set()
-        """Those that were at work when it was ended for not answering."""
+        """Devices that were at work when the stage was ended for not answering."""
         self._began_later: set[str] = set()
-        """Stages that were not wanted at first."""
-        kinds = ["localisation", "recorder"]
-        kinds += ["tape"] * config.recorder.enabled + ["depth"] * self._dense
+        """Stages started during the flight."""
+        kinds = ["localisation", "results"]
+        kinds += ["recorder"] * config.recorder.enabled + ["depth"] * self._dense
         kinds += ["topics"] * config.distributed.enabled
         self.stages = {kind: self._start(kind) for kind in kinds}
         for kind in kinds:
@@ -133,12 +133,12 @@ class LiveFlight:
 
     @property
     def ready(self) -> bool:
-        """Whether frames are worked on as they come."""
+        """Whether frames are processed as they come."""
         return self.folder is not None and self.stages["localisation"].progress is not None
 
     @property
     def stages_up(self) -> bool:
-        """Whether every stage that can be has begun its work, or has tried and will again."""
+        """Whether every stage that can run is up, or has failed to start and is retried."""
         return all(
             stage.progress is not None or self.n_restarted.get(kind, 0)
             for kind, stage in list(self.stages.items())
@@ -146,7 +146,7 @@ class LiveFlight:
         )
 
     def begin(self, folder: Path, keep: KeepMap | None = None) -> None:
-        """The flight begins, and leaves its results there; its map is kept as said in `keep`."""
+        """Begin the flight, with its results in `folder`; `keep` says where its map is kept."""
         self.folder, self._began_s = folder, monotonic_s()
         if keep is not None:
             self.stages["localisation"].offer(keep)
@@ -157,7 +157,7 @@ class LiveFlight:
             self._viewing = Viewing(self._config, self.camera, folder.name, self._warn)
 
     def frame(self, frame: Frame) -> None:
-        """Take a frame of the camera's size."""
+        """Take a frame of the camera's size; never waits."""
         if self.folder is None or self._over.is_set():
             return
         self.n_frames += 1
@@ -168,42 +168,44 @@ class LiveFlight:
         self._show(frame)
 
     def take(self, message: Telemetry | Warned) -> None:
-        """Take telemetry, or a warning for the log."""
+        """Take telemetry, or a warning for the log; never waits."""
         if self.folder is None or self._over.is_set():
             return
         if not isinstance(message, Warned):
             self.stages["localisation"].offer(message)
-        self.keep(message)
-        self._record(message)
+        self.record(message)
+        self._to_results(message)
 
-    def keep(self, message: Message | LinkBytes | HealthNote) -> None:
-        """Have something in the recording; nobody else hears of it."""
-        if "tape" in self.stages and self.folder is not None and not self._over.is_set():
-            self.stages["tape"].offer(message)
+    def record(self, message: Message | LinkBytes | HealthNote) -> None:
+        """Send a message to the recorder only."""
+        if "recorder" in self.stages and self.folder is not None and not self._over.is_set():
+            self.stages["recorder"].offer(message)
 
-    def tell(self, health: Health, origin: GeoOrigin | None) -> None:
-        """Have viewers and recording told how all is, once a second, and where the world lies."""
-        if self.folder is None or self._over.is_set() or health.t_ns - self._told_ns < TELL_NS:
+    def publish_health(self, health: Health, origin: GeoOrigin | None) -> None:
+        """Send health to viewers and results once a second, and a changed world's origin."""
+        if self.folder is None or self._over.is_set():
             return
-        self._told_ns = health.t_ns
-        self._record(health)
+        if health.t_ns - self._health_ns < HEALTH_EVERY_NS:
+            return
+        self._health_ns = health.t_ns
+        self._to_results(health)
         if origin is not None and origin != self._origin:
             self._origin = origin
-            self._record(origin)
+            self._to_results(origin)
 
     @property
     def viewing(self) -> Viewing | None:
-        """Who looks on; None if nobody may."""
+        """The viewers' exporter; None if nobody may view."""
         return self._viewing
 
-    def set_shares(self, features: float, dense: float, viewer: bool) -> None:
-        """Leave out some of the work, or take it up again; see companion.runtime.governor."""
+    def set_load_levels(self, features: float, dense: float, viewer: bool) -> None:
+        """Set the share of work of the stages; see companion.runtime.governor."""
         if self._viewing is not None:
             self._viewing.pictures = viewer
-        self.stages["localisation"].offer(SetShare(features))
+        self.stages["localisation"].offer(SetLoadLevel(features))
         self._dense_share = dense
         if "depth" in self.stages:
-            self.stages["depth"].offer(SetShare(dense))
+            self.stages["depth"].offer(SetLoadLevel(dense))
 
     @property
     def dense(self) -> bool:
@@ -211,7 +213,7 @@ class LiveFlight:
         return self._dense
 
     def set_dense(self, dense: bool) -> None:
-        """Make the dense map from now on, or leave it; what there is of it stays."""
+        """Start or stop dense mapping; the dense map so far stays."""
         with self._lock:
             if dense == self._dense or self._over.is_set():
                 return
@@ -222,26 +224,26 @@ class LiveFlight:
             self._dense = dense
         if not dense:
             return
-        self._take_up("depth")
+        self._bring_up_to_date("depth")
 
     def set_budget(self, kbit_s: float) -> None:
-        """All viewers together get no more from now on; 0 for no limit."""
+        """Limit the rate of all viewers together; 0 for no limit."""
         if self._viewing is not None:
             self._viewing.set_budget(kbit_s)
 
     def take_snapshot(self, number: int, origin: GeoOrigin | None) -> None:
-        """Have the cloud written as it is now; the listener hears how far that is."""
-        self.stages["recorder"].offer(TakeSnapshot(number, origin))
+        """Write the cloud as it is now; progress goes to the listener."""
+        self.stages["results"].offer(TakeSnapshot(number, origin))
 
     @property
     def has_origin(self) -> bool:
-        """Whether the map lies in the autopilot's own world."""
+        """Whether the map is georeferenced to the autopilot's origin."""
         found = self._last_map.georeference if self._last_map is not None else None
         return found is not None and found.has_origin
 
     @property
     def duration_s(self) -> float:
-        """Since it began."""
+        """Seconds since it began."""
         return monotonic_s() - self._began_s
 
     def kill_localisation(self) -> None:
@@ -249,9 +251,9 @@ class LiveFlight:
         self.stages["localisation"].interrupt()
 
     def end_stalled(self) -> None:
-        """End stages that hang, so that others take their place; localisation only as it starts.
+        """End stages that hang, so that they are restarted; localisation only as it starts.
 
-        Whether a localisation that has begun hangs is known by its poses, and sooner.
+        A running localisation that hangs is detected by its poses, and sooner.
         """
         now_s = monotonic_s()
         for kind, stage in list(self.stages.items()):
@@ -262,20 +264,20 @@ class LiveFlight:
                 stage.interrupt(STALLED.format(stalled_s))
 
     def hurry(self) -> None:
-        """Whatever `finish` is at, it has little time left."""
+        """Have `finish` end within three seconds."""
         self._hurry_s = monotonic_s()
 
     def finish(self, facts: Callable[[LiveFlight], RunFacts]) -> None:
-        """Give all results and end; after `hurry` within three seconds. Waits for it."""
+        """Write all results and end; within three seconds after `hurry`. Blocks."""
         with self._lock:
             self._over.set()
         if self.folder is not None:
             for kind in ("localisation", "depth"):
                 self._finish(kind)
-            self._ask("tape")
+            self._ask("recorder")
             self._ask("topics")
-            self._finish("recorder", facts(self))
-            self._wait("tape")
+            self._finish("results", facts(self))
+            self._wait("recorder")
             self._wait("topics")
         for stage in self.stages.values():
             stage.kill()
@@ -313,7 +315,7 @@ class LiveFlight:
             self._ended(kind, why)
 
         return StageProcess(
-            kind, NICE[kind], self._ring, self._deliver, ended, every_frame=kind == "tape"
+            kind, NICE[kind], self._ring, self._deliver, ended, every_frame=kind == "recorder"
         )
 
     def _set_up(self, kind: str) -> None:
@@ -327,7 +329,7 @@ class LiveFlight:
         self.stages[kind].begin(Setup(self._config, self.camera, folder, failed))
 
     def _ended(self, kind: str, why: str) -> None:
-        """A stage's process is gone; called from its own thread."""
+        """Handle the end of a stage's process; called from its own thread."""
         if not why:
             return
         with self._lock:
@@ -354,10 +356,10 @@ class LiveFlight:
             self.stages[kind] = self._start(kind)
             gone.kill()
             self._set_up(kind)
-        self._take_up(kind)
+        self._bring_up_to_date(kind)
 
     def _blame_driver(self, gone: StageProcess, why: str) -> None:
-        """A device whose driver has ended a stage is not used again in this flight.
+        """Exclude a device whose driver has ended a stage from the rest of the flight.
 
         A stage may have been too slow to answer for other reasons; that counts the second time.
         """
@@ -369,15 +371,15 @@ class LiveFlight:
             return
         self._failed_devices[driver.identity] = f"{driver.named}: {why}"
 
-    def _take_up(self, kind: str) -> None:
-        """A stage begins in mid-flight: it has to know what the others do."""
+    def _bring_up_to_date(self, kind: str) -> None:
+        """Give a stage that starts in flight the load level and the newest map."""
         if kind == "depth":
-            self.stages[kind].offer(SetShare(self._dense_share))
+            self.stages[kind].offer(SetLoadLevel(self._dense_share))
         if self._last_map is not None:
             self.stages[kind].offer(self._last_map)
 
     def _deliver(self, message: Message | Snapshot) -> None:
-        """What a stage gives goes to whom it is for; called from the stages' threads."""
+        """Route the output of a stage; called from the stages' threads."""
         if "topics" in self.stages and isinstance(message, PUBLISHED):
             self.stages["topics"].offer(message)
         if isinstance(message, Snapshot):
@@ -386,7 +388,7 @@ class LiveFlight:
         if isinstance(message, Odometry):
             self._listener.odometry(message)
             self._show(message)
-            self.keep(message)
+            self.record(message)
             return
         if isinstance(message, (Track, KeyframeAdded, MapUpdate)) and self._dense:
             self.stages["depth"].offer(message)
@@ -399,11 +401,11 @@ class LiveFlight:
             if not self._over.is_set():
                 return  # the listener hands it back, see `take`
         if isinstance(message, (MapUpdate, PointChunk)) and self._config.recorder.point_cloud:
-            self.keep(message)
-        self._record(message)
+            self.record(message)
+        self._to_results(message)
 
-    def _record(self, message: Watched) -> None:
-        self.stages["recorder"].offer(message)
+    def _to_results(self, message: Watched) -> None:
+        self.stages["results"].offer(message)
         self._show(message)
 
     def _show(self, message: Watched) -> None:
@@ -415,7 +417,7 @@ class LiveFlight:
         self._listener.warned(warning)
 
     def dropped(self) -> dict[str, int]:
-        """Frames that stages passed over, by stage, and messages that the viewer did."""
+        """Frames dropped by each stage, and messages dropped by the viewer."""
         counts: dict[str, Any] = {f"{k} frames": s.n_dropped for k, s in self.stages.items()}
         if self._viewing is not None:
             counts["viewer messages"] = self._viewing.n_dropped

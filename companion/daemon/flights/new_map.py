@@ -1,4 +1,4 @@
-"""Another map in mid-flight: its stages come up beside the flight that goes on, which then ends."""
+"""A new map in flight: its stages start beside the current flight, which then ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ READY_PERCENT = 90
 
 
 class NewMap:
-    """To be used in the event loop; `prepare` has stages brought up, `begin` begins a flight."""
+    """To be used in the event loop; `prepare` starts the stages, `begin` begins a flight."""
 
     def __init__(
         self, flights: Flights, prepare: Callable[[], None], begin: Callable[[], None]
@@ -23,7 +23,7 @@ class NewMap:
         self._since_s = 0.0
 
     def start(self, job: Job) -> None:
-        """Bring up the stages; the flight that there is goes on meanwhile."""
+        """Start the stages; the current flight continues meanwhile."""
         self._job, self._since_s = job, monotonic_s()
         self._prepare()
 
@@ -32,10 +32,10 @@ class NewMap:
         job = self._job
         if job is None:
             return
-        spare, waited_s = self._flights.spare, monotonic_s() - self._since_s
-        if self._flights.current is None or spare is None:
+        standby, waited_s = self._flights.standby, monotonic_s() - self._since_s
+        if self._flights.current is None or standby is None:
             job.result, self._job = FAILED, None
-        elif spare.stages["localisation"].progress is not None or waited_s > MOST_S:
+        elif standby.stages["localisation"].progress is not None or waited_s > MOST_S:
             self._flights.end()
             self._begin()
             job.percent, job.result, self._job = 100, ACCEPTED, None

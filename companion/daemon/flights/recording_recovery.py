@@ -1,6 +1,6 @@
-"""Recordings that an earlier daemon was not given the time to end, repaired beside the flight.
+"""Recovery of recordings that an earlier daemon could not finish, in the background.
 
-By `companion flights repair` in a process that gets what nobody else wants, and never while armed.
+Runs `companion flights repair` in a process of lowest priority, and never while armed.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from companion.timing.clock import FlightClock
 from drivers.system.low_priority import give_way
 
 AFTER_S = 10.0
-"""From the start, or the end of a flight: there is enough to be done then."""
+"""Delay after the start, or the end of a flight, when other work has priority."""
 LOOK_S = 0.2
 CUT_SHORT = "an earlier recording was cut short"
 
 
-class LeftOvers:
-    """Used in the event loop. `warn` hears of each recording."""
+class RecordingRecovery:
+    """Used in the event loop. `warn` takes a warning for each recording."""
 
     def __init__(
         self, flights: Path, clock: FlightClock, warn: Callable[[Warned], None],
@@ -32,7 +32,7 @@ class LeftOvers:
         self._flights, self._clock, self._warn, self._armed = flights, clock, warn, armed
 
     async def run(self) -> None:
-        """Repair what there is, now and after each flight, until cancelled."""
+        """Repair recordings, now and after each flight, until cancelled."""
         while True:
             await asyncio.sleep(AFTER_S)
             if not self._armed() and await self._repaired():
@@ -40,7 +40,7 @@ class LeftOvers:
                     await asyncio.sleep(LOOK_S)
 
     async def _repaired(self) -> bool:
-        """Whether it was not broken off by arming."""
+        """Run one repair; False where arming has cut it short."""
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "companion", "flights", "repair", "--gently",
             "--flights", str(self._flights), stdin=DEVNULL, stdout=PIPE, stderr=DEVNULL,

@@ -1,4 +1,4 @@
-"""The cloud as a file in mid-flight: who asked for it hears how far it is."""
+"""Cloud snapshots in flight, and their progress for whoever asked."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from companion.pilot_messages import CLOUD_NOT_SAVED, CLOUD_SAVED, PilotText
 from companion.runtime.stage_protocol import Snapshot
 from drivers.mavlink.command_server import ACCEPTED, FAILED, Job
 
-RECORDER_GONE = "its recorder is gone"
+RESULTS_GONE = "the results stage has died"
 
 
 class Snapshots:
     """One at a time; to be used in the event loop.
 
-    `tell` takes what the pilot hears, what the journal has, and whether it is good.
+    `tell` takes the pilot's text, the journal's text, and whether it is good news.
     """
 
     def __init__(self, flights: Flights, tell: Callable[[PilotText, str, bool], None]) -> None:
@@ -28,14 +28,14 @@ class Snapshots:
         self._number = self._n_restarted = 0
 
     def start(self, flight: LiveFlight, origin: GeoOrigin | None, job: Job) -> None:
-        """Have one written into the flight's folder."""
+        """Write a snapshot into the flight's folder."""
         self._number = self._number + 1 if flight is self._flight else 1
         self._flight, self._job = flight, job
-        self._n_restarted = flight.n_restarted["recorder"]
+        self._n_restarted = flight.n_restarted["results"]
         flight.take_snapshot(self._number, origin if flight.has_origin else None)
 
     def take(self, snapshot: Snapshot) -> None:
-        """The recorder says how far it is."""
+        """Take the progress that the results stage reports."""
         if self._job is None or snapshot.number != self._number:
             return
         self._job.percent = snapshot.percent
@@ -50,7 +50,7 @@ class Snapshots:
             self._fail(snapshot.why_not)
 
     def step(self) -> None:
-        """Notice that nothing more will come; to be called often."""
+        """Detect a snapshot that will not be finished; to be called often."""
         flight = self._flight
         if self._job is None or flight is None:
             return
@@ -58,9 +58,9 @@ class Snapshots:
             self._job = None
         elif (
             flight is not self._flights.current
-            or flight.n_restarted["recorder"] != self._n_restarted
+            or flight.n_restarted["results"] != self._n_restarted
         ):
-            self._fail(RECORDER_GONE)
+            self._fail(RESULTS_GONE)
 
     def _fail(self, why_not: str) -> None:
         assert self._job is not None

@@ -1,6 +1,6 @@
-"""The viewers of a flight: its exporter, and what shows it on board if anything is to.
+"""The viewers of a flight: its exporter, and the viewer on board if one is configured.
 
-Whoever calls `take` never waits, and nothing that becomes of a viewer matters to the flight.
+`take` never waits, and no failure of a viewer affects the flight.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from companion.timing.clock import monotonic_s
 
 LOOK_S = 0.5
 AGAIN_S = 3.0
-"""Between two attempts to show it."""
+"""Pause between two attempts to open the viewer."""
 PATIENCE_S, HURRIED_S = 3.0, 0.2
-"""What a viewer may take to show the last of a flight."""
+"""Time for a viewer to show the last messages of a flight."""
 STALLED_S = 30.0
-"""An exporter that takes nothing for so long is ended, and another takes its place."""
+"""An exporter that reads nothing for this long is restarted."""
 MANY = 50
-"""So many messages given up between two looks are an exporter that hangs."""
+"""Messages dropped between two checks that mean an exporter that hangs."""
 NOWHERE = "none"
 SHOWN = "the flight can be seen"
 NO_VIEWER = "the viewer cannot be shown"
@@ -35,9 +35,9 @@ CLOSED = "viewers cannot connect"
 
 
 class Viewing:
-    """Exports to `stream.listen` and keeps `daemon.viewer` shown until `close`.
+    """Exports to `stream.listen` and keeps `daemon.viewer` open until `close`.
 
-    `warn` takes what, a detail, and whether it is good.
+    `warn` takes a warning, its detail, and whether it is good news.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class Viewing:
         self._config, self._camera, self._name, self._warn = config, camera, name, warn
         self._stream = config.stream
         self.pictures = True
-        """Whether it is given pictures."""
+        """Whether images are sent to viewers."""
         self._n_dropped = self._n_seen = self._n_restarted = 0
         self._where = config.daemon.viewer
-        self._told = ""
+        self._last_warning = ""
         self._was_shown = False
         self._over = threading.Event()
         self._patience_s = PATIENCE_S
@@ -59,16 +59,16 @@ class Viewing:
 
     @property
     def n_dropped(self) -> int:
-        """Messages that there was no room for."""
+        """Messages dropped for lack of capacity."""
         return self._n_dropped + self._viewer.n_dropped
 
     @property
     def pid(self) -> int:
-        """Of the exporter."""
+        """Process id of the exporter."""
         return self._viewer.pid
 
     def health(self) -> StageHealth:
-        """How the exporter is; what it gave up for want of room on links counts as dropped."""
+        """Health of the exporter; data that it skipped on thin links counts as dropped."""
         report = self._viewer.report
         n_viewers = int(report.get("viewers", 0))
         plural = "" if n_viewers == 1 else "s"
@@ -91,12 +91,12 @@ class Viewing:
             self._viewer.take(message)
 
     def set_budget(self, kbit_s: float) -> None:
-        """All viewers together get no more from now on; 0 for no limit."""
+        """Limit the rate of all viewers together; 0 for no limit."""
         self._stream = replace(self._stream, budget_kbit_s=kbit_s)
         self._viewer.set_budget(kbit_s)
 
     def close(self, hurry: bool) -> None:
-        """The flight is over; what viewers have not got by then they never will."""
+        """End at the end of the flight; data that viewers lack by then is lost."""
         self._patience_s = HURRIED_S if hurry else PATIENCE_S
         self._over.set()
         self._thread.join(4 * self._patience_s + 1.0)
@@ -125,8 +125,8 @@ class Viewing:
         self._close_viewer(self._patience_s)
 
     def _show(self) -> float:
-        """Show it, for the first time or again; how long to wait after that."""
-        if self._told == "" and self._was_shown:
+        """Open the viewer, for the first time or again; seconds until the next attempt."""
+        if self._last_warning == "" and self._was_shown:
             self._tell(GONE, self._where)
             if self._where == "native":
                 self._where = NOWHERE  # its window was closed by whoever looked at it
@@ -136,7 +136,7 @@ class Viewing:
         except InputError as error:
             self._tell(NO_VIEWER, str(error))
             return AGAIN_S
-        self._was_shown, self._told = True, ""
+        self._was_shown, self._last_warning = True, ""
         if self._viewer.page:
             self._warn(SHOWN, f"open {self._viewer.page}", True)
         return LOOK_S
@@ -155,7 +155,7 @@ class Viewing:
         self._viewer.n_dropped = 0
 
     def _tell(self, what: str, detail: str) -> None:
-        """Say it, but not again as long as nothing else is to be said."""
-        if what != self._told:
-            self._told = what
+        """Warn, unless the same was the last warning."""
+        if what != self._last_warning:
+            self._last_warning = what
             self._warn(what, detail, False)

@@ -1,1 +1,1 @@
-"""A flight on several computers: which stages run where, and the node that makes the cloud."""
+"""Distributed flights: placement of stages on nodes, and the node that makes the cloud."""

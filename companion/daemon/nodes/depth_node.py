@@ -1,7 +1,7 @@
-"""A node on another machine: it fetches what a drone has tracked, and makes depth and cloud of it.
+"""Depth node on another machine: fetches keyframe bundles from a drone, makes depth and cloud.
 
-It asks for one bundle after the other, as fast as it can work on them. Whatever becomes of the
-link, of the drone or of itself, it goes on with the bundle after the last that counted.
+It asks for one bundle after the other, as fast as it can process them. After any failure of the
+link, of the drone or of itself it continues after the last bundle that counted.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from drivers.system.journal import WARNING, Journal
 from drivers.system.zenoh_bus import LAST, ZenohBus
 
 ASK_S = 10.0
-"""What an answer may take over a thin link."""
+"""Timeout of an answer over a thin link."""
 AGAIN_S, NOBODY_S = 0.15, 0.5
-"""Until it asks again: where there is nothing new, and where nobody answers."""
+"""Pause before the next query: where there is nothing new, and where nobody answers."""
 MOST_IN_A_ROW = 10
-"""Answers that cannot be read, before the next bundle is asked for."""
+"""Malformed answers before the bundle is skipped."""
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,79}")
 
 
@@ -43,7 +43,7 @@ def run_depth_node(config: Config, is_stopped: Callable[[], bool]) -> int:
 
 
 class DepthNode:
-    """See above."""
+    """Fetches bundles and runs the depth stage on them."""
 
     def __init__(self, config: Config, is_stopped: Callable[[], bool]) -> None:
         self._config, self._is_stopped = config, is_stopped
@@ -51,22 +51,22 @@ class DepthNode:
         self._devices = choose_devices(config.opencl, self._journal.say)
         self._bus = ZenohBus(config.distributed)
         for topic in ("depth", "cloud"):
-            self._bus.announce(topic, LAST)
+            self._bus.declare_publisher(topic, LAST)
         self._flight: RemoteFlight | None = None
         self._run = ""
         self._after = -1
         self._needs_whole = True
         self._is_heard = False
         self._over = ""
-        """The flight that has ended."""
+        """Flight that has ended."""
         self._n_malformed = self._n_in_a_row = 0
-        self._told_s = monotonic_s()
+        self._warned_s = monotonic_s()
         self._never = threading.Event()
         where = ", ".join(config.distributed.connect) or "who joins"
         self._journal.say(f"depth and cloud of {config.distributed.vehicle} at {where}")
 
     def run(self) -> None:
-        """Fetch and work until stopped."""
+        """Fetch and process until stopped."""
         while not self._is_stopped():
             if self._flight is None:
                 worked = self._look()
@@ -78,12 +78,12 @@ class DepthNode:
         self._journal.say("stopping")
 
     def close(self) -> None:
-        """Write what there is, and leave."""
+        """Write the results so far, and disconnect."""
         self._end_flight(hurry=True)
         self._bus.close()
 
     def _look(self) -> bool:
-        """Find out what flies; whether there is a flight to work on."""
+        """Find the current flight; whether there is one to work on."""
         answer = self._bus.ask("flight", b"", ASK_S)
         self._heard(answer is not None)
         if answer is None:
@@ -119,7 +119,7 @@ class DepthNode:
         self._after = self._flight.kept.resume_after(run)
 
     def _fetch(self, flight: RemoteFlight) -> bool:
-        """Ask for the next bundle and work on it; whether there was one."""
+        """Ask for the next bundle and process it; whether there was one."""
         wanted = {"run": self._run, "after": self._after, "whole": self._needs_whole}
         answer = self._bus.ask("depth_input", Envelope("wanted", wanted, {}).pack(), ASK_S)
         self._heard(answer is not None)
@@ -166,7 +166,7 @@ class DepthNode:
             )
 
     def _publish(self, topic: str, envelope: Callable[[], Envelope]) -> None:
-        if self._bus.is_wanted(topic):
+        if self._bus.has_subscribers(topic):
             self._bus.publish(topic, envelope().pack())
 
     def _heard(self, is_heard: bool) -> None:
@@ -177,14 +177,14 @@ class DepthNode:
 
     def _malformed(self, error: StreamError) -> None:
         self._n_malformed += 1
-        if self._n_malformed & (self._n_malformed - 1) == 0:  # of many only some are told
+        if self._n_malformed & (self._n_malformed - 1) == 0:  # only some of many are reported
             self._journal.say(f"warning: malformed, {self._n_malformed} so far: {error}", WARNING)
 
     def _tell(self) -> None:
         now_s = monotonic_s()
-        if now_s - self._told_s < self._config.daemon.status_every_s:
+        if now_s - self._warned_s < self._config.daemon.status_every_s:
             return
-        self._told_s = now_s
+        self._warned_s = now_s
         if self._flight is None:
             self._journal.say("waiting for a flight")
             return

@@ -1,7 +1,7 @@
-"""The cloud of a flight that is made in this node, as it grows: what a restart takes up again.
+"""Log of the cloud that this node makes of a flight, from which a restart continues.
 
-A file of cloud envelopes, each after its length (u32, little-endian). What was being written when
-the node ended is left out.
+A file of cloud envelopes, each after its length (u32, little-endian). An incomplete last one is
+ignored.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from companion.topics.message_codec import cloud_envelope, cloud_of_envelope
 
 NAME = "cloud.chunks"
 STEP_BACK = 4
-"""Depth maps whose neighbours were lost with the node; they are made again."""
+"""Depth maps whose neighbours were lost with the node; they are recomputed."""
 MARGIN = 2
 """Bundles before the first of them, whose frames it uses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kept:
-    """A chunk, and the bundle that its keyframe came with."""
+    """A chunk, and the number of the bundle that its keyframe came with."""
 
     chunk: PointChunk
     run: str
@@ -31,12 +31,12 @@ class Kept:
 
 
 class KeptChunks:
-    """The file in a flight's folder. Raises OSError where the folder does not take it."""
+    """The log file in a flight's folder. OSError where the folder cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
         self.found: list[Kept] = []
-        """What was there."""
+        """Chunks found in the file."""
         end = 0
         if self._path.exists():
             end = self._read()
@@ -45,7 +45,7 @@ class KeptChunks:
         self._have = {kept.chunk.keyframe_id for kept in self.found}
 
     def put(self, flight: str, chunk: PointChunk, run: str, number: int) -> bool:
-        """Keep a chunk; False where there is one of its keyframe, which then counts."""
+        """Append a chunk; False where there is one of its keyframe, which then counts."""
         if chunk.keyframe_id in self._have:
             return False
         self._have.add(chunk.keyframe_id)
@@ -57,7 +57,7 @@ class KeptChunks:
         return True
 
     def resume_after(self, run: str) -> int:
-        """The bundle of a run after which to go on; -1: from the oldest that there is."""
+        """Bundle of a run after which to continue; -1: from the oldest available."""
         numbers = sorted(kept.number for kept in self.found if kept.run == run)
         return max(numbers[-STEP_BACK] - MARGIN, -1) if len(numbers) >= STEP_BACK else -1
 
@@ -66,7 +66,7 @@ class KeptChunks:
         self._file.close()
 
     def _read(self) -> int:
-        """Take in what is whole; where that ends."""
+        """Read complete entries; returns the offset of their end."""
         end = 0
         with self._path.open("rb") as file:
             while len(head := file.read(LENGTH.size)) == LENGTH.size:

@@ -1,4 +1,4 @@
-"""Which of the stages run in this node, and with whom it is joined."""
+"""Configuration of a node: its stages and its peers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SETS = (frozenset({TRACKING}), frozenset({DEPTH, CLOUD}), frozenset({TRACKING, D
 
 
 def with_stages(config: Config, stages: Sequence[str] | None, join: Sequence[str]) -> Config:
-    """The configuration with what the options say; InputError where that is no node."""
+    """The configuration with the options applied; InputError for no valid node."""
     distributed = config.distributed
     if stages is not None:
         distributed = replace(distributed, enabled=True, stages=tuple(stages))

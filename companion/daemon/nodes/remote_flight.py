@@ -1,4 +1,4 @@
-"""A flight whose depth and cloud are made here, while it is flown and tracked elsewhere."""
+"""Dense mapping of a flight that is flown and tracked on another machine."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from companion.topics.message_codec import cloud_envelope, depth_envelope
 from drivers.system.journal import WARNING, Journal
 
 Publish = Callable[[str, Callable[[], Envelope]], None]
-"""Given a topic, and what makes an envelope of it."""
+"""Takes a topic, and a function that makes its envelope."""
 MOST_NUMBERS = 200
-"""Keyframes of which it is known with which bundle they came."""
+"""Most keyframes whose bundle number is remembered."""
 
 
 class RemoteFlight:
     """Bundles in; depth maps and points to files, viewers and topics.
 
-    A folder in which there is a cloud of the same flight already is gone on with.
+    A folder that has a cloud of the same flight is continued.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class RemoteFlight:
     ) -> None:  # fmt: skip
         self.flight, self.camera, self.folder = flight, camera, folder
         self.n_missed = 0
-        """Bundles that were gone before they could be fetched."""
+        """Bundles evicted before they could be fetched."""
         self._config, self._devices = config, devices
         self._publish, self._journal = publish, journal
         folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,7 @@ class RemoteFlight:
         return self._result.n_depth_maps
 
     def take(self, bundle: Bundle) -> None:
-        """Work on a bundle. StreamError for pictures that are none; the rest of it counts."""
+        """Process a bundle. StreamError for undecodable images; the rest of it counts."""
         for keyframe in bundle.keyframes:
             self._numbers[keyframe.keyframe_id] = (bundle.run, bundle.number)
         while len(self._numbers) > MOST_NUMBERS:
@@ -85,8 +85,8 @@ class RemoteFlight:
             self._result.take(frame)
             if picture.in_colour:
                 self._look(frame)
-        told: list[Message] = [*bundle.tracks, *bundle.keyframes]
-        for message in told:
+        messages: list[Message] = [*bundle.tracks, *bundle.keyframes]
+        for message in messages:
             self._step(message)
             self._show(message)
         if bundle.change is not None:
@@ -95,9 +95,9 @@ class RemoteFlight:
             self._step(self._update)
 
     def close(self, hurry: bool) -> None:
-        """Make what is still open, and write all results; the page not in a hurry.
+        """Complete open depth maps, and write all results; the page only without `hurry`.
 
-        Where no map has come, nothing is known of where points lie: what is there stays.
+        Where no map has come, nothing is known of the points' places: earlier results stay.
         """
         for out in self._depth.flush():
             self._give(out)
@@ -153,6 +153,6 @@ class RemoteFlight:
 
 
 def _free(folder: Path) -> Path:
-    """A recording that does not exist yet."""
+    """Path of a recording that does not exist yet."""
     names = ["flight.rrd", *(f"flight-{n}.rrd" for n in range(2, 1000))]
     return next(folder / name for name in names if not (folder / name).exists())

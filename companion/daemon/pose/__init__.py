@@ -1,1 +1,1 @@
-"""Poses on their way to the autopilot, and the reset counter that goes with them."""
+"""Poses sent to the autopilot, and their reset counter."""

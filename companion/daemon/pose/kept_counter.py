@@ -1,7 +1,7 @@
-"""The reset counter that an autopilot was last sent, on the disk, for the process after this one.
+"""Reset counter last sent to an autopilot, kept on disk for the next process.
 
-It is written before the first pose that bears it leaves: what is kept may be ahead of what was
-sent, never behind. The disk is waited for by a thread of its own.
+It is written before the first pose that has it is sent: the kept counter may be ahead of what was
+sent, never behind. A thread of its own waits for the disk.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ NAME = "sent_poses.json"
 
 @dataclass(frozen=True, slots=True)
 class KeptCounter:
-    """What one boot of the autopilot was sent."""
+    """Last counter sent in one boot of the autopilot."""
 
     boot: BootIdentity
     reset_counter: int
     home_down_m: float | None = None
-    """Where its home is in its local frame; see `drivers.mavlink.autopilot_height`."""
+    """Position of home on its local frame's down axis; see `drivers.mavlink.autopilot_height`."""
 
 
 def counter_path(flights: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """The file: in the service's state directory, else beside the folder of flights."""
+    """Path in the service's state directory, else beside the folder of flights."""
     state = environment.get("STATE_DIRECTORY", "").split(":")[0]
     return (Path(state) if state else Path(flights).parent) / NAME
 
 
 def read_counter(path: Path) -> KeptCounter | None:
-    """What the file keeps; None where there is none. OSError, ValueError where it is unreadable."""
+    """Content of the file; None where there is none. OSError, ValueError where unreadable."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -70,7 +70,7 @@ class CounterFile:
         self._failed: tuple[KeptCounter, str] | None = None
 
     def ask(self, kept: KeptCounter) -> None:
-        """Have it written; what still waits to be is left out."""
+        """Write this; skips an older request that still waits."""
         with self._lock:
             self._wanted = kept
             if self._writing:
@@ -79,12 +79,12 @@ class CounterFile:
         threading.Thread(target=self._write, name="reset counter", daemon=True).start()
 
     def has(self, kept: KeptCounter) -> bool:
-        """Whether the disk has it."""
+        """Whether it is on disk."""
         with self._lock:
             return self._written == kept
 
     def trouble_with(self, kept: KeptCounter) -> str:
-        """Why it could not be written; "" if it could, or is yet to be."""
+        """Reason why it could not be written; "" if written, or still waiting."""
         with self._lock:
             return self._failed[1] if self._failed is not None and self._failed[0] == kept else ""
 

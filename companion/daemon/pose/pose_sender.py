@@ -1,7 +1,7 @@
-"""Poses to the autopilot: each frame's at once, predicted ones in between, and what was measured.
+"""Poses to the autopilot: each frame's at once, predictions in between, with covariances.
 
-Everything here runs in the event loop. What a pose must be to be sent
-`companion.estimation.pose_gate` decides.
+Everything here runs in the event loop. `companion.estimation.pose_gate` decides which poses are
+sent.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ SWITCHED_OFF = "switched off"
 
 
 class PoseSender:
-    """Odometry of the newest flight in; ODOMETRY or VISION_POSITION_ESTIMATE out, or nothing.
+    """Odometry of the current flight in; ODOMETRY or VISION_POSITION_ESTIMATE out, or nothing.
 
-    The file at `counter_path` keeps what reset counter was sent, for the process after this one.
+    The file at `counter_path` keeps the reset counter sent, for the next process.
     """
 
     def __init__(
@@ -48,14 +48,14 @@ class PoseSender:
         self._gate = PoseGate(config, counter, height.down_m, self._counter.may_begin)
         self._rate, self._latency = RateMeter(), LatencyMeter()
         self._n_sent = 0
-        self._told: str | None = None
+        self._last_text: str | None = None
 
     def restart(self) -> None:
-        """Localisation begins anew."""
+        """Begin anew with another localisation."""
         self._gate.restart()
 
     def reconfigure(self, config: FeedbackConfig) -> None:
-        """Take over other limits, which hold for the next pose, or another way of sending."""
+        """Apply other limits, from the next pose on, or another message."""
         self._config = config
         self._gate.reconfigure(config)
         if config.mode == "off":
@@ -63,11 +63,11 @@ class PoseSender:
             self._tell()
 
     def take_attitude(self, sample: AttitudeSample) -> None:
-        """Take the autopilot's attitude."""
+        """Take an attitude of the autopilot."""
         self._gate.take_attitude(sample)
 
     def take(self, odometry: Odometry) -> None:
-        """Take the odometry of a frame, and send it if it may be sent."""
+        """Take the odometry of a frame, and send it if the gate allows."""
         if self._config.mode == "off":
             return
         self._counter.step(self._gate)
@@ -75,7 +75,7 @@ class PoseSender:
         self._tell()
 
     async def run(self) -> None:
-        """Send predicted poses when they are due, and say when poses cease."""
+        """Send predicted poses when due, and report when poses cease; until cancelled."""
         while True:
             await asyncio.sleep(TICK_S if self._gate.sending else IDLE_TICK_S)
             self.step()
@@ -83,12 +83,12 @@ class PoseSender:
     def step(self) -> None:
         """Send a predicted pose if one is due; to be called every few milliseconds."""
         self._counter.step(self._gate)
-        if self._config.mode != "off" or self._told == "":
+        if self._config.mode != "off" or self._last_text == "":
             self._send(self._gate.due(self._clock.now_ns()))
             self._tell()
 
     def health(self) -> FeedbackHealth:
-        """As it stands now."""
+        """Health of the feedback now."""
         if self._config.mode == "off":
             return FeedbackHealth(n_resets=self._gate.n_resets)
         now_ns = self._clock.now_ns()
@@ -119,13 +119,13 @@ class PoseSender:
             self._latency.add(now_ns, (now_ns - pose.t_ns) * 1e-6)
 
     def _tell(self) -> None:
-        """The pilot hears when poses begin and cease."""
+        """Tell the pilot when poses begin and cease."""
         state = "" if self._gate.sending else self._gate.why_not
-        if self._gate.sending and self._told != "":
-            told = self._link.say(POSITION_ON())
-        elif not self._gate.sending and self._told == "":
-            told = self._link.say(position_lost(state))
+        if self._gate.sending and self._last_text != "":
+            sent = self._link.say(POSITION_ON())
+        elif not self._gate.sending and self._last_text == "":
+            sent = self._link.say(position_lost(state))
         else:
             return
-        if told:  # else it is tried again
-            self._told = state
+        if sent:  # else it is tried again
+            self._last_text = state

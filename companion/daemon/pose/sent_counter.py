@@ -1,4 +1,4 @@
-"""The reset counter of the poses that are sent, tied to the autopilot's boot and to the disk."""
+"""Reset counter of the poses sent, tied to the boot of the autopilot and kept on disk."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.system.computer_boot import computer_boot
 
 PATIENCE_NS = 1_000_000_000
-"""The first pose of a row waits no longer for the disk. Cards that are written to by a recording
-take some tenths of a second; the counter of a reset is written while the pose is proven."""
+"""Longest wait of the first pose of a sequence for the disk. Cards in use by a recording take some
+tenths of a second; the counter of a reset is written while the pose is proven."""
 NO_CLOCK = "no autopilot clock"
 WAITING = "disk is slow"
 NOT_KEPT = "reset counter is not kept"
 
 
 class SentCounter:
-    """Reads what was kept, and has kept what is sent. To be used in the event loop.
+    """Restores the kept counter, and keeps the one that is sent. To be used in the event loop.
 
-    Where nothing can be kept, poses go out all the same, with a counter that was probably never
-    sent before; it is said once.
+    Where nothing can be kept, poses are sent all the same, with a counter that was probably never
+    sent before; a single warning says so.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class SentCounter:
         self._said = False
 
     def step(self, gate: PoseGate) -> None:
-        """Notice another boot of the autopilot, and what is to be written; to be called often."""
+        """Detect another boot of the autopilot, and keep a changed counter; to be called often."""
         before, now = self._boot, self._identity()
         if now is None:
             return
@@ -75,7 +75,7 @@ class SentCounter:
             self._ask()
 
     def may_begin(self, now_ns: int) -> str:
-        """Why no pose may be the first of a row now; "" if one may."""
+        """Reason why no first pose of a sequence may be sent now; "" if it may."""
         if self._boot is None:
             return NO_CLOCK
         asked = self._ask()
@@ -91,7 +91,7 @@ class SentCounter:
         return ""
 
     def _ask(self) -> KeptCounter:
-        """Have the counter written as it is now, unless that was asked for already."""
+        """Write the counter as it is now, unless already requested."""
         asked, boot = self._asked, self._boot
         assert boot is not None
         if (
@@ -104,7 +104,7 @@ class SentCounter:
         return asked
 
     def _kept_for(self, boot: BootIdentity) -> int | None:
-        """What a process before this one last sent to this boot; None if there was nothing."""
+        """Counter last sent to this boot by a process before; None without one."""
         if self._unreadable:
             self._say(self._unreadable)
             return unlike_any(self._clock.now_ns() * 1e-9) - 1

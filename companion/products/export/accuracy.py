@@ -1,4 +1,4 @@
-"""How far what is exported can be trusted, in words, from the numbers of the run's report."""
+"""Accuracy statement of an export, from the numbers of the run's report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ABSOLUTE = (
 
 
 class Axes(Enum):
-    """What the coordinates of an export are."""
+    """Coordinate frame of an export."""
 
     LOCAL = "local north, east, down in metres"
     FIRST_CAMERA = "right, down, forward of the first camera that was placed, in metres from it"
@@ -29,7 +29,7 @@ class Axes(Enum):
 
 
 def accuracy_statement(run: FinishedRun, file: str, axes: Axes | MapFrame) -> bytes:
-    """A page of text beside an export; for those in map coordinates `axes` is the map's frame."""
+    """Text beside an export; `axes` is the map frame of exports in map coordinates."""
     report = run.report
     lines = [f"{file}: how it was placed, and how far that can be trusted", ""]
     lines += _placed(run, axes)
@@ -55,12 +55,12 @@ def accuracy_statement(run: FinishedRun, file: str, axes: Axes | MapFrame) -> by
 
 
 def remarks_on_heights(run: FinishedRun) -> list[str]:
-    """What the run's warnings say against its heights: they are then not those above the sea."""
+    """Warnings of the run about its heights: they are then not above mean sea level."""
     return [f"{what}: {detail}" for what, detail in _warnings(run) if what.startswith("heights")]
 
 
 def _warnings(run: FinishedRun) -> list[tuple[str, str]]:
-    """What, and its first detail."""
+    """Kinds of warning, with the first detail of each."""
     return [
         (str(warning.get("what")), str(warning.get("first_detail", "")))
         for warning in run.report.get("warnings") or []

@@ -1,4 +1,4 @@
-"""The cloud as LAS 1.4, plain or packed (LAZ)."""
+"""Point cloud as LAS 1.4, uncompressed or LAZ."""
 
 from __future__ import annotations
 

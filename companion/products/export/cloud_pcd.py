@@ -1,4 +1,4 @@
-"""The cloud as a binary PCD file of the Point Cloud Library."""
+"""Point cloud as a binary PCD file of the Point Cloud Library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a finished run can be exported as, and beside each file how far it can be trusted."""
+"""Exports of a finished run, each file with a statement of its accuracy."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from companion.products.run_folder import FinishedRun
 
 @dataclass(eq=False)
 class Export:
-    """A run about to be exported; what several formats need is made once."""
+    """A run to be exported; data that several formats need is made once."""
 
     run: FinishedRun
     config: ExportConfig
 
     @cached_property
     def frame(self) -> MapFrame:
-        """Of maps and clouds."""
+        """Coordinate frame of maps and clouds."""
         above_sea = not remarks_on_heights(self.run)
         return map_frame(self.run.origin, self.run.metric, self.config.epsg, above_sea)
 
     @cached_property
     def surface(self) -> Surface:
-        """The ground as rasters."""
+        """Height and colour rasters of the ground."""
         return surface_of(self.run.cloud, self.frame, self.config.cell_m)
 
     @property
     def origin(self) -> GeoOrigin:
-        """Where on Earth it was; InputError where that is not known."""
+        """Geodetic origin; InputError where unknown."""
         if self.run.origin is None:
             raise InputError(
                 f"{self.run.path}: no place on Earth is known of this run, so that gpx, kml and "
@@ -54,12 +54,12 @@ class Export:
 
     @property
     def name(self) -> str:
-        """What to call it."""
+        """Name of the run."""
         return self.run.path.resolve().name
 
 
 class Product(NamedTuple):
-    """The files of a format, each with what makes it, and what their coordinates are."""
+    """Files of a format, each with its writer, and their coordinate frame."""
 
     what: str
     files: Mapping[str, Callable[[Export], bytes]]
@@ -116,8 +116,8 @@ PRODUCTS: Mapping[str, Product] = {
 def export_run(run: FinishedRun, out: Path, config: ExportConfig) -> list[Path]:
     """Write `config.formats` into folder `out`, each file with FILE.accuracy.txt beside it.
 
-    Everything is made before anything is written. InputError where a format is unknown, or cannot
-    be had of this run; return the files.
+    All files are made before any is written. InputError for an unknown format, or one that this run
+    cannot give; return the files.
     """
     check_formats(config)
     export = Export(run, config)

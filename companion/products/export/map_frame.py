@@ -1,7 +1,7 @@
-"""Coordinates of maps: where a run's points lie in UTM, in a given projection, or about its start.
+"""Map coordinates of a run: UTM, a given projection, or a local frame.
 
-Axes are east, north, up. Heights are the autopilot's, above mean sea level: the geoid that its GPS
-receiver knows, which for most is EGM96.
+Axes are east, north, up. Heights are the autopilot's, above mean sea level: by the geoid of its GPS
+receiver, which for most is EGM96.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class MapFrame:
 
     @property
     def wkt_with_height(self) -> str:
-        """What is written where heights are meant too, if they are what they should be."""
+        """WKT with the vertical frame, if heights are above mean sea level."""
         if not (self.wkt and self.above_sea):
             return self.wkt
         return f'COMPD_CS["{self.name} + EGM96 height",{self.wkt},{EGM96}]'
@@ -53,7 +53,7 @@ class MapFrame:
     def directions(self, vectors_ned: NDArray[np.floating], about: NDArray[np.floating]) -> Array:
         """Unit vectors (N, 3) in local NED, or zeros, in this frame.
 
-        Grid north is not true north: they are turned as in the middle of points `about` (N, 3).
+        Grid north is not true north: the rotation is that at the mean of points `about` (N, 3).
         """
         if len(vectors_ned) == 0:
             return np.zeros((0, 3))
@@ -68,9 +68,8 @@ def map_frame(
 ) -> MapFrame:
     """The frame with this EPSG number; by 0 the UTM zone of the origin, or without one local.
 
-    What is not `metric` keeps the map's own axes. `above_sea` tells whether heights are.
-
-    InputError where there is no such projection in metres, or no origin for it.
+    Where not `metric` the map's own axes are kept. `above_sea` tells whether heights are above mean
+    sea level. InputError where there is no such projection in metres, or no origin for it.
     """
     if origin is None:
         if epsg:

@@ -1,4 +1,4 @@
-"""The camera's path as places on Earth: GPX, KML and GeoJSON (WGS84, heights above the sea)."""
+"""Camera path in geodetic coordinates: GPX, KML and GeoJSON (WGS84, heights above sea level)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.products.flight_result import WorldPose
 
 
 def places_of(poses: Sequence[WorldPose], origin: GeoOrigin) -> Array:
-    """Latitude, longitude and height (N, 3) of the camera."""
+    """Latitude, longitude and height (N, 3) of the camera; degrees and metres."""
     if not poses:
         return np.zeros((0, 3))
     ned = np.stack([pose.world_from_camera.translation for pose in poses])
@@ -36,7 +36,7 @@ def path_gpx(poses: Sequence[WorldPose], origin: GeoOrigin, name: str) -> bytes:
 
 
 def path_kml(poses: Sequence[WorldPose], origin: GeoOrigin, name: str) -> bytes:
-    """KML 2.2: one line at its true height."""
+    """KML 2.2: one line with absolute heights."""
     line = "\n".join(
         f"{lon:.9f},{lat:.9f},{height:.3f}" for lat, lon, height in places_of(poses, origin)
     )
@@ -50,7 +50,7 @@ def path_kml(poses: Sequence[WorldPose], origin: GeoOrigin, name: str) -> bytes:
 
 
 def path_geojson(poses: Sequence[WorldPose], origin: GeoOrigin, name: str) -> bytes:
-    """RFC 7946: a line, or what there is of one, with the times of its places."""
+    """RFC 7946: a LineString with the times of its positions; no geometry below two poses."""
     coordinates = [
         [round(lon, 9), round(lat, 9), round(height, 3)]
         for lat, lon, height in places_of(poses, origin).tolist()

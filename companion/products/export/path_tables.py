@@ -1,4 +1,4 @@
-"""The camera's path in the formats by which programs compare paths."""
+"""Camera path in formats of trajectory evaluation tools."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from companion.products.flight_result import WorldPose
 
 
 def path_kitti(poses: Sequence[WorldPose]) -> bytes:
-    """Twelve numbers a line: the camera in the frame of the first camera, as KITTI has it."""
+    """KITTI: twelve numbers a line, camera poses in the frame of the first camera."""
     if not poses:
         return b""
     first_from_world = poses[0].world_from_camera.inverse()
@@ -18,12 +18,12 @@ def path_kitti(poses: Sequence[WorldPose]) -> bytes:
 
 
 def times_kitti(poses: Sequence[WorldPose]) -> bytes:
-    """Seconds since the first of these poses, a line each."""
+    """KITTI: seconds since the first pose, one a line."""
     return "".join(f"{(pose.t_ns - poses[0].t_ns) * 1e-9:.6e}\n" for pose in poses).encode()
 
 
 def path_euroc(poses: Sequence[WorldPose]) -> bytes:
-    """Nanoseconds, position and quaternion w x y z of the camera in the world."""
+    """EuRoC: nanoseconds, position and quaternion w x y z of the camera in the world."""
     head = (
         "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], "
         "q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"

@@ -1,4 +1,4 @@
-"""The ground as rasters: height and colour of the uppermost surface in each cell of a grid."""
+"""Surface model: rasters of height and colour of the uppermost surface in each grid cell."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from companion.products.cloud import Cloud
 from companion.products.export.map_frame import MapFrame
 
 UPPER_SHARE = 0.75
-"""The surface of a cell is this quantile of its points' heights: above most, below stray ones."""
+"""Quantile of the heights in a cell taken as its surface: above most points, below outliers."""
 MAX_CELLS = 100_000_000
 N_SPACING = 2000
 CELLS_PER_SPACING = 2.0
 MIN_NEIGHBOURS = 3
 FILL_STEPS = 2
-"""Holes up to twice so many cells wide are filled from their rim."""
+"""Holes up to twice this many cells wide are filled from their border."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
     """Rasters with north up: `height` (H, W) f32, nan where none; `rgb` (H, W, 3); `seen` (H, W).
 
-    `west`, `north` is the outer corner of the first cell, all in the map's metres; `seen` tells
-    cells that have points of their own from those filled in.
+    `west`, `north` is the outer corner of the first cell, all in the map's metres; `seen` is False
+    for interpolated cells.
     """
 
     height: Floats
@@ -41,7 +41,7 @@ class Surface:
 
 
 def surface_of(cloud: Cloud, frame: MapFrame, cell_m: float) -> Surface:
-    """Lay a grid over the cloud; by `cell_m` 0 of twice the spacing of its points.
+    """Grid the cloud; `cell_m` 0 takes twice the spacing of its points.
 
     InputError where there are no points, or too many cells.
     """
@@ -75,7 +75,7 @@ def surface_of(cloud: Cloud, frame: MapFrame, cell_m: float) -> Surface:
 
 
 def _spacing(points: Array) -> float:
-    """Median distance of neighbours, seen from above."""
+    """Median distance of neighbours in plan view."""
     flat = points[:, :2]
     sample = flat[:: max(1, len(flat) // N_SPACING)]
     distance, _ = cKDTree(flat).query(sample, k=2)
@@ -83,7 +83,7 @@ def _spacing(points: Array) -> float:
 
 
 def _filled(height: Floats, rgb: Bytes) -> tuple[Floats, Bytes]:
-    """Cells without points that have enough neighbours take their mean, a few steps deep."""
+    """Cells without points that have enough neighbours take their mean, a few iterations."""
     colours = rgb.astype(np.float32)
     for _ in range(FILL_STEPS):
         known = np.isfinite(height)
@@ -97,6 +97,6 @@ def _filled(height: Floats, rgb: Bytes) -> tuple[Floats, Bytes]:
 
 
 def _sums(values: Floats) -> Floats:
-    """Of each cell with its eight neighbours."""
+    """Sum of each cell with its eight neighbours."""
     summed = cv2.filter2D(values, -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT)
     return np.asarray(summed, np.float32)

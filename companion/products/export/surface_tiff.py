@@ -1,4 +1,4 @@
-"""The surface as GeoTIFF: heights, and an orthomosaic of what the cloud saw from above."""
+"""Surface model as GeoTIFF: heights, and an orthomosaic of the cloud's colours."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ TILED = {"compress": "deflate", "tiled": True, "blockxsize": 256, "blockysize": 
 
 
 def surface_tiff(surface: Surface, frame: MapFrame) -> bytes:
-    """Heights as 32 bit numbers, metres; -9999 where there are none."""
+    """Heights in metres as 32-bit floats; nodata -9999."""
     heights = np.where(np.isfinite(surface.height), surface.height, NODATA)[None]
     return _tiff(heights.astype(np.float32), surface, frame, nodata=NODATA, predictor=3)
 
 
 def orthomosaic_tiff(surface: Surface, frame: MapFrame) -> bytes:
-    """Red, green, blue and alpha; clear where nothing was seen.
+    """Red, green, blue and alpha; transparent where not seen.
 
-    Made of the cloud's colours, so that it is no finer than the cloud.
+    Made of the cloud's colours, and so no finer than the cloud.
     """
     alpha = np.where(np.isfinite(surface.height), 255, 0).astype(np.uint8)
     bands = np.concatenate([np.moveaxis(surface.rgb, 2, 0), alpha[None]])

@@ -1,4 +1,4 @@
-"""All flights of a batch on one page: a row and a picture for each."""
+"""HTML page about all flights of a batch: a row and a picture for each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 
 class Row(Protocol):
-    """What is shown of a flight."""
+    """One flight."""
 
     @property
     def name(self) -> str:
@@ -20,19 +20,19 @@ class Row(Protocol):
 
     @property
     def flight(self) -> Path:
-        """Where it was read."""
+        """Path of its source."""
 
     @property
     def error(self) -> str:
-        """What went wrong; "" where nothing did."""
+        """Error message; "" without one."""
 
     @property
     def report(self) -> dict[str, Any]:
-        """The numbers of its report."""
+        """Numbers of its report."""
 
 
 def batch_page(rows: Sequence[Row], pictures: Mapping[str, bytes]) -> bytes:
-    """HTML with the pictures, JPEG by name, in it; the reports are linked."""
+    """HTML with the pictures, JPEG by name, embedded; links to the reports."""
     environment = Environment(
         loader=PackageLoader("companion.products.report", ""),
         autoescape=True,

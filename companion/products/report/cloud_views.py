@@ -1,4 +1,4 @@
-"""The cloud as pictures: points splatted into a depth buffer, seen without perspective."""
+"""Pictures of the cloud: points splatted into a depth buffer, orthographic."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from companion.products.cloud import Cloud
 
 WIDTH_PX = 1100
 FINER = 2
-"""Views are drawn so much larger and then reduced, which smooths edges."""
+"""Supersampling factor of views, for smooth edges."""
 MAX_SPLAT_PX = 25
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudView:
-    """A picture (WebP, transparent where nothing is) and what lies over it, in its pixels.
+    """A picture (WebP, transparent where empty) and its overlay in pixels.
 
     `paths` are polylines (N, 2) of the camera; `bar` is a round length in the world's unit and
-    `bar_px` how long it is here.
+    `bar_px` its length in the picture.
     """
 
     title: str
@@ -38,32 +38,32 @@ class CloudView:
     bar_px: float
 
 
-def cloud_views(cloud: Cloud, stretches: Sequence[Array]) -> list[CloudView]:
-    """From above with north up, from the side, and at a slant; none for an empty cloud.
+def cloud_views(cloud: Cloud, segments: Sequence[Array]) -> list[CloudView]:
+    """Plan view with north up, side view, and oblique view; none for an empty cloud.
 
-    `stretches` are unbroken parts (N, 3) of the camera's path in the world (north, east, down).
+    `segments` are unbroken parts (N, 3) of the camera's path in the world (north, east, down).
     """
     if len(cloud) == 0:
         return []
-    heading = side_heading_rad(cloud, stretches)
+    heading = side_heading_rad(cloud, segments)
     side = f"From the side, looking {compass_point(heading)}"
     slant_heading = heading + np.radians(30)
     slant = f"At a slant, looking {compass_point(slant_heading)}"
     return [
-        _view("From above", cloud, stretches, 0.0, np.pi / 2, (1.3, 3.0)),
-        _view(side, cloud, stretches, heading, 0.0, (1.6, 1.6)),
-        _view(slant, cloud, stretches, slant_heading, np.radians(35), (1.6, 1.6)),
+        _view("From above", cloud, segments, 0.0, np.pi / 2, (1.3, 3.0)),
+        _view(side, cloud, segments, heading, 0.0, (1.6, 1.6)),
+        _view(slant, cloud, segments, slant_heading, np.radians(35), (1.6, 1.6)),
     ]
 
 
-def side_heading_rad(cloud: Cloud, stretches: Sequence[Array]) -> float:
-    """Heading that sees the cloud at its widest, from where the camera flew."""
+def side_heading_rad(cloud: Cloud, segments: Sequence[Array]) -> float:
+    """Heading from which the cloud is widest, on the side of the camera's path."""
     flat = cloud.points[:, :2].astype(np.float64)
     middle = np.median(flat, axis=0)
     _, axes = np.linalg.eigh(np.cov((flat - middle).T) if len(flat) > 1 else np.eye(2))
     across = axes[:, 0]
-    if stretches:
-        ahead = float(across @ (middle - np.median(np.concatenate(stretches)[:, :2], axis=0)))
+    if segments:
+        ahead = float(across @ (middle - np.median(np.concatenate(segments)[:, :2], axis=0)))
     else:
         ahead = float(across[0])
     if ahead < 0:
@@ -72,7 +72,7 @@ def side_heading_rad(cloud: Cloud, stretches: Sequence[Array]) -> float:
 
 
 def compass_point(heading_rad: float) -> str:
-    """The nearest of eight.
+    """Nearest of eight compass points.
 
     >>> compass_point(-1.6)
     'west'
@@ -81,7 +81,7 @@ def compass_point(heading_rad: float) -> str:
 
 
 def view_axes(heading_rad: float, pitch_down_rad: float) -> Array:
-    """Rows right, up and ahead (3, 3) of a view, in the world (north, east, down)."""
+    """Rows right, up and forward (3, 3) of a view, in the world (north, east, down)."""
     ch, sh = np.cos(heading_rad), np.sin(heading_rad)
     cp, sp = np.cos(pitch_down_rad), np.sin(pitch_down_rad)
     ahead = np.array([ch * cp, sh * cp, sp])
@@ -104,7 +104,7 @@ def splat(
 ) -> tuple[Bytes, Array]:
     """Draw points (N, 2) as squares of `size`, the nearest on top.
 
-    Returns the picture (H, W, 3) and how far ahead each pixel is (H, W), inf where nothing is.
+    Returns the picture (H, W, 3) and the depth of each pixel (H, W), inf where empty.
     """
     order = np.argsort(-ahead, kind="stable")
     columns, rows = np.floor(pixels[order] + 0.5).astype(np.int64).T
@@ -121,14 +121,14 @@ def splat(
 def _view(
     title: str,
     cloud: Cloud,
-    stretches: Sequence[Array],
+    segments: Sequence[Array],
     heading_rad: float,
     pitch_rad: float,
     aspects: tuple[float, float],
 ) -> CloudView:
     axes = view_axes(heading_rad, pitch_rad)
     seen = cloud.points.astype(np.float64) @ axes.T
-    flown = [stretch @ axes.T for stretch in stretches]
+    flown = [segment @ axes.T for segment in segments]
     low, high = _frame(seen, flown, aspects)
     px_per_unit = WIDTH_PX / (high[0] - low[0])
     width, height = WIDTH_PX, round((high[1] - low[1]) * px_per_unit)
@@ -144,16 +144,16 @@ def _view(
     bar = round_length(width / px_per_unit / 4)
     return CloudView(
         title, bool(pitch_rad > 1.5), _encode(shaded, np.isfinite(nearest), width, height),
-        width, height, [to_pixels(stretch) for stretch in flown], bar, float(bar * px_per_unit),
+        width, height, [to_pixels(segment) for segment in flown], bar, float(bar * px_per_unit),
     )  # fmt: skip
 
 
 def _frame(
     seen: Array, flown: Sequence[Array], aspects: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """Corners (2,), low and high, around the path and all but stray points.
+    """Corners (2,), low and high, around the path and all points but outliers.
 
-    Width over height lies within `aspects`: what is too narrow or too low gets room beside it.
+    Width over height lies within `aspects`: a view too narrow or too low is padded.
     """
     low, high = np.percentile(seen[:, :2], [0.2, 99.8], axis=0)
     for line in flown:
@@ -168,14 +168,14 @@ def _frame(
 
 
 def _splat_px(pixels: Array) -> int:
-    """Side of squares that just close the gaps between neighbours, by how dense points lie."""
+    """Side of squares that just close the gaps between points, by their density."""
     cells = np.unique(np.floor(pixels / 16).astype(np.int64), axis=0)
     per_cell = len(pixels) / len(cells)
     return int(np.clip(np.ceil(1.6 * 16 / np.sqrt(per_cell)), 1, MAX_SPLAT_PX))
 
 
 def _shade(nearest: Array, unit_per_px: float) -> Array:
-    """Darkens what lies behind its neighbours, so that edges show without any light."""
+    """Darken pixels behind their neighbours, so that edges show without lighting."""
     reach = 3
     drop = np.zeros(nearest.shape)
     filled = np.where(np.isfinite(nearest), nearest, np.nan)
@@ -187,7 +187,7 @@ def _shade(nearest: Array, unit_per_px: float) -> Array:
 
 
 def _encode(picture: Array, known: NDArray[np.bool_], width: int, height: int) -> bytes:
-    """Reduce to its size, with soft edges, and encode."""
+    """Downscale to the final size with smooth edges, and encode."""
     solid = known.astype(np.float32)
     full = np.dstack([picture[..., ::-1].astype(np.float32) * solid[..., None], solid])
     small = cv2.resize(full, (width, height), interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""How two runs of one flight differ: poses, cloud, times, in numbers."""
+"""Differences between two runs of one flight: poses, cloud, times."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from companion.products.run_folder import FinishedRun
 from companion.products.trajectory_error import align
 
 MOST_POINTS = 200_000
-"""Of a cloud that are looked up in the other; evenly spread where there are more."""
+"""Most points of a cloud looked up in the other; evenly sampled beyond it."""
 COUNTS = ("frames", "tracked", "segments", "keyframes", "depth_maps", "points", "path_length")
-"""Numbers of the reports that are set side by side."""
+"""Numbers of the reports that are compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseDifference:
-    """Of the frames that both runs placed, by their times: `apart_m`, `turned_deg` (N,).
+    """Frames localised in both runs, by time: `distance_m` (N,), `rotation_deg` (N,).
 
-    Both in the world as each run has it; `aligned_rms_m` is what is left after the best similarity,
-    whose scale is `scale`.
+    Both in the world of each run; `aligned_rms_m` is the ATE after the best similarity, whose scale
+    is `scale`.
     """
 
     n_only_a: int
@@ -34,15 +34,15 @@ class PoseDifference:
     t_ns: Array
     centres_a: Array
     centres_b: Array
-    apart_m: Array
-    turned_deg: Array
+    distance_m: Array
+    rotation_deg: Array
     aligned_rms_m: float
     scale: float
 
     @property
     def rms_m(self) -> float:
         """Root mean square of the distances; 0 where no frame is in both."""
-        return float(np.sqrt((self.apart_m**2).mean())) if len(self.apart_m) else 0.0
+        return float(np.sqrt((self.distance_m**2).mean())) if len(self.distance_m) else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class CloudDifference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Of run B with run A; `same_files` says of each result whether its bytes are the same."""
+    """Run B compared to run A; `same_files` says for each result whether its bytes are equal."""
 
     same_files: Mapping[str, bool]
     poses: PoseDifference
@@ -65,17 +65,17 @@ class Comparison:
     config: Mapping[str, tuple[Any, Any]]
     """Keys that differ."""
     versions: Mapping[str, tuple[Any, Any]]
-    """Likewise."""
+    """Versions that differ."""
     unit: str
 
     @property
     def identical(self) -> bool:
-        """Whether poses and cloud are the same to the last bit."""
+        """Whether poses and cloud are equal to the last bit."""
         return all(self.same_files.values())
 
 
 def compare_runs(a: FinishedRun, b: FinishedRun) -> Comparison:
-    """Compare two finished runs; InputError where no frame of one is in the other."""
+    """Compare two finished runs; InputError where they have no frame in common."""
     times = [{pose.t_ns for pose in run.poses} for run in (a, b)]
     if all(times) and times[0].isdisjoint(times[1]):
         raise InputError(
@@ -99,7 +99,7 @@ def compare_runs(a: FinishedRun, b: FinishedRun) -> Comparison:
 
 
 def numbers(found: Comparison) -> dict[str, Any]:
-    """The comparison for programs; null for what there is nothing of."""
+    """The comparison as JSON; null for missing values."""
     poses, cloud = found.poses, found.cloud
     return {
         "identical": found.identical,
@@ -107,8 +107,8 @@ def numbers(found: Comparison) -> dict[str, Any]:
         "unit": found.unit,
         "poses": {
             "common": len(poses.t_ns), "only_a": poses.n_only_a, "only_b": poses.n_only_b,
-            "rms": poses.rms_m, "max": _largest(poses.apart_m),
-            "turned_deg_max": _largest(poses.turned_deg),
+            "rms": poses.rms_m, "max": _largest(poses.distance_m),
+            "turned_deg_max": _largest(poses.rotation_deg),
             "aligned_rms": poses.aligned_rms_m, "scale": poses.scale,
         },
         "cloud": {

@@ -1,4 +1,4 @@
-"""The comparison of two runs as one page that needs no other file."""
+"""HTML page of a comparison, self-contained."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_POINTS = 3000
 
 
 def comparison_page(found: Comparison, name_a: str, name_b: str) -> bytes:
-    """HTML with all styles and plots in it."""
+    """HTML with all styles and plots embedded."""
     environment = Environment(
         loader=PackageLoader("companion.products.report", ""),
         autoescape=True,
@@ -43,7 +43,7 @@ def comparison_page(found: Comparison, name_a: str, name_b: str) -> bytes:
 
 
 def shown(value: Any) -> str:
-    """A number as short as it says enough; a dash for none."""
+    """A number with few digits; a dash for none."""
     if value is None:
         return "-"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -55,7 +55,7 @@ def _path(found: Comparison) -> Markup | None:
         return None
     step = -(-len(poses.t_ns) // MAX_POINTS)
     figure = Figure(figsize=(11, 4.4), layout="constrained")
-    plan, apart = figure.subplots(1, 2)
+    plan, distance = figure.subplots(1, 2)
     for centres, colour, width, name in (
         (poses.centres_a, A, 3.5, "A"),
         (poses.centres_b, B, 1.2, "B"),
@@ -66,15 +66,15 @@ def _path(found: Comparison) -> Markup | None:
     plan.set_ylabel(f"north [{found.unit}]")
     plan.legend()
     seconds = (poses.t_ns - poses.t_ns[0])[::step] * 1e-9
-    apart.plot(seconds, poses.apart_m[::step], color=DIFFERENCE, lw=1)
-    apart.set_xlabel("time [s]")
-    apart.set_ylabel(f"A and B apart [{found.unit}]")
-    apart.set_ylim(bottom=0)
-    turned = apart.twinx()
-    turned.plot(seconds, poses.turned_deg[::step], color=A, lw=1)
-    turned.set_ylabel("turned [deg], grey")
-    turned.set_ylim(bottom=0)
-    turned.grid(False)
+    distance.plot(seconds, poses.distance_m[::step], color=DIFFERENCE, lw=1)
+    distance.set_xlabel("time [s]")
+    distance.set_ylabel(f"A and B apart [{found.unit}]")
+    distance.set_ylim(bottom=0)
+    rotation = distance.twinx()
+    rotation.plot(seconds, poses.rotation_deg[::step], color=A, lw=1)
+    rotation.set_ylabel("turned [deg], grey")
+    rotation.set_ylim(bottom=0)
+    rotation.grid(False)
     return _svg(figure)
 
 

@@ -1,4 +1,4 @@
-"""The report's plots, as SVG that takes its colours and type from the page."""
+"""Plots of the report, as SVG that takes colours and type from the page."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ STYLE = {
 }
 MAX_POINTS = 3000
 AUTOPILOT: Any = {"color": OTHER, "lw": 4, "alpha": 0.55, "label": "autopilot"}
-"""Broad, since the camera's way often lies right on it."""
+"""Broad line, since the camera's path often lies right on it."""
 MIN_HEIGHT_M = 4.0
 """Least range of a height plot."""
 MIN_HALF = 0.5
-"""Half the least extent of a plan: a camera that stood still is a point with room around it."""
+"""Half the least extent of a plan: a camera that stood still is a point with a margin."""
 
 
-def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> str:
-    """The way from above, north up and east right; positions (N, 3) north, east, down."""
-    everything = [*stretches, *([autopilot] if autopilot is not None else [])]
+def plan_svg(segments: Sequence[Array], autopilot: Array | None, unit: str) -> str:
+    """Plan view of the path, north up and east right; positions (N, 3) north, east, down."""
+    everything = [*segments, *([autopilot] if autopilot is not None else [])]
     with _style("plan"):
         low, high = _bounds(everything)
         middle, half = (low + high) / 2, np.maximum(0.53 * (high - low), MIN_HALF)
@@ -63,9 +63,9 @@ def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> 
         axes = figure.add_subplot()
         if autopilot is not None:
             axes.plot(*_thin(autopilot)[:, 1::-1].T, **AUTOPILOT)
-        _draw_stretches(axes, [stretch[:, 1::-1] for stretch in stretches])
-        if stretches:
-            first, last = stretches[0][0], stretches[-1][-1]
+        _draw_segments(axes, [segment[:, 1::-1] for segment in segments])
+        if segments:
+            first, last = segments[0][0], segments[-1][-1]
             axes.plot(first[1], first[0], "o", ms=8, mfc="none", mec=PATH, label="start")
             axes.plot(last[1], last[0], "s", ms=6, color=PATH, label="end")
         metric = unit == "m"
@@ -79,7 +79,7 @@ def plan_svg(stretches: Sequence[Array], autopilot: Array | None, unit: str) -> 
 
 
 def height_svg(
-    stretches: Sequence[tuple[Array, Array]],
+    segments: Sequence[tuple[Array, Array]],
     autopilot: tuple[Array, Array] | None,
     unit: str,
     duration_s: float,
@@ -92,7 +92,7 @@ def height_svg(
             t_s, position = autopilot
             line = _thin(np.stack([t_s, -position[:, 2]], 1))
             axes.plot(*line.T, **AUTOPILOT)
-        _draw_stretches(axes, [np.stack([t, -p[:, 2]], 1) for t, p in stretches])
+        _draw_segments(axes, [np.stack([t, -p[:, 2]], 1) for t, p in segments])
         axes.set_ylabel("height [m]" if unit == "m" else f"-z [{unit}]")
         low, high = axes.get_ylim()
         if unit == "m" and high - low < MIN_HEIGHT_M:  # else centimetres look like mountains
@@ -104,7 +104,7 @@ def height_svg(
 
 
 def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
-    """Map points found in each frame, over bands where the place was not known."""
+    """Map points found in each frame, over bands where the pose was unknown."""
     with _style("tracking"):
         figure = Figure(figsize=(11.6, 2.6), layout="constrained")
         axes = figure.add_subplot()
@@ -113,7 +113,9 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
         found = np.where(known, [float(track.n_inliers) for track in tracks], np.nan)
         axes.plot(*_thin(np.stack([t_s, found], 1)).T, color=PATH, lw=1.2, label="map points found")
         for state, colour in (
-            (TrackState.INITIALISING, IDLE), (TrackState.COASTING, OTHER), (TrackState.LOST, BAD),
+            (TrackState.INITIALISING, IDLE),
+            (TrackState.DEAD_RECKONING, OTHER),
+            (TrackState.LOST, BAD),
         ):  # fmt: skip
             here = np.array([track.state is state for track in tracks])
             axes.fill_between(
@@ -130,7 +132,7 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
 
 
 def stages_svg(stage_times: Mapping[str, Mapping[str, float]]) -> str:
-    """Milliseconds for one call of each stage: bars to the median, lines to the 95th percentile."""
+    """Milliseconds per call of each stage: bars to the median, lines to the 95th percentile."""
     with _style("stages"):
         names = sorted(stage_times, key=lambda name: -stage_times[name]["total_s"])
         figure = Figure(figsize=(6.4, 0.32 * len(names) + 0.9), layout="constrained")
@@ -153,18 +155,18 @@ def stages_svg(stage_times: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _style(name: str) -> AbstractContextManager[None]:
-    """The report's style; the plot's name keeps its element ids apart from those of others."""
+    """Style of the report; the plot's name keeps its element ids unique."""
     style: Any = {**STYLE, "svg.hashsalt": name}
     return matplotlib.rc_context(style)
 
 
-def _draw_stretches(axes: Axes, lines: Sequence[Array]) -> None:
+def _draw_segments(axes: Axes, lines: Sequence[Array]) -> None:
     for n, line in enumerate(lines):
         axes.plot(*_thin(line).T, color=PATH, lw=1.8, label="camera" if n == 0 else "_")
 
 
 def _thin(line: Array) -> Array:
-    """At most `MAX_POINTS` of a line's points, its ends among them."""
+    """At most `MAX_POINTS` points of a line, its ends included."""
     if len(line) <= MAX_POINTS:
         return line
     thinned: Array = line[np.linspace(0, len(line) - 1, MAX_POINTS).round().astype(int)]
@@ -177,7 +179,7 @@ def _bounds(parts: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def _edges(t_s: Array) -> Array:
-    """Time of each frame, and where the last one ends."""
+    """Time of each frame, and the end of the last one."""
     step = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.05
     return np.append(t_s, t_s[-1] + step)
 
@@ -195,7 +197,7 @@ def _legend(axes: Axes) -> None:
 
 
 def _svg(figure: Figure) -> str:
-    """The figure as an element to put into a page, the same bytes each time."""
+    """The figure as an element to embed in a page, the same bytes each time."""
     figure.patch.set_alpha(0)
     for axes in figure.axes:
         axes.patch.set_alpha(0)

@@ -1,4 +1,4 @@
-"""What a run came to, in numbers, for programs and for the report's page."""
+"""Numbers of a run, for programs and for the report's page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.products.trajectory_file import exact_seconds
 def report(
     result: FlightResult, facts: RunFacts, poses: Sequence[WorldPose], cloud: Cloud
 ) -> dict[str, Any]:
-    """All numbers; lengths in `unit`, times in seconds, null for what is not known."""
+    """All numbers; lengths in `unit`, times in seconds, null for unknown values."""
     first, last = result.first_t_ns, result.last_t_ns
     duration_s = (last - first) * 1e-9 if first is not None and last is not None else 0.0
     spans = state_spans(result.tracks)
@@ -42,7 +42,7 @@ def report(
                 "moved": _finite(r.moved),
                 "scale": _finite(r.scale),
             }
-            for r in result.reunions
+            for r in result.loop_closures
         ],
         "depth_maps": result.n_depth_maps,
         "points": len(cloud),
@@ -75,12 +75,12 @@ def report(
 
 
 def report_json(numbers: dict[str, Any]) -> bytes:
-    """The numbers as JSON; raises ValueError on nan and infinity, which JSON has not."""
+    """The numbers as JSON; ValueError on nan and infinity, which JSON has not."""
     return (json.dumps(numbers, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def state_spans(tracks: Sequence[Track]) -> list[dict[str, Any]]:
-    """Stretches of one state: seconds since the first frame, and how many frames."""
+    """Spans of one tracking state: seconds since the first frame, and number of frames."""
     spans: list[dict[str, Any]] = []
     for track in tracks:
         t_s = round((track.t_ns - tracks[0].t_ns) * 1e-9, 3)

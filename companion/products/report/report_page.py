@@ -1,4 +1,4 @@
-"""The report as one page that needs no other file."""
+"""HTML page of the report, self-contained."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from companion.products.report.cloud_views import CloudView, cloud_views
 
 N_DEPTH_PICTURES = 6
 LAST_CENTURY_NS = 946_684_800 * 10**9
-"""Times before 2000 come from a clock that was never set, and are no dates."""
+"""Times before 2000 are of a clock that was never set, and are no dates."""
 
 
 def report_page(
@@ -30,7 +30,7 @@ def report_page(
     cloud: Cloud,
     numbers: dict[str, Any],
 ) -> bytes:
-    """HTML with all styles and pictures in it; `numbers` are those of report.json."""
+    """HTML with all styles and pictures embedded; `numbers` are those of report.json."""
     environment = Environment(
         loader=PackageLoader("companion.products.report", ""),
         autoescape=True,
@@ -39,13 +39,13 @@ def report_page(
         lstrip_blocks=True,
     )
     environment.filters.update(distance=distance, thousands=thousands, number=number)
-    stretches = path_stretches(poses)
+    segments = path_segments(poses)
     page = environment.get_template("report.html.j2").render(
         n=numbers,
         when=when(result.first_t_ns),
-        plots=_plots(result, facts, stretches, numbers["duration_s"]),
+        plots=_plots(result, facts, segments, numbers["duration_s"]),
         autopilot=_autopilot_name(result),
-        views=[_view(view) for view in cloud_views(cloud, [p for _, p in stretches])],
+        views=[_view(view) for view in cloud_views(cloud, [p for _, p in segments])],
         depths=_depths(result),
         stages={**numbers["stages"], **kernel_stages(result)},
         config=json.dumps(numbers["config"], indent=2, ensure_ascii=False),
@@ -54,14 +54,14 @@ def report_page(
 
 
 def kernel_stages(result: FlightResult) -> dict[str, dict[str, float]]:
-    """Times of the kernels, named so that they can stand among the stages."""
+    """Times of the kernels, named for the table of stages."""
     return {f"{name} (kernel)": times for name, times in result.kernel_times().items()}
 
 
-def path_stretches(poses: Sequence[WorldPose]) -> list[tuple[Array, Array]]:
+def path_segments(poses: Sequence[WorldPose]) -> list[tuple[Array, Array]]:
     """Parts of the path without gaps: t_ns (N,) and positions (N, 3) in the world.
 
-    A gap is five times the usual step, and half a second at least.
+    A gap is longer than five times the median step, and half a second at least.
     """
     if not poses:
         return []
@@ -91,7 +91,7 @@ def distance(value: float, unit: str = "m") -> str:
 
 
 def number(value: float) -> str:
-    """A number as short as it can be read."""
+    """A number with as few digits as it can be read by."""
     if value == 0:
         return "0"
     digits = int(np.clip(2 - np.floor(np.log10(abs(value))), 0, 3))
@@ -106,22 +106,22 @@ def thousands(value: int) -> str:
 def _plots(
     result: FlightResult,
     facts: RunFacts,
-    stretches: Sequence[tuple[Array, Array]],
+    segments: Sequence[tuple[Array, Array]],
     duration_s: float,
 ) -> dict[str, Markup | None]:
-    """The plots that there is something for; they are markup of our own making."""
+    """The plots that have data; they are markup of our own making."""
     first = result.first_t_ns or 0
     found = result.autopilot_path()
     autopilot = None
     placed = result.georeference is not None and result.georeference.has_origin
-    if found is not None and (placed or not stretches):
+    if found is not None and (placed or not segments):
         _, t_ns, position = found
         during = (t_ns >= first) & (t_ns <= (result.last_t_ns or first))
         if during.any():
             autopilot = ((t_ns[during] - first) * 1e-9, position[during])
     unit = "m" if autopilot is not None else result.unit
-    flown = [((t_ns - first) * 1e-9, position) for t_ns, position in stretches]
-    some_path = bool(stretches) or autopilot is not None
+    flown = [((t_ns - first) * 1e-9, position) for t_ns, position in segments]
+    some_path = bool(segments) or autopilot is not None
     stages = {**facts.stage_times, **kernel_stages(result)}
     drawn = {
         "plan": plots.plan_svg([p for _, p in flown], autopilot[1] if autopilot else None, unit)

@@ -1,4 +1,4 @@
-"""The results of a run, as files."""
+"""Result files of a run."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import numpy as np
 from companion.config import FeaturesConfig, MappingConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, angle_between
-from companion.messages import Reunited
+from companion.messages import LoopClosed
 from companion.slam.features.orb_features import Features
 from companion.slam.loop.loop_closure import Reunion, ReunionFinder
 from companion.slam.loop.map_merge import close_loop, weld
@@ -144,7 +144,7 @@ class Atlas:
         self.segments.remove(segment)
         self.segments.append(segment)
 
-    def extend(self, segment: SlamMap, keyframe: Keyframe) -> Reunited | None:
+    def extend(self, segment: SlamMap, keyframe: Keyframe) -> LoopClosed | None:
         """Take a keyframe into a map, and whatever it shows to be the same place."""
         mapper = self.mapper_of(segment)
         for gone in mapper.add(keyframe):
@@ -166,7 +166,7 @@ class Atlas:
         """Know a keyframe again that was put into a map by other means than `extend`."""
         self._places.add(keyframe.keyframe_id, keyframe.features.descriptors)
 
-    def _unite(self, segment: SlamMap, mapper: Mapper, found: Reunion) -> Reunited:
+    def _unite(self, segment: SlamMap, mapper: Mapper, found: Reunion) -> LoopClosed:
         same = found.there is segment
         moved, keyframe, other = 0.0, found.keyframe, found.located.keyframe
         seen_there = around(found.there, other)
@@ -185,7 +185,7 @@ class Atlas:
             self._due = segment if not same or moved else self._due
         elif not same or moved:
             mapper.adjust_all(LOOP_ITERATIONS)
-        return Reunited(
+        return LoopClosed(
             keyframe.t_ns, keyframe.keyframe_id, other.keyframe_id, same, moved, tie.scale
         )
 

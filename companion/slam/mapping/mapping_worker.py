@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from companion.messages import KeyframeAdded, Reunited
+from companion.messages import KeyframeAdded, LoopClosed
 
-Done = list[KeyframeAdded | Reunited]
+Done = list[KeyframeAdded | LoopClosed]
 Job = Callable[[], Done]
 Spare = Callable[[Callable[[], None]], None]
 """Work for when there is no other; it calls what it is given every few milliseconds."""

@@ -14,7 +14,7 @@ import numpy as np
 from companion.config import Config
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, angle_between
-from companion.messages import Frame, KeyframeAdded, Reunited, Track, TrackState
+from companion.messages import Frame, KeyframeAdded, LoopClosed, Track, TrackState
 from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.features.view import View
 from companion.slam.initialisation.bootstrap import Bootstrap, Start
@@ -35,7 +35,7 @@ MIN_FIRM, MIN_FIRM_SHARE = 25, 0.2
 """Without attitude a guess is believed when so many points of the last frame are found by it."""
 PARALLAX_RATIO = 1.5
 """So much more parallax is asked for each time that a map turned out wrong."""
-Told = Track | KeyframeAdded | Reunited
+Told = Track | KeyframeAdded | LoopClosed
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""What a person looks at: a flight becomes a Rerun recording. The only room that knows Rerun."""
+"""Viewer: a flight as a Rerun recording. The only package that knows Rerun."""
 
 import os
 

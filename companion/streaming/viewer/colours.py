@@ -1,4 +1,4 @@
-"""What the colours of the cloud tell: how it looked, how high it is, or how sure it is."""
+"""Colour modes of the cloud: image colour, height, or confidence."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from companion.geometry.transforms import Similarity
 from companion.messages import Bytes, Floats
 
 HEIGHT_PERIOD_M = 20.0
-"""Colours by height begin anew after so many metres, so that no range need be known."""
+"""Period of the colours by height, so that no range need be known."""
 
 
 class Colours(Enum):
-    """See above."""
+    """Colour modes."""
 
     PICTURE = "picture"
     HEIGHT = "height"
@@ -24,7 +24,7 @@ class Colours(Enum):
     def of(
         self, points_camera: Floats, rgb: Bytes, confidence: Floats, place: Similarity | None
     ) -> Bytes:
-        """Colours (N, 3) of points; those of the picture where no height is known yet.
+        """Colours (N, 3) of points; image colours where no height is known yet.
 
         `place` is the world from the points' frame.
         """

@@ -1,4 +1,4 @@
-"""Items to entities: what is drawn where. Called from one thread.
+"""Items to Rerun entities. To be called from one thread.
 
 world                       local NED in metres (z down)
   autopilot/<n>             the autopilot's own path, in pieces
@@ -10,7 +10,7 @@ world                       local NED in metres (z down)
     sparse                  the tracker's points (hidden at first)
 depth                       depth of the newest keyframe, near is red
 earth                       the path and the camera by latitude and longitude
-status                      how all is, in words
+status                      in words
 plots/…, log
 """
 
@@ -48,16 +48,16 @@ from companion.streaming.viewer.status_panel import status_text
 
 IMAGE_PLANE_UNITS = 0.15
 WIDTH = 640
-"""Of pictures, at most; a link that is thin brings smaller ones, which are enlarged."""
+"""Width of pictures; smaller ones, of a thin link, are enlarged."""
 STATE_LEVEL = {
-    Shown.WAITING: 0.0, Shown.LOST: 0.0, Shown.INITIALISING: 1.0, Shown.COASTING: 2.0,
+    Shown.WAITING: 0.0, Shown.LOST: 0.0, Shown.INITIALISING: 1.0, Shown.DEAD_RECKONING: 2.0,
     Shown.TRACKING: 3.0,
 }  # fmt: skip
 PLOTTED = {
     "rate_hz": ("rate", 1.0), "latency_ms": ("latency", 1.0), "link_kbit_s": ("link", 1.0),
     "cpu_share": ("cpu", 100.0), "scale_m": ("scale", 1.0),
 }  # fmt: skip
-"""Facts of the status that are plotted: as what, and in how many of its units."""
+"""Values that are plotted: name of the plot, and factor."""
 SERIES = {
     "height": "m above home", "speed": "m/s", "quality": "% sure", "rate": "poses a second",
     "latency": "ms late", "link": "kbit/s", "cpu": "% busy", "scale": "m per unit of the map",
@@ -73,8 +73,8 @@ NOWHERE = Similarity(1e-6, np.eye(3), np.zeros(3))
 class Drawing:
     """Draws items in one recording.
 
-    Live, what makes up the map is drawn for all times, so that a viewer never holds more than one
-    of it; in a file all has its time.
+    Live, map entities are static, so that a viewer never holds more than one version; in a file all
+    have their time.
     """
 
     def __init__(self, recording: rr.RecordingStream, *, live: bool, colours: Colours) -> None:
@@ -86,12 +86,12 @@ class Drawing:
         self._strips: dict[int, dict[int, Floats]] = {}
         self._coarse: dict[int, PointsItem] = {}
         self._width = 0
-        """Of pictures as they are drawn; 0 before the first."""
+        """Width of the pictures drawn; 0 before the first."""
         self._earth_ns = -(2**63)
         self.go_on_in(recording)
 
     def go_on_in(self, recording: rr.RecordingStream) -> None:
-        """Draw in another recording from now on: what is drawn later needs the places known now."""
+        """Draw in another recording from now on; repeats the places that later entities need."""
         self._rec = recording
         recording.log("world", rr.ViewCoordinates.FRD, static=True)
         for plot, name in SERIES.items():
@@ -170,7 +170,7 @@ class Drawing:
         self._rec.log("world/camera/image/found", found)
 
     def _pinhole(self, width: int) -> None:
-        """The lens of pictures that are so wide."""
+        """Pinhole of pictures of this width."""
         self._width = width
         assert self._flight is not None
         camera = self._flight.camera
@@ -215,7 +215,7 @@ class Drawing:
                 self._path_on_earth(keyframe_id)
 
     def _points(self, item: PointsItem) -> None:
-        """Points of one level; when both are there they become one, which is cheaper to show."""
+        """Points of one level; both levels are merged into one entity, which is cheaper to show."""
         points, rgb, confidence = item.points_camera, item.rgb, item.confidence
         if item.level == FINE:
             coarse = self._coarse.pop(item.keyframe_id, None)

@@ -1,4 +1,4 @@
-"""A flight that goes to files, written by a thread of their own."""
+"""Viewer file of a flight, written by a thread of its own."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.streaming.frame_jpeg import picture_of
 from companion.streaming.items import FlightItem, ImageItem, Item
-from companion.streaming.scene_encoder import Story, Watched
+from companion.streaming.scene_encoder import SceneEncoder, Watched
 from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.drawing import Drawing
 from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.rrd_files import RrdFiles
 
-ROOM_BYTES = 64 << 20
+CAPACITY_BYTES = 64 << 20
 
 
 class FileViewer:
-    """Everything, into a .rrd file: the caller waits when the file cannot keep up.
+    """All messages into a .rrd file: the caller waits when the file cannot keep up.
 
-    No more than `rrd_mb` of it is kept, the newest, in several files. What goes wrong in the thread
-    is raised when the file is closed, and not before. `indexed` is not for long flights, see
-    RrdFiles.
+    At most `rrd_mb` of the newest are kept, in several files. An error of the thread is raised when
+    the file is closed, and not before. `indexed` is not for long flights, see RrdFiles.
     """
 
     def __init__(
@@ -34,8 +33,8 @@ class FileViewer:
     ) -> None:  # fmt: skip
         self._files = RrdFiles(path, config.rrd_mb << 20, indexed)
         self._config = config
-        self._story = Story(FlightItem(path.parent.name, path.parent.name, camera, origin))
-        self._inbox = Inbox(ROOM_BYTES)
+        self._encoder = SceneEncoder(FlightItem(path.parent.name, path.parent.name, camera, origin))
+        self._inbox = Inbox(CAPACITY_BYTES)
         self._fault: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
 
@@ -63,10 +62,10 @@ class FileViewer:
         try:
             colours = Colours(self._config.colours)
             drawing = Drawing(self._files.recording, live=False, colours=colours)
-            drawing.draw(self._story.flight)
+            drawing.draw(self._encoder.flight)
             while (message := self._inbox.get()) is not None:
-                self._draw(drawing, self._story.take(message))
-            self._draw(drawing, self._story.close())
+                self._draw(drawing, self._encoder.take(message))
+            self._draw(drawing, self._encoder.close())
         except BaseException as fault:
             self._fault = fault
             self._inbox.close()

@@ -1,4 +1,4 @@
-"""The process that shows a flight on the machine where it runs: WHERE PORT COLOURS BIND."""
+"""Process of the viewer on the machine of the flight: WHERE PORT COLOURS BIND."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.ground_viewer import show
 from companion.streaming.viewer.live_viewer import READY
 from companion.streaming.viewer.screen import Screen
-from companion.streaming.viewer.web_gate import LOOPBACK
+from companion.streaming.viewer.web_proxy import LOOPBACK
 
 NICE = 10
 

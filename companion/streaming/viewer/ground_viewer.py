@@ -1,7 +1,7 @@
-"""What comes over the link is drawn on a screen. A screen that is slow slows the link, and no more.
+"""Draws items of a link on a screen. A slow screen slows the link, and nothing else.
 
-A call into Rerun whose peer hangs does not return. It is this process that hangs then, on the
-ground; the drone sees that nothing is taken any more, and sends nothing.
+A call into Rerun whose peer hangs does not return. Then this process hangs, on the ground; the
+drone gets no acknowledgements any more, and sends nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FLUSH_S = 2.0
 
 
 def show(link: GroundLink, screen: Screen, colours: Colours, stop: threading.Event) -> None:
-    """Draw all that a link gives, each flight in a recording of its own."""
+    """Draw the items of a link, each flight in a recording of its own."""
     recording: rr.RecordingStream | None = None
     drawing: Drawing | None = None
     flight_id = None
@@ -37,8 +37,8 @@ def show(link: GroundLink, screen: Screen, colours: Colours, stop: threading.Eve
             )
             recording.connect_grpc(screen.address, default_blueprint=layout(live=True))
             drawing = Drawing(recording, live=True, colours=colours)
-        if screen.gate is not None and not isinstance(item, (PoseItem, StatusItem)):
-            screen.gate.wait_for_room(stop)
+        if screen.proxy is not None and not isinstance(item, (PoseItem, StatusItem)):
+            screen.proxy.wait_for_browsers(stop)
         if drawing is not None:
             drawing.draw(item)
     if recording is not None:

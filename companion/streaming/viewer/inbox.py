@@ -1,4 +1,4 @@
-"""The queue before a viewer, bounded by bytes: images are large, all else is small."""
+"""Queue of messages for a viewer, bounded in bytes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from companion.streaming.scene_encoder import Watched
 
 
 class Inbox:
-    """Messages on their way from one thread to another, `room_bytes` of them at most.
+    """Queue of messages between threads, at most `capacity_bytes` of them.
 
-    A message that is larger than the room is let in when nothing else is there.
+    A message larger than that is let in when nothing else is there.
     """
 
-    def __init__(self, room_bytes: int) -> None:
-        self._room = room_bytes
+    def __init__(self, capacity_bytes: int) -> None:
+        self._capacity_bytes = capacity_bytes
         self._held: deque[tuple[Watched, int]] = deque()
         self._bytes = 0
         self._closed = False
@@ -27,25 +27,25 @@ class Inbox:
         return len(self._held)
 
     def put(self, message: Watched) -> None:
-        """Put in a message; wait for room. Does nothing once the inbox is closed."""
+        """Add a message; waits for capacity. Ignored once the inbox is closed."""
         size = size_bytes(message)
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._fits(size, self._room))
+            self._changed.wait_for(lambda: self._closed or self._fits(size, self._capacity_bytes))
             if not self._closed:
                 self._append(message, size)
 
     def offer(self, message: Watched) -> bool:
-        """Put in a message if there is room now; images leave half the room to what is small."""
+        """Add a message if there is capacity now; images leave half of it to small messages."""
         size = size_bytes(message)
-        room = self._room // 2 if isinstance(message, Frame) else self._room
+        capacity = self._capacity_bytes // 2 if isinstance(message, Frame) else self._capacity_bytes
         with self._changed:
-            if self._closed or not self._fits(size, room):
+            if self._closed or not self._fits(size, capacity):
                 return False
             self._append(message, size)
             return True
 
     def get(self) -> Watched | None:
-        """Take out the oldest message; wait for one. None once it is closed and empty."""
+        """Oldest message; waits for one. None once it is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or bool(self._held))
             if not self._held:
@@ -56,13 +56,13 @@ class Inbox:
             return message
 
     def close(self) -> None:
-        """Let in nothing more; what is there can still be taken out."""
+        """End input; waiting messages can still be taken out."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
-    def _fits(self, size: int, room: int) -> bool:
-        return not self._held or self._bytes + size <= room
+    def _fits(self, size: int, capacity: int) -> bool:
+        return not self._held or self._bytes + size <= capacity
 
     def _append(self, message: Watched, size: int) -> None:
         self._held.append((message, size))

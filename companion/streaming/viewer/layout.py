@@ -1,4 +1,4 @@
-"""The layout that is good without a click."""
+"""Default layout of the viewer."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ PLOTS = {
     "Flying": ("height", "speed"), "Quality": ("quality", "cpu"), "Poses": ("rate", "latency"),
     "Link": ("link",),
 }  # fmt: skip
-"""What their numbers are is said by the names of the series; see `drawing`."""
+"""Units are in the names of the series; see `drawing`."""
 LIVE_ONLY = ("Link",)
 RANGES = {"Quality": (0.0, 105.0), "Poses": (0.0, 120.0)}
-"""Plots of a fixed range: what hardly changes is to look so."""
+"""Plots of a fixed range, so that small changes look small."""
 PLOTTED_S = 120.0
 BACKGROUND = [20, 22, 26]
 ZOOM = 17.0
-"""About a metre for a point of the screen."""
+"""About a metre per point of the screen."""
 
 
 def layout(*, live: bool) -> rrb.Blueprint:

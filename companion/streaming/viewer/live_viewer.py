@@ -1,6 +1,6 @@
-"""A flight that is looked at now: an exporter in a process of its own, and who looks at it here.
+"""Live viewers of a flight: an exporter in a process of its own, and a viewer on board.
 
-What links and viewers do happens there. Nothing that becomes of them makes the caller wait.
+Links and viewers are served there. No failure of theirs makes the caller wait.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.reduced import SHOWN, reduced
 from companion.timing.clock import monotonic_s
 
-ROOM_BYTES = 32 << 20
+CAPACITY_BYTES = 32 << 20
 PATIENCE_S = 3.0
 START_S = 30.0
 READY = b"ready"
-"""Said by what shows it here, and what to open in a browser if that is to be done."""
+"""Prefix of the line in which the viewer process reports its address for browsers."""
 EXPORTER, GROUND = "companion.streaming.export_process", "companion.streaming.viewer.ground_process"
 NOWHERE = "none"
 FRAME_EVERY_NS = 60_000_000
-"""Frames that come sooner after another are not for viewers."""
+"""Least interval of frames for viewers."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
 class LiveViewer:
-    """Exports a flight to viewers that connect to `stream.listen`; `look` shows it here, too.
+    """Exports a flight to viewers that connect to `stream.listen`; `look` opens one here, too.
 
-    What there is no room for is given up and counted. `where` is as for `look`.
+    Messages beyond the capacity are dropped and counted. `where` is as for `look`.
     """
 
     def __init__(
@@ -52,15 +52,15 @@ class LiveViewer:
     ) -> None:  # fmt: skip
         self.n_dropped = 0
         self.report: Mapping[str, Any] = {}
-        """What the exporter last said of itself."""
+        """Last report of the exporter."""
         self.closed = ""
-        """Why nobody can connect, if so."""
+        """Reason why nobody can connect, or ""."""
         self.page = ""
-        """What to open in a browser; "" for a window."""
+        """Address for a browser; "" for a window."""
         self._config, self._width = config, min(config.image_width, camera.width)
-        self._inbox = Inbox(ROOM_BYTES)
+        self._inbox = Inbox(CAPACITY_BYTES)
         self._budget: SetBudget | None = None
-        """To be told to the exporter."""
+        """Change to be sent to the exporter."""
         self._frame_ns = -(2**63)
         self._port = 0
         self._has_port = threading.Event()
@@ -98,11 +98,11 @@ class LiveViewer:
             self.n_dropped += 1
 
     def set_budget(self, kbit_s: float) -> None:
-        """Have all viewers together get no more, from the next message on; 0 for no limit."""
+        """Limit the rate of all viewers together from the next message on; 0 for no limit."""
         self._budget = SetBudget(kbit_s)
 
     def look(self, where: str) -> None:
-        """Show it at `web`, `native`, or the rerun+http address of a viewer that runs.
+        """Open a viewer: `web`, `native`, or the rerun+http address of one that runs.
 
         Raises InputError where no viewer can be reached or started.
         """
@@ -122,16 +122,16 @@ class LiveViewer:
 
     @property
     def pid(self) -> int:
-        """Of the exporter."""
+        """Process id of the exporter."""
         return self._exporter.pid
 
     @property
     def alive(self) -> bool:
-        """Whether the exporter is there."""
+        """Whether the exporter runs."""
         return self._exporter.poll() is None
 
     def stalled_s(self, now_s: float) -> float:
-        """For how long the exporter has not taken a message; 0 where none waits for it."""
+        """Seconds for which the exporter has not read a message; 0 where none waits."""
         since_s = self._sending_since_s
         return now_s - since_s if since_s is not None else 0.0
 
@@ -141,7 +141,7 @@ class LiveViewer:
 
     @property
     def is_shown(self) -> bool:
-        """Whether the process is there that shows it here."""
+        """Whether the process of the viewer here runs."""
         return self._ground is not None and self._ground.poll() is None
 
     def __enter__(self) -> LiveViewer:
@@ -156,7 +156,7 @@ class LiveViewer:
         self.close(PATIENCE_S)
 
     def close(self, patience_s: float) -> None:
-        """Show what is queued, and end; each in the time given."""
+        """Send what is queued, and end; each in the time given."""
         self._inbox.close()
         self._thread.join(patience_s)
         children = [child for child in (self._exporter, self._ground) if child is not None]
@@ -217,7 +217,7 @@ def _child(module: str, *arguments: str, stdin: bool = False) -> subprocess.Pope
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    """End a child and what it started; nothing where it has ended by itself."""
+    """End a child process and its children; nothing where it has ended by itself."""
     if child.poll() is None:
         try:
             os.killpg(child.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""What of messages viewers need: no more is carried to the exporter."""
+"""Messages reduced to the data that viewers need, before they go to the exporter."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NO_BYTES = np.zeros((0, 0), np.uint8)
 
 
 def reduced(message: Watched, width: int) -> Watched:
-    """A message without what nobody is shown; frames no wider than `width`."""
+    """A message without data that is not shown; frames no wider than `width`."""
     if isinstance(message, Frame):
         rgb, height = message.rgb, message.rgb.shape[0]
         if width < rgb.shape[1]:

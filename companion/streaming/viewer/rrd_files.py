@@ -1,4 +1,4 @@
-"""The .rrd files of a flight: a new one when one has grown, and the oldest goes where room ends.
+"""Rotating .rrd files of a flight.
 
 They are parts of one recording: a viewer that is given several shows them as one.
 """
@@ -13,18 +13,17 @@ import rerun as rr
 from companion.streaming.viewer.layout import layout
 
 APPLICATION = "companion-2"
-"""Viewers remember by this name the layout that they were shown: a new layout has a new number."""
+"""Viewers store a layout by this name: a new layout has a new number."""
 N_FILES = 4
-"""The files that there is room for; each is one such part of it."""
+"""Number of files that share the size limit."""
 LOOK_EVERY = 16
 
 
 class RrdFiles:
-    """`path` and its followers: flight.rrd, flight-2.rrd, …; `most_bytes` is 0 for no limit.
+    """`path` and its successors: flight.rrd, flight-2.rrd, …; `most_bytes` is 0 for no limit.
 
-    With `indexed` each ends with a list of its chunks, by which programs find what they look for
-    without reading all of it. Until then that is in memory, and grows by some kilobytes with each
-    frame: not for flights of hours.
+    With `indexed` each ends with an index of its chunks, for programs that seek in it. Until then
+    the index is in memory, and grows by some kilobytes with each frame: not for flights of hours.
     """
 
     def __init__(self, path: Path, most_bytes: int, indexed: bool) -> None:
@@ -37,9 +36,9 @@ class RrdFiles:
         self.recording = self._begin()
 
     def is_full(self) -> bool:
-        """Whether it is time for the next file; looks at the disk now and then only.
+        """Whether the next file is due; checks the disk only now and then.
 
-        OSError where what was recorded cannot be written.
+        OSError where the recording cannot be written.
         """
         self._n_looked += 1
         if not self._each or self._n_looked % LOOK_EVERY:
@@ -51,7 +50,7 @@ class RrdFiles:
         return self._paths[-1].stat().st_size >= self._each
 
     def next(self) -> rr.RecordingStream:
-        """Close the file, and begin another; what is in the way of it goes."""
+        """Close the file, and begin another; deletes the oldest beyond the limit."""
         self.recording.disconnect()
         while len(self._paths) >= N_FILES:
             self._paths.pop(0).unlink(missing_ok=True)
@@ -59,7 +58,7 @@ class RrdFiles:
         return self.recording
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the rest."""
         self.recording.disconnect()
 
     def _begin(self) -> rr.RecordingStream:

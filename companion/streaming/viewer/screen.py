@@ -1,4 +1,4 @@
-"""Where a flight is looked at: a window, a page in a browser, or a viewer that runs already."""
+"""Screens: a window, a page in a browser, or a running viewer."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from companion.errors import InputError
-from companion.streaming.viewer.web_gate import LOOPBACK, WebGate, free_ports
+from companion.streaming.viewer.web_proxy import LOOPBACK, WebProxy, free_ports
 from companion.timing.clock import monotonic_s, wait_s
 
 WEB_PORT = 9090
 GRPC_PORT = 9876
 START_S = 20.0
 MEMORY = "50%"
-"""Of the ground's memory; the oldest poses and pictures go first, the map stays."""
+"""Share of the ground's memory; the oldest poses and pictures are dropped first, the map stays."""
 
 
 SERVER_MEMORY = "256MB"
-"""What is kept for browsers that come late; the map, which is drawn for all times, stays."""
+"""Buffer for browsers that join late; the static map stays."""
 
 
 class Screen:
-    """A viewer that listens at `address`, and its process where that is ours to end.
+    """A viewer that listens at `address`, and its process where we have started it.
 
-    `where` is web, native, or a rerun+http address; `bind` is where the web's two ports are
-    opened. Raises InputError where there is no such viewer.
+    `where` is web, native, or a rerun+http address; `bind` is the address of the two web ports.
+    Raises InputError where there is no such viewer.
     """
 
     def __init__(self, where: str, bind: str = LOOPBACK) -> None:
@@ -37,9 +37,9 @@ class Screen:
         self.is_ours = False
         """Whether it ends with the flight: a page does, a window stays."""
         self.page = ""
-        """What to open in a browser."""
-        self.gate: WebGate | None = None
-        """Through which browsers come; None where none do."""
+        """Address for a browser."""
+        self.proxy: WebProxy | None = None
+        """Proxy for browsers; None without any."""
         if where == "web":
             self._serve(bind)
         elif where == "native":
@@ -66,9 +66,9 @@ class Screen:
         )  # fmt: skip
         self.is_ours = True
         self.address = f"rerun+http://{LOOPBACK}:{inner_grpc}/proxy"
-        doors = {(bind, GRPC_PORT): inner_grpc, (bind, WEB_PORT): inner_web}
+        listeners = {(bind, GRPC_PORT): inner_grpc, (bind, WEB_PORT): inner_web}
         try:
-            self.gate = WebGate(doors, watched=GRPC_PORT)
+            self.proxy = WebProxy(listeners, watched=GRPC_PORT)
         except OSError as error:
             self.process.kill()
             self.process.wait()
@@ -81,22 +81,22 @@ class Screen:
         return self.process is not None and self.process.poll() is not None
 
     def close(self) -> None:
-        """End what is to end with the flight."""
-        if self.gate is not None:
-            self.gate.close()
+        """End what was started for this flight."""
+        if self.proxy is not None:
+            self.proxy.close()
         if self.process is not None and self.is_ours:
             self.process.terminate()
             self.process.wait()
 
 
 def page_of(host: str) -> str:
-    """The address, for a browser, of a page that shows what is served there."""
+    """Address, for a browser, of the page that shows this server."""
     shown = f"rerun%2Bhttp://{host}:{GRPC_PORT}/proxy"
     return f"http://{host}:{WEB_PORT}/?url={shown}&theme=dark"
 
 
 def listens(host: str, port: int) -> bool:
-    """Whether something accepts connections there."""
+    """Whether a server accepts connections there."""
     try:
         with socket.create_connection((host, port), timeout=3.0):
             return True
@@ -127,7 +127,7 @@ def _start(port: int, *arguments: str, detached: bool = False) -> subprocess.Pop
 
 
 def _executable() -> Path:
-    """The viewer that came with the library, wherever the shell looks for programs."""
+    """Viewer shipped with the library, whatever PATH says."""
     spec = importlib.util.find_spec("rerun_cli")
     for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
         program = Path(folder) / "rerun"

@@ -1,4 +1,4 @@
-"""How the companion is, as a pilot reads it."""
+"""Status panel, in the pilot's words."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ HOT_C = 80.0
 
 
 def status_text(facts: Mapping[str, Any], flight: str) -> str:
-    """Markdown: the state as a headline, what is wrong, what else is worth knowing.
+    """Markdown: the state as a headline, problems, other values.
 
-    Facts that are not known are left out.
+    Unknown values are left out.
     """
     state = str(facts.get("state", "Waiting"))
     lines = [f"# {state}", MEANINGS.get(state, ""), ""]

@@ -1,23 +1,23 @@
-"""Which baud rate a serial line is spoken at, told by whether packets come."""
+"""Automatic baud rate of a serial line, by whether packets come."""
 
 from __future__ import annotations
 
 BAUDS = (921600, 57600, 115200, 460800, 230400, 1500000, 500000, 38400, 19200, 9600)
-"""In the order in which they are tried: what companions are wired with most, first."""
+"""In order of the search: the most common first."""
 SURE_PACKETS = 2
 SILENT_NS = 1_200_000_000
-"""An autopilot that was asked for nothing still sends a heartbeat every second."""
+"""An autopilot sends at least a heartbeat every second."""
 HOPEFUL_NS = 2_500_000_000
 GARBAGE_BYTES = 560
-"""In so many there is a whole packet, wherever they begin: twice the longest."""
+"""Bytes that must contain a whole packet: twice the longest."""
 LOST_BYTES, LOST_NS = 2000, 3_000_000_000
 
 
 class BaudSearch:
-    """Tries one rate after the other until packets come, and again if they stop making sense.
+    """Tries one rate after the other until packets come, and again after lasting garbage.
 
-    Silence tells nothing, so a silent rate is left after a while for the next; noise tells that the
-    rate is wrong. A rate that was found is kept through any silence, and tried first next time.
+    Silence tells nothing, so a silent rate is left after a while for the next; garbage tells that
+    the rate is wrong. A rate that was found is kept through any silence, and tried first next time.
     """
 
     def __init__(self, bauds: tuple[int, ...] = BAUDS) -> None:
@@ -33,18 +33,18 @@ class BaudSearch:
 
     @property
     def baud(self) -> int:
-        """The one to listen at now."""
+        """Rate in use now."""
         return self._bauds[self._at]
 
     def begin(self, t_ns: int) -> None:
-        """The line was opened; it begins with the rate that was good last."""
+        """The line was opened; starts with the last good rate."""
         if self.found:
             self._bauds.insert(0, self._bauds.pop(self._at))
         self.found = False
         self._listen(0, t_ns)
 
     def heard(self, n_bytes: int, n_packets: int, t_ns: int) -> None:
-        """So many bytes came at `baud`, and so many packets ended in them."""
+        """Count bytes received at `baud`, and packets completed by them."""
         if n_packets:
             self._n_packets += n_packets
             self._packet_ns = t_ns
@@ -59,7 +59,7 @@ class BaudSearch:
             self.found = False
 
     def look(self, t_ns: int) -> bool:
-        """Whether it is time for another rate; `baud` is then that."""
+        """Whether another rate is due; `baud` is then that."""
         if self.found or len(self._bauds) == 1:
             return False
         patience_ns = HOPEFUL_NS if self._n_packets else SILENT_NS

@@ -1,4 +1,4 @@
-"""Hosts to addresses, without making the event loop or the program's end wait for a name server."""
+"""Host name resolution that blocks neither the event loop nor the program's end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which library speaks to the autopilot."""
+"""Choice of the MAVLink library."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from drivers.mavlink.wire.message_port import MavlinkPort
 
 
 def link_port(config: LinkConfig, router: RouterConfig, clock: FlightClock) -> MavlinkPort:
-    """The port of `link.url`; ConfigError where that cannot be. Loads the one library only."""
+    """Port of `link.url`; ConfigError where invalid. Imports the chosen library only."""
     if config.backend == "mavsdk":
         from drivers.mavlink.wire.mavsdk_port import MavsdkPort
 

@@ -1,4 +1,4 @@
-"""What a link or a router's client is plugged into, as the configuration writes it."""
+"""URLs of links and router clients."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BAUDS = range(1200, 12_000_001)
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A place to speak MAVLink at; `baud` is 0 where it is to be found out."""
+    """Endpoint of a MAVLink connection; `baud` is 0 for automatic."""
 
     kind: str
     host: str = ""
@@ -30,12 +30,12 @@ class Endpoint:
 
 
 def link_endpoint(url: str) -> Endpoint:
-    """What `link.url` names; ConfigError if it names nothing."""
+    """Endpoint of `link.url`; ConfigError if invalid."""
     return _endpoint("link.url", url, LINK_KINDS)
 
 
 def client_endpoint(url: str) -> Endpoint:
-    """What one of `router.clients` names; ConfigError if it names nothing."""
+    """Endpoint of one of `router.clients`; ConfigError if invalid."""
     return _endpoint("router.clients", url, CLIENT_KINDS)
 
 

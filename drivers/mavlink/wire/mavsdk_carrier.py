@@ -1,9 +1,9 @@
-"""MAVSDK as a carrier of packets: whole ones come out of its connection and go in, unchanged.
+"""MAVSDK as a carrier of raw packets, unchanged in both directions.
 
-Between a connection and its raw bytes MAVSDK passes packets on as they are, whatever their
-message, system or signature. Its own identity is one that nobody speaks to, since what is meant for
-itself it keeps; and what it has to say itself (heartbeats, requests for versions) is kept from
-going out, so that one component is on the link: ours.
+Between a connection and its raw bytes MAVSDK passes packets on unchanged, whatever their message,
+system or signature. It gets an identity of its own that nobody speaks to, since it keeps packets
+for itself; and its own messages (heartbeats, requests for versions) are suppressed, so that one
+component is on the link: ours.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ WARNING = 2
 
 
 def check_library() -> None:
-    """ConfigError unless this MAVSDK can be kept quiet; only its C interface has a name for how."""
+    """ConfigError unless this MAVSDK can be kept silent, by a function of its C interface."""
     try:
         intercept = library.mavsdk_subscribe_outgoing_messages_json
     except AttributeError:
@@ -41,9 +41,10 @@ def check_library() -> None:
 
 
 class Carrier:
-    """One connection, held by MAVSDK's threads. `start` and `end` may wait; not for the event loop.
+    """One connection, held by MAVSDK's threads.
 
-    `take` is called in MAVSDK's thread with each packet that comes.
+    `start` and `end` may block; not for the event loop. `take` is called in MAVSDK's thread with
+    each packet that comes.
     """
 
     def __init__(self, url: str, take: Callable[[bytes], None]) -> None:
@@ -54,7 +55,7 @@ class Carrier:
         self._silencer: Any = None
 
     def start(self) -> None:
-        """Open the connection; MavsdkError if that cannot be done now."""
+        """Open the connection; MavsdkError if that is impossible now."""
         with self._lock:
             complaints.listen()
             configuration = mavsdk.Configuration.create_manual(*NOBODY, False)
@@ -69,12 +70,12 @@ class Carrier:
             held.add_any_connection_with_handle_and_forwarding(self._url, on)
 
     def send(self, packet: bytes) -> None:
-        """Give MAVSDK a whole packet; it waits in a queue that has no bound."""
+        """Give MAVSDK a whole packet; its queue has no bound."""
         if self._held is not None:
             self._held.pass_received_raw_bytes(packet)
 
     def end(self) -> None:
-        """Close the connection. MAVSDK first goes through what it was given."""
+        """Close the connection. MAVSDK first processes its queue."""
         with self._lock:
             held, self._held = self._held, None
             if held is not None:
@@ -83,14 +84,14 @@ class Carrier:
 
 
 class Complaints:
-    """What MAVSDK last complained of. It has one log for the process, and would print it."""
+    """Newest warning of MAVSDK, whose log is one per process and would be printed."""
 
     def __init__(self) -> None:
         self.newest = ""
         self._callback: Any = None
 
     def listen(self) -> None:
-        """Forget what was; from now on nothing is printed."""
+        """Clear the newest warning; from now on nothing is printed."""
         self.newest = ""
         if self._callback is None:
             self._callback = mavsdk_logging.LogCallback(self._hear)

@@ -1,4 +1,4 @@
-"""MAVLink over a wire that MAVSDK holds; all above the wire is as without it."""
+"""MAVLink over a wire that MAVSDK holds; everything above the wire is as without it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 
 
 class MavsdkPort(PymavlinkPort):
-    """The autopilot's link through MAVSDK: the same messages, router and signing.
+    """Link to the autopilot through MAVSDK: the same messages, router and signing.
 
-    MAVSDK's own messages go through JSON, which knows no NaN: integers of PX4's parameters and
-    unknown covariances would be lost. So its packets are taken as they are. See docs/links.md.
+    MAVSDK's own messages go through JSON, which has no NaN: integers of PX4's parameters and
+    unknown covariances would be lost. So raw packets are used. See docs/links.md.
     """
 
     def __init__(self, config: LinkConfig, router: RouterConfig, clock: FlightClock) -> None:

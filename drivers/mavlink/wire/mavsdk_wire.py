@@ -1,7 +1,7 @@
-"""The wire to the autopilot, held by MAVSDK: it opens, reads, checks and writes in its own threads.
+"""Wire held by MAVSDK: it opens, reads, checks and writes in its own threads.
 
-Each packet is stamped in MAVSDK's thread as it comes, and reaches the event loop by a socket pair,
-which bounds what may wait.
+Each packet is stamped in MAVSDK's thread as it comes, and reaches the event loop through a socket
+pair, which bounds the backlog.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ LONGEST = 512
 PAIR_BYTES = 1 << 20
 LOOK_S = 0.1
 SILENT_NS = 5_000_000_000
-"""A serial line that spoke and has been silent for so long is opened anew."""
+"""A serial line that was heard and is silent for this long is reopened."""
 END_S = 1.5
 
 
 class MavsdkWire(Wire):
-    """What a link's URL names. ConfigError where MAVSDK cannot hold that.
+    """Wire of a link's URL. ConfigError where MAVSDK does not support it.
 
-    A listener answers whoever has sent to it, all of them.
+    A listener answers every peer that has sent to it.
     """
 
     read_size = LONGEST
@@ -52,7 +52,7 @@ class MavsdkWire(Wire):
             )
         check_library()
         self.n_overrun = 0
-        """Packets that came faster than the event loop took them, and were lost."""
+        """Packets lost because the event loop was too slow."""
         self._endpoint = endpoint
         self._search = BaudSearch((endpoint.baud,) if endpoint.baud else BAUDS)
         self._searching = False
@@ -65,7 +65,7 @@ class MavsdkWire(Wire):
         self._ending: asyncio.Task[None] | None = None
 
     async def run(self, end: WireEnd) -> None:
-        """Keep the wire open until cancelled; then MAVSDK has ended, or is left to."""
+        """Keep the wire open until cancelled; then MAVSDK has ended, or is abandoned."""
         try:
             await super().run(end)
         finally:
@@ -153,7 +153,7 @@ class MavsdkWire(Wire):
         self._looking = asyncio.get_running_loop().call_later(LOOK_S, self._look)
 
     def _look(self) -> None:
-        """MAVSDK does not see a serial line go, nor take it up again; a network's it does."""
+        """Reopen a serial line: MAVSDK does not see it go, nor reopen it; a network's it does."""
         self._look_later()
         now_ns = time.monotonic_ns()
         if not self._heard_ns and complaints.newest:
@@ -187,7 +187,7 @@ class MavsdkWire(Wire):
 
 
 async def _in_thread(call: Callable[[], None], name: str) -> None:
-    """Call what may hang, without holding up the event loop or the program's end."""
+    """Call a function that may hang, without blocking the event loop or the program's end."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[Exception | None] = loop.create_future()
 

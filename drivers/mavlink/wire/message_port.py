@@ -1,4 +1,4 @@
-"""MAVLink messages in and out, whatever library and whatever wire carries them."""
+"""Interface of a MAVLink port, whatever library and wire carry it."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from drivers.mavlink.wire.router import ClientCounts
 from drivers.mavlink.wire.wire import Tap
 
 OnMessage = Callable[[Any, int], None]
-"""Takes a message as pymavlink has it, and the flight's time at which it came, ns."""
+"""Takes a pymavlink message, and its arrival on the flight's clock, ns."""
 
 
 class MavlinkPort(Protocol):
     """One end of a MAVLink link. Used from one event loop; nothing here blocks or raises."""
 
     name: str
-    """For people: what it is plugged into."""
+    """Endpoint, for people."""
     identity: tuple[int, int]
-    """System and component that `send` speaks as; may be set at any time, by who knows it."""
+    """System and component of sent messages; may be set at any time."""
 
     @property
     def connected(self) -> bool:
-        """Whether the wire is there; it says nothing about an autopilot at its other end."""
+        """Whether the wire is open; says nothing about an autopilot at its other end."""
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the wire, for people; "" when nothing is known to be."""
+        """Problem of the wire, for people; "" without one."""
         return ""
 
     @property
     def n_received(self) -> int:
-        """Good packets that came, those of unknown messages too."""
+        """Valid packets received, those of unknown messages too."""
 
     @property
     def n_sent(self) -> int:
-        """Messages handed to the wire."""
+        """Messages given to the wire."""
 
     @property
     def n_dropped(self) -> int:
@@ -43,16 +43,16 @@ class MavlinkPort(Protocol):
 
     @property
     def n_bad(self) -> int:
-        """Times that something came which was refused: damaged, or not signed as it should be."""
+        """Rejected input: damaged packets, or missing or wrong signatures."""
 
     def clients(self) -> list[ClientCounts]:
-        """How those do who share the link; who has left is in it once more."""
+        """Counters of the router's clients; one that has left is listed once more."""
 
     def set_tap(self, tap: Tap | None) -> None:
-        """Have all bytes told to it, as they come from the wire and go on it; whoever sent them."""
+        """Call back with all bytes read from and written to the wire, whoever sent them."""
 
     async def run(self, on_message: OnMessage) -> None:
-        """Receive for ever, reconnecting as needed; ends when it is cancelled."""
+        """Receive until cancelled, reconnecting as needed."""
 
     def send(self, message: Any) -> None:
-        """Send a pymavlink message that has not been packed yet; dropped and counted if need be."""
+        """Send an unpacked pymavlink message; dropped and counted where impossible."""

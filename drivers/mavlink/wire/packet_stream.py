@@ -1,6 +1,6 @@
-"""Bytes to MAVLink packets: finds whole packets in whatever a wire brings, and takes none apart.
+"""Packet framing: finds MAVLink packets in a byte stream, without decoding them.
 
-pymavlink knows what a packet says (`decode`), but is asked only for what somebody wants to read.
+pymavlink decodes (`decode`), but only packets that somebody wants to read.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SIGNATURE_SIZE = 13
 LONGEST = 280
 MARKER = re.compile(b"[\xfd\xfe]")
 STALE_NS = 100_000_000
-"""A packet does not pause for so long; what comes after the pause may be another one."""
+"""Longest pause within a packet; after it another one may begin."""
 SURE_OF_EXTRA = 2
 MOST_LEARNED = 4096
 
@@ -34,11 +34,11 @@ def _crc_step(index: int) -> int:
 
 
 LAST_BYTE_OF = {_crc_step(index): index for index in range(256)}
-"""From what the last byte of a CRC-16/MCRF4XX changed, back to that byte."""
+"""Inverse of the last step of a CRC-16/MCRF4XX: from its change to the last byte."""
 
 
 class Packet(NamedTuple):
-    """One packet as it was on the wire, with what its header says."""
+    """One packet as it was on the wire, with its header's fields."""
 
     raw: bytes
     system: int
@@ -50,18 +50,18 @@ class Packet(NamedTuple):
 
     @property
     def signed(self) -> bool:
-        """Whether it bears a signature; it may be a wrong one."""
+        """Whether it has a signature, valid or not."""
         return self.raw[0] == V2 and bool(self.raw[2] & SIGNED)
 
     @property
     def payload(self) -> bytes:
-        """What the header and the checksum enclose; MAVLink 2 leaves out zeros at its end."""
+        """Bytes between header and checksum; MAVLink 2 leaves out zeros at their end."""
         begin = 10 if self.raw[0] == V2 else 6
         return self.raw[begin : begin + self.raw[1]]
 
     @property
     def target(self) -> tuple[int, int] | None:
-        """System and component it is meant for, 0 for any; None where the message names none."""
+        """Target system and component, 0 for any; None where the message has none."""
         places = _target_places(self.message_id) if self.known else None
         if places is None:
             return None
@@ -73,7 +73,7 @@ class Packet(NamedTuple):
 
 
 def decode(codec: mavlink.MAVLink, packet: Packet) -> Any | None:
-    """The message that a packet holds; None for one that our dialect cannot read."""
+    """Message of a packet; None for one that our dialect cannot read."""
     if not packet.known:
         return None
     try:
@@ -85,29 +85,30 @@ def decode(codec: mavlink.MAVLink, packet: Packet) -> Any | None:
 class MavlinkStream:
     """Finds the packets in a stream of bytes.
 
-    A packet that the dialect knows is told by its checksum. The checksum of an unknown one holds a
-    number that only its definition tells; that number is solved for, must then be the same in all
-    packets of its kind, and the first of them are believed only where the packet before ended.
+    A packet known to the dialect is validated by its checksum. The checksum of an unknown one
+    includes a number (CRC_EXTRA) that only its definition has; that number is solved for, must then
+    be the same in all packets of its kind, and the first of them are accepted only directly after a
+    packet.
     """
 
     def __init__(self) -> None:
         self.n_bad_bytes = 0
-        """Bytes that belonged to no packet."""
+        """Bytes outside any packet."""
         self.n_breaks = 0
-        """Times that packets ceased to follow each other without a gap."""
+        """Gaps between packets."""
         self._learned: dict[int, tuple[int, int]] = {}
         self._rest = b""
         self._in_step = True
         self._last_ns = 0
 
     def restart(self) -> None:
-        """Forget a packet begun: the wire was opened anew."""
+        """Discard an incomplete packet: the wire was reopened."""
         self.n_bad_bytes += len(self._rest)
         self._rest = b""
         self._in_step = True
 
     def feed(self, data: bytes, now_ns: int) -> list[Packet]:
-        """The packets that end in `data`, which came at `now_ns` by any steady clock."""
+        """Packets that end in `data`, which came at `now_ns` by any monotonic clock."""
         if self._rest:
             if now_ns - self._last_ns > STALE_NS:
                 self._in_step = False
@@ -185,7 +186,7 @@ class MavlinkStream:
 
 
 def _length(data: bytes, begin: int) -> int:
-    """Of the packet that would begin here; 0 if none can, too many for what is there if unknown."""
+    """Length of a packet that would begin here; 0 if none can, more than available if unknown."""
     if len(data) - begin < 3:
         return LONGEST
     if data[begin] == V1:
@@ -197,7 +198,7 @@ def _length(data: bytes, begin: int) -> int:
 
 
 def _fields(message_id: int) -> Iterator[tuple[str, int]]:
-    """Names of a message's fields, with their places in the payload."""
+    """Names of a message's fields, with their offsets in the payload."""
     kind = mavlink.mavlink_map[message_id]
     place = 0
     for name, letter, count in zip(

@@ -19,17 +19,17 @@ from drivers.mavlink.wire.transport import link_wire
 from drivers.mavlink.wire.wire import Tap, Wire, run_together
 
 FIRST_SYSTEM = 1
-"""What ArduPilot and PX4 are numbered unless somebody changed it."""
+"""Default system id of ArduPilot and PX4."""
 MANY_REFUSED = 10
 
 
 class PymavlinkPort:
     """One end of the autopilot's link, which others share through the router.
 
-    ConfigError if the configuration names nothing that can be opened, or a key that is none. It
-    begins as a component of the configured vehicle, or of system 1; set `identity` when the vehicle
-    has been heard. With a key only signed messages are delivered, and clients of the router must
-    sign what they send as well; what the autopilot says they get as it is.
+    ConfigError for an invalid URL or key. It begins as a component of the configured vehicle, or of
+    system 1; set `identity` when the vehicle has been heard. With a key only signed messages are
+    delivered, and clients of the router must sign their messages as well; they get the autopilot's
+    unchanged.
     """
 
     def __init__(
@@ -44,12 +44,12 @@ class PymavlinkPort:
         self.n_received = 0
         self.n_sent = 0
         self.n_lost = 0
-        """Packets that others sent and that never came, by their sequence numbers."""
+        """Packets of others that never came, by their sequence numbers."""
         self.n_unsigned = 0
-        """Packets of the link refused for want of a valid signature."""
+        """Packets of the link rejected without a valid signature."""
         self._n_unpacked = 0
         self._n_refused = 0
-        """Of `n_unsigned`, those since one was good."""
+        """Part of `n_unsigned` since the last valid one."""
         self._clock = clock
         self._stream = MavlinkStream()
         self._reader = mavlink.MAVLink(None)
@@ -65,12 +65,12 @@ class PymavlinkPort:
 
     @property
     def connected(self) -> bool:
-        """Whether the wire is there."""
+        """Whether the wire is open."""
         return self._wire.connected
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the wire or the router's places, for people; "" when nothing is."""
+        """Problem of the wire or the router's listeners, for people; "" without one."""
         keyless = ""
         if self._n_refused > MANY_REFUSED:
             keyless = f"{self.name}: what comes is not signed with the key of link.signing_key_file"
@@ -79,17 +79,17 @@ class PymavlinkPort:
 
     @property
     def n_dropped(self) -> int:
-        """Messages not sent: no wire, no room, or a field out of its range; clients' ones too."""
+        """Messages not sent: no wire, no capacity, or a field out of range; clients' ones too."""
         return self._wire.n_dropped + self._n_unpacked
 
     @property
     def n_bad(self) -> int:
-        """Times that the stream of packets was broken, and packets not signed as they should be."""
+        """Breaks of the packet stream, and packets without a valid signature where required."""
         return self._stream.n_breaks + self.n_unsigned
 
     @property
     def n_bad_bytes(self) -> int:
-        """Bytes that belonged to no packet."""
+        """Bytes outside any packet."""
         return self._stream.n_bad_bytes
 
     def clients(self) -> list[ClientCounts]:
@@ -161,7 +161,7 @@ class PymavlinkPort:
                 self.n_lost += missing
 
     def _is_signed(self, packet: Packet, monotonic_ns: int) -> bool:
-        """As well as it has to be."""
+        """Whether it is signed as required."""
         if self._signing is None:
             return True
         return self._signing.accepts(packet, self._clock.from_monotonic_ns(monotonic_ns))
@@ -173,4 +173,4 @@ class PymavlinkPort:
 
 
 def _ignore(message: Any, t_ns: int) -> None:
-    """Takes messages while nobody receives."""
+    """Sink of messages while nobody receives."""

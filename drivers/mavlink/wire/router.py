@@ -1,7 +1,7 @@
-"""Shares the autopilot's link with other programs: ground stations, loggers, another companion.
+"""MAVLink router: shares the autopilot's link with ground stations, loggers, companions.
 
-What the autopilot says goes to all clients, and so does what we say; what a client says goes to the
-autopilot, and to us where it is addressed to us. Clients do not hear each other.
+Packets of the autopilot and ours go to all clients; a client's packets go to the autopilot, and to
+us where addressed to us. Clients do not get each other's.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from companion.config import RouterConfig
 from drivers.mavlink.wire.link_url import client_endpoint
 from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
 from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
-from drivers.mavlink.wire.tcp_listener import TcpDoor
+from drivers.mavlink.wire.tcp_listener import TcpListener
 from drivers.mavlink.wire.tcp_wire import TcpConnection
 from drivers.mavlink.wire.udp_wire import UdpWire
 from drivers.mavlink.wire.wire import Wire, run_together
@@ -27,7 +27,7 @@ CLIENT_READ_SIZE = 4096
 MOST_GARBAGE = 64_000
 MOST_DEPARTED = 16
 CLIENTS_SHARE, OWN_SHARE = 0.85, 0.8
-"""Clients get what we leave of the link, and a twentieth of it at least."""
+"""Clients get the part of the link's rate that we leave, and a twentieth of it at least."""
 BURST_S, LEAST_BURST = 0.05, 600
 LOOP_NS = 1_000_000_000
 AUTOPILOT_NS = 5_000_000_000
@@ -37,23 +37,23 @@ TIMESYNC = 111
 
 @dataclass(frozen=True, slots=True)
 class ClientCounts:
-    """How one client is doing."""
+    """Counters of one client."""
 
     name: str
     connected: bool
     n_received: int
     n_dropped_out: int
-    """Packets that it was too slow for, or not there to take."""
+    """Packets to it that were dropped, as it was too slow or not connected."""
     n_dropped_in: int
-    """Packets of its own that the link had no room for."""
+    """Packets of it that were dropped for lack of capacity of the link."""
     n_bad_bytes: int
     n_refused: int
-    """Packets that came back in a circle, spoke in the autopilot's name or ours, told it another
-    time than ours, or lacked the signature."""
+    """Packets that came back in a loop, used the autopilot's or our identity, gave it another time
+    than ours, or lacked the signature."""
 
 
 class RouterClient:
-    """One client: its wire, what it sent, and what of that still waits for the link."""
+    """One client: its wire, its counters, and its packets that wait for the link."""
 
     def __init__(self, router: Router, wire: Wire) -> None:
         self.wire = wire
@@ -84,7 +84,7 @@ class RouterClient:
         return n_known
 
     def counts(self) -> ClientCounts:
-        """So far."""
+        """Counters so far."""
         return ClientCounts(
             self.wire.name, self.wire.connected, self.n_received, self.wire.n_dropped,
             self.inbox.n_dropped, self.stream.n_bad_bytes, self.n_refused,
@@ -92,10 +92,10 @@ class RouterClient:
 
 
 class Router:
-    """All clients of a link. ConfigError if one of them names nothing that can be opened.
+    """All clients of a link. ConfigError for an invalid URL of a client.
 
-    Clients share what we leave of the link, each in its turn, so that none of them can keep us or
-    another from the autopilot.
+    Clients share the part of the link's rate that we leave, in turn, so that none of them can keep
+    us or another from the autopilot.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Router:
         self._accepts = accepts
         self._queue_bytes = config.queue_kb * 1000
         self._clients: list[RouterClient] = []
-        self._doors: list[TcpDoor[RouterClient]] = []
+        self._listeners: list[TcpListener[RouterClient]] = []
         self._autopilots: dict[int, int] = {}
         self._recent: dict[bytes, tuple[RouterClient | None, int]] = {}
         self._budget = RateLimit(1.0, 1.0)
@@ -122,7 +122,7 @@ class Router:
         for url in config.clients:
             endpoint = client_endpoint(url)
             if endpoint.kind == "tcpin":
-                self._doors.append(TcpDoor(endpoint, self._connection, self._leave))
+                self._listeners.append(TcpListener(endpoint, self._connection, self._leave))
                 continue
             queue, limit = PacketQueue(self._queue_bytes), self._read_limit()
             self._join(UdpWire(endpoint, queue, limit, listens=endpoint.kind == "udpin"))
@@ -131,48 +131,48 @@ class Router:
         """Serve the clients until cancelled."""
         fixed = [client.wire.run(client) for client in self._clients]
         try:
-            await run_together(*fixed, *(door.run() for door in self._doors))
+            await run_together(*fixed, *(listener.run() for listener in self._listeners))
         finally:
             if self._pump_later is not None:
                 self._pump_later.cancel()
                 self._pump_later = None
 
     def counts(self) -> list[ClientCounts]:
-        """Of the clients that there are now."""
+        """Counters of the present clients."""
         return [client.counts() for client in self._clients]
 
     def take_departed(self) -> list[ClientCounts]:
-        """Of the newest of those that have left since the last call: each is told once."""
+        """Counters of the newest clients that have left since the last call."""
         departed = list(self._departed)
         self._departed.clear()
         return departed
 
     @property
-    def n_turned_away(self) -> int:
-        """Connections for which there was no room."""
-        return sum(door.n_turned_away for door in self._doors)
+    def n_rejected(self) -> int:
+        """Connections rejected for lack of capacity."""
+        return sum(listener.n_rejected for listener in self._listeners)
 
     @property
     def trouble(self) -> str:
-        """Why a place for clients is not open, for people; "" when all are."""
-        places = [door.trouble for door in self._doors]
+        """Reason why a listener is not open, for people; "" when all are."""
+        places = [listener.trouble for listener in self._listeners]
         places += [client.wire.trouble for client in self._clients if not client.wire.connected]
         return "; ".join(place for place in places if place)
 
     def from_link(self, packets: list[Packet], monotonic_ns: int) -> None:
-        """Pass on what came from the autopilot's side."""
+        """Forward a packet of the autopilot's side."""
         for packet in packets:
             if packet.component == AUTOPILOT and packet.known:
                 self._autopilots[packet.system] = monotonic_ns
             self._to_clients(packet.raw, monotonic_ns)
 
     def from_us(self, raw: bytes) -> None:
-        """Pass on what we have sent to the autopilot."""
+        """Forward a packet that we have sent to the autopilot."""
         self._budget.take(OWN_SHARE * len(raw))
         self._to_clients(raw, time.monotonic_ns())
 
     def from_client(self, client: RouterClient, packet: Packet, monotonic_ns: int) -> None:
-        """Pass on what a client sent."""
+        """Forward a packet of a client."""
         if (
             self._goes_in_circles(client, packet, monotonic_ns)
             or _answers_timesync(packet)
@@ -268,7 +268,7 @@ class Router:
 
 
 def _answers_timesync(packet: Packet) -> bool:
-    """Whether an autopilot would set its idea of our clock by this.
+    """Whether an autopilot would set its estimate of our clock by this.
 
     It asks all at once and takes any answer for ours, whose time is in the poses that it gets.
     """

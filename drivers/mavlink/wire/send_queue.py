@@ -1,4 +1,4 @@
-"""What waits for a wire that is not ready, and how much of it a wire is given at a time."""
+"""Send queue and rate limit of a wire."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import deque
 
 
 class PacketQueue:
-    """Whole packets waiting, of at most `most_bytes`; the oldest are given up for new ones."""
+    """Whole packets that wait, at most `most_bytes`; the oldest are dropped for new ones."""
 
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes = most_bytes
@@ -19,25 +19,25 @@ class PacketQueue:
         return len(self._packets)
 
     def push(self, packet: bytes) -> None:
-        """Add one behind the others."""
+        """Append a packet."""
         self._packets.append(packet)
         self.n_bytes += len(packet)
         while self.n_bytes > self.most_bytes and len(self._packets) > (1 + self._head_begun):
             self._drop()
 
     def head(self) -> bytes:
-        """What goes out next: the oldest packet, or what is left of it."""
+        """Oldest packet, or its unsent rest."""
         return self._packets[0]
 
     def pop(self) -> bytes:
-        """Take the oldest packet."""
+        """Remove the oldest packet."""
         self._head_begun = False
         packet = self._packets.popleft()
         self.n_bytes -= len(packet)
         return packet
 
     def written(self, n_bytes: int) -> None:
-        """So much of the head has gone out; its rest stays at the head, whatever is dropped."""
+        """Count sent bytes of the head; its rest stays at the head, whatever is dropped."""
         packet = self.pop()
         if n_bytes < len(packet):
             self._packets.appendleft(packet[n_bytes:])
@@ -45,7 +45,7 @@ class PacketQueue:
             self._head_begun = True
 
     def clear(self) -> None:
-        """Give up all; they count as dropped."""
+        """Drop all, counted."""
         self.n_dropped += len(self._packets)
         self._packets.clear()
         self.n_bytes = 0
@@ -61,7 +61,7 @@ class PacketQueue:
 
 
 class RateLimit:
-    """So many bytes a second, saved up to `burst`; `left` below zero is a debt."""
+    """Token bucket in bytes a second, up to `burst`; `left` below zero is a debt."""
 
     def __init__(self, bytes_per_s: float, burst: float) -> None:
         self.bytes_per_s = bytes_per_s
@@ -70,15 +70,15 @@ class RateLimit:
         self._last_ns = 0
 
     def refill(self, now_ns: int) -> None:
-        """Add what came in since the last time."""
+        """Add the tokens since the last call."""
         gained = (now_ns - self._last_ns) * 1e-9 * self.bytes_per_s
         self.left = min(self.burst, self.left + max(0.0, gained))
         self._last_ns = now_ns
 
     def take(self, n_bytes: float) -> None:
-        """Use so many, be they there or not."""
+        """Use tokens, available or not."""
         self.left -= n_bytes
 
     def wait_s(self, wanted: float = 0.0) -> float:
-        """How long until so many are left."""
+        """Seconds until this many are available."""
         return max(0.0, (wanted - self.left) / self.bytes_per_s)

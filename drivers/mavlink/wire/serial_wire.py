@@ -1,4 +1,4 @@
-"""MAVLink over a serial line, which may be unplugged and come back."""
+"""MAVLink over a serial line, which may be unplugged and replugged."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from drivers.mavlink.wire.wire import Wire, WireEnd
 BITS_PER_BYTE = 10
 QUEUE_S, LEAST_QUEUE_BYTES = 0.25, 2000
 KERNEL_S, LEAST_KERNEL_BYTES = 0.05, 300
-"""The kernel would take seconds of packets at a slow rate, and a late pose is worse than none."""
+"""Limit of the kernel's buffer, which would take seconds of packets at a slow rate: a late pose is
+worse than none."""
 LOOK_S = 0.1
 VMIN = 6
 
 
 class SerialWire(Wire):
-    """A serial line, opened by its path and by nobody else at the same time."""
+    """Serial line, opened by its path, exclusively."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         super().__init__(str(endpoint), 0.0, PacketQueue(LEAST_QUEUE_BYTES))

@@ -1,4 +1,4 @@
-"""MAVLink 2 signatures: neither who lacks the key is listened to, nor who repeats old packets."""
+"""MAVLink 2 signatures: rejects packets without the key, and replayed packets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KEY_DIGITS = 64
 
 
 def read_key(path: Path) -> bytes:
-    """The key in a file of 64 hexadecimal digits; ConfigError if it holds none."""
+    """Key in a file of 64 hexadecimal digits; ConfigError if invalid."""
     try:
         text = path.read_text("ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -35,10 +35,10 @@ def read_key(path: Path) -> bytes:
 
 
 class MavlinkSigning:
-    """Stamps for what we sign, and whether what others signed may be believed.
+    """Timestamps for our signatures, and validation of others'.
 
-    Stamps follow the clock, and the newest stamp of anybody who knows the key where that is ahead:
-    a computer without a battery for its clock is so put right by the autopilot.
+    Timestamps follow the clock, or the newest of anybody with the key where that is ahead: so the
+    autopilot corrects a computer without a battery clock.
     """
 
     def __init__(self, key: bytes) -> None:
@@ -47,7 +47,7 @@ class MavlinkSigning:
         self._streams: dict[tuple[int, int, int], int] = {}
 
     def next_stamp(self, unix_ns: int) -> int:
-        """For the next packet: later than any before."""
+        """Timestamp of the next packet: later than any before."""
         self._newest = max(self._newest + 1, (unix_ns - EPOCH_UNIX_NS) // UNIT_NS)
         return self._newest
 

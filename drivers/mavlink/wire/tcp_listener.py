@@ -1,4 +1,4 @@
-"""Where TCP clients of the router come in."""
+"""TCP listener of the router."""
 
 from __future__ import annotations
 
@@ -15,44 +15,44 @@ from drivers.mavlink.wire.wire import FIRST_RETRY_S, MOST_RETRY_S, WireEnd
 
 MOST_CONNECTIONS = 8
 ACCEPT_S = 0.02
-"""Between two that come in: who connects again and again costs no more than this."""
+"""Least interval of accepted connections, against clients that reconnect in a loop."""
 BACKLOG = 32
 
 
-class Guest(WireEnd, Protocol):
-    """What the router has at our end of a connection."""
+class ClientEnd(WireEnd, Protocol):
+    """The router's end of a connection."""
 
     n_received: int
 
 
-AnyGuest = TypeVar("AnyGuest", bound=Guest)
+AnyClient = TypeVar("AnyClient", bound=ClientEnd)
 
 
-class TcpDoor(Generic[AnyGuest]):
-    """Listens at an endpoint; `admit` gives a connection its wire and end, `leave` takes them back.
+class TcpListener(Generic[AnyClient]):
+    """Listens at an endpoint; `admit` makes wire and end of a connection, `leave` removes them.
 
-    When all places are taken, the oldest connection that has never sent a packet makes room for a
-    new one; if all have, the new one is turned away.
+    When all connections are in use, the oldest that has never sent a packet is closed for a new
+    one; if all have, the new one is rejected.
     """
 
     def __init__(
         self,
         endpoint: Endpoint,
-        admit: Callable[[str], tuple[TcpConnection, AnyGuest]],
-        leave: Callable[[AnyGuest], None],
+        admit: Callable[[str], tuple[TcpConnection, AnyClient]],
+        leave: Callable[[AnyClient], None],
     ) -> None:
         self.name = str(endpoint)
         self.trouble = ""
         self.port = 0
-        """That it listens at; 0 while it does not."""
-        self.n_turned_away = 0
+        """Port in use; 0 while it does not listen."""
+        self.n_rejected = 0
         self._endpoint = endpoint
         self._admit = admit
         self._leave = leave
-        self._guests: dict[asyncio.Task[None], tuple[TcpConnection, AnyGuest]] = {}
+        self._clients: dict[asyncio.Task[None], tuple[TcpConnection, AnyClient]] = {}
 
     async def run(self) -> None:
-        """Let clients in until cancelled."""
+        """Accept clients until cancelled."""
         retry_s = FIRST_RETRY_S
         try:
             while True:
@@ -65,12 +65,12 @@ class TcpDoor(Generic[AnyGuest]):
                     continue
                 retry_s = FIRST_RETRY_S
                 with listener:
-                    await self._welcome(listener)
+                    await self._accept_clients(listener)
         finally:
             self.port = 0
-            for task in list(self._guests):
+            for task in list(self._clients):
                 task.cancel()
-            await asyncio.gather(*self._guests, return_exceptions=True)
+            await asyncio.gather(*self._clients, return_exceptions=True)
 
     async def _listen(self) -> socket.socket:
         family, address = await resolve(self._endpoint.host, self._endpoint.port)
@@ -88,7 +88,7 @@ class TcpDoor(Generic[AnyGuest]):
         self.trouble = ""
         return listener
 
-    async def _welcome(self, listener: socket.socket) -> None:
+    async def _accept_clients(self, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()
         while True:
             try:
@@ -98,33 +98,33 @@ class TcpDoor(Generic[AnyGuest]):
                 await asyncio.sleep(MOST_RETRY_S)
                 continue
             self.trouble = ""
-            self._let_in(connected, f"{self.name} from {address[0]}:{address[1]}")
+            self._admit_client(connected, f"{self.name} from {address[0]}:{address[1]}")
             await asyncio.sleep(ACCEPT_S)
 
-    def _let_in(self, connected: socket.socket, name: str) -> None:
-        if len(self._guests) >= MOST_CONNECTIONS and not self._make_room():
-            self.n_turned_away += 1
+    def _admit_client(self, connected: socket.socket, name: str) -> None:
+        if len(self._clients) >= MOST_CONNECTIONS and not self._close_idle():
+            self.n_rejected += 1
             connected.close()
             return
-        wire, guest = self._admit(name)
+        wire, client = self._admit(name)
         try:
             fd = wire.take(connected)
         except OSError:  # it has gone already
             connected.close()
-            self._leave(guest)
+            self._leave(client)
             return
-        task = asyncio.get_running_loop().create_task(wire.serve(fd, guest))
-        self._guests[task] = wire, guest
-        task.add_done_callback(self._left)
+        task = asyncio.get_running_loop().create_task(wire.serve(fd, client))
+        self._clients[task] = wire, client
+        task.add_done_callback(self._closed)
 
-    def _make_room(self) -> bool:
-        for wire, guest in self._guests.values():
-            if wire.connected and guest.n_received == 0:
-                self.n_turned_away += 1
+    def _close_idle(self) -> bool:
+        for wire, client in self._clients.values():
+            if wire.connected and client.n_received == 0:
+                self.n_rejected += 1
                 wire.lose("made room for another")
                 return True
         return False
 
-    def _left(self, task: asyncio.Task[None]) -> None:
-        _, guest = self._guests.pop(task)
-        self._leave(guest)
+    def _closed(self, task: asyncio.Task[None]) -> None:
+        _, client = self._clients.pop(task)
+        self._leave(client)

@@ -17,11 +17,11 @@ from drivers.mavlink.wire.wire import Wire
 CONNECT_S = 2.0
 UNANSWERED_MS = 3000
 SEND_BUFFER = 65536
-"""Small, so that what waits is in our queue, where the oldest can be given up."""
+"""Small, so that packets wait in our queue, where the oldest can be dropped."""
 
 
 class TcpConnection(Wire):
-    """One connection; `run` it through `serve` with a socket that is connected already."""
+    """Accepted connection; `run` it through `serve` with a connected socket."""
 
     def __init__(
         self, name: str, queue: PacketQueue, read_limit: RateLimit | None = None
@@ -30,7 +30,7 @@ class TcpConnection(Wire):
         self._socket: socket.socket | None = None
 
     def take(self, connected: socket.socket) -> int:
-        """Make a connected socket this connection's; answers its file descriptor for `serve`."""
+        """Use a connected socket; returns its file descriptor for `serve`."""
         self._socket = connected
         connected.setblocking(False)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -60,7 +60,7 @@ class TcpConnection(Wire):
 
 
 class TcpWire(TcpConnection):
-    """TCP to a server, connected again whenever it is lost."""
+    """TCP to a server, reconnected whenever it is lost."""
 
     def __init__(self, endpoint: Endpoint, queue: PacketQueue) -> None:
         super().__init__(str(endpoint), queue)

@@ -1,4 +1,4 @@
-"""The wire to what `link.url` names."""
+"""Wire of `link.url`."""
 
 from __future__ import annotations
 

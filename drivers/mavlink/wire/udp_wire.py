@@ -1,4 +1,4 @@
-"""MAVLink over UDP, stamped by the kernel as packets come in."""
+"""MAVLink over UDP, stamped by the kernel on reception."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ MOST_AGE_NS = 500_000_000
 STEP_NS = 1_000_000
 PEER_SILENT_NS = 1_500_000_000
 NETWORK_BYTES_PER_S = 250e3
-"""More than any autopilot is told or tells."""
+"""More than any autopilot sends or receives."""
 
 
 class KernelStamps:
-    """Stamps that the kernel takes by the system's clock, put on CLOCK_MONOTONIC.
+    """Receive stamps of the kernel (system clock) as CLOCK_MONOTONIC.
 
-    What lies between the stamp and now is short, and is measured by one clock; only where that
-    clock was set meanwhile, the time of reading is taken.
+    The interval from stamp to now is short, and measured by one clock; only where that clock was
+    set meanwhile, the time of reading is taken.
     """
 
     def __init__(self) -> None:
         self._unix_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
 
     def monotonic_ns(self, unix_ns: int | None) -> int:
-        """When a packet came that has just been read; `unix_ns` is the kernel's stamp."""
+        """Arrival of a packet that has just been read; `unix_ns` is the kernel's stamp."""
         now_ns = time.monotonic_ns()
         offset_ns = time.time_ns() - now_ns
         was_set = abs(offset_ns - self._unix_minus_monotonic_ns) > STEP_NS
@@ -72,7 +72,7 @@ class UdpWire(Wire):
 
     @property
     def port(self) -> int:
-        """The port that it is bound to; 0 while it is not open."""
+        """Bound port; 0 while it is not open."""
         return 0 if self._socket is None else int(self._socket.getsockname()[1])
 
     async def _open(self) -> int:

@@ -1,4 +1,4 @@
-"""A wire that bytes come and go on: opened, watched by the event loop, opened anew when lost."""
+"""Base of all wires: opened, watched by the event loop, reopened when lost."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ async def run_together(*parts: Coroutine[Any, Any, None]) -> None:
 
 
 Tap = Callable[[bool, bytes, int], None]
-"""Takes whether bytes went out, the bytes, and when by CLOCK_MONOTONIC; must not block."""
+"""Takes whether bytes were sent, the bytes, and their time by CLOCK_MONOTONIC; must not block."""
 
 
 class WireEnd(Protocol):
-    """Who is at our end of a wire."""
+    """Our end of a wire."""
 
     def opened(self) -> None:
-        """The wire is there, for the first time or again; no bytes of before belong to it."""
+        """The wire is open, for the first time or again; earlier bytes do not belong to it."""
 
     def received(self, data: bytes, monotonic_ns: int) -> int:
-        """Take what came; answers how many packets of known messages there were in it."""
+        """Take received bytes; returns the number of packets of known messages in them."""
 
 
 class Wire(ABC):
-    """Bytes in and out without waiting.
+    """Non-blocking byte transport.
 
-    Packets are written whole and in turn; while the wire is not ready they wait in `queue`, and
-    while it is not there they are dropped. `read_limit` holds back a peer that sends too much.
+    Packets are written whole and in order; while the wire is not ready they wait in `queue`, and
+    while it is not open they are dropped. `read_limit` holds back a peer that sends too much.
     """
 
     read_size = 65536
@@ -63,16 +63,16 @@ class Wire(ABC):
     ) -> None:
         self.name = name
         self.bytes_per_s = bytes_per_s
-        """What it carries, as far as that is known."""
+        """Capacity, as far as known."""
         self.queue = queue
         self.connected = False
         self.trouble = ""
-        """Why it is not connected, or what is wrong with what comes; "" when nothing is."""
+        """Reason why it is not connected, or problem of its input; "" without one."""
         self.n_opened = 0
         self.n_unsent = 0
-        """Packets dropped while the wire was not there."""
+        """Packets dropped while the wire was not open."""
         self.tap: Tap | None = None
-        """Hears of all bytes as they come and go."""
+        """Called with all bytes read and written."""
         self._read_limit = read_limit
         self._fd = -1
         self._lost: asyncio.Future[str] | None = None
@@ -102,7 +102,7 @@ class Wire(ABC):
             await asyncio.sleep(retry_s)
 
     async def serve(self, fd: int, end: WireEnd) -> None:
-        """Use what is open as `fd` until it is lost or this is cancelled; then it is closed."""
+        """Use an open `fd` until it is lost or this is cancelled; then close it."""
         loop = asyncio.get_running_loop()
         self._fd = fd
         self._lost = loop.create_future()
@@ -127,7 +127,7 @@ class Wire(ABC):
             self._close()
 
     def write(self, packet: bytes) -> None:
-        """Send a whole packet as soon as the wire takes it; never waits, never raises."""
+        """Send a whole packet as soon as possible; never waits, never raises."""
         if not self.connected:
             self.n_unsent += 1
             return
@@ -138,22 +138,22 @@ class Wire(ABC):
             self.lose("nothing was taken for 30 s")
 
     def lose(self, why: str) -> None:
-        """Give the wire up; what runs it opens it again."""
+        """Close the wire as lost; `run` opens it again."""
         if self._lost is not None and not self._lost.done():
             self._lost.set_result(f"{self.name}: {why}")
         self.connected = False
 
     @abstractmethod
     async def _open(self) -> int:
-        """Open it; SourceError if it is not there now."""
+        """Open it; SourceError where impossible now."""
 
     @abstractmethod
     def _close(self) -> None:
-        """Close what is open."""
+        """Close the present file descriptor."""
 
     @abstractmethod
     def _read(self) -> tuple[bytes, int]:
-        """Some bytes and when they came by CLOCK_MONOTONIC; OSError, EOFError."""
+        """Some bytes and their arrival by CLOCK_MONOTONIC; OSError, EOFError."""
 
     def _deliver(self, end: WireEnd, data: bytes, monotonic_ns: int) -> None:
         end.received(data, monotonic_ns)

@@ -1,4 +1,4 @@
-"""A pretended autopilot that speaks real MAVLink over a real wire, in a thread of its own.
+"""Simulated autopilot that speaks real MAVLink over a real wire, in a thread of its own.
 
     with FakeAutopilot("px4", "udpout:127.0.0.1:14550", circle()) as autopilot:
         autopilot.wait_for("ODOMETRY", 10)

@@ -1,4 +1,4 @@
-"""What a pretended autopilot measures: a made-up trajectory, or a flight that was recorded."""
+"""Measurements of a simulated autopilot: a synthetic trajectory, or a recorded flight."""
 
 from __future__ import annotations
 

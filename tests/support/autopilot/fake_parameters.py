@@ -1,4 +1,4 @@
-"""Parameters of a pretended autopilot, with the values that a new one has."""
+"""Parameters of a simulated autopilot, with factory values."""
 
 from __future__ import annotations
 

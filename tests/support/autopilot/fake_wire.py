@@ -1,4 +1,4 @@
-"""The wires that a pretended autopilot hangs on: UDP, TCP, and a pty as a serial port."""
+"""Wires of a simulated autopilot: UDP, TCP, and a pty as a serial port."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A drone that has nothing to fly on but the poses that it is sent.
+"""Simulated drone that flies by the poses it is sent, and nothing else.
 
     with FlownByVision() as drone, HttpCamera(world_from_body=drone.world_from_body) as camera:
         ... a daemon that sees `camera` and talks to `drone`

@@ -1,4 +1,4 @@
-"""A ground station that asks our component: by hand in unit tests, by TCP at a router's port."""
+"""Simulated ground station: direct calls in unit tests, TCP at a router's port."""
 
 from __future__ import annotations
 

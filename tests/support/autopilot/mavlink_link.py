@@ -1,4 +1,4 @@
-"""Packets for tests of the MAVLink link, and waiting for what comes of them."""
+"""Packets for tests of the MAVLink link, and waiting for their effects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A MAVLink port without a wire: a test says what is heard on it, and reads what is sent."""
+"""MAVLink port without a wire: a test gives its input, and reads its output."""
 
 from __future__ import annotations
 

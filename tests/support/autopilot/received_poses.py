@@ -1,4 +1,4 @@
-"""Poses that a pretended autopilot got, as numbers, and where the body truly was."""
+"""Poses received by a simulated autopilot, as arrays, and their ground truth."""
 
 from __future__ import annotations
 

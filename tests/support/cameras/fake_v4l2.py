@@ -1,4 +1,4 @@
-"""A camera as its driver shows it, by the structures of the kernel: the tables are a webcam's.
+"""Simulated Video4Linux driver, by the structures of the kernel: its tables are a webcam's.
 
 Its node is an ordinary file in a folder of the test, whose bytes are the memory of the buffers.
 """

@@ -1,4 +1,4 @@
-"""A video as a GoPro writes it, of nothing to be seen, with what its gyro felt in a GPMF track."""
+"""Synthetic GoPro video: blank images, and gyroscope data in a GPMF track."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A network camera that does what it is told, rightly or wrongly: JPEG pictures over HTTP.
+"""Simulated network camera: JPEG images over HTTP, valid or not.
 
     with HttpCamera() as camera:
         ... camera.url, camera.write_calibration(path)

@@ -1,4 +1,4 @@
-"""Photographs with EXIF, as cameras on drones write them."""
+"""Synthetic stills with EXIF, as cameras on drones write them."""
 
 from __future__ import annotations
 

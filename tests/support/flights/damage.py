@@ -1,4 +1,4 @@
-"""Damaged copies of files, and what becomes of reading them in a process with limits."""
+"""Damaged copies of files, and their reading in a process with limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A made-up flight: a square flown over a coloured hill, all of whose numbers are known."""
+"""Synthetic flight: a square over a coloured hill, with all values known."""
 
 from __future__ import annotations
 

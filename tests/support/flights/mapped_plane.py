@@ -1,4 +1,4 @@
-"""What the depth stage is told of a made-up flight with true poses: no tracker is wanted."""
+"""Input of the depth stage for a synthetic flight with true poses, without a tracker."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def at(k: int) -> Pose:
 
 
 def told(
-    camera: Camera, n: int, unit_of: dict[int, float] | None = None
+    camera: Camera, n: int, scale_of: dict[int, float] | None = None
 ) -> Iterator[tuple[int, Message]]:
     """Messages of n frames in order, each with the frame's number, which is its time in ns too."""
     world = PlaneWorld(np.random.default_rng(21))
@@ -42,4 +42,4 @@ def told(
             points = np.c_[n2 * z[:, None], z]
             seen = points[np.isfinite(points).all(1)]
             yield k, KeyframeAdded(keyframe, k, k, at(k), seen)
-            yield k, MapUpdate(k, k, dict(poses), np.zeros((0, 3)), None, unit_of or {})
+            yield k, MapUpdate(k, k, dict(poses), np.zeros((0, 3)), None, scale_of or {})

@@ -1,4 +1,4 @@
-"""A short made-up flight, recorded as the daemon would."""
+"""A short synthetic flight, recorded as by the daemon."""
 
 from __future__ import annotations
 

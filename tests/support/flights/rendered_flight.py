@@ -1,4 +1,4 @@
-"""Flights made up for a test: what a camera on a known path over known ground sees and is told."""
+"""Rendered flights: images and telemetry of a camera on a known path over known ground."""
 
 from __future__ import annotations
 
@@ -140,11 +140,11 @@ class Flown:
 
 def fly(
     camera: Camera, ned_from_body: PathOf, terrain: Terrain, seconds: float, rate_hz: float,
-    *, told: bool = True, blind_s: tuple[float, float] = (0.0, 0.0),
+    *, told: bool = True, dropout_s: tuple[float, float] = (0.0, 0.0),
 ) -> Flown:  # fmt: skip
     """Fly, in lockstep; without `told` there is no telemetry, and the mount is not known.
 
-    From the first to the second time of `blind_s` the picture is white.
+    From the first to the second time of `dropout_s` the picture is white.
     """
     if not told:
         camera = replace(camera, body_from_camera=None)
@@ -158,9 +158,9 @@ def fly(
 
     def pictures() -> Iterator[Frame]:
         for seq, (t_ns, pose) in enumerate(poses):
-            blind = _ns(blind_s[0]) <= t_ns < _ns(blind_s[1])
+            dropped_out = _ns(dropout_s[0]) <= t_ns < _ns(dropout_s[1])
             grey = terrain.picture(camera, pose)
-            grey = np.full_like(grey, 252) if blind else grey
+            grey = np.full_like(grey, 252) if dropped_out else grey
             yield Frame(seq, t_ns, grey, np.repeat(grey[..., None], 3, 2))
 
     samples = list(_telemetry(ned_from_body, seconds)) if told else []

@@ -1,4 +1,4 @@
-"""Flights made from the sample with something wrong in them."""
+"""The sample flight with faults."""
 
 from __future__ import annotations
 

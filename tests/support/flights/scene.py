@@ -1,4 +1,4 @@
-"""A textured world of planes, rendered exactly: known answers for whatever looks at it."""
+"""Textured scene of planes, rendered exactly, with ground truth."""
 
 from __future__ import annotations
 

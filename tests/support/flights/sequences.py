@@ -1,4 +1,4 @@
-"""A few seconds of the sample flight, written in the formats of other people's data sets.
+"""A few seconds of the sample flight in the formats of other data sets.
 
 Written by the formats' published descriptions, with none of the readers' code.
 """

@@ -1,4 +1,4 @@
-"""Maps that begin tilted: wrong motions and wrong depths put into what the initialiser found.
+"""Maps initialised with a tilt: wrong motions and depths put into the initialiser's result.
 
 | kind  | what is wrong                                                                          |
 |-------|----------------------------------------------------------------------------------------|

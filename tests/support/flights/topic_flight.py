@@ -1,4 +1,4 @@
-"""A made-up flight as it goes over topics: bundles, and the messages that they are made of."""
+"""Synthetic flight as topics: bundles, and their messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The companion's service on a booted Debian: that of the computer, or of one of its users."""
+"""The service on a booted Debian: that of the computer, or of one of its users."""
 
 from __future__ import annotations
 

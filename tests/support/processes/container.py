@@ -1,4 +1,4 @@
-"""A Debian in a container that boots with systemd as its first process, without a network.
+"""Debian container that boots systemd, without a network.
 
     with Container(folder, "bookworm", ("python3.11",)) as container:
         container.boot()

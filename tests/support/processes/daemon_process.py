@@ -1,4 +1,4 @@
-"""The daemon as its users run it: a process that is watched, asked, signalled, and always ended.
+"""The daemon as a child process: watched, queried, signalled, and always ended.
 
     with Daemon(tmp_path, "camera.source=pattern") as daemon:
         daemon.until(lambda health: health["tracker"] == "tracking", 20)

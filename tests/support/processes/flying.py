@@ -1,4 +1,4 @@
-"""A daemon in flight: a camera and an autopilot that see the same, and what it may tell of it.
+"""A daemon in flight: a camera and an autopilot with the same trajectory, and checks of poses.
 
     with Flying(tmp_path) as flying:
         flying.take_off()

@@ -1,4 +1,4 @@
-"""One flight over one link: an exporter and a viewer in namespaces, and what came of it."""
+"""One flight over one link: exporter and viewer in network namespaces, and measurements."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Trial:
 
     began_s: float
     ended_s: float
-    told: dict[str, float]
-    """When chunks of points were told to the exporter, by keyframe."""
+    given: dict[str, float]
+    """Times at which chunks of points were given to the exporter, by keyframe."""
     poses: list[tuple[float, float]]
     """When they were drawn, and of when they are."""
     coarse: dict[str, float]
@@ -58,18 +58,18 @@ class Trial:
         out = []
         for now_s in np.arange(since_s, until_s, 0.1):
             missing = [
-                t for k, t in self.told.items() if t <= now_s and drawn.get(k, np.inf) > now_s
+                t for k, t in self.given.items() if t <= now_s and drawn.get(k, np.inf) > now_s
             ]
             out.append(now_s - min(missing) if missing else 0.0)
         return np.array(out)
 
 
 def fly(
-    link: TwoNamespaces, tape: Path, folder: Path, seconds: float, budget_kbit_s: float = 0.0,
+    link: TwoNamespaces, log: Path, folder: Path, seconds: float, budget_kbit_s: float = 0.0,
     meanwhile: Callable[[float, subprocess.Popen[bytes]], None] = lambda now_s, ground: None,
     joins_s: float = 0.0,
 ) -> Trial:  # fmt: skip
-    """Tell a tape over a link; `meanwhile` is called often, with seconds since the start.
+    """Play a message log over a link; `meanwhile` is called often, with seconds since the start.
 
     The viewer is started `joins_s` after that.
     """
@@ -77,7 +77,7 @@ def fly(
     python = [sys.executable, "-m"]
     out = {side: folder / f"{side}.json" for side in ("drone", "ground")}
     drone = subprocess.Popen(
-        [*link.in_drone, *python, "tests.bench.links_feeder", str(tape), listen,
+        [*link.in_drone, *python, "tests.bench.links_feeder", str(log), listen,
          str(budget_kbit_s), str(seconds), str(out["drone"])],
     )  # fmt: skip
     wait = ["sh", "-c", 'sleep "$0"; exec "$@"', str(joins_s)] if joins_s else []
@@ -113,7 +113,7 @@ def fly(
         for keyframe_id, at_s in drawn:
             first[level].setdefault(keyframe_id, at_s)
     return Trial(
-        began_s, ended_s, sent["told"], [tuple(p) for p in got["poses"]], first["coarse"],
+        began_s, ended_s, sent["given"], [tuple(p) for p in got["poses"]], first["coarse"],
         first["fine"], [tuple(p) for p in got["pictures"]],
         [tuple(p) for p in sent["memory_mib"]], [tuple(p) for p in got["memory_mib"]], rates,
         got["connections"], sent["dropped"], sent["slowest_take_ms"],

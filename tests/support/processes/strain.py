@@ -1,4 +1,4 @@
-"""How much of the time this machine withholds: limits are stated for one that does not.
+"""Processor time withheld by this machine: test limits are stated for one without load.
 
 A thread looks fifty times a second at how many want a processor and how many there are: where
 twice as many want one, what is asked of the daemon may take twice as long. What the thread itself

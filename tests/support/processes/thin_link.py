@@ -8,7 +8,7 @@ from collections.abc import Callable
 from companion.streaming.framing import Reassembly
 from companion.streaming.item_codec import decode
 from companion.streaming.items import Item
-from companion.streaming.send_window import Budget
+from companion.streaming.send_window import TokenBucket
 from companion.streaming.session import Session
 
 STEP_S = 0.005
@@ -28,7 +28,7 @@ class ThinLink:
         self.arrived: list[tuple[float, Item]] = []
         self.n_arrived = self.n_sent = 0
         self.most_queued_s = 0.0
-        self._budget = Budget(budget_kbit_s)
+        self._budget = TokenBucket(budget_kbit_s)
         self._on_way: deque[tuple[float, bytes]] = deque()
         self._acknowledged: deque[tuple[float, int]] = deque()
         self._free_s = 0.0
@@ -55,7 +55,9 @@ class ThinLink:
 
     def _send(self) -> None:
         while self.is_up:
-            room = min(self.session.window.room_bytes(), self._budget.room_bytes(self.now_s))
+            room = min(
+                self.session.window.available_bytes(), self._budget.available_bytes(self.now_s)
+            )
             piece = self.session.next_piece(self.now_s, room)
             if piece is None:
                 return

@@ -1,4 +1,4 @@
-"""A screen of its own for windows, without a graphics card: what is on it can be looked at.
+"""Virtual display for windows, without a graphics card, with screenshots.
 
 with VirtualDisplay(folder) as display:
     subprocess.Popen(command, env=display.environment)

@@ -1,4 +1,4 @@
-"""`companion calibrate` as its users know it: a file, or a reason, and no good file lost."""
+"""`companion calibrate`: a calibration file, or a reason without loss of an old file."""
 
 from __future__ import annotations
 

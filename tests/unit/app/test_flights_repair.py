@@ -1,4 +1,4 @@
-"""Recordings that were cut short, ended later: by command, and by the daemon beside its work."""
+"""Repair of recordings that were cut short: by command, and by the daemon in the background."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from companion.app.cli import main
 from companion.daemon.flights import recording_recovery
-from companion.daemon.flights.recording_recovery import CUT_SHORT, LeftOvers
+from companion.daemon.flights.recording_recovery import CUT_SHORT, RecordingRecovery
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
 from drivers.recording.flight_summary import summarise
@@ -63,7 +63,7 @@ def test_what_another_writes_to_is_left_alone(
 
 
 async def until_warned(cut: Path, warned: list[Warned], armed: list[bool]) -> None:
-    over = LeftOvers(cut.parents[1], FlightClock(), warned.append, lambda: armed[0])
+    over = RecordingRecovery(cut.parents[1], FlightClock(), warned.append, lambda: armed[0])
     running = asyncio.ensure_future(over.run())
     await asyncio.sleep(0.2)
     assert not psutil.Process().children()  # as long as it is armed
@@ -85,7 +85,7 @@ def test_the_daemon_does_it_when_disarmed(cut: Path, monkeypatch: pytest.MonkeyP
 
 def test_arming_breaks_it_off(cut: Path) -> None:
     warned: list[Warned] = []
-    over = LeftOvers(cut.parents[1], FlightClock(), warned.append, lambda: True)
+    over = RecordingRecovery(cut.parents[1], FlightClock(), warned.append, lambda: True)
     assert asyncio.run(over._repaired()) is False
     assert not warned and not psutil.Process().children()
     assert unfinished(cut)

@@ -1,4 +1,4 @@
-"""Flights of other formats as flight folders, read again as they were."""
+"""Flights of other formats as flight folders, read back equal."""
 
 from __future__ import annotations
 
@@ -119,12 +119,12 @@ def test_as_a_recording(tmp_path: Path, flown: Piece, origin: GeoOrigin | None) 
         import_flight(tmp_path / "bag", tmp_path / "a.mcap", Config(), NoProgress(), print)
 
 
-def test_lines_about_what_was_amiss_may_be_damaged(tmp_path: Path) -> None:
+def test_warning_lines_may_be_damaged(tmp_path: Path) -> None:
     said = ['1,["a, b", "c"]', '1,["a"]', "1,[", '-1,["a", "b"]', "1,7", "", f'{9**30},["a", "b"]']
     lines = [*(f"# warning,{each}" for each in said), "unix_ns,kind,values", "5,height,1.0", ""]
     (tmp_path / "telemetry.csv").write_text("\n".join(lines))
-    amiss = read_telemetry_csv(tmp_path / "telemetry.csv").warnings
-    assert [(w.t_ns, w.what, w.detail) for w in amiss] == [(1, "a, b", "c")]
+    warnings = read_telemetry_csv(tmp_path / "telemetry.csv").warnings
+    assert [(w.t_ns, w.what, w.detail) for w in warnings] == [(1, "a, b", "c")]
 
 
 def test_recording_that_cannot_be_written(tmp_path: Path, flown: Piece) -> None:

@@ -1,4 +1,4 @@
-"""What holds until the motors are disarmed: over a crash of ours, and what is no disarming."""
+"""Changes held until disarming: over a crash of the daemon, and false disarming."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_where_there_can_be_no_file_nothing_is_held(tmp_path: Path) -> None:
     assert read_settings(tmp_path / "file" / "flights", READ) == (None, "")
 
 
-def test_what_is_written_is_read_back_and_a_full_disk_is_told(
+def test_what_is_written_is_read_back_and_a_full_disk_is_reported(
     autopilot: Autopilot, tmp_path: Path
 ) -> None:
     in_flight(autopilot, tmp_path, OFF)

@@ -1,4 +1,4 @@
-"""Flights are in order, and get their dates, on a computer that learns late what time it is."""
+"""Order and dates of flights on a computer that gets the time late."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the ground may set and when; how it is kept; what the HEARTBEAT says of it all."""
+"""Commands and parameters of the ground: permissions, kept settings, and the HEARTBEAT."""
 
 from __future__ import annotations
 

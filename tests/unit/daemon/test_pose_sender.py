@@ -1,4 +1,4 @@
-"""What an autopilot is sent over its life and ours: heights, reset counters, and what disks do."""
+"""Poses sent over boots of the autopilot and restarts of ours: heights, reset counters, disks."""
 
 from __future__ import annotations
 
@@ -254,7 +254,7 @@ async def test_a_copter_that_tells_no_local_position_yet_tells_its_climb(tmp_pat
 
 
 @flown
-async def test_a_disk_that_cannot_be_written_is_told_once(tmp_path: Path) -> None:
+async def test_a_disk_that_cannot_be_written_is_reported_once(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     vehicle, counters = Vehicle(tmp_path / "file" / "kept.json"), []
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""While armed what decides about poses becomes tighter, whatever way a change comes."""
+"""While armed, settings of the pose gate only become tighter, however a change comes."""
 
 from __future__ import annotations
 

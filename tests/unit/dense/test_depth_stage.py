@@ -40,7 +40,7 @@ def stage(camera: Camera, devices: Devices | None = None) -> DepthStage:
 
 
 def fly(
-    camera: Camera, n: int = 34, unit_of: dict[int, float] | None = None, *,
+    camera: Camera, n: int = 34, scale_of: dict[int, float] | None = None, *,
     devices: Devices | None = None, before: Callable[[int], object] = int,
 ) -> list[Message]:  # fmt: skip
     """A flight with true poses and a keyframe every fourth frame; all that the stage gives.
@@ -48,7 +48,7 @@ def fly(
     `before` is told each frame's number before the stage gets it.
     """
     it, out, last = stage(camera, devices), [], -1
-    for k, message in told(camera, n, unit_of):
+    for k, message in told(camera, n, scale_of):
         if k != last:
             before(k)
         last = k
@@ -84,7 +84,7 @@ def test_points_lie_on_the_surfaces(camera: Camera) -> None:
 
 
 def test_keyframes_of_other_segments_do_not_meet() -> None:
-    alone = fly(RADTAN, unit_of={k: 1.0 + 0.1 * k for k in range(20)})
+    alone = fly(RADTAN, scale_of={k: 1.0 + 0.1 * k for k in range(20)})
     assert not [m for m in alone if isinstance(m, PointChunk)], "no two keyframes share a unit"
 
 

@@ -25,12 +25,12 @@ def update(scale: float = 1.0, unit: float = 1.0) -> MapUpdate:
 def test_spans_tell_how_the_map_was_stretched() -> None:
     spans = update().spans_of(8)
     assert set(spans) == {2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14}
-    assert update().stretch_of(8, spans) == 1.0
-    assert update(0.98).stretch_of(8, spans) == pytest.approx(0.98)
+    assert update().local_scale_of(8, spans) == 1.0
+    assert update(0.98).local_scale_of(8, spans) == pytest.approx(0.98)
 
 
 def test_another_unit_is_no_stretch() -> None:
-    assert update(unit=7.0).stretch_of(8, update().spans_of(8)) == pytest.approx(1.0)
+    assert update(unit=7.0).local_scale_of(8, update().spans_of(8)) == pytest.approx(1.0)
 
 
 def test_keyframes_that_went_elsewhere_do_not_tell() -> None:
@@ -38,13 +38,13 @@ def test_keyframes_that_went_elsewhere_do_not_tell() -> None:
     now = update(1.02)
     there = {**now.map_from_camera, 6: Pose(np.eye(3), np.full(3, 90.0))}
     del there[10]
-    moved = replace(now, map_from_camera=there, unit_of={12: 3.0})
-    assert moved.stretch_of(8, spans) == pytest.approx(1.02)
+    moved = replace(now, map_from_camera=there, scale_of={12: 3.0})
+    assert moved.local_scale_of(8, spans) == pytest.approx(1.02)
 
 
 def test_what_nobody_tells_of_is_not_stretched() -> None:
-    assert update(2.0).stretch_of(8, {}) == 1.0
-    assert update(2.0).stretch_of(N + 50, {3: 1.0}) == 1.0
+    assert update(2.0).local_scale_of(8, {}) == 1.0
+    assert update(2.0).local_scale_of(N + 50, {3: 1.0}) == 1.0
     assert update(2.0).spans_of(N + 50) == {}
 
 

@@ -103,9 +103,9 @@ def test_coasting_goes_on_with_ever_less_certainty_and_lands_without_a_jump() ->
         give(odometry, track(k))
     coasted = []
     for k in range(10, 30):
-        blind = replace(track(k, state=TrackState.COASTING), sigma_position=0.01 + 0.02 * (k - 9))
-        coasted.append(give(odometry, blind))
-    assert [o.state for o in coasted] == [TrackState.COASTING] * 20
+        blind = track(k, state=TrackState.DEAD_RECKONING)
+        coasted.append(give(odometry, replace(blind, sigma_position=0.01 + 0.02 * (k - 9))))
+    assert [o.state for o in coasted] == [TrackState.DEAD_RECKONING] * 20
     assert {o.quality for o in coasted} == {1}
     assert (np.diff([o.sigma_position_m for o in coasted]) > 0).all()
     seen = [give(odometry, track(k, off=0.3)) for k in range(30, 40)]

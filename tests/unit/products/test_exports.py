@@ -1,4 +1,4 @@
-"""Exports of a run of known content, read back by the formats' own libraries."""
+"""Exports of a known run, read back by the formats' own libraries."""
 
 from __future__ import annotations
 

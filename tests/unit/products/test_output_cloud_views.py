@@ -47,7 +47,7 @@ def from_above() -> CloudView:
     return cloud_views(plate(), [])[0]
 
 
-def test_from_above_north_is_up_and_east_is_right(from_above: CloudView) -> None:
+def test_plan_view_has_north_up_and_east_right(from_above: CloudView) -> None:
     rgb, opacity = decode(from_above)
     rows, columns = np.nonzero(opacity > 200)
     middle = (rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2

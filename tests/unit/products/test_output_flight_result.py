@@ -48,7 +48,7 @@ def test_a_corrected_keyframe_takes_its_frames_along() -> None:
 def test_a_keyframes_unit_scales_what_hangs_on_it() -> None:
     result = flight()
     update = flown.update(known=False)
-    result.take(replace(update, unit_of={3: 2.0}))
+    result.take(replace(update, scale_of={3: 2.0}))
     keyframe, seq = update.map_from_camera[3], 3 * flown.PER_KEYFRAME + 7
     step = flown.map_from_camera(seq).translation - keyframe.translation
     found = next(pose for pose in result.poses() if pose.seq == seq)

@@ -12,7 +12,7 @@ from companion.geometry.camera import Camera
 from companion.messages import PointChunk, PositionSample, PositionSource
 from companion.products.flight_result import FlightResult
 from companion.products.report.report_json import report
-from companion.products.report.report_page import number, path_stretches, report_page, when
+from companion.products.report.report_page import number, path_segments, report_page, when
 from tests.support.flights import flown
 
 VOID = {"meta", "img", "br", "path", "use", "polyline", "rect", "link"}
@@ -166,11 +166,11 @@ def test_path_breaks_where_the_camera_was_lost() -> None:
     result = FlightResult()
     for message in flown.messages():
         result.take(message)
-    parts = path_stretches(result.poses())
+    parts = path_segments(result.poses())
     assert len(parts) == 2
     assert parts[0][0][-1] == flown.time_ns(flown.LOST[0] - 1)
     assert parts[1][0][0] == flown.time_ns(flown.LOST[-1] + 1)
-    assert path_stretches([]) == []
+    assert path_segments([]) == []
 
 
 def test_a_clock_that_was_never_set_has_no_date() -> None:

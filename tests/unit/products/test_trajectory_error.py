@@ -1,4 +1,4 @@
-"""Path errors against made paths, and against evo's figures."""
+"""Trajectory errors of synthetic paths, and against evo."""
 
 from __future__ import annotations
 

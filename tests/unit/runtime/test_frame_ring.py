@@ -1,4 +1,4 @@
-"""Frames between processes: whole, or known to be too late. Each reader is a process of its own."""
+"""Frame ring between processes: frames whole, or reported as overwritten."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from companion.messages import Frame
-from companion.runtime.frame_ring import FrameInRing, FrameRing
+from companion.runtime.frame_ring import FrameHandle, FrameRing
 
 ROOT = Path(__file__).parents[3]
 WIDTH, HEIGHT = 640, 480
@@ -32,9 +32,9 @@ def slowly(self, place, colour):
     return frame
 FrameRing._copy = slowly
 while (line := sys.stdin.readline()).strip():
-    from companion.runtime.frame_ring import FrameInRing
+    from companion.runtime.frame_ring import FrameHandle
     seq, serial = map(int, line.split())
-    frame = ring.get(FrameInRing(seq, 0, serial))
+    frame = ring.get(FrameHandle(seq, 0, serial))
     if frame is None:
         print("late", flush=True)
     else:
@@ -52,7 +52,7 @@ class Reader:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(ring.fd,), text=True, cwd=ROOT,
         )  # fmt: skip
 
-    def ask(self, place: FrameInRing) -> None:
+    def ask(self, place: FrameHandle) -> None:
         self.say(f"{place.seq} {place.serial}")
 
     def say(self, line: str) -> None:

@@ -13,7 +13,7 @@ from companion.messages import (
     PositionSource,
     Warned,
 )
-from companion.runtime.gaps import with_gaps_named
+from companion.runtime.gaps import with_gap_warnings
 
 S = 1_000_000_000
 
@@ -37,7 +37,7 @@ def position(t_s: float) -> PositionSample:
 
 def warnings(messages: Iterable[Message]) -> list[tuple[str, float]]:
     ordered = sorted(messages, key=lambda message: (message.t_ns, isinstance(message, Frame)))
-    return [(w.what, w.t_ns / S) for w in with_gaps_named(ordered) if isinstance(w, Warned)]
+    return [(w.what, w.t_ns / S) for w in with_gap_warnings(ordered) if isinstance(w, Warned)]
 
 
 def times(start_s: float, stop_s: float, hz: float) -> list[float]:
@@ -54,7 +54,7 @@ def test_steady_flight_gives_no_warning(rng: np.random.Generator, hz: float) -> 
 def test_messages_pass_unchanged_and_in_order(rng: np.random.Generator) -> None:
     messages: list[Message] = [frame(t, rng) for t in (0, 0.1, 0.2, 0.3)]
     messages += [attitude(0.35), frame(5, rng)]
-    passed = list(with_gaps_named(messages))
+    passed = list(with_gap_warnings(messages))
     assert [m for m in passed if not isinstance(m, Warned)] == messages
     assert isinstance(passed[-2], Warned)
 

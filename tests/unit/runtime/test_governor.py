@@ -5,20 +5,20 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.runtime.governor import LEVELS, Governor, Pressure
+from companion.runtime.governor import LEVELS, Governor, LoadSample
 
 S = 1_000_000_000
-EASY = Pressure(0.5, 0.4, 60.0, 30.0)
-LATE = Pressure(0.9, 0.4, 60.0, 80.0)
+EASY = LoadSample(0.5, 0.4, 60.0, 30.0)
+LATE = LoadSample(0.9, 0.4, 60.0, 80.0)
 
 
 def run(
-    governor: Governor, seconds: range, pressure: Callable[[int, int], Pressure] | Pressure
+    governor: Governor, seconds: range, sample: Callable[[int, int], LoadSample] | LoadSample
 ) -> list[tuple[int, int]]:
     """Ask once a second: when the level changed and to what."""
     changes = []
     for t in seconds:
-        now = pressure if isinstance(pressure, Pressure) else pressure(t, governor.level.number)
+        now = sample if isinstance(sample, LoadSample) else sample(t, governor.level.number)
         if governor.step(t * S, now):
             changes.append((t, governor.level.number))
     return changes
@@ -53,49 +53,49 @@ def test_one_late_second_is_no_reason() -> None:
 def test_a_step_that_helps_is_the_last() -> None:
     governor = Governor(hot_c=85)
 
-    def load(t: int, level: int) -> Pressure:
-        return LATE if level < 2 else Pressure(0.9, 0.4, 60.0, 50.0)
+    def load(t: int, level: int) -> LoadSample:
+        return LATE if level < 2 else LoadSample(0.9, 0.4, 60.0, 50.0)
 
     assert run(governor, range(120), load) == [(1, 1), (3, 2)]
 
 
 def test_very_late_poses_are_helped_faster() -> None:
     governor = Governor(hot_c=85)
-    assert run(governor, range(60), Pressure(pose_latency_p95_ms=200.0))[-1] == (4, 4)
+    assert run(governor, range(60), LoadSample(pose_latency_p95_ms=200.0))[-1] == (4, 4)
 
 
 def test_heat_is_given_time_to_fall() -> None:
     governor = Governor(hot_c=85)
-    warm = Pressure(0.5, 0.4, 86.0, 30.0)
+    warm = LoadSample(0.5, 0.4, 86.0, 30.0)
     assert run(governor, range(40), warm) == [(1, 1), (16, 2), (31, 3)]
     assert "86 C" in governor.degraded
     severe = Governor(hot_c=85)
-    assert run(severe, range(40), Pressure(0.5, 0.4, 93.0, 30.0))[-1] == (7, 4)
+    assert run(severe, range(40), LoadSample(0.5, 0.4, 93.0, 30.0))[-1] == (7, 4)
 
 
 @pytest.mark.parametrize(
-    ("pressure", "word"),
+    ("sample", "word"),
     [
-        (Pressure(pose_dropped_hz=5.0), "5 frames/s go without a pose"),
-        (Pressure(memory_share=0.95), "memory is 95 % full"),
-        (Pressure(cpu_share=1.0, pose_latency_p95_ms=55.0), "processor is full"),
+        (LoadSample(pose_dropped_hz=5.0), "5 frames/s go without a pose"),
+        (LoadSample(memory_share=0.95), "memory is 95 % full"),
+        (LoadSample(cpu_share=1.0, pose_latency_p95_ms=55.0), "processor is full"),
     ],
 )
-def test_each_reason_is_named(pressure: Pressure, word: str) -> None:
+def test_each_reason_is_named(sample: LoadSample, word: str) -> None:
     governor = Governor(hot_c=85)
-    assert not governor.step(0, pressure) and governor.step(S, pressure)
+    assert not governor.step(0, sample) and governor.step(S, sample)
     assert governor.degraded.startswith("viewer off, since ")
     assert word in governor.degraded
 
 
 def test_a_full_processor_alone_is_no_reason() -> None:
-    assert run(Governor(hot_c=85), range(60), Pressure(1.0, 0.4, 60.0, 30.0)) == []
+    assert run(Governor(hot_c=85), range(60), LoadSample(1.0, 0.4, 60.0, 30.0)) == []
 
 
 def test_what_is_not_known_is_no_reason() -> None:
     governor = Governor(hot_c=85)
     run(governor, range(2), LATE)
-    assert run(governor, range(2, 30), Pressure()) == [(12, 0)]
+    assert run(governor, range(2, 30), LoadSample()) == [(12, 0)]
 
 
 def test_it_comes_back_step_by_step_after_a_while() -> None:
@@ -107,9 +107,9 @@ def test_it_comes_back_step_by_step_after_a_while() -> None:
 
 def test_between_easy_and_too_much_it_stays() -> None:
     governor = Governor(hot_c=85)
-    run(governor, range(2), Pressure(temperature_c=86.0))
-    assert run(governor, range(2, 300), Pressure(temperature_c=82.0)) == []
-    assert run(governor, range(300, 320), Pressure(temperature_c=79.0)) == [(310, 0)]
+    run(governor, range(2), LoadSample(temperature_c=86.0))
+    assert run(governor, range(2, 300), LoadSample(temperature_c=82.0)) == []
+    assert run(governor, range(300, 320), LoadSample(temperature_c=79.0)) == [(310, 0)]
 
 
 def test_what_does_not_fit_is_tried_less_and_less_often() -> None:

@@ -6,13 +6,13 @@ import pytest
 from companion.config import Config
 from companion.geometry.transforms import Pose
 from companion.messages import AttitudeSample, DepthMap, Frame, MapUpdate
-from companion.runtime.mail_policy import fate_of
-from companion.runtime.mailbox import Fate, Mailbox
+from companion.runtime.mail_policy import drop_policy_of
+from companion.runtime.mailbox import DropPolicy, Mailbox
 from companion.runtime.message_size import ENTRY_BYTES, SMALL_BYTES, size_bytes
 from companion.runtime.stage_protocol import Finish, Setup
 from tests.support.flights.topic_flight import CAMERA
 
-Sent = tuple[Fate, int, str]
+Sent = tuple[DropPolicy, int, str]
 
 
 def mailbox(room: int = 100) -> Mailbox[Sent]:
@@ -29,50 +29,55 @@ def names_in(box: Mailbox[Sent]) -> list[str]:
 
 def test_messages_come_out_in_the_order_in_which_they_came() -> None:
     box = mailbox()
-    for number, fate in enumerate((Fate.LOSSLESS, Fate.PICTURE, Fate.ALWAYS, Fate.MAP)):
-        box.put((fate, 10, str(number)))
+    for number, policy in enumerate(
+        (DropPolicy.LOSSLESS, DropPolicy.PICTURE, DropPolicy.ALWAYS, DropPolicy.MAP)
+    ):
+        box.put((policy, 10, str(number)))
     assert (len(box), box.n_bytes) == (4, 40)
     assert names_in(box) == ["0", "1", "2", "3"]
     assert (len(box), box.n_bytes) == (0, 0)
 
 
-def test_the_latest_frame_wins_whether_there_is_room_or_not() -> None:
+def test_the_newest_frame_wins_with_and_without_overflow() -> None:
     box = mailbox()
     for number in range(3):
-        box.put((Fate.LATEST_WINS, 1, f"frame {number}"))
-        box.put((Fate.LOSSLESS, 1, f"sample {number}"))
-    assert (box.n_dropped, box.n_overflown) == (2, 0)
+        box.put((DropPolicy.LATEST_WINS, 1, f"frame {number}"))
+        box.put((DropPolicy.LOSSLESS, 1, f"sample {number}"))
+    assert (box.n_dropped, box.n_overflowed) == (2, 0)
     assert names_in(box) == ["sample 0", "sample 1", "frame 2", "sample 2"]
 
 
 def test_pictures_go_first_then_the_map_then_the_rest_but_never_an_order() -> None:
     box = mailbox(60)
-    fates = (Fate.ALWAYS, Fate.LOSSLESS, Fate.MAP, Fate.PICTURE, Fate.PICTURE, Fate.LOSSLESS)
-    for number, fate in enumerate(fates):
-        box.put((fate, 10, str(number)))
-    box.put((Fate.LOSSLESS, 10, "6"))
-    assert box.n_overflown == 1
-    box.put((Fate.LOSSLESS, 25, "7"))
-    assert (box.n_overflown, box.n_bytes) == (4, 55)
+    policies = (
+        DropPolicy.ALWAYS, DropPolicy.LOSSLESS, DropPolicy.MAP,
+        DropPolicy.PICTURE, DropPolicy.PICTURE, DropPolicy.LOSSLESS,
+    )  # fmt: skip
+    for number, policy in enumerate(policies):
+        box.put((policy, 10, str(number)))
+    box.put((DropPolicy.LOSSLESS, 10, "6"))
+    assert box.n_overflowed == 1
+    box.put((DropPolicy.LOSSLESS, 25, "7"))
+    assert (box.n_overflowed, box.n_bytes) == (4, 55)
     assert names_in(box) == ["0", "5", "6", "7"]
 
 
-def test_what_is_larger_than_the_room_is_let_in_alone() -> None:
+def test_a_message_larger_than_the_capacity_is_let_in_alone() -> None:
     box = mailbox(10)
-    box.put((Fate.PICTURE, 50, "large"))
-    assert box.n_overflown == 0
-    box.put((Fate.PICTURE, 60, "larger"))
-    assert box.n_overflown == 1
+    box.put((DropPolicy.PICTURE, 50, "large"))
+    assert box.n_overflowed == 0
+    box.put((DropPolicy.PICTURE, 60, "larger"))
+    assert box.n_overflowed == 1
     assert names_in(box) == ["larger"]
 
 
-def test_a_stage_that_takes_nothing_for_an_hour_holds_no_more_than_its_room() -> None:
-    box: Mailbox[object] = Mailbox(lambda message: fate_of(message, True), size_bytes, 1 << 20)
+def test_a_stage_that_takes_nothing_for_an_hour_stays_within_its_capacity() -> None:
+    box: Mailbox[object] = Mailbox(lambda m: drop_policy_of(m, True), size_bytes, 1 << 20)
     box.put(Setup(Config(), CAMERA))
     for t_ns in range(20_000):
         box.put(AttitudeSample(t_ns, np.array([1.0, 0, 0, 0])))
     assert box.n_bytes <= 1 << 20
-    assert box.n_overflown > 10_000
+    assert box.n_overflowed > 10_000
     box.put(Finish(hurry=True))
     assert isinstance(box.get(), Setup), "what it is to do comes before all else"
 

@@ -1,4 +1,4 @@
-"""Feeding: order of time in lockstep, the latest frame when paced."""
+"""Message order: by time in lockstep, the newest frame when paced."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def large(seq: int) -> Frame:
 
 @pytest.mark.parametrize("where", ["step", "flush"])
 @pytest.mark.parametrize("lossless", [True, False])
-def test_a_stage_that_fails_is_told_of_and_nobody_waits(where: str, lossless: bool) -> None:
+def test_a_stage_that_fails_is_reported_and_nobody_waits(where: str, lossless: bool) -> None:
     stage = Slow(where)
     stage.may_go_on.set()
     thread = StageThread(stage, lossless)

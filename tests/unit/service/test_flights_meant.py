@@ -1,4 +1,4 @@
-"""Which folder `companion flights` looks into without being told."""
+"""Default folder of `companion flights`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The steps of an installation; that they make a service of it is seen in tests/system."""
+"""Installation steps; the installed service is tested in tests/system."""
 
 from __future__ import annotations
 

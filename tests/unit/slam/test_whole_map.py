@@ -13,7 +13,7 @@ import pytest
 from companion.config import Config, MappingConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity, rotation_from_vector
-from companion.messages import Frame, Reunited, Track
+from companion.messages import Frame, LoopClosed, Track
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping import map_adjustment
 from companion.slam.mapping.atlas import Atlas
@@ -183,7 +183,7 @@ def test_a_live_flight_is_tracked_while_its_map_is_adjusted_whole(
     extend, put = Atlas.extend, map_adjustment.put_back_later
     n_adjusted = 0
 
-    def extended(self: Atlas, segment: SlamMap, keyframe: Keyframe) -> Reunited | None:
+    def extended(self: Atlas, segment: SlamMap, keyframe: Keyframe) -> LoopClosed | None:
         self._due = segment
         return extend(self, segment, keyframe)
 

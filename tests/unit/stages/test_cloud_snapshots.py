@@ -1,4 +1,4 @@
-"""The cloud written in mid-flight: between other work, whole or not at all."""
+"""Cloud snapshots in flight: in slices, whole or not at all."""
 
 from __future__ import annotations
 

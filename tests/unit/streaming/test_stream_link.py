@@ -12,10 +12,10 @@ import pytest
 
 from companion.errors import StreamError
 from companion.streaming.exporter import Exporter, open_listener
-from companion.streaming.framing import HELLO, MOST_ITEM_BYTES, Reassembly, frame, greeting
+from companion.streaming.framing import HELLO, MOST_ITEM_BYTES, Reassembly, frame, hello_datagram
 from companion.streaming.ground_link import GroundLink, host_and_port
 from companion.streaming.item_codec import Kind, decode
-from companion.streaming.item_store import Store
+from companion.streaming.item_store import ItemStore
 from companion.streaming.items import COARSE, FlightItem, Item, PointsItem, PoseItem, Shown
 from companion.streaming.parts import parts_of
 from tests.unit.streaming.test_stream_session import add_points, filled
@@ -24,7 +24,7 @@ from tests.unit.streaming.test_viewer_recording import CAMERA
 
 @contextmanager
 def serving(
-    store: Store, budget_kbit_s: float = 0, most: int = 4
+    store: ItemStore, budget_kbit_s: float = 0, most: int = 4
 ) -> Iterator[tuple[Exporter, int]]:
     exporter = Exporter(store, most, budget_kbit_s)
     listener = open_listener("127.0.0.1:0")
@@ -116,7 +116,7 @@ def test_a_viewer_that_connects_again_is_not_sent_the_map_again() -> None:
             connection.socket.shutdown(socket.SHUT_RDWR)
         until(lambda: viewer.link.n_connections == 2)
         add_points(exporter._store, 77)
-        exporter._rouse()
+        exporter._wake_up()
         until(lambda: 77 in viewer.coarse())
         again = [i.keyframe_id for i in viewer.items[n:] if isinstance(i, PointsItem)]
         assert set(again) == {77}
@@ -164,7 +164,7 @@ def test_datagrams_go_to_nobody_who_is_not_connected() -> None:
     with serving(filled(1)) as (exporter, port):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.settimeout(0.5)
-            stranger.sendto(greeting(bytes(16), 1), ("127.0.0.1", port))
+            stranger.sendto(hello_datagram(bytes(16), 1), ("127.0.0.1", port))
             stranger.sendto(b"x" * 300, ("127.0.0.1", port))
             tell(exporter, pose(1))
             with pytest.raises(TimeoutError):
@@ -180,7 +180,7 @@ def test_the_budget_holds_headers_and_all() -> None:
         assert 40_000 < rate < 105_000  # of 100 000 bytes/s
 
 
-def test_who_is_no_viewer_is_shown_the_door_and_so_is_one_too_many() -> None:
+def test_a_peer_that_is_no_viewer_is_rejected_and_so_is_one_too_many() -> None:
     with serving(filled(1), most=1) as (exporter, port):
         with socket.create_connection(("127.0.0.1", port), timeout=5) as stranger:
             stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")

@@ -7,7 +7,7 @@ import pytest
 
 from companion.geometry.transforms import Pose, Similarity
 from companion.messages import PointChunk
-from companion.streaming.item_store import Store
+from companion.streaming.item_store import ItemStore
 from companion.streaming.items import (
     COARSE,
     FINE,
@@ -45,9 +45,9 @@ CHUNKS = [points(k) for k in range(12)]
 PARTS = [parts_of(chunk) for chunk in CHUNKS]
 
 
-def filled(n_keyframes: int) -> Store:
+def filled(n_keyframes: int) -> ItemStore:
     """A store with a map of so many keyframes."""
-    store = Store(ROOM)
+    store = ItemStore(ROOM)
     store.take(FlightItem("a", "flight", CAMERA))
     for k in range(n_keyframes):
         place(store, k)
@@ -55,7 +55,7 @@ def filled(n_keyframes: int) -> Store:
     return store
 
 
-def add_points(store: Store, k: int) -> None:
+def add_points(store: ItemStore, k: int) -> None:
     """One of a few known chunks under another keyframe's number."""
     parts = [
         Part(kind, k, payload[:8] + k.to_bytes(4, "little") + payload[12:])
@@ -64,12 +64,12 @@ def add_points(store: Store, k: int) -> None:
     store.put(CHUNKS[k % 12], parts)
 
 
-def place(store: Store, k: int, shift: float = 0.0) -> None:
+def place(store: ItemStore, k: int, shift: float = 0.0) -> None:
     where = Similarity(1.0, np.eye(3), np.array([k + shift, 0.0, 0.0]))
     store.take(PlacesItem(k, {k: where}))
 
 
-def flying(store: Store) -> Callable[[float], None]:
+def flying(store: ItemStore) -> Callable[[float], None]:
     """A flight goes on in a store: poses, frames and points by simulated time."""
     due = dict.fromkeys(("pose", "image", "points", "status"), 0.0)
     n = [10_000]
@@ -188,7 +188,7 @@ def test_after_an_outage_the_newest_comes_at_once_and_nothing_is_missing() -> No
     assert len(coarse) >= 58
 
 
-def test_what_a_connection_had_on_its_way_is_sent_by_the_next() -> None:
+def test_items_in_flight_on_a_lost_connection_are_sent_on_the_next() -> None:
     store = filled(20)
     link = ThinLink(Session(store), 62_500, 0.15)
     link.run(1.0)
@@ -218,16 +218,16 @@ def test_a_viewer_that_takes_nothing_is_sent_little_and_makes_nothing_grow() -> 
 
 
 def test_the_store_is_bounded_and_gives_up_the_finest_of_the_oldest() -> None:
-    one = Store(ROOM)
+    one = ItemStore(ROOM)
     one.take(CHUNKS[0])
-    store = Store(16 * one.points_bytes)
+    store = ItemStore(16 * one.points_bytes)
     for k in range(30):
         add_points(store, k)
     for n in range(500):
         store.take(LogItem(n, "said"))
     assert store.points_bytes <= 16 * one.points_bytes
-    assert store.n_given_up["fine"] > 15 and store.n_given_up["coarse"] == 0
-    assert store.n_given_up["log"] == 300
+    assert store.n_evicted["fine"] > 15 and store.n_evicted["coarse"] == 0
+    assert store.n_evicted["log"] == 300
     link = ThinLink(Session(store), 2_500_000, 0.01)
     link.run(10.0)
     items = [i for _, i in link.arrived]

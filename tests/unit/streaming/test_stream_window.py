@@ -4,20 +4,20 @@ from collections import deque
 
 import pytest
 
-from companion.streaming.send_window import LEAST_BYTES, MOST_BYTES, Budget, Window
+from companion.streaming.send_window import LEAST_BYTES, MOST_BYTES, SendWindow, TokenBucket
 
 
 class Sender:
     """Sends as much as there is room for; what has come is acknowledged each 10 ms."""
 
     def __init__(self) -> None:
-        self.window, self.now_s = Window(), 0.0
+        self.window, self.now_s = SendWindow(), 0.0
         self._on_way: list[tuple[float, int]] = []
 
     def run(self, round_trips_s: list[float]) -> float:
         """Go on, each 10 ms with another round trip; the window's size."""
         for round_trip_s in round_trips_s:
-            while room := self.window.room_bytes() // 500 * 500:
+            while room := self.window.available_bytes() // 500 * 500:
                 self.window.sent(self.now_s, min(room, 1000))
                 self._on_way.append((self.now_s + round_trip_s, self.window.sent_bytes))
             self.now_s += 0.01
@@ -40,13 +40,13 @@ def test_it_closes_when_all_is_delayed_but_not_when_some_is() -> None:
 
 
 def test_a_link_that_is_always_full_has_no_queue_that_grows() -> None:
-    window, now_s, free_s = Window(), 0.0, 0.0
+    window, now_s, free_s = SendWindow(), 0.0, 0.0
     bytes_s, round_trip_s = 2.5e6, 0.02
     on_way: deque[tuple[float, int]] = deque()
     queued_s = []
     while now_s < 120.0:
         now_s += 0.002
-        while (room := window.room_bytes()) >= 1000:
+        while (room := window.available_bytes()) >= 1000:
             piece = min(room, 5000)
             window.sent(now_s, piece)
             free_s = max(free_s, now_s) + piece / bytes_s
@@ -60,23 +60,23 @@ def test_a_link_that_is_always_full_has_no_queue_that_grows() -> None:
 
 
 def test_what_was_never_sent_or_is_old_is_no_acknowledgement() -> None:
-    window = Window()
+    window = SendWindow()
     window.sent(0.0, 1000)
     window.acknowledged(0.1, 5000)
-    assert window.on_way_bytes == 1000
+    assert window.in_flight_bytes == 1000
     window.acknowledged(0.2, 600)
     window.acknowledged(0.3, 500)
-    assert window.on_way_bytes == 400 and window.round_trip_s is None
+    assert window.in_flight_bytes == 400 and window.round_trip_s is None
     window.acknowledged(0.4, 1000)
     assert window.round_trip_s == pytest.approx(0.4)
 
 
 def test_a_budget_fills_at_its_rate_and_holds_little() -> None:
-    budget = Budget(800)  # 100 kB/s
-    assert budget.room_bytes(0.0) == 0
-    assert budget.room_bytes(0.01) == 1000
-    assert budget.room_bytes(100.0) == 5000
+    budget = TokenBucket(800)  # 100 kB/s
+    assert budget.available_bytes(0.0) == 0
+    assert budget.available_bytes(0.01) == 1000
+    assert budget.available_bytes(100.0) == 5000
     budget.charge(7000)
-    assert budget.room_bytes(100.01) == 0
-    assert budget.room_bytes(100.04) == 2000
-    assert Budget(0).room_bytes(5.0) >= MOST_BYTES
+    assert budget.available_bytes(100.01) == 0
+    assert budget.available_bytes(100.04) == 2000
+    assert TokenBucket(0).available_bytes(5.0) >= MOST_BYTES

@@ -118,7 +118,7 @@ def test_who_connects_sees_the_flight_of_all_of_it_the_newest() -> None:
     assert viewer.n_dropped == 0
 
 
-def test_a_port_that_is_taken_is_told_and_opened_when_it_is_free() -> None:
+def test_a_port_in_use_is_reported_and_opened_when_free() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -180,7 +180,7 @@ def test_view_refuses_what_is_no_host_and_what_is_no_viewer() -> None:
         assert said in run.stderr and run.stderr.count("\n") == 1
 
 
-def test_inbox_is_bounded_by_bytes_and_keeps_room_for_what_is_small() -> None:
+def test_inbox_is_bounded_by_bytes_and_reserves_capacity_for_small_messages() -> None:
     inbox = Inbox(20 * size_bytes(image(0)))
     taken = [inbox.offer(image(seq)) for seq in range(40)]
     assert sum(taken) == 10
@@ -193,7 +193,7 @@ def test_inbox_is_bounded_by_bytes_and_keeps_room_for_what_is_small() -> None:
     assert seqs == list(range(10))
 
 
-def test_inbox_lets_in_what_is_larger_than_its_room() -> None:
+def test_inbox_lets_in_a_message_larger_than_its_capacity() -> None:
     inbox = Inbox(10)
     inbox.put(image(0))
     assert not inbox.offer(flown.position(0))
@@ -201,7 +201,7 @@ def test_inbox_lets_in_what_is_larger_than_its_room() -> None:
     assert inbox.offer(flown.position(0))
 
 
-def test_inbox_makes_its_caller_wait_until_there_is_room_or_it_is_closed() -> None:
+def test_inbox_blocks_until_there_is_capacity_or_it_is_closed() -> None:
     inbox = Inbox(10)
     inbox.put(image(0))
     waiting = threading.Thread(target=inbox.put, args=(image(1),))

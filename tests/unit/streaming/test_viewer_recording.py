@@ -182,7 +182,7 @@ def test_states_warnings_and_timings_are_there(flight: Rows) -> None:
     assert heights[0] == pytest.approx(-flown.place_m(flown.N_INITIALISING)[2])
 
 
-def test_a_recording_stays_within_its_room_and_keeps_the_newest(tmp_path: Path) -> None:
+def test_a_viewer_file_stays_within_its_limit_and_keeps_the_newest(tmp_path: Path) -> None:
     random = np.random.default_rng(4)
     noise = random.integers(0, 255, (480, 640, 3)).astype(np.uint8)
     camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)

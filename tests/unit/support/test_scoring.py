@@ -1,4 +1,4 @@
-"""The yardsticks themselves."""
+"""Scoring functions of the tests."""
 
 from __future__ import annotations
 

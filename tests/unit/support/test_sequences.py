@@ -1,4 +1,4 @@
-"""Data sets of other people, written small from the sample flight and read back."""
+"""Data sets in other formats, written from the sample flight and read back."""
 
 from __future__ import annotations
 

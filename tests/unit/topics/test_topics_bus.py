@@ -110,8 +110,8 @@ def test_the_subscriber_of_the_documentation_works(tmp_path: Path, closing: Exit
     try:
         assert reader.stdout is not None
         until_s = time.monotonic() + WAIT_S
-        is_wanted = drone.bus.is_wanted
-        while not is_wanted("pose") and time.monotonic() < until_s:
+        has_subscribers = drone.bus.has_subscribers
+        while not has_subscribers("pose") and time.monotonic() < until_s:
             time.sleep(0.05)
         drone.step(Odometry(1, 17, TrackState.TRACKING, 0, 50, Pose.identity(), np.zeros(3)))
         for message in topic_flight.messages(8):

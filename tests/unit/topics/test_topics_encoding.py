@@ -78,7 +78,7 @@ def test_a_cloud_says_where_it_lies_in_the_world() -> None:
 
 
 def test_map_and_depth_are_as_they_were() -> None:
-    update = replace(flown.update(), unit_of={2: 1.5}, n_retired=1)
+    update = replace(flown.update(), scale_of={2: 1.5}, n_retired=1)
     back = map_of_envelope(unpack(map_envelope("f", update).pack()))
     assert list(back.map_from_camera) == list(update.map_from_camera) and back.n_retired == 1
     assert back.georeference is not None and back.georeference.method == "GPS positions"
@@ -123,7 +123,7 @@ def test_bundles_are_as_they_were() -> None:
             assert np.abs(image.grey.astype(int) - true_frame.grey).mean() < 3
 
 
-def test_a_map_is_told_by_its_changes() -> None:
+def test_a_map_is_rebuilt_from_its_changes() -> None:
     changes, mirror = MapChanges(), MapMirror()
     first = mirror.take(changes.since_last(flown.update()))
     assert len(first.map_from_camera) == len(flown.update().map_from_camera)

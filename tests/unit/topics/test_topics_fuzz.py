@@ -1,4 +1,4 @@
-"""Bytes from a network that may send anything: decoded, or refused with a StreamError."""
+"""Fuzzing of topic decoders: decoded, or refused with a StreamError."""
 
 from __future__ import annotations
 

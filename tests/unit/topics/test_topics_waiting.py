@@ -17,8 +17,8 @@ def fetched(
     return bundle_of(envelope) if envelope.kind == "bundle" else None
 
 
-def filled(room_bytes: int = 1 << 26, budget_bytes_s: float = 0.0) -> Backlog:
-    backlog = Backlog("run", room_bytes, budget_bytes_s)
+def filled(capacity_bytes: int = 1 << 26, budget_bytes_s: float = 0.0) -> Backlog:
+    backlog = Backlog("run", capacity_bytes, budget_bytes_s)
     for bundle in topic_flight.bundles(60):
         backlog.put(bundle, topic_flight.update(59))
     return backlog
@@ -92,13 +92,13 @@ def test_who_begins_anew_gets_the_whole_map_first() -> None:
 
 
 def test_the_oldest_give_way_and_are_counted() -> None:
-    backlog = filled(room_bytes=100_000)
-    assert backlog.n_given_up > 2
+    backlog = filled(capacity_bytes=100_000)
+    assert backlog.n_evicted > 2
     first = fetched(backlog, "run", -1, 1.0)
     assert first is not None and first.change is not None and first.change.whole
     following = fetched(backlog, "run", first.number, 1.0)
     assert following is not None and following.number == first.number + 1
-    assert following.number == backlog.n_given_up
+    assert following.number == backlog.n_evicted
 
 
 def test_no_more_is_given_than_the_budget_allows() -> None:

@@ -1,4 +1,4 @@
-"""The camera's thread against a source that does what a test tells it."""
+"""Camera supervisor with a scripted source."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def running(source: ToldSource | None = None, **keys: float | str) -> Iterator[R
 @pytest.fixture(autouse=True)
 def faster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_feed, "RETRY_S", 0.05)
-    monkeypatch.setattr(camera_feed, "AMISS_S", 0.4)
+    monkeypatch.setattr(camera_feed, "INVALID_S", 0.4)
     monkeypatch.setattr(camera_feed, "FROZEN_S", 0.2)
 
 
@@ -170,7 +170,7 @@ def a_drivers_bug(_: Picture) -> Picture:
 
 
 @pytest.mark.parametrize("where", ["open", "read", "picture", "close"])
-def test_a_drivers_own_bug_is_told_with_its_place(
+def test_a_drivers_own_bug_is_reported_with_its_place(
     where: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("JOURNAL_STREAM", raising=False)
@@ -202,12 +202,12 @@ def test_a_drivers_own_bug_is_told_with_its_place(
     assert camera_feed.GONE not in run.told() and camera_feed.MISSING not in run.told()
     printed = capfd.readouterr().err
     assert printed.count("Traceback") == 1
-    assert ("_amiss" if where == "picture" else "in a_drivers_bug") in printed
+    assert ("_why_invalid" if where == "picture" else "in a_drivers_bug") in printed
     assert "secret" not in printed and (where == "picture" or "camera.url" in printed)
     assert all(line.startswith("companion: ") for line in printed.splitlines())
 
 
-def test_a_silent_camera_is_opened_anew() -> None:
+def test_a_silent_camera_is_reopened() -> None:
     with running() as run:
         run.more()
         run.source.making = lambda _: None
@@ -218,7 +218,7 @@ def test_a_silent_camera_is_opened_anew() -> None:
     assert run.told() == [camera_feed.SILENT, camera_feed.BACK]
 
 
-def test_a_frozen_camera_gives_no_frames_and_is_opened_anew() -> None:
+def test_a_frozen_camera_gives_no_frames_and_is_reopened() -> None:
     with running() as run:
         run.more()
         kept: list[Picture] = []
@@ -312,7 +312,7 @@ def test_stamps_far_from_now_are_refused_and_do_no_lasting_harm(off_s: int) -> N
     assert run.told()[0] == camera_feed.WRONG_STAMP
 
 
-def test_what_a_source_remarks_is_told() -> None:
+def test_remarks_of_a_source_are_reported() -> None:
     with running() as run:
         run.source.remarks.append("told: 15 pictures/s, 30 were asked")
         run.until(lambda: len(run.warned) == 1)

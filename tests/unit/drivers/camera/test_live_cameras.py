@@ -1,4 +1,4 @@
-"""Cameras that need no hardware: files in real time, the test pattern, GStreamer; and clocks."""
+"""Cameras without hardware: files in real time, the test pattern, GStreamer; and clocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Video4Linux against a simulated driver: what is set, what stamps mean, what comes of faults."""
+"""Video4Linux camera with a simulated driver: settings, stamps, faults."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_stamps_are_moved_to_mid_exposure(
 
 
 @pytest.mark.parametrize("wrong", ["unknown clock", "an hour ago"])
-def test_stamps_that_cannot_be_used_are_replaced_and_told(
+def test_invalid_stamps_are_replaced_and_reported(
     webcam: FakeV4l2, camera: V4l2Camera, wrong: str
 ) -> None:
     if wrong == "unknown clock":
@@ -148,7 +148,7 @@ def test_a_camera_without_the_control(webcam: FakeV4l2) -> None:
         V4l2Camera(CameraConfig(focus=3)).open()
 
 
-def test_another_rate_than_asked_is_told(webcam: FakeV4l2) -> None:
+def test_a_rate_other_than_requested_is_reported(webcam: FakeV4l2) -> None:
     camera = V4l2Camera(CameraConfig(rate_hz=60))
     camera.open()
     camera.close()
@@ -157,7 +157,7 @@ def test_another_rate_than_asked_is_told(webcam: FakeV4l2) -> None:
     ]
 
 
-def test_two_cameras_must_be_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_cameras_are_ambiguous(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     both = FakeV4l2(tmp_path, "left"), FakeV4l2(tmp_path, "right")
     for number, each in enumerate(both):
         each.plug_in(2 * number)

@@ -1,4 +1,4 @@
-"""Our structures against linux/videodev2.h: numbers that a C compiler gave on a 64-bit system."""
+"""Structures against linux/videodev2.h: values of a C compiler on a 64-bit system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Video4Linux nodes of other kinds than a webcam's, and such as refuse what they are asked."""
+"""Video4Linux nodes other than a webcam's, and drivers that refuse requests."""
 
 from __future__ import annotations
 

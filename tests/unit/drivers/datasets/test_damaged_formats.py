@@ -1,4 +1,4 @@
-"""A few damaged copies of flights of every format; `tests.bench.damaged_files` tries hundreds."""
+"""Some damaged copies of flights of every format; `tests.bench.damaged_files` tries hundreds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photographs with places in EXIF as a flight."""
+"""Geotagged stills as a flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The autopilot's link against pretended autopilots on real wires, and against made-up messages."""
+"""The autopilot's link with simulated autopilots on real wires, and with synthetic messages."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
 from drivers.mavlink.vehicle import vehicle_of
 from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
-from drivers.telemetry.live_positions import LivePlaces
+from drivers.telemetry.live_positions import LivePositions
 from drivers.telemetry.telemetry_log import GeodeticFix, kind_of
 from drivers.telemetry.telemetry_tlog import read_tlog
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
@@ -625,7 +625,7 @@ def test_nonsense_is_dropped_and_nothing_breaks() -> None:
     run(test())
 
 
-def test_arming_is_told_on_change() -> None:
+def test_arming_is_reported_on_change() -> None:
     async def test() -> None:
         async with spoken() as (heard, _port, talk):
             for n, armed in enumerate([False, True, True, False]):
@@ -735,22 +735,22 @@ def _fix(north_deg: float = 0.0, source: PositionSource = PositionSource.GLOBAL)
 
 
 def test_positions_in_both_frames_tell_where_the_local_one_is() -> None:
-    places = LivePlaces()
+    places = LivePositions()
     assert places.local(_local(100.0), 10 * SECOND) is not None
     found = places.fix(_fix(), 10 * SECOND + 20_000_000)
     assert found is not None and found.position_ned_m == pytest.approx([100, 0, 0], abs=0.01)
 
 
 def test_the_first_place_is_the_origin_where_there_is_no_other() -> None:
-    places = LivePlaces()
+    places = LivePositions()
     assert places.fix(_fix(source=PositionSource.GPS), 10 * SECOND) is None
     found = places.fix(_fix(source=PositionSource.GPS), 13 * SECOND)
     assert found is not None and found.position_ned_m == pytest.approx([0, 0, 0], abs=1e-6)
 
 
 def test_local_positions_go_on_from_where_they_were_before_a_reboot() -> None:
-    places = LivePlaces()
-    places.told(HERE)
+    places = LivePositions()
+    places.set_origin(HERE)
     places.local(_local(0.0), 10 * SECOND)
     places.restart()
     assert places.local(_local(0.0), 1 * SECOND) is None  # no telling where its zero is now

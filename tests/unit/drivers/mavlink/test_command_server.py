@@ -1,4 +1,4 @@
-"""Commands given to our component: answered as the protocol has it, and carried out once."""
+"""Command protocol of our component: acknowledgements, and execution exactly once."""
 
 from __future__ import annotations
 

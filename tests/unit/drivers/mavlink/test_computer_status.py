@@ -1,4 +1,4 @@
-"""The load as it is read, from this computer and from files like a Jetson's, and as it is sent."""
+"""System load as read, from this computer and from a Jetson's files, and as sent."""
 
 from __future__ import annotations
 

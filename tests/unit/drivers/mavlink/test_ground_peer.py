@@ -1,4 +1,4 @@
-"""What a ground station that is written with pymavlink sees of our component, over UDP."""
+"""Our component as seen by a pymavlink ground station over UDP."""
 
 from __future__ import annotations
 

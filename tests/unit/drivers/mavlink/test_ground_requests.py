@@ -1,4 +1,4 @@
-"""Requests through the link: who is listened to, how much, and that nothing sent can break it."""
+"""Requests over the link: who may send them, rate limits, and malformed ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is listened to at the router's port: who signs where there is a key, nobody in our name."""
+"""Trust at the router's port: signatures where there is a key, nobody under our identity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The port as those above it use it, with an autopilot that speaks real MAVLink."""
+"""MAVLink port with an autopilot that speaks real MAVLink."""
 
 from __future__ import annotations
 

@@ -383,14 +383,14 @@ def test_a_thousand_connections_leave_nothing_behind() -> None:
     asyncio.run(play())
 
 
-def test_who_only_holds_a_place_makes_room() -> None:
+def test_an_idle_connection_is_closed_for_a_new_one() -> None:
     async def play() -> None:
         async with flown() as scene:
             clients = [await scene.tcp_client() for _ in range(MOST_CONNECTIONS)]
             clients[0].send(Speaker(255, 190).heartbeat())
             await until(lambda: len(scene.autopilot.hear()) == 1)
             late = await scene.tcp_client()
-            await until(lambda: scene.port.router.n_turned_away == 1)
+            await until(lambda: scene.port.router.n_rejected == 1)
             packet = Speaker(1, 1).attitude(1)
             await asyncio.sleep(0.05)
             scene.autopilot.send(packet)
@@ -409,7 +409,7 @@ def test_clients_that_come_before_the_autopilot_are_there_when_it_comes(tmp_path
         with contextlib.ExitStack() as ends:
             async with running(port.run(Heard())):
                 scene = Scene(port, Side(ends.enter_context(udp())), Heard(), tcp_port, 0, ends)
-                await until(lambda: port.router._doors[0].port != 0)
+                await until(lambda: port.router._listeners[0].port != 0)
                 client = await scene.tcp_client()
                 client.send(Speaker(255, 190).heartbeat())
                 await until(lambda: port.n_dropped == 1)

@@ -1,4 +1,4 @@
-"""What ground stations ask of every component: single messages, and how often they come."""
+"""Message requests of ground stations: single messages, and their intervals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Our component's parameters over MAVLink, as ground stations ask for them."""
+"""Parameter protocol of our component."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_setting_is_for_us_alone(served: Served) -> None:
     assert served.values.values["FIRST"] == 1.5
 
 
-def test_a_storm_of_requests_waits_in_little_room(served: Served) -> None:
+def test_a_storm_of_requests_takes_little_memory(served: Served) -> None:
     message = mavlink.MAVLink_param_request_list_message(1, 197)
     wrong = mavlink.MAVLink_param_request_read_message(1, 197, b"NONE", -1)
     for _ in range(1000):

@@ -145,14 +145,14 @@ def test_cut_short_it_is_repaired_and_says_so(tmp_path: Path) -> None:
         assert flight.n_frames >= 20
 
 
-def test_video_after_a_hole_waits_for_a_picture_that_stands_alone(tmp_path: Path) -> None:
+def test_video_after_a_gap_waits_for_an_intra_picture(tmp_path: Path) -> None:
     folder = tmp_path / "f"
     record(folder, 75, "h264", per_chunk=10)
     path = folder / "flight.mcap"
     flight = opened(folder)
     whole = {f.seq: f.rgb for f in frames_of(flight)}
     places = flight.recording.pictures
-    assert [p.seq for p in places if p.alone] == [5, 35, 65]
+    assert [p.seq for p in places if p.intra] == [5, 35, 65]
     chunk = flight.recording.found.chunks[places[10].chunk]
     assert places[0].chunk < places[10].chunk < places[25].chunk
     data = bytearray(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Consoles in made-up file systems, laid out as a Jetson and a Raspberry Pi have them."""
+"""Login consoles in synthetic file systems of a Jetson and a Raspberry Pi."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scrapes over real loopback TCP, read back with the library's own parser."""
+"""Metrics over real loopback TCP, parsed by the library."""
 
 from __future__ import annotations
 

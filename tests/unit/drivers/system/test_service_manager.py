@@ -1,4 +1,4 @@
-"""Against a real datagram socket, as systemd holds one; and the unit file, as systemd reads it."""
+"""sd_notify on a real datagram socket; and the unit file, as systemd reads it."""
 
 from __future__ import annotations
 

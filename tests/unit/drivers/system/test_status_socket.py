@@ -1,4 +1,4 @@
-"""Real unix sockets: daemons that are killed, meet, and are asked by clients that misbehave."""
+"""Status socket on real unix sockets: killed daemons, two daemons, misbehaving clients."""
 
 from __future__ import annotations
 

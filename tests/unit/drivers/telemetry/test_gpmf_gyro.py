@@ -1,4 +1,4 @@
-"""A GoPro's own gyro, and a log put on its video's time by it, with nothing to be seen in it."""
+"""GoPro gyroscope, and time alignment of a log by it, without any texture in the images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
 from companion.geometry.transforms import Array, rotation_from_quaternion, vector_from_rotation
 from drivers.open_flight import open_flight
-from drivers.telemetry.gpmf_gyro import gyro_turns
+from drivers.telemetry.gpmf_gyro import gyro_rotation
 from tests.support.cameras.gopro import gyro_block, write_gopro
 
 SAMPLE = Path(__file__).parents[4] / "sample" / "survey"
@@ -34,7 +34,7 @@ def test_turns_about_the_axes_of_the_camera() -> None:
     good = [gyro_block(hero5_from_camera(turn), HERO5) for turn in (right, right, roll)]
     contents = [good[0], b"DEVC\0\1\xff\xff", good[1], good[2]]
     blocks = [(k * SECOND, (k + 1) * SECOND, block) for k, block in enumerate(contents)]
-    turns = gyro_turns(blocks)
+    turns = gyro_rotation(blocks)
     assert turns is not None and turns.axes_known
     assert turns.t_ns[0] == 0.5 / RATE_HZ * SECOND
     at = np.searchsorted(turns.t_ns, 3 * SECOND)
@@ -47,10 +47,10 @@ def test_turns_about_the_axes_of_the_camera() -> None:
     [("Gyroscope", "ZXY", True), (HERO5, "zxY", True), ("Gyroscope", "", False),
      ("Gyroscope", "ZXX", False), ("Gyroscope", "zXY", False)],
 )  # fmt: skip
-def test_axes_that_are_told_or_not(name: str, orientation: str, known: bool) -> None:
+def test_axes_known_or_unknown(name: str, orientation: str, known: bool) -> None:
     """The last one would be left-handed."""
     rates = np.tile([0.1, 0.2, 0.3], (RATE_HZ, 1))
-    turns = gyro_turns([(0, SECOND, gyro_block(rates, name, orientation))])
+    turns = gyro_rotation([(0, SECOND, gyro_block(rates, name, orientation))])
     assert turns is not None and turns.axes_known == known
     told = {"ZXY": [-0.2, -0.1, -0.3], "zxY": [0.2, 0.1, -0.3]}
     expected = told.get(orientation, [0.1, 0.2, 0.3])
@@ -59,8 +59,8 @@ def test_axes_that_are_told_or_not(name: str, orientation: str, known: bool) -> 
 
 
 def test_a_video_without_is_known_as_such() -> None:
-    assert gyro_turns([]) is None
-    assert gyro_turns([(0, SECOND, gyro_block(np.zeros((3, 3)), HERO5))]) is None
+    assert gyro_rotation([]) is None
+    assert gyro_rotation([(0, SECOND, gyro_block(np.zeros((3, 3)), HERO5))]) is None
 
 
 def felt(first_ns: int) -> list[Array]:

@@ -1,4 +1,4 @@
-"""A long flight made of a short one: its pictures and telemetry forwards and backwards in turn."""
+"""A long flight made of a short one: forward and return passes in turn."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from companion.messages import (
 KINDS = (AttitudeSample, PositionSample, RangeSample, HeightSample)
 
 
-def walk(first: int, last: int, n: int) -> Iterator[int]:
-    """`n` steps to and fro between two numbers, beginning at the first."""
+def back_and_forth(first: int, last: int, n: int) -> Iterator[int]:
+    """`n` indices that go from `first` to `last` and back, again and again."""
     at, step = first, 1
     for _ in range(n):
         yield at
@@ -29,10 +29,10 @@ def walk(first: int, last: int, n: int) -> Iterator[int]:
         at += step
 
 
-def flown_again(
+def reordered(
     frames: list[Frame], telemetry: Iterable[Telemetry], order: Iterable[int]
 ) -> Iterator[Frame | Telemetry]:
-    """Frames in this order and what telemetry was between them, as one flight in its own time."""
+    """Frames in this order, and the telemetry between them, as one flight with rising times."""
     samples = [s for s in telemetry if isinstance(s, KINDS)]
     times = np.array([s.t_ns for s in samples])
     now_ns, before = frames[0].t_ns, None

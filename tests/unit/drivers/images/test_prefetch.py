@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.images.prefetch import Ahead
+from drivers.images.prefetch import Prefetch
 
 
 class Source:
@@ -26,14 +26,14 @@ class Source:
 
 
 def test_order_is_kept() -> None:
-    assert list(Ahead(Source().items(), 3)) == list(range(100))
+    assert list(Prefetch(Source().items(), 3)) == list(range(100))
 
 
 def test_no_more_is_made_than_was_asked_for() -> None:
     source = Source()
-    ahead = Ahead(source.items(), 3)
-    taken = [number for number, _ in zip(ahead, range(5), strict=False)]
-    ahead.close()
+    prefetch = Prefetch(source.items(), 3)
+    taken = [number for number, _ in zip(prefetch, range(5), strict=False)]
+    prefetch.close()
     assert taken == [0, 1, 2, 3, 4]
     assert source.made <= 5 + 3 + 2
     assert source.closed.is_set()
@@ -42,12 +42,12 @@ def test_no_more_is_made_than_was_asked_for() -> None:
 def test_an_error_comes_where_its_item_would() -> None:
     taken = []
     with pytest.raises(ValueError, match="broken"):
-        for number in Ahead(Source(fail_at=4).items(), 2):
+        for number in Prefetch(Source(fail_at=4).items(), 2):
             taken.append(number)
     assert taken == [0, 1, 2, 3]
 
 
 def test_closing_what_nobody_read() -> None:
     source = Source()
-    Ahead(source.items(), 2).close()
+    Prefetch(source.items(), 2).close()
     assert source.closed.is_set()

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from companion.streaming.viewer.web_gate import LOOPBACK, WebGate, free_ports
+from companion.streaming.viewer.web_proxy import LOOPBACK, WebProxy, free_ports
 
 
 @contextmanager
@@ -40,13 +40,13 @@ def served(data: bytes) -> Iterator[int]:
 
 
 @contextmanager
-def gated(inner: int) -> Iterator[tuple[WebGate, int]]:
+def gated(inner: int) -> Iterator[tuple[WebProxy, int]]:
     (port,) = free_ports(1)
-    gate = WebGate({(LOOPBACK, port): inner}, watched=port)
+    proxy = WebProxy({(LOOPBACK, port): inner}, watched=port)
     try:
-        yield gate, port
+        yield proxy, port
     finally:
-        gate.close()
+        proxy.close()
 
 
 def all_of(opened: socket.socket) -> bytes:
@@ -58,29 +58,29 @@ def all_of(opened: socket.socket) -> bytes:
 
 def test_all_goes_through_as_it_is_and_ends_when_it_ends() -> None:
     data = bytes(range(256)) * 20_000
-    with served(data) as inner, gated(inner) as (gate, port):
+    with served(data) as inner, gated(inner) as (proxy, port):
         for _ in range(2):
             with socket.create_connection((LOOPBACK, port), timeout=10) as browser:
                 browser.sendall(b"give\n")
                 assert all_of(browser) == data
-        assert not gate.is_behind
+        assert not proxy.is_lagging
 
 
 def test_a_browser_that_takes_nothing_is_noticed_and_waited_for_but_not_for_ever() -> None:
     data = bytes(8 << 20)
-    with served(data) as inner, gated(inner) as (gate, port):
+    with served(data) as inner, gated(inner) as (proxy, port):
         with socket.create_connection((LOOPBACK, port), timeout=10) as browser:
             browser.sendall(b"give\n")
             end = time.monotonic() + 10
-            while not gate.is_behind:
+            while not proxy.is_lagging:
                 assert time.monotonic() < end
                 time.sleep(0.01)
             began = time.monotonic()
-            gate.wait_for_room(threading.Event())
+            proxy.wait_for_browsers(threading.Event())
             assert 1.5 < time.monotonic() - began < 4
             assert all_of(browser) == data
-        gate.wait_for_room(threading.Event())
-        assert not gate.is_behind
+        proxy.wait_for_browsers(threading.Event())
+        assert not proxy.is_lagging
 
 
 def test_a_server_that_is_not_there_closes_the_connection() -> None:
@@ -90,6 +90,6 @@ def test_a_server_that_is_not_there_closes_the_connection() -> None:
             assert browser.recv(10) == b""
 
 
-def test_a_door_that_is_taken_is_an_error() -> None:
+def test_a_port_in_use_is_an_error() -> None:
     with served(b"") as inner, pytest.raises(OSError, match="in use"):
-        WebGate({(LOOPBACK, inner): 1}, watched=inner)
+        WebProxy({(LOOPBACK, inner): 1}, watched=inner)

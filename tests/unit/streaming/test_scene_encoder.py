@@ -25,16 +25,16 @@ from companion.streaming.items import (
     StatusItem,
 )
 from companion.streaming.parts import parts_of
-from companion.streaming.scene_encoder import Story, Watched
+from companion.streaming.scene_encoder import SceneEncoder, Watched
 from tests.support.flights import flown
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 ORIGIN = GeoOrigin(47.0, 8.0, 400.0)
 
 
-def told(messages: list[Watched], story: Story | None = None) -> list[Item]:
-    story = story or Story(FlightItem("a", "a", CAMERA))
-    return [item for message in messages for item in story.take(message)]
+def told(messages: list[Watched], encoder: SceneEncoder | None = None) -> list[Item]:
+    encoder = encoder or SceneEncoder(FlightItem("a", "a", CAMERA))
+    return [item for message in messages for item in encoder.take(message)]
 
 
 def lost(seq: int) -> Track:
@@ -42,10 +42,11 @@ def lost(seq: int) -> Track:
 
 
 def test_each_state_of_the_tracker_has_its_word() -> None:
-    coasting = replace(flown.track(21), state=TrackState.COASTING, n_inliers=0)
+    coasting = replace(flown.track(21), state=TrackState.DEAD_RECKONING, n_inliers=0)
     items = told([flown.update(), flown.track(20), coasting, lost(22), lost(23)])
     poses = [item for item in items if isinstance(item, PoseItem)]
-    assert [p.shown for p in poses] == [Shown.TRACKING, Shown.COASTING, Shown.LOST, Shown.LOST]
+    states = [Shown.TRACKING, Shown.DEAD_RECKONING, Shown.LOST, Shown.LOST]
+    assert [p.shown for p in poses] == states
     assert [p.world_from_camera is not None for p in poses] == [True, True, False, False]
     assert {state.value for state in TrackState} <= {shown.value.lower() for shown in Shown}
     said = [(item.text, item.is_warning) for item in items if isinstance(item, LogItem)]
@@ -60,24 +61,24 @@ def test_who_was_never_tracked_is_lost_at_once() -> None:
 
 
 def test_a_keyframe_that_has_left_the_map_lies_nowhere_and_may_come_back() -> None:
-    story = Story(FlightItem("a", "a", CAMERA))
-    told([flown.update()], story)
-    gone = [i for i in told([flown.update(without=(3,))], story) if isinstance(i, PlacesItem)]
+    encoder = SceneEncoder(FlightItem("a", "a", CAMERA))
+    told([flown.update()], encoder)
+    gone = [i for i in told([flown.update(without=(3,))], encoder) if isinstance(i, PlacesItem)]
     assert [i.places for i in gone] == [{3: None}]
-    again = told([flown.update(without=(3,))], story)
+    again = told([flown.update(without=(3,))], encoder)
     assert not any(isinstance(item, PlacesItem) for item in again)
-    (back,) = [i for i in told([flown.update()], story) if isinstance(i, PlacesItem)]
+    (back,) = [i for i in told([flown.update()], encoder) if isinstance(i, PlacesItem)]
     assert list(back.places) == [3] and back.places[3] is not None
 
 
-def test_the_origin_is_told_once_the_map_is_known_to_lie_in_its_world() -> None:
-    story = Story(FlightItem("a", "a", CAMERA))
-    assert told([ORIGIN, flown.update(known=False)], story)[0].__class__ is PlacesItem
+def test_the_origin_is_sent_once_the_map_is_georeferenced() -> None:
+    encoder = SceneEncoder(FlightItem("a", "a", CAMERA))
+    assert told([ORIGIN, flown.update(known=False)], encoder)[0].__class__ is PlacesItem
     scaled = flown.update()
     assert scaled.georeference is not None
     elsewhere = replace(scaled, georeference=replace(scaled.georeference, has_origin=False))
-    assert not any(isinstance(item, FlightItem) for item in told([elsewhere], story))
-    flights = [i for i in told([scaled, scaled], story) if isinstance(i, FlightItem)]
+    assert not any(isinstance(item, FlightItem) for item in told([elsewhere], encoder))
+    flights = [i for i in told([scaled, scaled], encoder) if isinstance(i, FlightItem)]
     assert [flight.origin for flight in flights] == [ORIGIN]
 
 
@@ -94,8 +95,8 @@ def test_frames_come_with_the_points_that_were_found_in_them() -> None:
 
 
 def test_a_thinned_path_is_thin_and_goes_through_the_same_places() -> None:
-    story = Story(FlightItem("a", "a", CAMERA), path_step_ns=4 * flown.STEP_NS)
-    items = told([flown.track(seq) for seq in range(flown.N_FRAMES)], story) + story.close()
+    encoder = SceneEncoder(FlightItem("a", "a", CAMERA), path_step_ns=4 * flown.STEP_NS)
+    items = told([flown.track(seq) for seq in range(flown.N_FRAMES)], encoder) + encoder.close()
     last = {item.piece: item for item in items if isinstance(item, PathItem)}
     n_tracked = flown.N_FRAMES - flown.N_INITIALISING - len(flown.LOST)
     n = sum(len(item.strip) for item in last.values())
@@ -191,22 +192,22 @@ def test_the_cloud_that_viewers_have_is_the_one_that_is_written() -> None:
     assert np.linalg.norm(without[:, None] - written, axis=2).min(axis=1).max() > 0.5
 
 
-def test_a_map_that_is_stretched_sends_transforms_only() -> None:
-    story = Story(FlightItem("a", "a", CAMERA))
+def test_a_local_scale_correction_sends_transforms_only() -> None:
+    encoder = SceneEncoder(FlightItem("a", "a", CAMERA))
     ids = range(len(flown.update().map_from_camera))
-    told([flown.update(), *(spanned_chunk(k) for k in ids)], story)
-    (moved,) = told([stretched(1.08)], story)
+    told([flown.update(), *(spanned_chunk(k) for k in ids)], encoder)
+    (moved,) = told([stretched(1.08)], encoder)
     assert isinstance(moved, PlacesItem)
     place = moved.places[max(ids)]
     assert place is not None and place.scale == pytest.approx(1.08)
-    assert told([stretched(1.08)], story) == []
+    assert told([stretched(1.08)], encoder) == []
 
 
-def test_points_that_come_after_the_map_was_stretched_are_stretched_at_once() -> None:
-    story = Story(FlightItem("a", "a", CAMERA))
+def test_late_points_get_the_local_scale_correction_at_once() -> None:
+    encoder = SceneEncoder(FlightItem("a", "a", CAMERA))
     last = max(flown.update().map_from_camera)
-    told([stretched(1.08)], story)
-    places, _ = told([spanned_chunk(last)], story)
+    told([stretched(1.08)], encoder)
+    places, _ = told([spanned_chunk(last)], encoder)
     assert isinstance(places, PlacesItem)
     place = places.places[last]
     assert place is not None and place.scale == pytest.approx(1.08)

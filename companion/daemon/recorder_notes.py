@@ -1,4 +1,4 @@
-"""What the daemon itself has to say for the recording: bytes of the link, and how all is."""
+"""The daemon's own entries in the recording: bytes of the link, and health once a second."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from drivers.recording.recorded_content import HealthNote, LinkBytes
 
 EVERY_S = 1.0
 LEAD_NS = 10_000_000_000
-"""A flight's recording begins with the bytes of so long before."""
+"""A recording begins with the link bytes of this long before the flight."""
 MOST_IN_LEAD = 10_000
-"""Pieces; more than the fastest link brings in that time."""
+"""Reads from the link; more than the fastest link gives in that time."""
 
 
-class TapeNotes:
-    """Used in the event loop."""
+class RecorderNotes:
+    """Records link bytes and health. To be used in the event loop."""
 
     def __init__(
         self, clock: FlightClock, flights: Flights, watch: HealthWatch, link: AutopilotLink | None
@@ -32,10 +32,10 @@ class TapeNotes:
             link.port.set_tap(self._on_bytes)
 
     async def run(self) -> None:
-        """Note how all is once a second, until cancelled."""
+        """Record health once a second, until cancelled."""
         while True:
             await asyncio.sleep(EVERY_S)
-            self._flights.keep(HealthNote(self._clock.now_ns(), self._document()))
+            self._flights.record(HealthNote(self._clock.now_ns(), self._document()))
 
     def _on_bytes(self, outgoing: bool, data: bytes, monotonic_ns: int) -> None:
         taken = LinkBytes(
@@ -46,7 +46,7 @@ class TapeNotes:
             self._lead.popleft()
         if self._flights.current is not None:
             while self._lead:
-                self._flights.keep(self._lead.popleft())
+                self._flights.record(self._lead.popleft())
 
     def _document(self) -> dict[str, Any]:
         document: dict[str, Any] = {"health": self._watch.document()}

@@ -1,6 +1,6 @@
-"""What the stages gave of a flight, kept once and told again at the flight's own pace.
+"""Message log: the output of the stages in a flight, kept once and played in real time.
 
-Told again it costs next to nothing, so that what is measured is the link and not the tracker.
+Playing it costs next to nothing, so that the link is measured and not the tracker.
 """
 
 from __future__ import annotations
@@ -49,39 +49,39 @@ class _Jpeg:
     jpeg: bytes
 
 
-class Keeper:
-    """Writes a tape."""
+class MessageLogWriter:
+    """Writes the messages that viewers are shown to a file."""
 
     def __init__(self, path: Path, camera: Camera, origin: GeoOrigin | None) -> None:
         self._camera = camera
-        self._tape = path.open("wb")
-        pickle.dump((camera, origin), self._tape)
+        self._file = path.open("wb")
+        pickle.dump((camera, origin), self._file)
 
     def take(self, message: Message) -> None:
         """Keep a message, if viewers are shown it."""
         if isinstance(message, Frame):
             bgr = cv2.cvtColor(message.rgb, cv2.COLOR_RGB2BGR)
             _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 90])
-            pickle.dump(_Jpeg(message.seq, message.t_ns, jpeg.tobytes()), self._tape)
+            pickle.dump(_Jpeg(message.seq, message.t_ns, jpeg.tobytes()), self._file)
         elif isinstance(message, KEPT):
-            pickle.dump(reduced(message, self._camera.width), self._tape)
+            pickle.dump(reduced(message, self._camera.width), self._file)
 
-    def __enter__(self) -> Keeper:
+    def __enter__(self) -> MessageLogWriter:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._tape.close()
+        self._file.close()
 
 
-def make_tape(flight_path: Path, path: Path, config: Config) -> None:
+def write_message_log(flight_path: Path, path: Path, config: Config) -> None:
     """Replay a flight once, and keep all that a viewer is shown."""
     flight = open_flight(flight_path, config.camera, config.telemetry)
     log = flight.telemetry()
     times, devices = StageTimes(), choose_devices(config.opencl)
-    with Keeper(path, flight.camera, log.origin) as keeper:
+    with MessageLogWriter(path, flight.camera, log.origin) as writer:
         pipeline = Pipeline(
             LocalisationStage(config, flight.camera, times, beside=False),
-            DepthStage(config.depth, config.cloud, flight.camera, devices, times), [keeper],
+            DepthStage(config.depth, config.cloud, flight.camera, devices, times), [writer],
             lossless=True,
         )  # fmt: skip
         start_ns, stop_ns = flight.start_ns, flight.stop_ns
@@ -91,17 +91,17 @@ def make_tape(flight_path: Path, path: Path, config: Config) -> None:
         pipeline.finish()
 
 
-class Tape:
-    """A flight as it was kept."""
+class MessageLog:
+    """A message log, read back."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with path.open("rb") as tape:
+        with path.open("rb") as log:
             self.camera: Camera
             self.origin: GeoOrigin | None
-            self.camera, self.origin = pickle.load(tape)
+            self.camera, self.origin = pickle.load(log)
 
-    def told(self, seconds: float) -> Iterator[Any]:
+    def messages(self, seconds: float) -> Iterator[Any]:
         """Messages as their time comes, stamped with now; again from the start where it ends."""
         began_ns, lap = time.monotonic_ns(), 0
         epoch_ns = time.time_ns() - began_ns
@@ -125,11 +125,11 @@ class Tape:
             lap += 1
 
     def _messages(self) -> Iterator[Any]:
-        with self._path.open("rb") as tape:
-            pickle.load(tape)
+        with self._path.open("rb") as log:
+            pickle.load(log)
             while True:
                 try:
-                    message = pickle.load(tape)
+                    message = pickle.load(log)
                 except EOFError:
                     return
                 if isinstance(message, _Jpeg):
@@ -146,7 +146,7 @@ def _moved(message: Any, shift_ns: int, number: int) -> Any:
         changes["map_from_camera"] = {
             k + number: pose for k, pose in message.map_from_camera.items()
         }
-        changes["unit_of"] = {k + number: unit for k, unit in message.unit_of.items()}
+        changes["scale_of"] = {k + number: unit for k, unit in message.scale_of.items()}
     elif number and getattr(message, "keyframe_id", None) is not None:
         changes["keyframe_id"] = message.keyframe_id + number
     return replace(message, **changes)

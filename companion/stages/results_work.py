@@ -1,0 +1,57 @@
+"""Stage `results`: the viewer file of a flight while it is flown, and its results at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import ExitStack
+from typing import Any
+
+from companion.errors import StageError
+from companion.messages import Message
+from companion.products.flight_result import FlightResult
+from companion.products.report.write_results import write_results
+from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from companion.runtime.stage_work import Work
+from companion.stages.cloud_snapshots import CloudSnapshots
+from companion.streaming.viewer import FileViewer
+
+
+class _Results(Work):
+    def __init__(self, setup: Setup) -> None:
+        super().__init__()
+        if setup.folder is None:
+            raise StageError("the results need a folder")
+        self._folder, self._voxel_m = setup.folder, setup.config.cloud.voxel_m
+        self._open = ExitStack()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._result = FlightResult(self._folder, setup.config.cloud.memory_mb)
+        self._snapshots = CloudSnapshots(self._folder, self._result, self._voxel_m)
+        self._viewer_file = self._open.enter_context(
+            FileViewer(
+                setup.config.viewer, setup.camera, self._folder / "flight.rrd", indexed=False
+            )
+        )
+
+    def step(self, message: Any) -> Iterable[Message | Snapshot]:
+        if isinstance(message, TakeSnapshot):
+            self._snapshots.begin(message)
+            return self._snapshots.step()
+        self._result.take(message)
+        self._viewer_file.take(message)
+        return self._snapshots.step()
+
+    def finish(self, finish: Finish) -> Iterable[Message]:
+        try:
+            self._open.close()
+        finally:  # a viewer file that cannot be written is no reason to lose the results
+            if finish.facts is not None:
+                write_results(
+                    self._folder, self._result, finish.facts, self._voxel_m, page=not finish.hurry
+                )
+        self._result.close()
+        return []
+
+
+def work(setup: Setup) -> Work:
+    """The stage for a setup."""
+    return _Results(setup)
