@@ -174,7 +174,7 @@ class KeyframeAdded:
 
 
 @dataclass(frozen=True, slots=True)
-class Reunited:
+class LoopClosed:
     """A place was known again: keyframe `keyframe_id` shows what `other_id` showed before.
 
     Within the same map a loop closed, which moved the newer end by `moved` map units; else two maps
@@ -355,7 +355,7 @@ class ClockReport:
 
 
 Message = (
-    Frame | Telemetry | Track | Odometry | KeyframeAdded | Reunited | MapUpdate | DepthMap
+    Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
     | PointChunk | Warned
 )  # fmt: skip
 

@@ -24,7 +24,7 @@ LEAST_SPAN_NS = 3_000_000_000
 SPACING_NS = 45_000_000
 """A little under the period of 20 frames/s: every frame of such a camera."""
 LAGS_NS = (200_000_000, 500_000_000)
-"""Turns over two times, so that a body that rocks in one of them still shows in the other."""
+"""Rotations over two spans, so that a body that rocks in one of them still shows in the other."""
 OFFSETS_NS = np.arange(-240, 241, 20) * 1_000_000
 """Links and cameras are late by up to 200 ms."""
 LEAST_TURN_RAD = np.radians(0.7)
@@ -39,7 +39,7 @@ KEPT_SHARE = 0.85
 """The greatest turns of the body are left out: where an autopilot sets its heading anew, it turns
 by tens of degrees in itself alone, which is in one pair of eight at most."""
 FILTERED = 3.0
-"""Turns that overlap count for so much less."""
+"""RelativeRotationFactor that overlap count for so much less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,13 +44,13 @@ FOLLOWED_AGAIN = "camera turns with the body again: attitude used"
 class Verdict:
     """What is to be done: a word to whom it concerns, and what becomes of map and attitudes.
 
-    The map in use begins anew with `begin_anew`, the `n_anew`th in a row, and is of no use at all
+    The map in use begins anew with `reinitialise`, the `n_anew`th in a row, and is of no use at all
     if it is `young`. Attitudes since `disowned_since_ns` were not the camera's. With `mount` it is,
     or was until now, how the camera sits on the body that was wrong.
     """
 
     warning: Warned
-    begin_anew: bool = False
+    reinitialise: bool = False
     young: bool = True
     disowned_since_ns: int | None = None
     mount: bool = False
@@ -180,7 +180,7 @@ class AttitudeVerdict:
         young = not self._straight
         self.forget()
         detail = f"by {off_deg:.0f} degrees, number {self.n_anew} of {MOST_ANEW} in a row"
-        return Verdict(Warned(t_ns, BEGUN_ANEW, detail), begin_anew=True, young=young)
+        return Verdict(Warned(t_ns, BEGUN_ANEW, detail), reinitialise=True, young=young)
 
     def _drop(self, t_ns: int, what: str) -> Verdict:
         """Leave the attitude aside until turns agree again."""

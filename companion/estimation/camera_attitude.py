@@ -30,14 +30,14 @@ class Judged(NamedTuple):
 
     After a correction `now_from_before` (3, 3) turns what was told in the camera's axes by the
     mount as it was, and `before_from_now_ned` (3, 3) is by what the frame's attitude was off. With
-    `begin_anew` the map in use is tilted, and of no use at all if it is `young`; `n_anew` is how
+    `reinitialise` the map in use is tilted, and of no use at all if it is `young`; `n_anew` is how
     many in a row were. Attitudes since `disowned_since_ns` were not the camera's.
     """
 
     warnings: list[Warned]
     now_from_before: Array | None = None
     before_from_now_ned: Array | None = None
-    begin_anew: bool = False
+    reinitialise: bool = False
     young: bool = True
     n_anew: int = 0
     disowned_since_ns: int | None = None
@@ -159,7 +159,7 @@ class CameraAttitude:
                 if not verdict.mount:
                     self._estimator.forget()  # it was given a gimbal's turns
             return Judged(
-                [verdict.warning], begin_anew=verdict.begin_anew, young=verdict.young,
+                [verdict.warning], reinitialise=verdict.reinitialise, young=verdict.young,
                 n_anew=self._verdict.n_anew, disowned_since_ns=verdict.disowned_since_ns,
             )  # fmt: skip
         if not self.used or t_ns < self._due_ns:

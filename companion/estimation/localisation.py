@@ -35,7 +35,7 @@ from companion.messages import (
     TrackState,
     Warned,
 )
-from companion.slam.loop.loop_closure import Reunion
+from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.map_part import map_of, part_around
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
@@ -60,12 +60,12 @@ class LocalisationStage:
     """
 
     def __init__(
-        self, config: Config, camera: Camera, times: Timer, *, beside: bool = False
+        self, config: Config, camera: Camera, times: Timer, *, background: bool = False
     ) -> None:
         self._config = config
         self._camera = camera
         self._times = times
-        self._tracker = Tracker(config, camera, times, beside)
+        self._tracker = Tracker(config, camera, times, background)
         self._attitude = CameraAttitude(camera.body_from_camera)
         self._motion = MotionFilter()
         self._georeferencer = Georeferencer(
@@ -79,8 +79,8 @@ class LocalisationStage:
         self._let_go_ns: int | None = None
         self._resumption: Resumption | None = None
         """While a map from before is in question."""
-        self._tracker.atlas.allowed = self._allowed
-        self._tracker.atlas.ways_of = self._places.ways_of
+        self._tracker.atlas.loop_allowed = self._allowed
+        self._tracker.atlas.displacements_of = self._places.displacements_of
 
     @property
     def state(self) -> TrackState:
@@ -118,7 +118,7 @@ class LocalisationStage:
 
     def set_effort(self, share: float) -> None:
         """Look for this share of the features from now on, where time is short."""
-        self._tracker.set_effort(share)
+        self._tracker.set_feature_ratio(share)
 
     def checkpoint(self) -> Checkpoint | None:
         """What another process needs to go on from the last frame; None unless it was tracked.
@@ -135,7 +135,7 @@ class LocalisationStage:
         mounted = self._camera.body_from_camera is not None
         if georeference is not None and mounted and told is None:
             return None
-        with self._times("checkpoint"), self._tracker.turn.tracking():
+        with self._times("checkpoint"), self._tracker.map_lock.tracking():
             place = last.map_from_camera.translation
             (nearest,) = segment.nearest(place, 1, set())
             part = part_around(segment, segment.keyframes[nearest], MOST_BYTES)
@@ -158,7 +158,7 @@ class LocalisationStage:
         self._resumption = Resumption(kept, t_ns, absent_ns)
         told = {k.keyframe_id: k.ned_from_camera for k in kept.part.keyframes}
         self._attitude.take_up(kept.body_from_camera, kept.late_ns, told)
-        self._tracker.take_up(segment, kept.next_keyframe_id, self._resumption.until_ns)
+        self._tracker.resume(segment, kept.next_keyframe_id, self._resumption.until_ns)
 
     def finish(self, adjust: bool = True) -> list[Message]:
         """Give the map as it is at the end of a flight, all of it adjusted once more or not."""
@@ -178,7 +178,9 @@ class LocalisationStage:
     def _frame(self, frame: Frame) -> Iterator[Message]:
         self._t_ns = frame.t_ns
         attitude = self._attitude.at(frame.t_ns)
-        with self._tracker.turn.tracking():  # all of it: beside mapping each would slow the other
+        with (
+            self._tracker.map_lock.tracking()
+        ):  # all of it: beside mapping each would slow the other
             self._follow_map()
             predicted = self._predicted(frame.t_ns, attitude)
             before = self._tracker.map
@@ -223,7 +225,7 @@ class LocalisationStage:
         if self._let_go_ns is not None and t_ns < self._let_go_ns + LET_GO_EVERY_NS:
             return
         self._let_go_ns = t_ns
-        with self._tracker.turn.tracking():
+        with self._tracker.map_lock.tracking():
             living = {k.keyframe_id: k.t_ns for s in self._segments() for k in s.keyframes.values()}
         self._attitude.let_go(living.keys())
         when_ns: Array = np.array(sorted(living.values()))
@@ -242,8 +244,8 @@ class LocalisationStage:
             return
         self._resumption = None
         if verdict is Verdict.REFUSED:
-            with self._tracker.turn.tracking():
-                self._tracker.leave(kept.part.first_keyframe_id)
+            with self._tracker.map_lock.tracking():
+                self._tracker.drop_map(kept.part.first_keyframe_id)
             if in_use:
                 self._forget_frames()
             yield Warned(t_ns, NOT_TAKEN_UP, resumption.why_not)
@@ -263,7 +265,7 @@ class LocalisationStage:
         self._last = None
 
     def _map_update(self) -> MapUpdate:
-        with self._times("georeference"), self._tracker.turn.tracking():
+        with self._times("georeference"), self._tracker.map_lock.tracking():
             return self._places.update(self._segments(), self._t_ns, final=False)
 
     def _follow_map(self) -> None:
@@ -339,7 +341,7 @@ class LocalisationStage:
             pose = segment.pose_of(keyframe_id)
             return None if pose is None else pose.rotation.T
 
-        with self._tracker.turn.tracking():
+        with self._tracker.map_lock.tracking():
             judged = self._attitude.judge(
                 t_ns, rotation_of, None if placed is None else placed.world_from_map.rotation
             )
@@ -349,9 +351,9 @@ class LocalisationStage:
             self._motion.attitude_corrected(judged.before_from_now_ned)
         if judged.disowned_since_ns is not None:
             self._disown_attitudes(judged.disowned_since_ns)
-        if judged.begin_anew:
-            with self._tracker.turn.tracking():
-                self._tracker.begin_anew(judged.n_anew, keep=not judged.young)
+        if judged.reinitialise:
+            with self._tracker.map_lock.tracking():
+                self._tracker.reinitialise(judged.n_anew, keep=not judged.young)
             self._motion.reset()
             self._attitude.forget()
             self._last = None
@@ -360,7 +362,7 @@ class LocalisationStage:
     def _disown_attitudes(self, since_ns: int) -> None:
         """Keyframes since then were given attitudes that are not the camera's."""
         self._motion.untie()
-        with self._tracker.turn.tracking():
+        with self._tracker.map_lock.tracking():
             for segment in self._tracker.segments:
                 for keyframe in segment.keyframes.values():
                     if keyframe.t_ns >= since_ns:
@@ -368,11 +370,11 @@ class LocalisationStage:
 
     def _turn_attitudes(self, turn: Array) -> None:
         """What keyframes were told of their attitude was told by the mount as it was stated."""
-        with self._tracker.turn.tracking():
+        with self._tracker.map_lock.tracking():
             for segment in self._tracker.segments:
                 for keyframe in segment.keyframes.values():
                     if keyframe.ned_from_camera is not None:
                         keyframe.ned_from_camera = keyframe.ned_from_camera @ turn.T
 
-    def _allowed(self, keyframe: Keyframe, other: Keyframe, found: Reunion) -> bool:
+    def _allowed(self, keyframe: Keyframe, other: Keyframe, found: LoopClosure) -> bool:
         return self._places.allowed(self._tracker.map, keyframe, other, found)

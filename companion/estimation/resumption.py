@@ -15,7 +15,7 @@ from companion.estimation.checkpoint import Checkpoint
 from companion.estimation.smooth_odometry import MAX_ACCELERATION_M_S2
 from companion.geometry.transforms import Array, Pose, angle_between
 from companion.messages import Track
-from companion.slam.loop.relocalizer import MIN_SEEN
+from companion.slam.loop.relocalizer import MIN_FOUND
 
 MOST_ABSENT_NS = 60_000_000_000
 """What was kept longer ago is of another flight, or of another place by now."""
@@ -85,7 +85,7 @@ class Resumption:
         self, track: Track, map_from_camera: Pose, ned_from_camera: Array | None,
         camera_from_body: Pose,
     ) -> bool:  # fmt: skip
-        if track.n_inliers < MIN_SEEN:
+        if track.n_inliers < MIN_FOUND:
             self.why_not = "too little of it is seen"
             return False
         if self.kept.ned_from_map is not None and ned_from_camera is not None:

@@ -18,11 +18,11 @@ from companion.estimation.trajectory_alignment import (
 )
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Georeference, MapUpdate
-from companion.slam.loop.loop_closure import Reunion
+from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.sparse_map import Keyframe, SlamMap
-from companion.slam.optimisation.displacement_factor import Ways, usual_error
+from companion.slam.optimisation.displacement_factor import DisplacementFactor, typical_error
 
-MAX_REUNION_OFF_M = 6.0
+MAX_LOOP_ERROR_M = 6.0
 """What the autopilot's own positions may be wrong by between two times."""
 ALIKE = 3.0
 """Each window takes the same ways anew, and their errors are alike: sigmas are so much larger."""
@@ -114,18 +114,20 @@ class SegmentPlaces:
             if segment is segments[-1]:
                 self.main_from_newest = main_from_own
             n_retired += len(segment.retired)
-            for key, map_from_camera in segment.places():
+            for key, map_from_camera in segment.poses():
                 poses[key] = main_from_own.apply_to_pose(map_from_camera)
                 unit = main_from_own.scale * segment.unit_of.get(key, 1.0)
                 if unit != 1.0:
                     scales[key] = unit
-            points.append(main_from_own.apply(segment.living_positions()))
+            points.append(main_from_own.apply(segment.point_positions()))
         return MapUpdate(
             self._revision, t_ns, poses, np.concatenate(points), anchor, scales, n_retired
         )
 
-    def ways_of(self, segment: SlamMap, keyframes: list[Keyframe]) -> Ways | None:
-        """Ways between keyframes of a segment that follow each other, by the autopilot's velocity.
+    def displacements_of(
+        self, segment: SlamMap, keyframes: list[Keyframe]
+    ) -> DisplacementFactor | None:
+        """DisplacementFactor between keyframes of a segment that follow each other, by the autopilot's velocity.
 
         As wrong as they are found to be all over the segment; None where they do not fit it.
         """
@@ -136,13 +138,13 @@ class SegmentPlaces:
         whole = self._ways(placed, everywhere)
         if whole is None:
             return None
-        error = usual_error(whole, *_poses(everywhere))
+        error = typical_error(whole, *_poses(everywhere))
         ways = None if error is None else self._ways(placed, keyframes)
         if ways is None or error is None:
             return None
         return replace(ways, sigma_m=ALIKE * ways.sigma_m * max(error, 1.0))
 
-    def _ways(self, placed: Georeference, keyframes: list[Keyframe]) -> Ways | None:
+    def _ways(self, placed: Georeference, keyframes: list[Keyframe]) -> DisplacementFactor | None:
         t_ns = np.array([k.t_ns for k in keyframes])
         travelled_m = self._georeferencer.travelled(t_ns)
         if travelled_m is None:
@@ -152,17 +154,21 @@ class SegmentPlaces:
         where_m = travelled_m + self._georeferencer.lever_ned(ned_from_camera)
         order = np.argsort(t_ns, kind="stable")
         first, second = order[:-1], order[1:]
-        way_m, dt_s = where_m[second] - where_m[first], (t_ns[second] - t_ns[first]) * 1e-9
-        use = np.isfinite(way_m[:, :2]).all(1) & (dt_s < MAX_STEP_S)
+        displacement_m, dt_s = where_m[second] - where_m[first], (t_ns[second] - t_ns[first]) * 1e-9
+        use = np.isfinite(displacement_m[:, :2]).all(1) & (dt_s < MAX_STEP_S)
         if not use.any():
             return None
         placing = np.hypot(placed.sigma_scale, placed.sigma_yaw_rad)
         sigma_m = np.hypot(
             SIGMA_VELOCITY_M_S * np.sqrt(dt_s * np.maximum(dt_s, VELOCITY_TAU_S)),
-            placing * np.linalg.norm(np.nan_to_num(way_m), axis=1),
+            placing * np.linalg.norm(np.nan_to_num(displacement_m), axis=1),
         )
-        return Ways(
-            first[use], second[use], way_m[use], sigma_m[use], to_world.scale * to_world.rotation
+        return DisplacementFactor(
+            first[use],
+            second[use],
+            displacement_m[use],
+            sigma_m[use],
+            to_world.scale * to_world.rotation,
         )
 
     def _main_of(self, segments: Sequence[SlamMap], final: bool) -> SlamMap:
@@ -209,7 +215,7 @@ class SegmentPlaces:
         return replace(own, world_from_map=replace(to_world, translation=origin))
 
     def allowed(
-        self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: Reunion
+        self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: LoopClosure
     ) -> bool:
         """Whether the autopilot can have been where a reunion would have it been.
 
@@ -220,12 +226,14 @@ class SegmentPlaces:
         if placed is None:
             return True
         way = found.here_from_there.apply(other.centre) - keyframe.centre
-        way_m = placed.world_from_map.scale * placed.world_from_map.rotation @ way
+        displacement_m = placed.world_from_map.scale * placed.world_from_map.rotation @ way
         flown_m = self._georeferencer.way_between(keyframe.t_ns, other.t_ns)
         if flown_m is None:
             return True
-        off_m = float(np.linalg.norm(way_m - flown_m))
-        return off_m < MAX_REUNION_OFF_M + 3.0 * placed.sigma_scale * float(np.linalg.norm(way_m))
+        off_m = float(np.linalg.norm(displacement_m - flown_m))
+        return off_m < MAX_LOOP_ERROR_M + 3.0 * placed.sigma_scale * float(
+            np.linalg.norm(displacement_m)
+        )
 
     def _placed(self, segment: SlamMap, keyframes: list[Keyframe]) -> list[Place]:
         poses = [k.camera_from_map.inverse() for k in keyframes]
@@ -246,7 +254,7 @@ class SegmentPlaces:
             return [None] * len(poses)
         beams = [pose.rotation @ mount.rotation[2] for pose in poses]
         down = np.sum(beams, axis=0)
-        ground = GroundBelow(segment.living_positions(), down / np.linalg.norm(down))
+        ground = GroundBelow(segment.point_positions(), down / np.linalg.norm(down))
         return [
             ground.distance(pose.translation, beam) for pose, beam in zip(poses, beams, strict=True)
         ]

@@ -20,12 +20,12 @@ from companion.messages import (
     DepthMap,
     Frame,
     Georeference,
+    LoopClosed,
     MapUpdate,
     Message,
     PointChunk,
     PositionSample,
     PositionSource,
-    Reunited,
     Track,
     Warned,
 )
@@ -96,7 +96,7 @@ class FlightResult:
         self.last_t_ns: int | None = None
         self.warnings: dict[str, WarningCount] = {}
         self.update: MapUpdate | None = None
-        self.reunions: list[Reunited] = []
+        self.reunions: list[LoopClosed] = []
         self._tracks = TrackStore()
         self._chunks = ChunkStore(folder, memory_mb)
         self._median_depths: dict[int, float] = {}
@@ -116,7 +116,7 @@ class FlightResult:
             self._tracks.put(message)
         elif isinstance(message, MapUpdate):
             self.update = message
-        elif isinstance(message, Reunited):
+        elif isinstance(message, LoopClosed):
             self.reunions.append(message)
         elif isinstance(message, PointChunk):
             self._take_points(message)

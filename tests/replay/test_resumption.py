@@ -113,9 +113,7 @@ class Resumed:
     first_ns: int
 
 
-def resumed(
-    left: Left, places: slice, change: Change = unchanged, kept: bool = True
-) -> Resumed:
+def resumed(left: Left, places: slice, change: Change = unchanged, kept: bool = True) -> Resumed:
     stage = LocalisationStage(CONFIG, left.camera, lambda _: nullcontext())
     out = Resumed(stage, [], [], 0)
     shown = list(walk(places.start, places.stop - 1, 1000))
@@ -164,9 +162,7 @@ def test_without_what_was_kept_hovering_tells_no_scale(left: Left) -> None:
 
 @pytest.mark.parametrize(
     ("places", "change"),
-    [
-        ("elsewhere", unchanged), ("here", turned(0.0, 0.0, 25.0)), ("here", turned(20.0, 0.0, 0.0))
-    ],
+    [("elsewhere", unchanged), ("here", turned(0.0, 0.0, 25.0)), ("here", turned(20.0, 0.0, 0.0))],
     ids=["over other ground", "under another heading", "under another vertical"],
 )
 def test_what_does_not_agree_is_never_taken_up(left: Left, places: str, change: Change) -> None:
@@ -190,7 +186,7 @@ def test_a_map_in_question_that_is_given_up_lends_the_next_no_scale(left: Left) 
                 stage.take_up(kept, message.t_ns, round(ABSENT_S * 1e9))
             n_frames += 1
             if n_frames == 3:
-                stage._tracker.begin_anew(0, keep=True)
+                stage._tracker.reinitialise(0, keep=True)
         for out in stage.step(message):
             assert not (isinstance(out, Odometry) and out.world_from_body is not None)
             said += [out.what] if isinstance(out, Warned) else []

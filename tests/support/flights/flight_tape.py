@@ -80,7 +80,7 @@ def make_tape(flight_path: Path, path: Path, config: Config) -> None:
     times, devices = StageTimes(), choose_devices(config.opencl)
     with Keeper(path, flight.camera, log.origin) as keeper:
         pipeline = Pipeline(
-            LocalisationStage(config, flight.camera, times, beside=False),
+            LocalisationStage(config, flight.camera, times, background=False),
             DepthStage(config.depth, config.cloud, flight.camera, devices, times), [keeper],
             lossless=True,
         )  # fmt: skip

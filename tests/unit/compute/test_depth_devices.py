@@ -13,13 +13,13 @@ from companion.dense.opencl import POCL, PROCESSOR, open_device
 from companion.dense.self_test import SIZE, SelfTest, engine_for, reconstruct, scene
 from companion.errors import DeviceError
 from companion.messages import PixelState
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 from tests.support.reference.failing_driver import WrongDevice
 
 
-@pytest.mark.parametrize("number", at_hand.working())
+@pytest.mark.parametrize("number", opencl_devices.working())
 def test_devices_pass(number: str) -> None:
-    device = at_hand.opened(number)
+    device = opencl_devices.opened(number)
     SelfTest(device).run()
     it = scene(*SIZE)
     found = reconstruct(engine_for(device, it), it)
@@ -30,14 +30,16 @@ def test_devices_pass(number: str) -> None:
 
 
 def test_a_device_that_computes_wrongly_is_refused() -> None:
-    good = at_hand.best()
+    good = opencl_devices.best()
     with pytest.raises(DeviceError, match=r"self-test failed: only .* are right"):
         SelfTest(WrongDevice(good.device)).run()
 
 
 def test_without_a_linker_pocl_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """It would end the process."""
-    every = [each for each in at_hand.known() if each.platform == POCL and each.kind == PROCESSOR]
+    every = [
+        each for each in opencl_devices.known() if each.platform == POCL and each.kind == PROCESSOR
+    ]
     monkeypatch.setenv("PATH", str(tmp_path))
     for each in every:
         with pytest.raises(DeviceError, match="apt install gcc libc6-dev"):
@@ -47,7 +49,9 @@ def test_without_a_linker_pocl_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_p
 def test_devices_are_listed_with_their_speed() -> None:
     document = json.loads(devices(as_json=True, verbose=False))
     listed = document["opencl_devices"]
-    assert [device["number"] for device in listed] == [each.number for each in at_hand.known()]
+    assert [device["number"] for device in listed] == [
+        each.number for each in opencl_devices.known()
+    ]
     assert all((device["frames_per_s"] is None) == bool(device["problem"]) for device in listed)
     works = [each["number"] for each in listed if each["frames_per_s"]]
     assert document["opencl_auto"]["number"] in works

@@ -26,7 +26,7 @@ from companion.config import OpenclConfig
 from companion.dense.device_choice import MeasuredDevice, in_order, why_taken
 from companion.dense.opencl import ACCELERATOR, GPU, PROCESSOR, ListedDevice
 from companion.errors import DeviceError
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 from tests.support.reference.failing_driver import fail, two_devices
 
 DEVICE = ListedDevice("0:0", "a device", "a platform")
@@ -242,7 +242,9 @@ class Measuring:
     """Chooses the device of this computer, which is measured by a program that counts."""
 
     def __init__(self, folder: Path) -> None:
-        best = next(each for each in at_hand.known() if each.number == at_hand.working()[0])
+        best = next(
+            each for each in opencl_devices.known() if each.number == opencl_devices.working()[0]
+        )
         self._log = folder / "measured.txt"
         self._log.write_text("")
         self.said: list[str] = []
@@ -259,7 +261,7 @@ class Measuring:
 
 @pytest.fixture
 def measuring(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Measuring:
-    at_hand.known()
+    opencl_devices.known()
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path / "cache"))
     return Measuring(tmp_path)
 
@@ -375,8 +377,8 @@ def test_what_was_measured_before_an_interruption_is_kept(
 
 
 def test_in_flight_what_has_failed_is_passed_over_and_none_may_be_left() -> None:
-    (number, *_) = at_hand.working()
-    best = next(each for each in at_hand.known() if each.number == number)
+    (number, *_) = opencl_devices.working()
+    best = next(each for each in opencl_devices.known() if each.number == number)
     devices = choose_devices(OpenclConfig(number), failed={best.identity: "it: was lost"})
     assert devices.current is None
     assert devices.described == "none is left; failed: it: was lost"

@@ -19,14 +19,14 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, rotation_from_vector
 from companion.messages import Bytes, DepthMap, PixelState
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld, texture
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 
 STATES = {state.value for state in PixelState}
 
 
 @pytest.fixture(scope="module")
 def device() -> ComputeDevice:
-    return at_hand.best()
+    return opencl_devices.best()
 
 
 def engine(device: ComputeDevice, width: int, height: int, **keys: float) -> DepthEngine:
@@ -206,7 +206,7 @@ def test_what_no_device_can_hold_is_an_error(device: ComputeDevice) -> None:
 
 
 def test_a_device_is_found_by_number_and_by_name_and_never_replaced() -> None:
-    listed = [each.listed for each in at_hand.known()]
+    listed = [each.listed for each in opencl_devices.known()]
     for each in listed:
         assert device_asked_for(each.number, listed) is each
         assert device_asked_for(each.name, listed).name == each.name

@@ -14,7 +14,7 @@ from companion.dense.regularisation import HUBER, Regularisation
 from companion.dense.view_selection import Intrinsics, Views
 from companion.geometry.transforms import Pose, rotation_from_vector
 from tests.support.flights.scene import texture
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 from tests.support.reference import reference_depth as reference
 
 PLANES = 32
@@ -23,9 +23,9 @@ MOST_APART = 9000.0
 """What the sum of squared differences of a window may be where it is alike."""
 
 
-@pytest.fixture(scope="module", params=at_hand.working())
+@pytest.fixture(scope="module", params=opencl_devices.working())
 def device(request: pytest.FixtureRequest) -> ComputeDevice:
-    return at_hand.opened(request.param)
+    return opencl_devices.opened(request.param)
 
 
 @pytest.fixture(scope="module")

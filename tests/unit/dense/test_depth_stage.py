@@ -26,7 +26,7 @@ from companion.messages import (
     Warned,
 )
 from tests.support.flights.mapped_plane import at, told
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 from tests.support.reference.failing_driver import WrongDevice
 
 RADTAN = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
@@ -35,7 +35,11 @@ FISHEYE = Camera(242, 181, 170.0, 170.0, 121.0, 90.0, Distortion.EQUIDISTANT, (0
 
 def stage(camera: Camera, devices: Devices | None = None) -> DepthStage:
     return DepthStage(
-        DepthConfig(), CloudConfig(), camera, devices or at_hand.devices(), lambda _: nullcontext()
+        DepthConfig(),
+        CloudConfig(),
+        camera,
+        devices or opencl_devices.devices(),
+        lambda _: nullcontext(),
     )
 
 
@@ -107,7 +111,9 @@ def undisturbed() -> list[Message]:
 
 def twice() -> Devices:
     """The best device, and once more to take over from itself."""
-    best = next(each for each in at_hand.known() if each.number == at_hand.working()[0])
+    best = next(
+        each for each in opencl_devices.known() if each.number == opencl_devices.working()[0]
+    )
     return Devices([best, best], lambda _: "")
 
 
@@ -164,7 +170,9 @@ def test_without_another_device_depth_ends_and_the_stage_goes_on(
 
 def test_a_stage_that_begins_with_a_failed_device_says_so() -> None:
     """As one does that is started again in flight."""
-    best = next(each for each in at_hand.known() if each.number == at_hand.working()[0])
+    best = next(
+        each for each in opencl_devices.known() if each.number == opencl_devices.working()[0]
+    )
     out = fly(RADTAN, 12, devices=Devices([best], lambda _: "", ["another: was lost"]))
     (warned,) = [m for m in out if isinstance(m, Warned)]
     assert (warned.what, warned.detail) == (TOOK_OVER, f"{best.named}; another: was lost")

@@ -93,7 +93,7 @@ def fly(
         judged = verdict.judge(at_ns, lambda _: np.eye(3), DOWN_LOOKING, ned_from_map)
         if judged is not None:
             flight.told.append((t_s, judged.warning.what))
-            if judged.begin_anew:
+            if judged.reinitialise:
                 flight.anew_s.append(t_s)
                 began_s = t_s
     flight.used = verdict.used

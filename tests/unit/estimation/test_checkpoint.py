@@ -39,7 +39,14 @@ from companion.slam.map.sparse_map import SlamMap
 from companion.stages import localisation_work, map_keeper
 from companion.stages.map_keeper import MapKeeper
 from companion.timing.clock import since_boot_ns
-from tests.support.reference.made_map import CAMERA, N_LEVELS, SCALE_FACTOR, Ground, flown, mapped
+from tests.support.reference.synthetic_map import (
+    CAMERA,
+    N_LEVELS,
+    SCALE_FACTOR,
+    Ground,
+    flown,
+    mapped,
+)
 
 SETUP = Setup(Config(), CAMERA)
 SECOND_NS = 1_000_000_000

@@ -12,7 +12,7 @@ from companion.estimation.segment_georeference import SegmentPlaces
 from companion.geometry.transforms import Array, Pose, Similarity, quaternion_from_rotation
 from companion.messages import AttitudeSample, Georeference, RangeSample
 from companion.slam.map.sparse_map import SlamMap
-from tests.support.reference.made_map import HEIGHT, Ground, flown, mapped
+from tests.support.reference.synthetic_map import HEIGHT, Ground, flown, mapped
 
 MOUNT = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
 METRES_PER_UNIT = 2.0
@@ -78,9 +78,7 @@ def test_a_place_in_the_world_is_not_given_up(slam_map: SlamMap) -> None:
     ],
     ids=["surer", "of fewer", "less sure", "contradicted"],
 )
-def test_the_surer_of_two_scales_counts(
-    slam_map: SlamMap, kept: Georeference, stays: bool
-) -> None:
+def test_the_surer_of_two_scales_counts(slam_map: SlamMap, kept: Georeference, stays: bool) -> None:
     found = placed(slam_map, kept, TRUE)
     assert (found is kept) == stays
     assert stays or found.method == "rangefinder"

@@ -1,4 +1,4 @@
-"""The whole map is adjusted beside a flight that goes on: nothing waits, nothing tears."""
+"""Global adjustment during a flight: nothing waits, and the map stays consistent."""
 
 from __future__ import annotations
 
@@ -13,18 +13,24 @@ import pytest
 from companion.config import Config, MappingConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity, rotation_from_vector
-from companion.messages import Frame, Reunited, Track
+from companion.messages import Frame, LoopClosed, Track
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping import map_adjustment
 from companion.slam.mapping.atlas import Atlas
 from companion.slam.mapping.culling import retire
-from companion.slam.mapping.map_adjustment import Taken, parts_of, put_back, put_back_later, take
+from companion.slam.mapping.map_adjustment import (
+    AdjustmentProblem,
+    apply_result,
+    apply_result_later,
+    build_problem,
+    partition,
+)
 from companion.slam.mapping.mapper import Mapper
-from companion.slam.mapping.mapping_worker import Beside, Done, MapTurn
-from companion.slam.optimisation.bundle_adjustment import Adjusted, adjust
+from companion.slam.mapping.mapping_worker import BackgroundMapping, Done, MapLock
+from companion.slam.optimisation.bundle_adjustment import AdjustmentResult, adjust
 from companion.slam.tracking.tracker import Prior, Tracker
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld, aligned_error
-from tests.support.reference.made_map import CAMERA, Ground, flown, mapped
+from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
 
 N = 14
 SMALL = Camera(320, 240, 260.0, 258.0, 161.0, 118.0)
@@ -48,20 +54,20 @@ def disturbed() -> SlamMap:
 
 
 def error_px(slam_map: SlamMap, keyframe: Keyframe) -> float:
-    features, points = slam_map.seen_by(keyframe)
+    features, points = slam_map.observations_of(keyframe)
     seen = CAMERA.project(keyframe.camera_from_map.apply(slam_map.positions[points]))
     return float(np.median(np.linalg.norm(seen - keyframe.features.pixels[features], axis=1)))
 
 
-def test_a_map_that_stood_still_is_as_if_put_back_at_once() -> None:
+def test_result_applied_later_to_an_unchanged_map_is_the_same() -> None:
     at_once, later = disturbed(), disturbed()
     points = np.zeros(0, np.int64)
-    for slam_map, put in ((at_once, put_back), (later, put_back_later)):
-        (part,) = parts_of(slam_map)
-        taken = take(slam_map, *part)
-        assert taken is not None
-        put(slam_map, taken, adjust(taken.bundle, 5))
-        points = taken.points
+    for slam_map, put in ((at_once, apply_result), (later, apply_result_later)):
+        (part,) = partition(slam_map)
+        problem = build_problem(slam_map, *part)
+        assert problem is not None
+        put(slam_map, problem, adjust(problem.bundle, 5))
+        points = problem.points
     for key, keyframe in at_once.keyframes.items():
         same = later.keyframes[key].camera_from_map
         assert np.abs(same.matrix() - keyframe.camera_from_map.matrix()).max() < 1e-9
@@ -70,16 +76,16 @@ def test_a_map_that_stood_still_is_as_if_put_back_at_once() -> None:
     assert np.abs(later.positions[points] - at_once.positions[points]).max() < 1e-9
 
 
-def test_what_came_meanwhile_moves_with_what_it_was_built_upon() -> None:
+def test_additions_during_adjustment_move_with_their_references() -> None:
     slam_map = disturbed()
     newest, before = slam_map.keyframes[N - 1], slam_map.keyframes[N - 2]
     del slam_map.keyframes[N - 1]
     own = slam_map.first_seen[: slam_map.n_points] == N - 1
     slam_map.alive[: slam_map.n_points][own] = False
-    (part,) = parts_of(slam_map)
-    taken = take(slam_map, *part)
-    assert taken is not None
-    result = adjust(taken.bundle, 5)
+    (part,) = partition(slam_map)
+    problem = build_problem(slam_map, *part)
+    assert problem is not None
+    result = adjust(problem.bundle, 5)
 
     slam_map.keyframes[N - 1] = newest
     slam_map.alive[: slam_map.n_points][own] = True
@@ -90,11 +96,11 @@ def test_what_came_meanwhile_moves_with_what_it_was_built_upon() -> None:
     fresh = np.flatnonzero(own)
     assert len(fresh) > 5
     inside = newest.camera_from_map.apply(slam_map.positions[fresh])
-    given_again = taken.points[3]
+    given_again = problem.points[3]
     slam_map.born[given_again] = slam_map.first_seen[given_again] = N - 1
     again = newest.camera_from_map.apply(slam_map.positions[given_again])
 
-    put_back_later(slam_map, taken, result)
+    apply_result_later(slam_map, problem, result)
     assert before.camera_from_map.matrix() == pytest.approx(result.poses[N - 4].matrix(), abs=1e-9)
     now = newest.camera_from_map @ before.camera_from_map.inverse()
     assert now.matrix() == pytest.approx(relative.matrix(), abs=1e-9)
@@ -110,21 +116,21 @@ def test_what_came_meanwhile_moves_with_what_it_was_built_upon() -> None:
     assert max(error_px(slam_map, slam_map.keyframes[k]) for k in range(2, N - 2) if k != 5) < 0.6
 
 
-def test_an_adjustment_that_a_loop_overtook_is_given_up() -> None:
+def test_adjustment_is_dropped_after_another_loop() -> None:
     slam_map = disturbed()
     before = [k.camera_from_map for k in slam_map.keyframes.values()]
-    mapper = Mapper(MappingConfig(), CAMERA, slam_map, MapTurn())
-    mapper.adjust_all_later(2, lambda: None, lambda: False)
+    mapper = Mapper(MappingConfig(), CAMERA, slam_map, MapLock())
+    mapper.adjust_all_in_background(2, lambda: None, lambda: False)
     assert all(
         k.camera_from_map is pose
         for k, pose in zip(slam_map.keyframes.values(), before, strict=True)
     )
-    mapper.adjust_all_later(5, lambda: None, lambda: True)
+    mapper.adjust_all_in_background(5, lambda: None, lambda: True)
     assert max(error_px(slam_map, k) for k in slam_map.keyframes.values()) < 0.6
 
 
-def test_keyframes_and_frames_go_before_spare_work() -> None:
-    turn = MapTurn()
+def test_keyframes_and_frames_precede_idle_work() -> None:
+    turn = MapLock()
     order: list[str] = []
     begun, enough = threading.Event(), threading.Event()
 
@@ -132,14 +138,14 @@ def test_keyframes_and_frames_go_before_spare_work() -> None:
         order.append(name)
         return []
 
-    def spare(meanwhile: Callable[[], None]) -> None:
+    def idle_work(yield_point: Callable[[], None]) -> None:
         order.append("begun")
         begun.set()
         while not enough.wait(0.001):
-            meanwhile()
+            yield_point()
         order.append("ended")
 
-    worker = Beside(turn, spare)
+    worker = BackgroundMapping(turn, idle_work)
     worker.submit(lambda: job("first"))
     assert begun.wait(5)
     for k in range(3):
@@ -161,49 +167,49 @@ def test_keyframes_and_frames_go_before_spare_work() -> None:
     assert order[8] == "ended"
 
 
-def test_the_end_does_not_wait_for_spare_work() -> None:
+def test_close_does_not_wait_for_idle_work() -> None:
     begun = threading.Event()
 
-    def forever(meanwhile: Callable[[], None]) -> None:
+    def forever(yield_point: Callable[[], None]) -> None:
         begun.set()
         while True:
-            meanwhile()
+            yield_point()
 
-    worker = Beside(MapTurn(), forever)
+    worker = BackgroundMapping(MapLock(), forever)
     worker.submit(list)
     assert begun.wait(5)
     worker.close()
     assert worker.done() == []
 
 
-def test_a_live_flight_is_tracked_while_its_map_is_adjusted_whole(
+def test_live_flight_is_tracked_during_global_adjustment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As if a loop were closed at each keyframe; what is adjusted then meets the next frames."""
-    extend, put = Atlas.extend, map_adjustment.put_back_later
+    """As if a loop were closed at each keyframe; the result then meets the next frames."""
+    extend, put = Atlas.insert_keyframe, map_adjustment.apply_result_later
     n_adjusted = 0
 
-    def extended(self: Atlas, segment: SlamMap, keyframe: Keyframe) -> Reunited | None:
-        self._due = segment
+    def extended(self: Atlas, segment: SlamMap, keyframe: Keyframe) -> LoopClosed | None:
+        self._pending = segment
         return extend(self, segment, keyframe)
 
-    def counted(slam_map: SlamMap, taken: Taken, result: Adjusted) -> None:
+    def counted(slam_map: SlamMap, problem: AdjustmentProblem, result: AdjustmentResult) -> None:
         nonlocal n_adjusted
         n_adjusted += 1
-        put(slam_map, taken, result)
+        put(slam_map, problem, result)
 
     monkeypatch.setattr(Atlas, "extend", extended)
-    monkeypatch.setattr("companion.slam.mapping.mapper.put_back_later", counted)
+    monkeypatch.setattr("companion.slam.mapping.mapper.apply_result_later", counted)
     world = PlaneWorld(np.random.default_rng(7))
-    tracker = Tracker(Config(), SMALL, lambda _: nullcontext(), beside=True)
+    tracker = Tracker(Config(), SMALL, lambda _: nullcontext(), background=True)
     worker = tracker._worker
-    assert isinstance(worker, Beside)
+    assert isinstance(worker, BackgroundMapping)
     tracks: dict[int, Track] = {}
     pose: Pose | None = None
     for k in range(40):
         grey, _ = world.render(SMALL, path(k))
         frame = Frame(k, k * 100_000_000, grey, np.zeros((1, 1, 3), np.uint8))
-        with tracker.turn.tracking():
+        with tracker.map_lock.tracking():
             told = tracker.step(frame, Prior(pose, path(k).rotation))
         for message in told:
             if isinstance(message, Track) and message.map_from_camera is not None:

@@ -1,4 +1,4 @@
-"""OpenCL devices for tests: those that the choice takes. Without any a test fails."""
+"""OpenCL devices for tests: those that device selection accepts. Without any a test fails."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ def working() -> list[str]:
 
 
 def opened(number: str) -> ComputeDevice:
-    """One of them; AssertionError where there is none."""
+    """One of them; AssertionError where it is missing."""
     found = [each for each in known() if each.number == number]
     assert found, f"no OpenCL device works: {[(each.named, each.problem) for each in known()]}"
     return open_device(found[0])
 
 
 def best() -> ComputeDevice:
-    """The one that "auto" takes."""
+    """The one that "auto" selects."""
     return opened(working()[0])
 
 
 def devices() -> Devices:
-    """As stages are given them."""
+    """As passed to stages."""
     return choose_devices(OpenclConfig())

@@ -1,4 +1,4 @@
-"""Where a camera is by what it sees, its vertical known; about half of what it sees being wrong."""
+"""Absolute pose with known gravity and half of the matches outliers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from companion.slam.optimisation.upright_pose import upright_pose
 
 
 def scene(seed: int, pitch: float) -> tuple[Array, Array, Array, Array, Array]:
-    """Points, what is seen of them, the level frame, and the true camera_from_map."""
+    """Points, their observations, the level frame, and the true camera_from_map."""
     rng = np.random.default_rng(seed)
     heading = rng.uniform(-np.pi, np.pi)
     map_from_level = rotation_from_quaternion(quaternion_from_euler(0, 0, heading))
@@ -37,8 +37,8 @@ def test_two_points_are_enough(seed: int, pitch: float) -> None:
     assert np.abs(pose.translation - translation).max() < 1e-6
 
 
-def test_what_gives_no_pose() -> None:
-    """One point; the same twice; two at eye level, whose heights say nothing."""
+def test_degenerate_points_give_no_pose() -> None:
+    """One point; the same twice; two at eye level, whose heights carry no information."""
     level = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     point, seen = np.array([[1.0, 2.0, 3.0]]), np.array([[0.1, 0.2]])
     assert upright_pose(point, seen, level, 0.01, 0) is None

@@ -1,4 +1,4 @@
-"""Maps made of known points and cameras, with features that need no image."""
+"""Maps of known points and cameras, with features that need no image."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Ground:
         self.descriptors: Bytes = rng.integers(0, 256, (n, 32)).astype(np.uint8)
 
     def repeat(self, period: float) -> None:
-        """Let descriptors depend on the place within a period along x only, as on a facade."""
+        """Make descriptors periodic in x, as on a facade."""
         cell = np.floor((self.points % period) * 4).astype(np.int64)
         kind = cell[:, 0] * 10_000 + np.floor(self.points[:, 1] * 4).astype(np.int64)
         kinds, which = np.unique(kind, return_inverse=True)
@@ -38,7 +38,7 @@ class Ground:
         self.descriptors = some[which]
 
     def seen_from(self, world_from_camera: Pose, noise_px: float = 0.3) -> tuple[Features, Array]:
-        """Features of a camera, and the point that each shows."""
+        """Features of a camera, and the point that each observes."""
         rng = self._rng
         p = world_from_camera.inverse().apply(self.points)
         pixels = CAMERA.project(p) + rng.normal(scale=noise_px, size=(len(p), 2))
@@ -58,7 +58,7 @@ class Ground:
 
 
 def flown(place: Array, yaw_rad: float = 0.0) -> Pose:
-    """World from a camera that looks straight down from (x, y), 10 m up."""
+    """`world_from_camera` of a nadir camera above (x, y), 10 m up."""
     return Pose(yaw_rotation(yaw_rad) @ DOWN_LOOKING, np.array([place[0], place[1], -HEIGHT]))
 
 
@@ -66,10 +66,10 @@ def mapped(
     ground: Ground, path: list[Pose], map_from_world: Similarity, first_id: int = 0,
     memory: int = 1000, after_each: Callable[[SlamMap, Keyframe], object] = lambda m, k: None,
 ) -> SlamMap:  # fmt: skip
-    """The map that cameras along a path would make, with its own axes and unit.
+    """The map of cameras along a path, with axes and unit of its own.
 
-    A point that so many keyframes ago was seen first is not known again. `after_each` may look at
-    the map when a keyframe has come.
+    A point is not matched any more `memory` keyframes after its first observation. `after_each` is
+    called after each keyframe.
     """
     slam_map = SlamMap(SCALE_FACTOR, N_LEVELS, level=True)
     slam_map.first_keyframe_id = first_id
@@ -85,9 +85,7 @@ def mapped(
         )  # fmt: skip
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
         oldest = first_id + k - memory
-        known = {
-            i: p for i, p in known.items() if slam_map.born[p] >= oldest and slam_map.alive[p]
-        }
+        known = {i: p for i, p in known.items() if slam_map.born[p] >= oldest and slam_map.alive[p]}
         fresh = np.array([i not in known for i in index.tolist()])
         new = np.flatnonzero(fresh)
         ids = slam_map.add_points(
@@ -95,8 +93,8 @@ def mapped(
         )
         known.update(zip(index[new].tolist(), ids.tolist(), strict=True))
         points = np.array([known[i] for i in index.tolist()])
-        slam_map.observe(keyframe, np.arange(len(features)), points)
-        slam_map.refresh(points, [keyframe])
-        slam_map.poses_changed()
+        slam_map.add_observations(keyframe, np.arange(len(features)), points)
+        slam_map.update_geometry(points, [keyframe])
+        slam_map.invalidate_centres()
         after_each(slam_map, keyframe)
     return slam_map

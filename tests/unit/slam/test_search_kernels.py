@@ -1,4 +1,4 @@
-"""Compiled projection of the map and search in an image, beside the same in plain numpy."""
+"""Projection and search kernels against numpy."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from companion.slam.features.orb_features import Features
 from companion.slam.map.local_map import Projector, Visible
 from companion.slam.map.patch_refinement import _warps
 from companion.slam.map.sparse_map import SlamMap
-from tests.support.reference import plain_loops
-from tests.support.reference.made_map import Ground, flown, mapped
+from tests.support.reference import numpy_kernels
+from tests.support.reference.synthetic_map import Ground, flown, mapped
 
 LENSES = [
     Camera(640, 480, 500.0, 480.0, 310.0, 245.0),
@@ -38,7 +38,7 @@ def slam_map() -> SlamMap:
 
 
 def places(slam_map: SlamMap) -> list[Pose]:
-    """Cameras within the map, beside it, and turned away from it."""
+    """Cameras within the map, next to it, and facing away from it."""
     first = slam_map.keyframes[2].camera_from_map
     turn = yaw_rotation(0.4)
     back = np.diag([-1.0, 1.0, -1.0])
@@ -51,13 +51,13 @@ def places(slam_map: SlamMap) -> list[Pose]:
 
 
 @pytest.mark.parametrize("camera", LENSES, ids=lambda c: c.distortion.value)
-def test_what_is_visible_is_as_in_plain_numpy(slam_map: SlamMap, camera: Camera) -> None:
+def test_visibility_matches_numpy(slam_map: SlamMap, camera: Camera) -> None:
     ids = np.flatnonzero(slam_map.alive)[::3]
     projector = Projector(camera)
     counts = []
     for pose in places(slam_map):
         seen = projector.visible(slam_map, pose, ids)
-        wanted = plain_loops.visible(camera, slam_map, pose, ids, projector._max_radius)
+        wanted = numpy_kernels.visible(camera, slam_map, pose, ids, projector._max_radius)
         np.testing.assert_array_equal(seen.ids, wanted[0])
         np.testing.assert_allclose(seen.pixels, wanted[1], atol=1e-8)
         np.testing.assert_array_equal(seen.octaves, wanted[2])
@@ -65,7 +65,7 @@ def test_what_is_visible_is_as_in_plain_numpy(slam_map: SlamMap, camera: Camera)
     assert counts[0] > 40 and counts[1] > 10 and counts[3] == 0
 
 
-def test_of_no_points_none_is_visible(slam_map: SlamMap) -> None:
+def test_no_points_none_visible(slam_map: SlamMap) -> None:
     none = np.zeros(0, np.int64)
     seen = Projector(LENSES[0]).visible(slam_map, places(slam_map)[0], none)
     assert len(seen.ids) == len(seen.octaves) == 0
@@ -73,7 +73,7 @@ def test_of_no_points_none_is_visible(slam_map: SlamMap) -> None:
 
 
 def crowded(rng: np.random.Generator, n: int) -> Features:
-    """Features in heaps, of many levels, whose descriptors differ by few bits."""
+    """Clustered features of many levels whose descriptors differ by few bits."""
     heaps = rng.uniform([5, 5], [635, 475], (max(n // 8, 1), 2))
     pixels = heaps[rng.integers(len(heaps), size=n)] + rng.normal(scale=4.0, size=(n, 2))
     descriptors = np.packbits(rng.random((n, 256)) < 0.15, axis=1)
@@ -86,7 +86,7 @@ def crowded(rng: np.random.Generator, n: int) -> Features:
 
 @pytest.mark.parametrize("radius_px", [3.0, 15.0, 60.0])
 @pytest.mark.parametrize("n", [2, 13, 900])
-def test_what_is_found_is_as_in_plain_numpy(radius_px: float, n: int) -> None:
+def test_projected_matches_match_numpy(radius_px: float, n: int) -> None:
     rng = np.random.default_rng(n)
     features = crowded(rng, n)
     slam_map = SlamMap(1.2, 8)
@@ -101,7 +101,7 @@ def test_what_is_found_is_as_in_plain_numpy(radius_px: float, n: int) -> None:
     points, found = Projector(LENSES[0]).search(
         slam_map, Visible(ids, projected, levels), features, radius_px, usable
     )
-    wanted, there = plain_loops.match_projected(
+    wanted, there = numpy_kernels.match_projected(
         projected, slam_map.descriptors[ids], levels, features, radius_px * 1.2**levels, usable
     )
     np.testing.assert_array_equal(points, ids[wanted])
@@ -109,7 +109,7 @@ def test_what_is_found_is_as_in_plain_numpy(radius_px: float, n: int) -> None:
     assert n < 900 or len(found) > 80
 
 
-def test_nothing_is_found_among_nothing() -> None:
+def test_no_features_no_matches() -> None:
     rng = np.random.default_rng(3)
     slam_map = SlamMap(1.2, 8)
     slam_map.descriptors = rng.integers(0, 256, (9, 32)).astype(np.uint8)
@@ -122,7 +122,7 @@ def test_nothing_is_found_among_nothing() -> None:
         assert len(points) == len(found) == 0
 
 
-def test_patches_are_warped_as_in_plain_numpy(slam_map: SlamMap) -> None:
+def test_warps_match_numpy(slam_map: SlamMap) -> None:
     pose = places(slam_map)[1]
     ids = np.flatnonzero(slam_map.alive)[::7]
     jacobian = np.random.default_rng(6).normal(size=(len(ids), 2, 2)) * 200.0
@@ -130,7 +130,7 @@ def test_patches_are_warped_as_in_plain_numpy(slam_map: SlamMap) -> None:
     for first_id in np.unique(slam_map.first_seen[ids]).tolist():
         here = slam_map.first_seen[ids] == first_id
         first = slam_map.keyframes[first_id].camera_from_map
-        wanted = plain_loops.warps(slam_map, pose, ids[here], jacobian[here], first)
+        wanted = numpy_kernels.warps(slam_map, pose, ids[here], jacobian[here], first)
         np.testing.assert_allclose(found[here], wanted, rtol=1e-9)
     slam_map.first_seen[ids[:2]] = 12345  # a keyframe that nobody knows
     assert np.isnan(_warps(slam_map, pose, ids, jacobian)[:2]).all()
@@ -138,7 +138,7 @@ def test_patches_are_warped_as_in_plain_numpy(slam_map: SlamMap) -> None:
 
 
 @pytest.mark.parametrize("n", [2, 40, 600])
-def test_what_is_found_along_lines_is_as_in_plain_numpy(n: int) -> None:
+def test_epipolar_matches_match_numpy(n: int) -> None:
     rng = np.random.default_rng(n)
     camera = LENSES[0]
     points = rng.uniform([-3, -2, 3], [3, 2, 9], (n, 3))
@@ -160,7 +160,7 @@ def test_what_is_found_along_lines_is_as_in_plain_numpy(n: int) -> None:
     a, b = seen
     index_a, index_b = rng.permutation(n)[: n - n // 9], rng.permutation(n)[: n - n // 7]
     found = match_epipolar(a, b, index_a, index_b, b_from_a)
-    wanted = plain_loops.match_epipolar(a, b, index_a, index_b, b_from_a)
+    wanted = numpy_kernels.match_epipolar(a, b, index_a, index_b, b_from_a)
     np.testing.assert_array_equal(found[0], wanted[0])
     np.testing.assert_array_equal(found[1], wanted[1])
     assert n < 600 or len(found[0]) > 100

@@ -1,4 +1,4 @@
-"""Two views that a map could begin with, by matches of which some are wrong."""
+"""Two-view initialisation with outliers among the matches."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from companion.geometry.transforms import Array, Pose, angle_between, rotation_from_vector
 from companion.slam.features.orb_features import Features
-from companion.slam.initialisation.initializer import TwoView, initialise
+from companion.slam.initialisation.initializer import TwoViewGeometry, initialise
 
 FOCAL_PX, N = 500.0, 300
 TURN = rotation_from_vector(np.radians([2.0, -3.0, 4.0]))
@@ -23,8 +23,8 @@ def features(normalised: Array) -> Features:
     )  # fmt: skip
 
 
-def begun(way: float, wrong_share: float, seed: int) -> TwoView | None:
-    """Sideways before hills far away, and nearer things: a start, if there is one."""
+def begun(way: float, wrong_share: float, seed: int) -> TwoViewGeometry | None:
+    """Sideways motion over distant hills and closer objects: the geometry, if found."""
     rng = np.random.default_rng(seed)
     seen_a = rng.uniform(-0.5, 0.5, (N, 2))
     depth = np.where(rng.random(N) < FAR_SHARE, rng.uniform(150, 400, N), rng.uniform(8, 14, N))
@@ -43,14 +43,14 @@ def begun(way: float, wrong_share: float, seed: int) -> TwoView | None:
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.3])
 @pytest.mark.parametrize("seed", range(5))
-def test_most_of_what_is_seen_has_to_show_the_way(seed: int, wrong_share: float) -> None:
+def test_most_matches_must_show_parallax(seed: int, wrong_share: float) -> None:
     """Wrong matches, which no turn explains, do not count for it."""
     assert begun(0.4, wrong_share, seed) is None
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.3])
 @pytest.mark.parametrize("seed", range(5))
-def test_a_way_that_shows_is_found_among_wrong_matches(seed: int, wrong_share: float) -> None:
+def test_baseline_is_found_among_outliers(seed: int, wrong_share: float) -> None:
     found = begun(6.0, wrong_share, seed)
     assert found is not None
     assert np.degrees(angle_between(found.b_from_a.rotation, TURN)) < 0.3

@@ -1,4 +1,4 @@
-"""Cameras over the ground and the small turns that they are told wrongly by."""
+"""Nadir cameras, and random attitude errors."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ LOOKING_DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Rotation `camera_from_map`."""
 
 
-def turned(rng: np.random.Generator, sigma_rad: float) -> Array:
-    """A turn about any axis, by so much about each."""
+def random_rotation(rng: np.random.Generator, sigma_rad: float) -> Array:
+    """Rotation by a normally distributed rotation vector, `sigma_rad` about each axis."""
     return rotation_from_vector(rng.normal(scale=sigma_rad, size=3))

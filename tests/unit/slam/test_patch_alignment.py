@@ -1,4 +1,4 @@
-"""Patches found again to a fraction of a pixel, or not at all."""
+"""Patch alignment: sub-pixel accuracy, or a detected failure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from companion.geometry.transforms import Array
 from companion.messages import Bytes
 from companion.slam.features.orb_features import Bools
 from companion.slam.features.patches import align, cut, image_levels
-from tests.support.reference import plain_patches
+from tests.support.reference import numpy_patch_alignment
 
 CENTRE = np.array([160.0, 120.0])
 N = 120
@@ -24,7 +24,7 @@ def picture(rng: np.random.Generator) -> Bytes:
 
 
 def find(warp: Array, level: int, off_px: float, gain: float = 1.0) -> tuple[Array, Bools]:
-    """How far the places found lie from the true ones, and which are sure."""
+    """Distances of aligned positions from the true ones, and the mask of success."""
     rng = np.random.default_rng(level)
     first = picture(rng)
     shift = CENTRE - warp @ CENTRE + [5.3, -4.6]
@@ -46,7 +46,7 @@ def turn(angle: float, scale: float) -> Array:
 
 @pytest.mark.parametrize(("level", "within_px"), [(0, 0.1), (1, 0.15)])
 @pytest.mark.parametrize("angle", [0.0, 0.5, 3.0])
-def test_a_moved_turned_and_darkened_patch_is_found(
+def test_moved_rotated_and_darkened_patch_is_aligned(
     level: int, within_px: float, angle: float
 ) -> None:
     error, sure = find(turn(angle, 1.1), level, 0.7, gain=0.8)
@@ -54,13 +54,13 @@ def test_a_moved_turned_and_darkened_patch_is_found(
     assert np.median(error[sure]) < within_px
 
 
-def test_a_patch_at_twice_the_size_is_found_a_level_up() -> None:
+def test_patch_at_twice_the_size_is_aligned_one_level_up() -> None:
     error, sure = find(turn(0.2, 1.9), 0, 0.7)
     assert sure.mean() > 0.7
     assert np.median(error[sure]) < 0.15
 
 
-def test_what_is_not_there_is_not_found() -> None:
+def test_absent_patch_is_not_aligned() -> None:
     rng = np.random.default_rng(1)
     first, other = picture(rng), picture(rng)
     pixels = rng.uniform([60, 60], [260, 180], (N, 2))
@@ -70,7 +70,7 @@ def test_what_is_not_there_is_not_found() -> None:
     assert sure.mean() < 0.1
 
 
-def test_patches_of_nothing_and_at_the_edge_are_left_alone() -> None:
+def test_untextured_and_border_patches_are_unchanged() -> None:
     blank = np.full((240, 320), 99, np.uint8)
     pixels = np.array([[160.0, 120.0], [2.0, 2.0]])
     patches = cut(image_levels(blank), pixels, np.zeros(2, np.int64))
@@ -81,7 +81,7 @@ def test_patches_of_nothing_and_at_the_edge_are_left_alone() -> None:
     assert np.array_equal(found, pixels)
 
 
-def test_patches_are_found_where_plain_numpy_finds_them() -> None:
+def test_alignment_matches_numpy() -> None:
     rng = np.random.default_rng(8)
     first = picture(rng)
     turned = cv2.warpAffine(first, np.array([[1.05, 0.1, -20.0], [-0.05, 0.9, 15.0]]), (320, 240))
@@ -99,7 +99,7 @@ def test_patches_are_found_where_plain_numpy_finds_them() -> None:
     start = pixels @ np.array([[1.05, 0.1], [-0.05, 0.9]]).T + [-20.0, 15.0]
     start += rng.normal(scale=0.7, size=start.shape)
     found, sure = align(patches, warps, image_levels(moved), start, np.full(300, 2.0))
-    there, certain = plain_patches.align(
+    there, certain = numpy_patch_alignment.align(
         patches, warps, image_levels(moved), start, np.full(300, 2.0)
     )
     assert not sure[:4].any()
@@ -110,7 +110,7 @@ def test_patches_are_found_where_plain_numpy_finds_them() -> None:
     assert np.array_equal(found[~sure], start[~sure])
 
 
-def test_no_patches_are_found_nowhere() -> None:
+def test_no_patches() -> None:
     levels = image_levels(np.zeros((48, 64), np.uint8))
     patches = cut(levels, np.zeros((0, 2)), np.zeros(0, np.int64))
     found, sure = align(patches, np.zeros((0, 2, 2)), levels, np.zeros((0, 2)), np.zeros(0))

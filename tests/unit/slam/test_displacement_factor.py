@@ -1,4 +1,4 @@
-"""Ways told by velocity in bundle adjustment: they hold the scale where images hardly do."""
+"""Displacement factor in bundle adjustment: it holds the scale where images hardly do."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ import pytest
 
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.slam.optimisation.bundle_adjustment import Bundle, adjust
-from companion.slam.optimisation.displacement_factor import USELESS, Ways, usual_error
-from tests.support.reference.told_cameras import FOCAL, LOOKING_DOWN
+from companion.slam.optimisation.displacement_factor import (
+    MAX_TYPICAL_ERROR,
+    DisplacementFactor,
+    typical_error,
+)
+from tests.support.reference.nadir_cameras import FOCAL, LOOKING_DOWN
 
 TO_WORLD = 2.0 * rotation_from_vector(np.array([0.1, -0.2, 0.7]))
 N = 24
@@ -22,25 +26,25 @@ def centres(cameras: list[Pose]) -> Array:
     return np.stack([p.inverse().translation for p in cameras])
 
 
-def told(cameras: list[Pose], rng: np.random.Generator, sigma_m: float) -> Ways:
-    """Ways between cameras that follow each other."""
-    way_m = np.diff(centres(cameras), axis=0) @ TO_WORLD.T
-    n = len(way_m)
-    return Ways(
-        np.arange(n), np.arange(1, n + 1), way_m + rng.normal(scale=sigma_m, size=(n, 3)),
+def told(cameras: list[Pose], rng: np.random.Generator, sigma_m: float) -> DisplacementFactor:
+    """Displacement factor between consecutive cameras."""
+    displacement_m = np.diff(centres(cameras), axis=0) @ TO_WORLD.T
+    n = len(displacement_m)
+    return DisplacementFactor(
+        np.arange(n), np.arange(1, n + 1), displacement_m + rng.normal(scale=sigma_m, size=(n, 3)),
         np.full(n, sigma_m), TO_WORLD,
     )  # fmt: skip
 
 
-def test_the_gradient_is_that_of_the_cost(rng: np.random.Generator) -> None:
+def test_gradient_matches_the_cost(rng: np.random.Generator) -> None:
     cameras = [Pose(rotation_from_vector(rng.normal(size=3)), rng.normal(size=3)) for _ in range(6)]
-    ways = told(cameras, rng, 0.2)
-    ways.way_m[1, 2] = np.nan
-    ways.way_m[3] += 4.0
+    factor = told(cameras, rng, 0.2)
+    factor.displacement_m[1, 2] = np.nan
+    factor.displacement_m[3] += 4.0
     rotation, translation = poses_of(cameras)
     translation = translation + rng.normal(scale=0.1, size=translation.shape)
     information, gradient = np.zeros((4, 6, 4, 6)), np.zeros((4, 6))
-    ways.add_to(information, gradient, rotation, translation)
+    factor.add_normal_equations(information, gradient, rotation, translation)
     flat = information.reshape(24, 24)
     assert flat == pytest.approx(flat.T)
     assert np.linalg.eigvalsh(flat).min() > -1e-6
@@ -51,15 +55,13 @@ def test_the_gradient_is_that_of_the_cost(rng: np.random.Generator) -> None:
             r, t = rotation.copy(), translation.copy()
             turn = rotation_from_vector(move[:3])
             r[camera], t[camera] = turn @ r[camera], turn @ t[camera] + move[3:]
-            slope = (ways.cost(r, t) - ways.cost(rotation, translation)) / step
+            slope = (factor.cost(r, t) - factor.cost(rotation, translation)) / step
             assert gradient[camera, axis] == pytest.approx(slope, rel=1e-3, abs=2e-2)
 
 
 @pytest.mark.parametrize("wrong", [False, True], ids=["all right", "one is wrong"])
-def test_a_scale_that_drifts_where_little_is_seen_is_held(
-    rng: np.random.Generator, wrong: bool
-) -> None:
-    """A dozen points in each image, a path that shrinks: images alone leave it short."""
+def test_scale_drift_with_few_points_is_held(rng: np.random.Generator, wrong: bool) -> None:
+    """A dozen points per image and a path that shrinks: images alone leave it short."""
     truth = [Pose(LOOKING_DOWN, -LOOKING_DOWN @ np.array([0.5 * k, 0.0, -4.0])) for k in range(N)]
     n = 12 * N
     ground = np.c_[rng.uniform(-2, 0.5 * N + 2, n), rng.uniform(-2, 2, n), np.zeros(n)]
@@ -79,30 +81,32 @@ def test_a_scale_that_drifts_where_little_is_seen_is_held(
     start[:2] = truth[:2]
     order = [*range(2, N), 0, 1]
     place = np.argsort(order)
-    ways = told(truth, rng, 0.03)
-    ways = Ways(place[ways.first], place[ways.second], ways.way_m, ways.sigma_m, TO_WORLD)
+    factor = told(truth, rng, 0.03)
+    factor = DisplacementFactor(
+        place[factor.first], place[factor.second], factor.displacement_m, factor.sigma_m, TO_WORLD
+    )
     if wrong:
-        ways.way_m[10] = [5.0, -5.0, 0.0]
+        factor.displacement_m[10] = [5.0, -5.0, 0.0]
 
-    def off(ways: Ways | None) -> float:
+    def off(factor: DisplacementFactor | None) -> float:
         bundle = Bundle(
             [start[k] for k in order], N - 2, ground.copy(), place[np.concatenate(camera)],
             np.concatenate(point), np.concatenate(seen),
             np.broadcast_to(np.eye(2) * FOCAL, (len(np.concatenate(camera)), 2, 2)),
-            () if ways is None else (ways,),
+            () if factor is None else (factor,),
         )  # fmt: skip
         result = adjust(bundle, 30)
         found = [result.poses[int(place[k])] for k in range(N)]
         return float(np.linalg.norm(centres(found) - centres(truth), axis=1).max())
 
-    assert off(ways) < 0.25
-    assert off(ways) < 0.6 * off(None)
+    assert off(factor) < 0.25
+    assert off(factor) < 0.6 * off(None)
 
 
-def test_ways_that_do_not_fit_the_map_are_of_no_use(rng: np.random.Generator) -> None:
+def test_displacements_that_do_not_fit_the_map_are_not_used(rng: np.random.Generator) -> None:
     cameras = [Pose(LOOKING_DOWN, np.array([0.4 * k, 0.1 * k, 4.0])) for k in range(N)]
-    ways = told(cameras, rng, 0.1)
-    error = usual_error(ways, *poses_of(cameras))
+    factor = told(cameras, rng, 0.1)
+    error = typical_error(factor, *poses_of(cameras))
     assert error == pytest.approx(1.0, rel=0.4)
-    ways.way_m[:] = -ways.way_m * 2 * USELESS
-    assert usual_error(ways, *poses_of(cameras)) is None
+    factor.displacement_m[:] = -factor.displacement_m * 2 * MAX_TYPICAL_ERROR
+    assert typical_error(factor, *poses_of(cameras)) is None

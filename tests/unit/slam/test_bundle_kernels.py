@@ -1,4 +1,4 @@
-"""The compiled sums of a bundle beside what matrices written out in full give."""
+"""Bundle adjustment kernels against dense matrices."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 
 from companion.geometry.transforms import Array, rotation_from_vector
 from companion.slam.compiled.bundle_sums import (
+    back_substitute,
     errors,
-    moves_of_points,
     normal_equations,
-    without_points,
+    schur_complement,
 )
 from companion.slam.features.orb_features import Ints
 
@@ -38,7 +38,7 @@ class Scene:
         )  # fmt: skip
 
     def moved(self, by: Array) -> Array:
-        """The errors (2 O,) where cameras and points move by (6 V + 3 P,)."""
+        """Errors (2 O,) after steps of cameras and points (6 V + 3 P,)."""
         rotation, translation = self.rotation.copy(), self.translation.copy()
         for k, move in enumerate(by[: 6 * N_VARIABLE].reshape(-1, 6)):
             turn = rotation_from_vector(move[:3])
@@ -52,7 +52,7 @@ class Scene:
 
 @pytest.fixture
 def scene() -> Scene:
-    """A few observations off by much, one of a point behind its camera, one point seen by none."""
+    """Few observations with large errors, one behind its camera, one unobserved point."""
     rng = np.random.default_rng(4)
     rotation = np.stack([rotation_from_vector(v) for v in rng.normal(scale=0.2, size=(5, 3))])
     translation = rng.normal(scale=0.5, size=(5, 3)) + [0.0, 0.0, 6.0]
@@ -68,7 +68,7 @@ def scene() -> Scene:
 
 
 def in_full(scene: Scene) -> tuple[Array, Array]:
-    """The whole information and gradient, by differences."""
+    """Dense information and gradient by finite differences."""
     inside, residual, _ = scene.errors()
     n = 6 * N_VARIABLE + 3 * N_POINTS
     jacobian = np.stack(
@@ -79,7 +79,7 @@ def in_full(scene: Scene) -> tuple[Array, Array]:
     return jacobian.T @ (weight[:, None] * jacobian), jacobian.T @ (weight * residual.ravel())
 
 
-def test_errors_and_loss_are_those_of_the_definition(scene: Scene) -> None:
+def test_errors_and_loss_match_their_definition(scene: Scene) -> None:
     inside, residual, cost = scene.errors()
     by_hand = np.stack(
         [
@@ -97,7 +97,7 @@ def test_errors_and_loss_are_those_of_the_definition(scene: Scene) -> None:
     assert 0 < np.count_nonzero(by_hand[:, 2] <= 0) < 6
 
 
-def test_sums_are_those_of_the_whole_matrix(scene: Scene) -> None:
+def test_normal_equations_match_the_dense_matrix(scene: Scene) -> None:
     inside, residual, _ = scene.errors()
     whole, gradient = in_full(scene)
     hcc, gc, hpp, gp, hcp = normal_equations(
@@ -121,7 +121,7 @@ def test_sums_are_those_of_the_whole_matrix(scene: Scene) -> None:
     assert not hpp[N_POINTS - 1].any()
 
 
-def test_cameras_without_points_and_points_after_cameras(scene: Scene) -> None:
+def test_schur_complement_and_back_substitution_match_the_dense_solution(scene: Scene) -> None:
     inside, residual, _ = scene.errors()
     _, _, hpp, gp, hcp = normal_equations(
         scene.rotation, inside, residual, scene.camera, scene.point, scene.whitening, N_VARIABLE,
@@ -130,7 +130,9 @@ def test_cameras_without_points_and_points_after_cameras(scene: Scene) -> None:
     inverse = np.asarray(np.linalg.inv(hpp + 3.0 * np.eye(3)), np.float64)
     moving = np.flatnonzero(scene.camera < N_VARIABLE)
     by_point: Ints = moving[np.argsort(scene.point[moving], kind="stable")]
-    taken, added = without_points(inverse, gp, hcp, scene.camera, scene.point, by_point, N_VARIABLE)
+    taken, added = schur_complement(
+        inverse, gp, hcp, scene.camera, scene.point, by_point, N_VARIABLE
+    )
     ties = np.zeros((6 * N_VARIABLE, 3 * N_POINTS))
     for o in moving:
         c, p = scene.camera[o], scene.point[o]
@@ -142,18 +144,18 @@ def test_cameras_without_points_and_points_after_cameras(scene: Scene) -> None:
     np.testing.assert_allclose(taken, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
     np.testing.assert_allclose(added, ties @ blocks @ gp.ravel(), rtol=1e-9, atol=1e-6)
     moves = np.random.default_rng(1).normal(size=(N_VARIABLE, 6))
-    moved = moves_of_points(inverse, gp, hcp, scene.camera, scene.point, by_point, moves)
+    moved = back_substitute(inverse, gp, hcp, scene.camera, scene.point, by_point, moves)
     np.testing.assert_allclose(
         moved.ravel(), blocks @ (-gp.ravel() - ties.T @ moves.ravel()), rtol=1e-9, atol=1e-9
     )
 
 
-def test_without_observations_nothing_is_summed() -> None:
+def test_no_observations_give_zero_sums() -> None:
     none, whole = np.zeros(0, np.int64), np.zeros((0, 2, 2))
     turn, place, points = np.eye(3)[None], np.zeros((1, 3)), np.ones((2, 3))
     inside, residual, cost = errors(turn, place, points, none, none, np.zeros((0, 2)), whole)
     assert cost == 0.0
     hcc, gc, hpp, gp, hcp = normal_equations(turn, inside, residual, none, none, whole, 1, 2)
     assert not (hcc.any() or gc.any() or hpp.any() or gp.any())
-    taken, added = without_points(hpp, gp, hcp, none, none, none, 1)
+    taken, added = schur_complement(hpp, gp, hcp, none, none, none, 1)
     assert taken.shape == (6, 6) and not taken.any() and not added.any()

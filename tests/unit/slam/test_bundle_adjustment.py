@@ -1,4 +1,4 @@
-"""Bundle adjustment, pose refinement, triangulation and the two-view start against exact scenes."""
+"""Bundle adjustment, pose refinement, triangulation and initialisation on exact scenes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def whitening(n: int) -> Array:
     return out
 
 
-def test_bundle_recovers_disturbed_cameras_and_points(rng: np.random.Generator) -> None:
+def test_adjustment_recovers_perturbed_cameras_and_points(rng: np.random.Generator) -> None:
     points, poses = scene(rng), cameras(5)
     camera = np.repeat(np.arange(5), len(points))
     point = np.tile(np.arange(len(points)), 5)
@@ -70,7 +70,7 @@ def test_bundle_recovers_disturbed_cameras_and_points(rng: np.random.Generator) 
         np.testing.assert_allclose(result.poses[k].matrix(), poses[order[k]].matrix(), atol=1e-4)
 
 
-def test_bundle_sets_wrong_matches_aside(rng: np.random.Generator) -> None:
+def test_adjustment_rejects_outliers(rng: np.random.Generator) -> None:
     points, poses = scene(rng), cameras(4)
     camera = np.repeat(np.arange(4), len(points))
     point = np.tile(np.arange(len(points)), 4)
@@ -85,7 +85,7 @@ def test_bundle_sets_wrong_matches_aside(rng: np.random.Generator) -> None:
     assert np.count_nonzero(~result.inlier) <= 45
 
 
-def test_pose_is_refined_past_a_third_of_wrong_points(rng: np.random.Generator) -> None:
+def test_pose_refinement_tolerates_a_third_of_outliers(rng: np.random.Generator) -> None:
     points, pose = scene(rng), cameras(3)[2]
     seen = project(pose, points) + rng.normal(scale=0.5 / FOCAL, size=(len(points), 2))
     seen[:50] += rng.uniform(-0.3, 0.3, (50, 2))
@@ -99,7 +99,7 @@ def test_pose_is_refined_past_a_third_of_wrong_points(rng: np.random.Generator) 
     assert np.linalg.eigvalsh(information).min() > 0
 
 
-def test_triangulation_is_exact_and_tells_parallel_rays(rng: np.random.Generator) -> None:
+def test_triangulation_is_exact_and_detects_parallel_rays(rng: np.random.Generator) -> None:
     points, (a, b) = scene(rng), cameras(2)
     b_from_a = b @ a.inverse()
     found, cosine = triangulate(project(a, points), project(b, points), b_from_a)
@@ -121,7 +121,7 @@ def features(normalised: Array) -> Features:
 
 @pytest.mark.parametrize("flat", [False, True], ids=["scene with depth", "plane"])
 @pytest.mark.parametrize("prior", [False, True], ids=["vision alone", "with attitude"])
-def test_two_views_start_a_map(rng: np.random.Generator, flat: bool, prior: bool) -> None:
+def test_two_views_initialise_a_map(rng: np.random.Generator, flat: bool, prior: bool) -> None:
     points = scene(rng, 400)
     if flat:
         points[:, 2] = 7.0 + 0.15 * points[:, 0]
@@ -146,7 +146,7 @@ def test_two_views_start_a_map(rng: np.random.Generator, flat: bool, prior: bool
     assert len(result.points_a) > 250
 
 
-def test_what_two_coarse_pictures_of_the_ground_leave_open_a_told_turn_tells(
+def test_measured_rotation_resolves_planar_ambiguity_at_low_resolution(
     rng: np.random.Generator,
 ) -> None:
     points = np.c_[rng.uniform(-0.35, 0.35, (140, 2)), rng.normal(1.0, 0.08, 140)]
@@ -165,7 +165,7 @@ def test_what_two_coarse_pictures_of_the_ground_leave_open_a_told_turn_tells(
     assert 0.1 < np.degrees(angle_between(found[0], found[1])) < 1.0
 
 
-def test_pure_rotation_and_tiny_parallax_start_nothing(rng: np.random.Generator) -> None:
+def test_pure_rotation_and_tiny_parallax_do_not_initialise(rng: np.random.Generator) -> None:
     points = scene(rng, 300)
     a = Pose.identity()
     b = Pose(rotation_from_vector(np.array([0.02, 0.1, 0.03])), np.zeros(3))

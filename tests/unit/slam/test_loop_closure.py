@@ -1,4 +1,4 @@
-"""Places seen again: the index, the upright solver, welding of maps, loops and false loops."""
+"""Place recognition, upright pose solver, map merging, loop closure and false loops."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     yaw_rotation,
 )
-from companion.slam.loop.loop_closure import Reunion, ReunionFinder
-from companion.slam.loop.map_merge import close_loop, weld
-from companion.slam.loop.place_recognition import PlaceIndex
+from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
+from companion.slam.loop.map_merge import close_loop, merge_maps
+from companion.slam.loop.place_recognition import KeyframeDatabase
 from companion.slam.loop.relocalizer import Relocalizer
 from companion.slam.map.sparse_map import SlamMap
 from companion.slam.optimisation.pose_graph import Edge, relax
 from companion.slam.optimisation.upright_pose import upright_pose
-from tests.support.reference.made_map import CAMERA, Ground, flown, mapped
+from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
 
 NOWHERE = Similarity.identity()
 ELSEWHERE = Similarity(0.4, yaw_rotation(1.1), np.array([3.0, -7.0, 2.0]))
@@ -32,32 +32,32 @@ def line(start: tuple[float, float], end: tuple[float, float], n: int, yaw: floa
     return [flown(p, yaw) for p in np.linspace(start, end, n)]
 
 
-def index_of(*maps: SlamMap) -> PlaceIndex:
-    index = PlaceIndex()
+def index_of(*maps: SlamMap) -> KeyframeDatabase:
+    index = KeyframeDatabase()
     for slam_map in maps:
         for key, keyframe in slam_map.keyframes.items():
             index.add(key, keyframe.features.descriptors)
     return index
 
 
-def find(newest: int, here: SlamMap, maps: list[SlamMap]) -> Reunion | None:
-    finder = ReunionFinder(index_of(*maps), Relocalizer(CAMERA))
+def find(newest: int, here: SlamMap, maps: list[SlamMap]) -> LoopClosure | None:
+    finder = LoopDetector(index_of(*maps), Relocalizer(CAMERA))
     return finder.find(here.keyframes[newest], here, maps, lambda found, same: True)
 
 
-def test_the_index_names_the_place_and_nothing_elsewhere() -> None:
+def test_query_returns_the_place_and_nothing_else() -> None:
     ground = Ground(np.random.default_rng(1))
     path = line((-20, -20), (20, -20), 40, 0.0)
-    index = PlaceIndex()
+    index = KeyframeDatabase()
     for key, pose in enumerate(path):
         index.add(key, ground.seen_from(pose)[0].descriptors)
     again, _ = ground.seen_from(flown(np.array([0.3, -19.8]), yaw_rad=2.0))
-    assert set(index.alike(again.descriptors, 3)) <= {18, 19, 20, 21, 22}
-    assert 21 not in index.alike(again.descriptors, 3, {21})
+    assert set(index.query(again.descriptors, 3)) <= {18, 19, 20, 21, 22}
+    assert 21 not in index.query(again.descriptors, 3, {21})
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.7])
-def test_two_points_and_the_vertical_give_a_pose(wrong_share: float) -> None:
+def test_two_points_and_gravity_give_a_pose(wrong_share: float) -> None:
     rng = np.random.default_rng(3)
     tilted = yaw_rotation(1.2) @ rotation_from_vector(np.array([0.3, -0.2, 0.0]))
     camera = Pose(tilted @ flown(np.zeros(2)).rotation, np.array([3.0, 4.0, -20.0])).inverse()
@@ -79,7 +79,7 @@ def test_one_point_is_not_enough() -> None:
     assert upright_pose(np.ones((1, 3)), np.zeros((1, 2)), np.eye(3), 0.01, seed=1) is None
 
 
-def test_a_closed_square_loses_its_drift() -> None:
+def test_pose_graph_removes_the_drift_of_a_closed_square() -> None:
     corners = [(0, 0), (10, 0), (10, 10), (0, 10), (0, 0)]
     truth = [
         Similarity(1.0, yaw_rotation(k * np.pi / 2), np.array([*p, -5.0]))
@@ -92,8 +92,7 @@ def test_a_closed_square_loses_its_drift() -> None:
     for step in steps:
         drifted.append(drifted[-1] @ step @ drift)
     edges = [
-        Edge(k, k + 1, a.inverse() @ b)
-        for k, (a, b) in enumerate(itertools.pairwise(drifted))
+        Edge(k, k + 1, a.inverse() @ b) for k, (a, b) in enumerate(itertools.pairwise(drifted))
     ]
     before = max(
         float(np.linalg.norm(a.translation - b.translation))
@@ -112,7 +111,7 @@ def test_a_closed_square_loses_its_drift() -> None:
     assert max(tilts) < 1e-9
 
 
-def test_two_maps_that_meet_become_one() -> None:
+def test_overlapping_maps_are_merged() -> None:
     ground = Ground(np.random.default_rng(5))
     old = mapped(ground, line((-6, 0), (6, 0), 9, 0.0), ELSEWHERE)
     new = mapped(ground, line((6, 12), (2, 0.5), 9, 0.6), NOWHERE, first_id=20)
@@ -121,19 +120,19 @@ def test_two_maps_that_meet_become_one() -> None:
     assert found.there is old
     assert found.here_from_there.scale == pytest.approx(1 / ELSEWHERE.scale, rel=0.01)
     n_points = new.n_points
-    weld(new, old, found.here_from_there)
+    merge_maps(new, old, found.here_from_there)
     assert list(new.keyframes) == [*range(9), *range(20, 29)]
     assert new.unit_of == pytest.approx(dict.fromkeys(range(9), 1 / ELSEWHERE.scale), rel=0.01)
     for key, x in ((0, -6.0), (8, 6.0)):
         assert new.keyframes[key].centre == pytest.approx([x, 0, -10], abs=0.15)
-    features, points = new.seen_by(new.keyframes[4])
+    features, points = new.observations_of(new.keyframes[4])
     assert (points >= n_points).all()
     p = new.keyframes[4].camera_from_map.apply(new.positions[points])
     error = CAMERA.project(p) - new.keyframes[4].features.pixels[features]
     assert np.median(np.linalg.norm(error, axis=1)) < 1.5
 
 
-def test_a_loop_closes_and_takes_its_points_along() -> None:
+def test_loop_closure_moves_its_points() -> None:
     ground = Ground(np.random.default_rng(6))
     corners = [(0.0, 0.0), (16.0, 0.0), (16.0, 16.0), (0.0, 16.0), (0.0, 1.0)]
     sides = itertools.pairwise(corners)
@@ -145,12 +144,12 @@ def test_a_loop_closes_and_takes_its_points_along() -> None:
     assert off > 1.0
     found = find(newest, slam_map, [slam_map])
     assert found is not None
-    assert found.located.keyframe.keyframe_id < 4
+    assert found.relocalised.keyframe.keyframe_id < 4
     moved = close_loop(slam_map, found)
     assert moved == pytest.approx(off, rel=0.2)
     assert slam_map.keyframes[newest].centre == pytest.approx(path[-1].translation, abs=0.3)
     keyframe = slam_map.keyframes[newest]
-    features, points = slam_map.seen_by(keyframe)
+    features, points = slam_map.observations_of(keyframe)
     own = slam_map.first_seen[points] == newest
     p = keyframe.camera_from_map.apply(slam_map.positions[points[own]])
     error = CAMERA.project(p) - keyframe.features.pixels[features[own]]
@@ -168,7 +167,7 @@ def _bend(slam_map: SlamMap, per_keyframe: float) -> None:
 
 
 @pytest.mark.parametrize("level", [True, False], ids=["level", "vision alone"])
-def test_a_wall_that_repeats_itself_is_no_loop(level: bool) -> None:
+def test_repetitive_facade_is_no_loop(level: bool) -> None:
     ground = Ground(np.random.default_rng(7))
     ground.repeat(period=4.0)
     slam_map = mapped(ground, line((-24, 0), (24, 0), 30, 0.0), NOWHERE)

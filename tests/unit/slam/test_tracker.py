@@ -86,7 +86,7 @@ def test_every_frame_of_an_easy_flight_is_tracked_to_centimetres(
     assert error < 0.12  # metres, at 12 m above ground, where a pixel is 0.046 m
 
 
-def test_attitude_levels_the_map_and_turns_it_north(images: list[np.ndarray]) -> None:
+def test_attitude_levels_the_map_and_aligns_it_north(images: list[np.ndarray]) -> None:
     _tracker, tracks, _ = run(images, attitude=True)
     track = tracks[max(tracks)]
     assert track.map_from_camera is not None
@@ -105,7 +105,7 @@ def test_two_runs_give_the_same_poses_to_the_last_bit(images: list[np.ndarray]) 
         assert np.array_equal(track.map_from_camera.matrix(), other.map_from_camera.matrix())
 
 
-def test_a_blinded_camera_is_lost_honestly_and_found_again_in_the_same_map(
+def test_image_dropout_is_reported_lost_and_relocalised_in_the_same_map(
     images: list[np.ndarray],
 ) -> None:
     blind = range(22, 26)
@@ -118,7 +118,7 @@ def test_a_blinded_camera_is_lost_honestly_and_found_again_in_the_same_map(
     assert error < 0.12
 
 
-def test_a_camera_that_only_turns_starts_no_map() -> None:
+def test_pure_rotation_initialises_no_map() -> None:
     world = PlaneWorld(np.random.default_rng(3))
     tracker = Tracker(Config(), CAMERA, nothing)
     for k in range(12):
@@ -134,7 +134,7 @@ def test_a_camera_that_only_turns_starts_no_map() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
-def test_an_image_of_nothing_yields_no_pose(level: int) -> None:
+def test_blank_image_yields_no_pose(level: int) -> None:
     tracker = Tracker(Config(), CAMERA, nothing)
     grey = np.full((240, 320), level, np.uint8)
     for k in range(4):
@@ -145,7 +145,7 @@ def test_an_image_of_nothing_yields_no_pose(level: int) -> None:
         assert track.map_from_camera is None
 
 
-def test_a_pose_that_the_attitude_rules_out_is_not_taken(images: list[np.ndarray]) -> None:
+def test_pose_inconsistent_with_attitude_is_rejected(images: list[np.ndarray]) -> None:
     tracker, tracks, _ = run(images[:20], attitude=True)
     last = tracks[19].map_from_camera
     assert last is not None
@@ -157,7 +157,7 @@ def test_a_pose_that_the_attitude_rules_out_is_not_taken(images: list[np.ndarray
     assert track.state is TrackState.LOST
 
 
-def test_a_map_that_was_outrun_is_carried_on_by_two_views(images: list[np.ndarray]) -> None:
+def test_map_is_continued_by_two_views_after_loss(images: list[np.ndarray]) -> None:
     """Without attitude, and with too few points left to be tracked by, but enough for the scale."""
     config = Config()
     few = replace(config, tracking=replace(config.tracking, min_inliers=100))
@@ -185,7 +185,7 @@ def test_a_map_that_was_outrun_is_carried_on_by_two_views(images: list[np.ndarra
     assert error < 0.2
 
 
-def test_a_map_begins_level_where_the_attitude_comes_after_the_first_frames(
+def test_map_is_level_where_attitude_arrives_after_the_first_frames(
     images: list[np.ndarray],
 ) -> None:
     tracker = Tracker(Config(), CAMERA, nothing)

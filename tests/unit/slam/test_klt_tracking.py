@@ -1,4 +1,4 @@
-"""Points followed from picture to picture where corners are not found again."""
+"""KLT tracking of map points where corners are not detected again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.messages import Bytes
-from companion.slam.features.klt_tracking import follow
+from companion.slam.features.klt_tracking import track_points
 from tests.support.flights.rendered_flight import Terrain
 from tests.support.flights.scene import DOWN_LOOKING
 
@@ -23,44 +23,44 @@ SECOND = Pose(
 
 
 def faint(picture: Bytes, seed: int) -> Bytes:
-    """Out of focus, and with noise on it."""
+    """Out of focus and noisy."""
     noise = np.random.default_rng(seed).normal(scale=3.0, size=picture.shape)
     blurred = cv2.GaussianBlur(picture, (0, 0), 3.0)
     return np.asarray(np.clip(100 + 0.5 * (blurred - 128.0) + noise, 0, 255), np.uint8)
 
 
 def seen(rng: np.random.Generator) -> Array:
-    """Points on the ground that the first camera sees."""
+    """Points on the ground that the first camera observes."""
     pixels = rng.uniform([20, 20], [300, 220], (120, 2))
     rays = np.c_[CAMERA.normalise(pixels), np.ones(120)] @ FIRST.rotation.T
     out: Array = FIRST.translation + rays * (2.0 / rays[:, 2:])
     return out
 
 
-def test_a_faint_picture_from_much_nearer_is_placed(rng: np.random.Generator) -> None:
+def test_low_contrast_image_from_much_closer_is_tracked(rng: np.random.Generator) -> None:
     grey = faint(TERRAIN.picture(CAMERA, FIRST), 1)
     next_grey = faint(TERRAIN.picture(CAMERA, SECOND), 2)
     guess = Pose(SECOND.rotation, SECOND.translation + [0.05, 0.08, -0.1]).inverse()
-    found = follow(CAMERA, seen(rng), grey, FIRST.inverse(), next_grey, guess)
+    found = track_points(CAMERA, seen(rng), grey, FIRST.inverse(), next_grey, guess)
     assert found is not None
     assert np.linalg.norm(found.inverse().translation - SECOND.translation) < 0.03
     assert np.array_equal(found.rotation, guess.rotation)
 
 
-def test_another_place_is_not_taken_for_this_one(rng: np.random.Generator) -> None:
+def test_another_scene_is_not_tracked(rng: np.random.Generator) -> None:
     grey = TERRAIN.picture(CAMERA, FIRST)
     elsewhere = Pose(SECOND.rotation, SECOND.translation + [20.0, 20.0, 0.0])
     next_grey = TERRAIN.picture(CAMERA, elsewhere)
     points = seen(rng)
-    assert follow(CAMERA, points, grey, FIRST.inverse(), next_grey, SECOND.inverse()) is None
+    assert track_points(CAMERA, points, grey, FIRST.inverse(), next_grey, SECOND.inverse()) is None
 
 
-def test_a_blank_picture_and_too_few_points_are_not_placed(rng: np.random.Generator) -> None:
+def test_blank_image_and_too_few_points_are_not_tracked(rng: np.random.Generator) -> None:
     grey, points = TERRAIN.picture(CAMERA, FIRST), seen(rng)
     here, there = FIRST.inverse(), SECOND.inverse()
     blank = np.full_like(grey, 200)
-    assert follow(CAMERA, points, grey, here, blank, there) is None
-    assert follow(CAMERA, points, blank, here, grey, there) is None
-    assert follow(CAMERA, points[:10], grey, here, grey, here) is None
+    assert track_points(CAMERA, points, grey, here, blank, there) is None
+    assert track_points(CAMERA, points, blank, here, grey, there) is None
+    assert track_points(CAMERA, points[:10], grey, here, grey, here) is None
     behind = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3)) @ here
-    assert follow(CAMERA, points, grey, here, grey, behind) is None
+    assert track_points(CAMERA, points, grey, here, grey, behind) is None

@@ -1,4 +1,4 @@
-"""What the compiled loops do, in plain numpy: what they are compared with."""
+"""Reference implementations of the kernels in numpy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _residuals(
 def robust_cost(
     camera_from_map: Pose, points_map: Array, normalised: Array, whitening: Array
 ) -> float:
-    """Huber's loss of all N points, those behind the camera at a high price."""
+    """Huber's loss of all N points, those behind the camera at a high constant."""
     r, depth = _residuals(camera_from_map, points_map, normalised, whitening)
     size = np.sqrt((r * r).sum(1))
     loss = np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER))
@@ -89,7 +89,7 @@ def refine_pose(
 def visible(
     camera: Camera, slam_map: SlamMap, camera_from_map: Pose, ids: Ints, max_radius: float
 ) -> tuple[Ints, Array, Ints]:
-    """Ids, pixels and levels of the points that a camera should see."""
+    """Ids, pixels and levels of the visible points."""
     position = slam_map.positions[ids]
     p = camera_from_map.apply(position)
     towards = (-camera_from_map.rotation.T @ camera_from_map.translation) - position
@@ -113,7 +113,7 @@ def match_projected(
     projected_px: Array, descriptors: Bytes, octaves: Ints, features: Features, radius_px: Array,
     usable: Bools, max_distance: float = 64, ratio: float = 0.85, max_octave_gap: int = 2,
 ) -> tuple[Ints, Ints]:  # fmt: skip
-    """Indices of points and features that are each other's."""
+    """Indices of mutually best points and features."""
     n, far = len(features), np.float32(1000.0)
     near_px, candidates = cKDTree(features.pixels).query(projected_px, k=min(12, n))
     candidates = candidates.astype(np.int64)
@@ -141,7 +141,7 @@ def match_projected(
 def warps(
     slam_map: SlamMap, camera_from_map: Pose, points: Ints, jacobian: Array, first: Pose
 ) -> Array:
-    """How pixels of the first view of each point move in this one."""
+    """Warps of pixels from the reference view of each point to this view."""
     depth = first.apply(slam_map.positions[points])[:, 2]
     turn = camera_from_map.rotation @ first.rotation.T
     seen = camera_from_map.apply(slam_map.positions[points])

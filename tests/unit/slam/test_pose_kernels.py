@@ -1,4 +1,4 @@
-"""The compiled refinement of a pose beside the same in plain numpy."""
+"""Pose refinement kernel against numpy."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import pytest
 
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.slam.optimisation.pose_refinement import refine_pose, robust_cost
-from tests.support.reference import plain_loops
+from tests.support.reference import numpy_kernels
 
 Sight = tuple[Pose, Array, Array, Array]
 
 
 def sight(n: int, noise: float = 1e-3) -> Sight:
-    """A start some way off, points, some behind, where they are seen, a third of it wrong."""
+    """An initial pose off the truth, points, some behind, and observations, a third of them
+    outliers."""
     rng = np.random.default_rng(n)
     pose = Pose(rotation_from_vector(np.array([0.3, -0.2, 0.1])), np.array([0.5, -1.0, 4.0]))
     points = rng.normal(size=(n, 3)) * [3.0, 2.0, 1.0]
@@ -28,25 +29,25 @@ def sight(n: int, noise: float = 1e-3) -> Sight:
 
 @pytest.mark.parametrize("rounds", [1, 2, 4])
 @pytest.mark.parametrize("n", [6, 7, 40, 500])
-def test_a_pose_is_refined_as_in_plain_numpy(n: int, rounds: int) -> None:
+def test_pose_refinement_matches_numpy(n: int, rounds: int) -> None:
     start, points, seen, whitening = sight(n)
     pose, inlier, information = refine_pose(start, points, seen, whitening, rounds)
-    wanted, agree, known = plain_loops.refine_pose(start, points, seen, whitening, rounds)
+    wanted, agree, known = numpy_kernels.refine_pose(start, points, seen, whitening, rounds)
     np.testing.assert_array_equal(inlier, agree)
     np.testing.assert_allclose(pose.matrix(), wanted.matrix(), atol=1e-9)
     np.testing.assert_allclose(information, known, rtol=1e-7, atol=1e-7 * np.abs(known).max())
 
 
-def test_the_loss_is_that_of_plain_numpy() -> None:
+def test_loss_matches_numpy() -> None:
     found = sight(101)
-    loss = plain_loops.robust_cost(*found)
+    loss = numpy_kernels.robust_cost(*found)
     assert robust_cost(*found) == pytest.approx(loss, rel=1e-12)
     ahead = (found[0], found[1][20:], found[2][20:], found[3][20:])
     assert robust_cost(*ahead) < loss
 
 
 @pytest.mark.parametrize("n", [0, 1, 5])
-def test_too_few_points_leave_a_pose_as_it_is(n: int) -> None:
+def test_too_few_points_leave_the_pose_unchanged(n: int) -> None:
     start, points, seen, whitening = sight(n)
     pose, inlier, information = refine_pose(start, points, seen, whitening)
     np.testing.assert_allclose(pose.matrix(), start.matrix(), atol=1e-12)
@@ -55,14 +56,14 @@ def test_too_few_points_leave_a_pose_as_it_is(n: int) -> None:
     assert robust_cost(start, *(a[:0] for a in (points, seen, whitening))) == 0.0
 
 
-def test_points_that_are_no_numbers_are_seen_by_nobody() -> None:
+def test_points_that_are_nan_are_no_inliers() -> None:
     start, points, seen, whitening = sight(30, noise=0.0)
     points[:] = np.nan
     _, inlier, _ = refine_pose(start, points, seen, whitening)
     assert not inlier.any()
 
 
-def test_arrays_need_not_lie_in_rows() -> None:
+def test_non_contiguous_arrays_are_accepted() -> None:
     start, points, seen, whitening = sight(60)
     turned = Pose(np.asfortranarray(start.rotation), start.translation)
     other = refine_pose(

@@ -1,4 +1,4 @@
-"""What the compiled alignment of patches does, in plain numpy: what it is compared with."""
+"""Reference implementation of patch alignment in numpy."""
 
 from __future__ import annotations
 

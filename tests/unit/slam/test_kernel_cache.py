@@ -1,4 +1,4 @@
-"""Loops are kept on disk, and still compiled where they cannot be."""
+"""Kernels are cached on disk, and compiled where they cannot be."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def scaled(values, by):
 
 
 @pytest.fixture(autouse=True)
-def not_kept(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def cache_errors(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     found: list[str] = []
-    monkeypatch.setattr(compiling, "not_kept", found)
+    monkeypatch.setattr(compiling, "cache_errors", found)
     yield found
 
 
@@ -38,34 +38,34 @@ def module_in(folder: Path) -> Any:
     return module
 
 
-def test_a_loop_is_compiled_once(tmp_path: Path, not_kept: list[str]) -> None:
+def test_kernel_is_compiled_once(tmp_path: Path, cache_errors: list[str]) -> None:
     module_in(tmp_path)
     (kept,) = tmp_path.rglob("*.nbc")  # there before it is called
     stamp = kept.stat().st_mtime_ns
     scaled = module_in(tmp_path).scaled
     assert scaled(np.array([1.0, -2.0, 0.0]), 3.0)[:2].tolist() == [np.inf, -np.inf]
     assert [path.stat().st_mtime_ns for path in tmp_path.rglob("*.nbc")] == [stamp]
-    assert not_kept == []
+    assert cache_errors == []
 
 
-def test_a_kept_loop_that_is_damaged_is_compiled_anew(tmp_path: Path, not_kept: list[str]) -> None:
+def test_corrupt_cache_is_recompiled(tmp_path: Path, cache_errors: list[str]) -> None:
     module_in(tmp_path)
     (kept,) = tmp_path.rglob("*.nbc")
     kept.write_bytes(kept.read_bytes()[:100])
     assert np.isnan(module_in(tmp_path).scaled(np.zeros(3), 1.0)).all()
-    assert len(not_kept) == 1 and not_kept[0].startswith("scaled: ")
+    assert len(cache_errors) == 1 and cache_errors[0].startswith("scaled: ")
 
 
-def test_without_a_place_to_keep_it_a_loop_is_compiled_all_the_same(
-    tmp_path: Path, not_kept: list[str], monkeypatch: pytest.MonkeyPatch
+def test_without_a_cache_folder_kernels_are_compiled(
+    tmp_path: Path, cache_errors: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "__pycache__").write_text("no folder")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "__pycache__"))
     assert np.isnan(module_in(tmp_path).scaled(np.zeros(2), 1.0)).all()
-    assert len(not_kept) == 1 and "cannot cache" in not_kept[0]
+    assert len(cache_errors) == 1 and "cannot cache" in cache_errors[0]
 
 
-def test_arrays_of_any_kind_and_order_are_taken(tmp_path: Path) -> None:
+def test_arrays_of_any_type_and_order_are_accepted(tmp_path: Path) -> None:
     scaled = module_in(tmp_path).scaled
     values = np.arange(1, 9, dtype=np.int32)[::-2]
     assert scaled(values, -1.0).tolist() == [-np.inf] * 4
