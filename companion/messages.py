@@ -103,7 +103,7 @@ class TrackState(Enum):
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
-    COASTING = "coasting"
+    DEAD_RECKONING = "coasting"
     """Nothing is recognised; the pose is carried on by the autopilot's attitude and velocity."""
     LOST = "lost"
 

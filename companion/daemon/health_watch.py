@@ -49,7 +49,7 @@ STUCK = "localisation hangs and is ended"
 IN_WORDS = {
     TrackState.INITIALISING: "initialising",
     TrackState.TRACKING: "tracking",
-    TrackState.COASTING: "coasting",
+    TrackState.DEAD_RECKONING: "coasting",
     TrackState.LOST: "lost",
 }
 
@@ -213,9 +213,7 @@ class HealthWatch:
     def _apply(self) -> None:
         level = self._governor.level
         if self._flights.current is not None:
-            self._flights.current.set_shares(
-                level.feature_share, level.dense_share, level.viewer
-            )
+            self._flights.current.set_shares(level.feature_share, level.dense_share, level.viewer)
 
     def line_due(self) -> str | None:
         """The status line, if it is due now."""

@@ -66,7 +66,7 @@ class _Localisation(Work):
         if self._to_take_up is not None:
             kept, tracked_ns = self._to_take_up
             self._to_take_up = None
-            self._stage.take_up(kept, frame.t_ns, since_boot_ns() - tracked_ns)
+            self._stage.resume(kept, frame.t_ns, since_boot_ns() - tracked_ns)
         yield from self._stage.step(frame)
         keeper = self._keeper
         if keeper is None or keeper.busy or frame.t_ns - self._kept_ns < KEEP_EVERY_NS:

@@ -60,7 +60,7 @@ MOST_IMAGES_HELD = 4
 IN_WORDS = {
     TrackState.INITIALISING: Shown.INITIALISING,
     TrackState.TRACKING: Shown.TRACKING,
-    TrackState.COASTING: Shown.COASTING,
+    TrackState.DEAD_RECKONING: Shown.COASTING,
     TrackState.LOST: Shown.LOST,
 }
 

@@ -196,7 +196,7 @@ def _row(
         _nees_yaw(listener.odometry, truth, stage),
         max((o.reset_counter for o in listener.odometry), default=0),
         _longest_gap_s(due, known),
-        sum(o.state is TrackState.COASTING for o in listener.odometry),
+        sum(o.state is TrackState.DEAD_RECKONING for o in listener.odometry),
         update.n_keyframes if update is not None else 0, stage.n_segments, stage.n_loops,
         found.method if found is not None else "none",
         round(float(np.median(cost.frame_ms)), 2),

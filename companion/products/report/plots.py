@@ -113,7 +113,8 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
         found = np.where(known, [float(track.n_inliers) for track in tracks], np.nan)
         axes.plot(*_thin(np.stack([t_s, found], 1)).T, color=PATH, lw=1.2, label="map points found")
         for state, colour in (
-            (TrackState.INITIALISING, IDLE), (TrackState.COASTING, OTHER), (TrackState.LOST, BAD),
+            (TrackState.INITIALISING, IDLE), (TrackState.DEAD_RECKONING, OTHER),
+            (TrackState.LOST, BAD),
         ):  # fmt: skip
             here = np.array([track.state is state for track in tracks])
             axes.fill_between(

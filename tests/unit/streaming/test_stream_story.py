@@ -42,7 +42,7 @@ def lost(seq: int) -> Track:
 
 
 def test_each_state_of_the_tracker_has_its_word() -> None:
-    coasting = replace(flown.track(21), state=TrackState.COASTING, n_inliers=0)
+    coasting = replace(flown.track(21), state=TrackState.DEAD_RECKONING, n_inliers=0)
     items = told([flown.update(), flown.track(20), coasting, lost(22), lost(23)])
     poses = [item for item in items if isinstance(item, PoseItem)]
     assert [p.shown for p in poses] == [Shown.TRACKING, Shown.COASTING, Shown.LOST, Shown.LOST]

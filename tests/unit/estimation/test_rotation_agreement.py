@@ -1,4 +1,4 @@
-"""Late and jittery telemetry is told from a gimbal by how camera turns follow the body's."""
+"""Rotation regression separates late and jittery telemetry from a gimbal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.estimation.attitude_following import Following, FollowingTest
+from companion.estimation.attitude_following import RotationAgreement, RotationComparison
 from companion.geometry.transforms import (
     Array,
     angle_between,
@@ -39,7 +39,7 @@ def body(t_s: float) -> Array:
 
 
 def levelled(t_s: float) -> Array:
-    """Roll and pitch held, heading followed."""
+    """Roll and pitch stabilised, heading followed."""
     return rotation_from_quaternion(quaternion_from_euler(0.0, 0.0, euler(t_s)[2]))
 
 
@@ -48,7 +48,7 @@ def without_roll(t_s: float) -> Array:
 
 
 def swept(t_s: float) -> Array:
-    """Held level, and panned and tilted by the pilot."""
+    """Levelled, and panned and tilted by the pilot."""
     return rotation_from_quaternion(
         quaternion_from_euler(0.0, 0.3 * np.sin(0.8 * t_s), 0.6 * np.sin(0.5 * t_s + 1))
     )
@@ -64,10 +64,10 @@ def result(
     body_as: Callable[[float], Array] = body,
     mount: Array = DOWN_LOOKING,
     rate_hz: float = 20.0,
-) -> Following:
-    """What turns say at the end of a flight whose frames are stamped so."""
+) -> RotationAgreement:
+    """Agreement at the end of a flight with these stamps."""
     rng = np.random.default_rng(3)
-    test = FollowingTest()
+    test = RotationComparison()
     heading = rotation_from_vector(np.array([0.0, 0.0, 1.1]))
     for k in range(int((SECONDS + 1.0) * 50)):
         noise = rotation_from_vector(rng.normal(scale=0.0015, size=3))
@@ -98,30 +98,32 @@ def late(delay_s: float, jitter_s: float, kind: str) -> Stamp:
 @pytest.mark.parametrize("kind", ["normal", "uniform", "quantised"])
 @pytest.mark.parametrize("jitter_s", [0.0, 0.015, 0.03])
 @pytest.mark.parametrize("delay_s", [-0.15, 0.0, 0.04, 0.09, 0.15])
-def test_a_late_and_jittery_camera_follows(delay_s: float, jitter_s: float, kind: str) -> None:
+def test_late_and_jittery_camera_is_body_fixed(delay_s: float, jitter_s: float, kind: str) -> None:
     found = result(late(delay_s, jitter_s, kind))
-    assert not found.held
-    assert found.follows
+    assert not found.stabilised
+    assert found.body_fixed
     assert abs(found.offset_s + delay_s) < 0.05
 
 
 @pytest.mark.parametrize("camera_on", [levelled, without_roll, fixed, swept])
 @pytest.mark.parametrize("jitter_s", [0.0, 0.03])
-def test_a_gimbal_holds_the_camera(camera_on: Callable[[float], Array], jitter_s: float) -> None:
+def test_gimbal_is_detected_as_stabilised(
+    camera_on: Callable[[float], Array], jitter_s: float
+) -> None:
     found = result(late(0.05, jitter_s, "uniform"), camera_on)
-    assert found.held
-    assert not found.follows
+    assert found.stabilised
+    assert not found.body_fixed
 
 
-def test_a_camera_that_is_swept_over_a_still_body_does_not_follow() -> None:
+def test_panned_camera_on_a_still_body_is_not_body_fixed() -> None:
     found = result(camera_on=swept, body_as=fixed)
-    assert not found.held
-    assert not found.follows
-    assert found.turns_alone
+    assert not found.stabilised
+    assert not found.body_fixed
+    assert found.rotates_independently
 
 
-def test_a_heading_that_is_set_anew_is_no_gimbal() -> None:
-    """An autopilot turns by 25 degrees in itself when its compass is found to be wrong."""
+def test_heading_reset_is_no_gimbal() -> None:
+    """An autopilot rotates its own estimate by 25 degrees when its compass is corrected."""
 
     def body_as(t_s: float) -> Array:
         jump = rotation_from_vector(np.array([0.0, 0.0, np.radians(25.0) * (t_s > 4.5)]))
@@ -133,33 +135,33 @@ def test_a_heading_that_is_set_anew_is_no_gimbal() -> None:
         return rotation_from_quaternion(quaternion_from_euler(*(euler(t_s) * [1.0, 1.0, 0.0])))
 
     found = result(camera_on=camera_on, body_as=body_as)
-    assert not found.held
-    assert found.follows
+    assert not found.stabilised
+    assert found.body_fixed
 
 
-def test_where_nothing_turns_nothing_is_claimed() -> None:
+def test_without_rotation_nothing_is_concluded() -> None:
     found = result(camera_on=fixed, body_as=fixed)
-    assert not found.held
-    assert not found.follows
-    assert not found.turns_alone
+    assert not found.stabilised
+    assert not found.body_fixed
+    assert not found.rotates_independently
 
 
-def test_a_mount_stated_wrongly_is_found() -> None:
-    """A camera that was put on the other way round."""
+def test_wrong_mount_is_estimated() -> None:
+    """A camera mounted the other way round."""
     turn = rotation_from_vector(np.radians([0.0, 0.0, 90.0]))
     found = result(mount=turn @ DOWN_LOOKING)
-    assert not found.follows
-    assert found.turned_mount is not None
-    assert np.degrees(angle_between(found.turned_mount, turn)) < 5.0
-    assert result(camera_on=levelled).turned_mount is None
+    assert not found.body_fixed
+    assert found.mount_correction is not None
+    assert np.degrees(angle_between(found.mount_correction, turn)) < 5.0
+    assert result(camera_on=levelled).mount_correction is None
 
 
-def test_a_mount_stated_wrongly_by_15_degrees_follows() -> None:
+def test_mount_off_by_15_degrees_is_body_fixed() -> None:
     turn = rotation_from_vector(np.radians([9.0, 9.0, 7.0]))
     found = result(mount=turn @ DOWN_LOOKING)
-    assert found.follows
-    assert not found.held
+    assert found.body_fixed
+    assert not found.stabilised
 
 
-def test_too_little_says_nothing() -> None:
-    assert FollowingTest().result(DOWN_LOOKING) is None
+def test_too_little_data_gives_none() -> None:
+    assert RotationComparison().result(DOWN_LOOKING) is None

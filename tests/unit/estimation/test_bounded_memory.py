@@ -1,4 +1,4 @@
-"""What must not grow while a flight lasts for hours: counted, not timed. See bench.one_process."""
+"""Memory that must not grow over hours of flight: counted, not timed. See bench.one_process."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ START_NS = 1_700_000_000_000_000_000
 
 
 def held_bytes(of: object) -> int:
-    """Arrays and entries of containers that can be reached, as bytes; nothing of modules."""
+    """Reachable arrays and container entries, as bytes; none of modules."""
     seen: set[int] = set()
     waiting, total = [of], 0
     while waiting:
@@ -54,7 +54,7 @@ def held_bytes(of: object) -> int:
 
 
 def told(minutes: range) -> Iterator[Telemetry | Frame]:
-    """Telemetry at 20 Hz and now and then a frame that shows nothing."""
+    """Telemetry at 20 Hz, and occasional blank frames."""
     start_ns = START_NS + minutes.start * MINUTE_NS
     for t_ns in range(start_ns, START_NS + minutes.stop * MINUTE_NS, SAMPLE_NS):
         t_s = (t_ns - START_NS) * 1e-9
@@ -70,7 +70,7 @@ def told(minutes: range) -> Iterator[Telemetry | Frame]:
             yield Frame(round(t_s * 20), t_ns, grey, np.zeros((*shape, 3), np.uint8))
 
 
-def test_localisation_holds_no_more_after_half_an_hour_than_after_some_minutes() -> None:
+def test_memory_of_localisation_is_bounded() -> None:
     camera = replace(CAMERA, body_from_camera=Pose.identity())
     stage = LocalisationStage(Config(), camera, StageTimes())
 
@@ -84,7 +84,7 @@ def test_localisation_holds_no_more_after_half_an_hour_than_after_some_minutes()
     assert fly(range(12, 36)) < 1.1 * after_twelve
 
 
-def test_tracks_and_positions_of_an_hour_are_some_megabytes() -> None:
+def test_tracks_and_positions_of_an_hour_take_megabytes() -> None:
     result = FlightResult()
     relative = Pose(np.eye(3), np.array([1.0, 2, 3]))
     tracemalloc.start()
@@ -107,8 +107,8 @@ def test_tracks_and_positions_of_an_hour_are_some_megabytes() -> None:
     np.testing.assert_array_equal(path[2][-1], np.full(3, 35_999.0))
 
 
-def test_a_frame_that_was_tracked_stays_so() -> None:
-    """Of the tracks of a frame the last that was tracking counts, else the last."""
+def test_tracked_frame_stays_tracked() -> None:
+    """Of the tracks of a frame the last tracking one counts, else the last."""
     result = FlightResult()
     pose = Pose.identity()
     tracking = Track(1, 1, TrackState.TRACKING, pose, 4, pose, 10, 20)
@@ -120,7 +120,7 @@ def test_a_frame_that_was_tracked_stays_so() -> None:
 
 
 @pytest.mark.parametrize("before", [0, 37, 500, 999, 5000])
-def test_samples_read_the_same_at_keyframes_once_others_are_gone(before: int) -> None:
+def test_interpolation_at_keyframes_is_unchanged_by_pruning(before: int) -> None:
     rng = np.random.default_rng(before)
     times = START_NS + np.cumsum(rng.integers(50, 120, 1000)) * 1_000_000
     keyframes: Array = np.sort(rng.integers(times[0] - 10**9, times[-1] + 10**9, 40))
@@ -133,7 +133,7 @@ def test_samples_read_the_same_at_keyframes_once_others_are_gone(before: int) ->
     for t_ns in times.tolist():
         series.add(t_ns, rng.normal(size=3))
     first = read(series)
-    series.let_go(int(times[min(before, 999)]) + (before > 999) * 10**12, keyframes)
+    series.prune(int(times[min(before, 999)]) + (before > 999) * 10**12, keyframes)
     assert len(series) <= 1000 - min(before, 999) + 2 * len(keyframes) + 2
     wanted = 1 if before > 999 else 2
     for then, now in list(zip(first, read(series), strict=True))[:wanted]:

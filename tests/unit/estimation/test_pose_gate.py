@@ -1,4 +1,4 @@
-"""No bad pose leaves; a good one does, at the rate and with the stamp that an autopilot wants."""
+"""Pose gate: bad poses are withheld, good ones sent at the rate and stamps of an autopilot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def odometry(t_ns: int, **changes: Any) -> Odometry:
 
 
 class Flight:
-    """Frames each `period_ms`, and the gate asked every 5 ms as the daemon does."""
+    """Frames every `period_ms`, and the gate polled every 5 ms as in the daemon."""
 
     def __init__(self, period_ms: int = 50, **config: Any) -> None:
         self.gate = PoseGate(FeedbackConfig(mode="odometry", **config))
@@ -41,7 +41,7 @@ class Flight:
         self.yaw_rate_rad_s = 0.0
         self.told = True
         """Whether the autopilot says its attitude, and how late."""
-        self.late_ns = 0
+        self.delay_ns = 0
 
     def yaw(self, t_ns: int) -> float:
         return 0.7 + self.yaw_rate_rad_s * (t_ns - 10**12) * 1e-9
@@ -51,7 +51,7 @@ class Flight:
         for _ in range(round(seconds * 200)):
             self.now_ns += 5 * MS
             if self.told and self.now_ns % (20 * MS) == 0:
-                at_ns = self.now_ns - self.late_ns
+                at_ns = self.now_ns - self.delay_ns
                 attitude = quaternion_from_euler(0.1, -0.2, self.yaw(at_ns))
                 self.gate.take_attitude(AttitudeSample(at_ns, attitude))
             if frames and self.now_ns % self.period_ns == 0:
@@ -71,7 +71,7 @@ class Flight:
             self.sent.append((self.now_ns, pose))
 
 
-def test_nothing_before_belief_has_held() -> None:
+def test_nothing_is_sent_before_proof() -> None:
     flight = Flight()
     assert not flight.run(0.9)
     assert flight.gate.why_not == "belief must hold first"
@@ -92,7 +92,7 @@ def test_rate_and_order(period_ms: int, least_hz: int) -> None:
     assert any(pose.predicted for pose in poses) == (period_ms > 40)
 
 
-def test_prediction_turns_with_the_autopilot() -> None:
+def test_prediction_rotates_with_the_autopilot() -> None:
     flight = Flight(100)
     flight.yaw_rate_rad_s = 0.5
     flight.run(2)
@@ -119,7 +119,7 @@ def test_prediction_turns_with_the_autopilot() -> None:
         ({"velocity_world_m_s": np.array([math.nan, 0, 0])}, "position too uncertain"),
     ],
 )  # fmt: skip
-def test_stops_in_time_and_takes_up_again(changes: dict[str, Any], why_not: str) -> None:
+def test_stops_in_time_and_resumes(changes: dict[str, Any], why_not: str) -> None:
     flight = Flight()
     flight.run(2)
     assert flight.gate.sending
@@ -141,7 +141,7 @@ def test_no_frames_at_all() -> None:
     assert flight.gate.why_not == "no frames"
 
 
-def test_a_single_bad_frame_is_bridged() -> None:
+def test_single_rejected_frame_is_bridged() -> None:
     flight = Flight()
     flight.run(2)
     flight.run(0.05, state=TrackState.LOST, world_from_body=None)
@@ -170,7 +170,7 @@ def test_discontinuities_are_counted_across_restarts() -> None:
     assert flight.sent[-1][1].reset_counter == 2
 
 
-def test_a_discontinuity_before_the_first_pose_is_nothing_to_the_autopilot() -> None:
+def test_discontinuity_before_the_first_pose_is_not_counted() -> None:
     """Its EKF may take a first counter of 1 for a reset."""
     flight = Flight()
     flight.gate.restart()
@@ -193,7 +193,7 @@ def test_every_reset_is_proven() -> None:
     assert {pose.reset_counter for pose in poses} == {1}
 
 
-def test_proof_is_of_poses_that_came_one_after_the_other() -> None:
+def test_proof_requires_successive_poses() -> None:
     flight = Flight()
     flight.run(0.5)
     flight.run(3, frames=False)
@@ -201,8 +201,8 @@ def test_proof_is_of_poses_that_came_one_after_the_other() -> None:
     assert flight.run(0.4)
 
 
-def test_a_stalled_loop_is_a_gap_too() -> None:
-    """Nobody asked for what was due meanwhile, and a whole row of frames comes at once."""
+def test_stalled_loop_is_a_gap() -> None:
+    """Nothing was polled meanwhile, and a series of frames arrives at once."""
     flight = Flight()
     flight.run(2)
     flight.now_ns += 400 * MS
@@ -222,8 +222,8 @@ def test_without_an_attitude_nothing_is_sent() -> None:
     assert not flight.run(3, world_from_body=rolled_over(0))
 
 
-def test_poses_cease_with_the_autopilots_attitude() -> None:
-    """And none is predicted that nobody could check: 120 ms is the most an attitude holds."""
+def test_poses_stop_without_attitude() -> None:
+    """And none is predicted unchecked: attitude is extrapolated by at most 120 ms."""
     flight = Flight()
     flight.run(2)
     flight.told, silent_ns = False, flight.now_ns
@@ -236,7 +236,7 @@ def test_poses_cease_with_the_autopilots_attitude() -> None:
     assert flight.run(0.4)
 
 
-def test_attitudes_far_apart_tell_nothing_of_what_is_between_them() -> None:
+def test_attitudes_are_not_interpolated_over_gaps() -> None:
     flight = Flight()
     flight.run(2)
     flight.told = False
@@ -249,9 +249,9 @@ def test_attitudes_far_apart_tell_nothing_of_what_is_between_them() -> None:
 
 
 @pytest.mark.parametrize("late_ms", [20, 60])
-def test_attitudes_may_come_later_than_the_frame(late_ms: int) -> None:
+def test_attitudes_may_arrive_after_the_frame(late_ms: int) -> None:
     flight = Flight()
-    flight.late_ns = late_ms * MS
+    flight.delay_ns = late_ms * MS
     flight.run(2)
     assert len(flight.run(2)) >= 59
 
@@ -259,7 +259,7 @@ def test_attitudes_may_come_later_than_the_frame(late_ms: int) -> None:
 @pytest.mark.parametrize(
     "quaternion", [[math.nan] * 4, [0.0] * 4, [math.inf, 0.0, 0.0, 0.0], [1e-3, 0.0, 0.0, 0.0]]
 )
-def test_an_attitude_that_is_none_checks_nothing(quaternion: list[float]) -> None:
+def test_invalid_attitude_is_ignored(quaternion: list[float]) -> None:
     flight = Flight()
     flight.told = False
     for _ in range(150):
@@ -268,7 +268,7 @@ def test_an_attitude_that_is_none_checks_nothing(quaternion: list[float]) -> Non
     assert flight.gate.why_not == "no autopilot attitude"
 
 
-def test_rates_that_are_none_are_left_out() -> None:
+def test_invalid_rates_are_ignored() -> None:
     flight = Flight()
     flight.told = False
     for _ in range(150):
@@ -279,7 +279,7 @@ def test_rates_that_are_none_are_left_out() -> None:
     assert all(np.isfinite(pose.world_from_body.rotation).all() for _, pose in flight.sent)
 
 
-def test_poses_begin_at_the_autopilots_own_height_and_keep_to_it() -> None:
+def test_poses_start_at_the_height_of_the_autopilot() -> None:
     gate = PoseGate(FeedbackConfig(mode="odometry"), start_down_m=lambda _t_ns: start_m)
     flight = Flight()
     flight.gate, start_m = gate, None
@@ -294,7 +294,7 @@ def test_poses_begin_at_the_autopilots_own_height_and_keep_to_it() -> None:
     assert flight.run(2, reset_counter=1)[-1].world_from_body.translation[2] == 40.0
 
 
-def test_a_pause_without_a_discontinuity_moves_no_height() -> None:
+def test_pause_without_discontinuity_keeps_the_height_offset() -> None:
     start_m = -7.5
     flight = Flight()
     flight.gate = PoseGate(FeedbackConfig(mode="odometry"), start_down_m=lambda _t_ns: start_m)
@@ -306,10 +306,10 @@ def test_a_pause_without_a_discontinuity_moves_no_height() -> None:
     assert {p.reset_counter for p in poses} == {0}
 
 
-def test_what_stands_against_a_beginning_holds_the_first_pose_back_and_no_other() -> None:
+def test_start_condition_withholds_the_first_pose_only() -> None:
     against = "not yet"
     flight = Flight()
-    flight.gate = PoseGate(FeedbackConfig(mode="odometry"), may_begin=lambda _now_ns: against)
+    flight.gate = PoseGate(FeedbackConfig(mode="odometry"), may_start=lambda _now_ns: against)
     assert not flight.run(2) and flight.gate.why_not == "not yet"
     against = ""
     assert flight.run(0.1)
@@ -317,7 +317,7 @@ def test_what_stands_against_a_beginning_holds_the_first_pose_back_and_no_other(
     assert len(flight.run(1)) >= 29
 
 
-def test_another_boot_of_the_autopilot_begins_at_0() -> None:
+def test_reboot_of_the_autopilot_resets_the_counter() -> None:
     flight = Flight()
     flight.run(2)
     flight.run(2, reset_counter=1)
@@ -331,13 +331,13 @@ def test_another_boot_of_the_autopilot_begins_at_0() -> None:
     assert {p.reset_counter for p in flight.run(2, reset_counter=2)} == {0}
 
 
-def test_no_scale_is_told() -> None:
+def test_missing_scale_is_reported() -> None:
     flight = Flight()
     assert not flight.run(2, world_from_body=None, quality=-1)
     assert flight.gate.why_not == "no metric scale"
 
 
-def test_what_is_not_known_of_the_heading_is_said_to_be_unknown() -> None:
+def test_unknown_heading_variance_is_sent_as_unknown() -> None:
     pose = PoseToSend(
         10**12, Pose.identity(), np.zeros(3), 0.1, math.inf, 0.01, math.inf, 80, 0
     )  # fmt: skip
@@ -347,7 +347,7 @@ def test_what_is_not_known_of_the_heading_is_said_to_be_unknown() -> None:
     assert math.isnan(message.velocity_covariance[0])
 
 
-def test_the_headings_uncertainty_is_sent() -> None:
+def test_heading_variance_is_sent() -> None:
     flight = Flight()
     assert {pose.sigma_yaw_rad for pose in flight.run(2)} == {0.05}
 

@@ -1,4 +1,4 @@
-"""A pose that jumps is not sent before it has been proven anew, whatever the rate of the camera."""
+"""A pose that jumps is not sent before it is proven again, at any frame rate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TICK_NS, ATTITUDE_NS, LATENCY_NS = 2_000_000, 20_000_000, 40_000_000
 
 
 class Flight:
-    """Northward at a steady speed; what is seen may be off by some metres."""
+    """Northward at constant speed; poses may be off by metres."""
 
     def __init__(self, rate_hz: float) -> None:
         self.odometry = SmoothOdometry(CAMERA, FeedbackConfig().max_jump_m)
@@ -60,13 +60,13 @@ class Flight:
             self.sent.append((self.now_ns, pose))
 
     def off_m(self, pose: PoseToSend) -> float:
-        """How far a pose is from where the body was."""
+        """Distance of a pose from the true position."""
         north_m = SPEED_M_S * (pose.t_ns - 10**12) * 1e-9
         return float(abs(pose.world_from_body.translation[0] - north_m))
 
 
 @pytest.mark.parametrize("rate_hz", [10, 30, 60, 120])
-def test_a_jump_of_fifty_metres_is_proven_first(rate_hz: float) -> None:
+def test_jump_of_fifty_metres_is_proven_first(rate_hz: float) -> None:
     flight = Flight(rate_hz)
     flight.run(3)
     assert flight.gate.sending
@@ -83,8 +83,8 @@ def test_a_jump_of_fifty_metres_is_proven_first(rate_hz: float) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10, 30, 60, 120])
-def test_places_that_contradict_each_other_are_never_believed(rate_hz: float) -> None:
-    """Each other frame is off: neither row of places is one that motion can have led to."""
+def test_contradicting_positions_are_never_sent(rate_hz: float) -> None:
+    """Every other frame is off: neither series is reachable from the other."""
     flight = Flight(rate_hz)
     flight.run(3)
     flight.run(1.5, off_m=50.0, every_other=True)
@@ -93,7 +93,7 @@ def test_places_that_contradict_each_other_are_never_believed(rate_hz: float) ->
 
 
 @pytest.mark.parametrize("rate_hz", [30, 120])
-def test_a_single_false_place_is_bridged(rate_hz: float) -> None:
+def test_single_outlier_is_bridged(rate_hz: float) -> None:
     flight = Flight(rate_hz)
     flight.run(3)
     flight.interrupted = False
@@ -104,8 +104,8 @@ def test_a_single_false_place_is_bridged(rate_hz: float) -> None:
     assert {pose.reset_counter for _, pose in flight.sent} == {0}
 
 
-def test_what_was_doubted_for_long_is_a_reset_though_motion_might_have_led_there() -> None:
-    """After some seconds the body may be anywhere, so distance alone would hide the jump."""
+def test_pose_rejected_for_long_is_a_reset_even_if_reachable() -> None:
+    """After seconds the body may be anywhere, so distance alone would hide the jump."""
     flight = Flight(30)
     flight.run(3)
     for _ in range(12):  # no two of them agree for long

@@ -1,4 +1,4 @@
-"""What was known of a map before a restart, beside what a rangefinder tells of it since."""
+"""Stored georeference of a resumed map against rangefinder measurements since."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from companion.config import GeoreferenceConfig
 from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.georeference import Georeferencer
-from companion.estimation.segment_georeference import SegmentPlaces
+from companion.estimation.segment_georeference import SegmentGeoreferences
 from companion.geometry.transforms import Array, Pose, Similarity, quaternion_from_rotation
 from companion.messages import AttitudeSample, Georeference, RangeSample
 from companion.slam.map.sparse_map import SlamMap
@@ -21,7 +21,7 @@ N = 12
 
 @pytest.fixture(scope="module")
 def slam_map() -> SlamMap:
-    """Half as large as the world in which its rangefinder measures; its ground is 0 to 2 m high."""
+    """Half the size of the world in which its rangefinder measures; its ground is 0 to 2 m high."""
     path = [flown(p) for p in np.linspace((-4, 0), (4, 0), N)]
     to_map = Similarity(1.0 / METRES_PER_UNIT, np.eye(3), np.zeros(3))
     return mapped(Ground(np.random.default_rng(4)), path, to_map)
@@ -33,11 +33,11 @@ def known(scale: float, sigma: float, n: int, has_origin: bool) -> Georeference:
 
 
 def placed(slam_map: SlamMap, kept: Georeference | None, measured: Array) -> Georeference:
-    """What is thought of the map when a rangefinder has measured these distances."""
+    """Georeference of the map given these ranges."""
     georeferencer, attitude = Georeferencer(GeoreferenceConfig(), MOUNT), CameraAttitude(MOUNT)
-    places = SegmentPlaces(georeferencer, attitude, MOUNT)
+    places = SegmentGeoreferences(georeferencer, attitude, MOUNT)
     if kept is not None:
-        places.take_up(slam_map, kept)
+        places.resume(slam_map, kept)
     end_ns = max(k.t_ns for k in slam_map.keyframes.values())
     ned_from_body = flown(np.zeros(2)).rotation @ MOUNT.rotation.T
     for t_ns in range(0, end_ns + 100_000_000, 50_000_000):
@@ -53,14 +53,14 @@ def placed(slam_map: SlamMap, kept: Georeference | None, measured: Array) -> Geo
 TRUE = np.full(N, HEIGHT - 1.0)
 
 
-def test_a_rangefinder_alone_tells_the_scale(slam_map: SlamMap) -> None:
+def test_rangefinder_alone_gives_the_scale(slam_map: SlamMap) -> None:
     found = placed(slam_map, None, TRUE)
     assert found.world_from_map.scale == pytest.approx(METRES_PER_UNIT, rel=0.05)
     assert not found.has_origin
 
 
-def test_a_place_in_the_world_is_not_given_up(slam_map: SlamMap) -> None:
-    """It would lead the vehicle's pose away to the origin, though nothing has moved."""
+def test_world_position_is_kept(slam_map: SlamMap) -> None:
+    """Else the pose of the vehicle would be led to the origin, though nothing has moved."""
     kept = known(METRES_PER_UNIT, 0.08, 3, has_origin=True)
     assert placed(slam_map, kept, TRUE) is kept
     wrong = placed(slam_map, known(1.4 * METRES_PER_UNIT, 0.02, 3, has_origin=True), TRUE)
@@ -78,7 +78,7 @@ def test_a_place_in_the_world_is_not_given_up(slam_map: SlamMap) -> None:
     ],
     ids=["surer", "of fewer", "less sure", "contradicted"],
 )
-def test_the_surer_of_two_scales_counts(slam_map: SlamMap, kept: Georeference, stays: bool) -> None:
+def test_more_certain_scale_is_used(slam_map: SlamMap, kept: Georeference, stays: bool) -> None:
     found = placed(slam_map, kept, TRUE)
     assert (found is kept) == stays
     assert stays or found.method == "rangefinder"

@@ -1,4 +1,4 @@
-"""Attitude between its samples, and the motion filter."""
+"""Attitude interpolation, and the motion filter."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def yaw_at(history: AttitudeHistory, t_ns: int) -> float:
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
-def test_attitude_is_interpolated_and_carried_on_by_its_rate() -> None:
+def test_attitude_is_interpolated_and_extrapolated_by_its_rate() -> None:
     history = AttitudeHistory()
     history.add(sample(0, 0.10, 2.0))
     history.add(sample(100_000_000, 0.30, 2.0))
@@ -39,7 +39,7 @@ def test_attitude_is_interpolated_and_carried_on_by_its_rate() -> None:
     assert history.at(900_000_000) is None, "too long ago"
 
 
-def test_late_samples_take_their_place_and_doubles_are_ignored() -> None:
+def test_late_samples_are_sorted_and_duplicates_ignored() -> None:
     history = AttitudeHistory()
     for t_ns, yaw in ((0, 0.0), (200_000_000, 0.4), (100_000_000, 0.1), (100_000_000, 3.0)):
         history.add(sample(t_ns, yaw))
@@ -47,7 +47,7 @@ def test_late_samples_take_their_place_and_doubles_are_ignored() -> None:
     assert history.newest_t_ns == 200_000_000
 
 
-def test_a_gap_is_not_bridged() -> None:
+def test_gap_is_not_interpolated() -> None:
     history = AttitudeHistory()
     history.add(sample(0, 0.0))
     history.add(sample(2_000_000_000, 1.0))
@@ -60,7 +60,7 @@ def path(k: int) -> Pose:
 
 
 @pytest.mark.parametrize("attitude", [False, True], ids=["without attitude", "with attitude"])
-def test_a_steady_motion_is_predicted(attitude: bool) -> None:
+def test_constant_motion_is_predicted(attitude: bool) -> None:
     motion = MotionFilter()
     offset = yaw_rotation(0.3)  # the autopilot's heading is wrong, but steadily so
 
@@ -75,18 +75,18 @@ def test_a_steady_motion_is_predicted(attitude: bool) -> None:
     assert angle_between(predicted.rotation, path(20).rotation) < np.radians(0.3)
 
 
-def tied(motion: MotionFilter, map_from_ned: np.ndarray) -> None:
-    """Half a second of flight under an autopilot whose axes lie so to the map's."""
+def align(motion: MotionFilter, map_from_ned: np.ndarray) -> None:
+    """Half a second of flight with this alignment of map and autopilot."""
     for k in range(10):
         motion.correct(k * STEP_NS, path(k), map_from_ned.T @ path(k).rotation)
 
 
 @pytest.mark.parametrize("error_rad", [0.0, 1.0, 2.0, 3.1])
-def test_an_update_turns_by_the_share_that_its_variances_give(error_rad: float) -> None:
-    """However the map lies to the autopilot: a turn is composed, not added to a rotation vector."""
+def test_update_rotates_by_the_kalman_gain(error_rad: float) -> None:
+    """For any alignment: rotations are composed, not added as rotation vectors."""
     map_from_ned = rotation_from_vector(error_rad * np.array([0.6, 0.0, 0.8]))
     motion = MotionFilter()
-    tied(motion, map_from_ned)
+    align(motion, map_from_ned)
     turn = np.radians(5.0) * np.array([0.0, 1.0, 0.0])
     turned = rotation_from_vector(turn) @ map_from_ned
     filter_ = motion._filter
@@ -100,11 +100,11 @@ def test_an_update_turns_by_the_share_that_its_variances_give(error_rad: float) 
     assert angle_between(predicted.rotation, expected) < np.radians(0.02)
 
 
-def test_a_corrected_map_takes_the_covariance_with_it() -> None:
+def test_map_correction_transforms_the_covariance() -> None:
     """Normalised error squared: 9 on average for 9 states, before and after."""
     chance = np.random.default_rng(3)
     motion = MotionFilter()
-    tied(motion, rotation_from_vector(np.array([0.4, -1.2, 0.9])))
+    align(motion, rotation_from_vector(np.array([0.4, -1.2, 0.9])))
     filter_ = motion._filter
     assert filter_ is not None
     spread = np.diag([0.3, 0.02, 0.01, 0.5, 0.1, 0.02, 0.02, 0.004, 0.001])
@@ -126,7 +126,7 @@ def test_a_corrected_map_takes_the_covariance_with_it() -> None:
             scale * turn @ (x[3:6] + off[3:6]),
             turn @ rotation_from_vector(off[6:]) @ error,
         ))  # fmt: skip
-    motion.map_moved(before, after, scale)
+    motion.correct_map(before, after, scale)
     moved = filter_.x.ravel()
     inverse = np.linalg.inv(filter_.P)
     squares = []
@@ -139,8 +139,8 @@ def test_a_corrected_map_takes_the_covariance_with_it() -> None:
     assert np.mean(squares) == pytest.approx(9.0, abs=4 * np.sqrt(18 / 4000))
 
 
-def test_an_attitude_is_carried_on_for_a_tenth_of_a_second_and_no_longer() -> None:
-    """In gusts a craft has turned otherwise by degrees after two tenths."""
+def test_attitude_extrapolation_is_limited() -> None:
+    """In gusts a craft rotates by degrees within two tenths of a second."""
     history = AttitudeHistory()
     history.add(sample(0, 0.0))
     assert history.at(100_000_000) is not None

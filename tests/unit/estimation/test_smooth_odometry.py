@@ -1,4 +1,4 @@
-"""Smooth odometry: no jump when the map is corrected, carried on while nothing is seen."""
+"""Smooth odometry: no jump when the map is corrected, dead reckoning while lost."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def north(told: Odometry) -> float:
     return float(told.world_from_body.translation[0])
 
 
-def test_a_corrected_map_moves_the_pose_slowly() -> None:
+def test_map_correction_is_slew_limited() -> None:
     odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
     for k in range(10):
         before = give(odometry, track(k))
     last = track(9, off=1.5).map_from_camera
     assert last is not None
-    odometry.map_moved(last)
+    odometry.correct_map(last)
     after = [give(odometry, track(k, off=1.5)) for k in range(10, 400)]
     steps = np.diff([north(before), *[north(o) for o in after]])
     assert np.abs(steps - 0.2).max() < 0.03
@@ -51,12 +51,12 @@ def test_a_corrected_map_moves_the_pose_slowly() -> None:
     assert north(after[-1]) == pytest.approx(2 * (39.9 + 1.5), abs=0.01)
 
 
-def test_what_is_worked_in_is_no_way_flown_and_says_so() -> None:
+def test_slew_correction_adds_to_the_drift_sigma() -> None:
     odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
     before = [give(odometry, track(k)) for k in range(200)][-1].sigma_position_m
     last = track(199, off=1.5).map_from_camera
     assert last is not None
-    odometry.map_moved(last)
+    odometry.correct_map(last)
     after = [give(odometry, track(k, off=1.5)).sigma_position_m for k in range(200, 600)]
     # three metres at 0.15 m/s: for twenty seconds each ten have 1.5 m of it
     assert max(after) == pytest.approx(np.hypot(before, 1.5 / np.sqrt(3)), rel=0.02)
@@ -64,8 +64,8 @@ def test_what_is_worked_in_is_no_way_flown_and_says_so() -> None:
     assert after[-1] == pytest.approx(before, rel=0.02)
 
 
-def test_the_heading_is_as_certain_as_the_maps_and_less_where_it_is_not_the_maps() -> None:
-    """What the map learns of north is worked in slowly; until then the pose is off by the rest."""
+def test_heading_sigma_includes_the_pending_correction() -> None:
+    """Heading corrections are slewed; until then the pose is off by the rest."""
     odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
     for k in range(10):
         before = give(odometry, track(k))
@@ -88,7 +88,7 @@ def test_the_heading_is_as_certain_as_the_maps_and_less_where_it_is_not_the_maps
     )
 
 
-def test_a_jump_that_no_correction_explains_is_a_reset() -> None:
+def test_unexplained_jump_is_a_reset() -> None:
     odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
     for k in range(10):
         give(odometry, track(k))
@@ -97,15 +97,17 @@ def test_a_jump_that_no_correction_explains_is_a_reset() -> None:
     assert after[-1].reset_counter == 1
 
 
-def test_coasting_goes_on_with_ever_less_certainty_and_lands_without_a_jump() -> None:
+def test_dead_reckoning_grows_uncertain_and_reacquires_without_a_jump() -> None:
     odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
     for k in range(10):
         give(odometry, track(k))
     coasted = []
     for k in range(10, 30):
-        blind = replace(track(k, state=TrackState.COASTING), sigma_position=0.01 + 0.02 * (k - 9))
+        blind = replace(
+            track(k, state=TrackState.DEAD_RECKONING), sigma_position=0.01 + 0.02 * (k - 9)
+        )
         coasted.append(give(odometry, blind))
-    assert [o.state for o in coasted] == [TrackState.COASTING] * 20
+    assert [o.state for o in coasted] == [TrackState.DEAD_RECKONING] * 20
     assert {o.quality for o in coasted} == {1}
     assert (np.diff([o.sigma_position_m for o in coasted]) > 0).all()
     seen = [give(odometry, track(k, off=0.3)) for k in range(30, 40)]
@@ -114,7 +116,7 @@ def test_coasting_goes_on_with_ever_less_certainty_and_lands_without_a_jump() ->
     assert seen[-1].reset_counter == 0
 
 
-def test_a_lost_camera_has_no_pose() -> None:
+def test_lost_camera_has_no_pose() -> None:
     odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
     give(odometry, track(0))
     lost = give(odometry, Track(1, 100_000_000, TrackState.LOST))

@@ -1,4 +1,4 @@
-"""A rangefinder gives the scale by ground mapped ahead, where the camera does not look down."""
+"""Scale by a rangefinder from ground mapped ahead, where the camera does not look down."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.config import Config
-from companion.estimation.height_above_ground import GroundBelow
+from companion.estimation.height_above_ground import HeightAboveGround
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (
@@ -32,30 +32,30 @@ def flat(rng: np.random.Generator, n: int = 12_000, half_m: float = 20.0) -> Arr
 
 
 @pytest.mark.parametrize("lean_deg", [0.0, 10.0, 25.0])
-def test_flat_ground_along_a_beam_that_leans(rng: np.random.Generator, lean_deg: float) -> None:
+def test_flat_ground_along_a_tilted_beam(rng: np.random.Generator, lean_deg: float) -> None:
     beam = rotation_from_vector(np.radians([lean_deg, 0.0, 0.0])) @ DOWN
-    found = GroundBelow(flat(rng), DOWN).distance(np.array([1.0, -2.0, -HEIGHT_M]), beam)
+    found = HeightAboveGround(flat(rng), DOWN).distance(np.array([1.0, -2.0, -HEIGHT_M]), beam)
     assert found == pytest.approx(HEIGHT_M / np.cos(np.radians(lean_deg)), rel=0.015)
 
 
-def test_a_slope(rng: np.random.Generator) -> None:
+def test_slope(rng: np.random.Generator) -> None:
     points = flat(rng)
     points[:, 2] -= 0.3 * points[:, 0]
-    found = GroundBelow(points, DOWN).distance(np.array([5.0, 0.0, -HEIGHT_M - 1.5]), DOWN)
+    found = HeightAboveGround(points, DOWN).distance(np.array([5.0, 0.0, -HEIGHT_M - 1.5]), DOWN)
     assert found == pytest.approx(HEIGHT_M, rel=0.02)
 
 
-def test_a_wall_says_nothing(rng: np.random.Generator) -> None:
+def test_wall_gives_none(rng: np.random.Generator) -> None:
     wall = np.c_[np.zeros(2000), rng.uniform(-5, 5, 2000), rng.uniform(-6, 0, 2000)]
-    assert GroundBelow(wall, DOWN).distance(np.array([0.0, 0.0, -HEIGHT_M]), DOWN) is None
+    assert HeightAboveGround(wall, DOWN).distance(np.array([0.0, 0.0, -HEIGHT_M]), DOWN) is None
 
 
-def test_near_the_edge_of_a_roof_it_is_what_is_under_the_axis_or_nothing(
+def test_roof_edge_gives_the_surface_on_the_axis_or_none(
     rng: np.random.Generator,
 ) -> None:
     roof = flat(rng, n=60_000)
     roof[roof[:, 0] > 0, 2] -= 4.0
-    ground = GroundBelow(roof, DOWN)
+    ground = HeightAboveGround(roof, DOWN)
     n_known = 0
     for x_m in np.arange(-2.05, 2.0, 0.1):
         found = ground.distance(np.array([x_m, 0.0, -HEIGHT_M]), DOWN)
@@ -65,11 +65,13 @@ def test_near_the_edge_of_a_roof_it_is_what_is_under_the_axis_or_nothing(
     assert 30 <= n_known < 41
 
 
-def test_nothing_mapped_below_says_nothing(rng: np.random.Generator) -> None:
+def test_unmapped_ground_gives_none(rng: np.random.Generator) -> None:
     points = flat(rng)
-    assert GroundBelow(points, DOWN).distance(np.array([60.0, 0.0, -HEIGHT_M]), DOWN) is None
-    assert GroundBelow(points, DOWN).distance(np.array([0.0, 0.0, 5.0]), DOWN) is None
-    assert GroundBelow(points[:0], DOWN).distance(np.array([0.0, 0.0, -HEIGHT_M]), DOWN) is None
+    assert HeightAboveGround(points, DOWN).distance(np.array([60.0, 0.0, -HEIGHT_M]), DOWN) is None
+    assert HeightAboveGround(points, DOWN).distance(np.array([0.0, 0.0, 5.0]), DOWN) is None
+    assert (
+        HeightAboveGround(points[:0], DOWN).distance(np.array([0.0, 0.0, -HEIGHT_M]), DOWN) is None
+    )
 
 
 def scale_error(pitch_deg: float, n_frames: int = 60) -> float:
@@ -123,5 +125,5 @@ def scale_error(pitch_deg: float, n_frames: int = 60) -> float:
 
 
 @pytest.mark.parametrize("pitch_deg", [30.0, 45.0, 80.0])
-def test_a_rangefinder_alone_gives_the_scale(pitch_deg: float) -> None:
+def test_rangefinder_alone_gives_the_scale(pitch_deg: float) -> None:
     assert abs(scale_error(pitch_deg)) < 0.04

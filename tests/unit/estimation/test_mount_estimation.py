@@ -1,4 +1,4 @@
-"""A camera that sits askew and a clock that is late, each found from turns alone."""
+"""Mount error and stamp delay from rotations alone."""
 
 from __future__ import annotations
 
@@ -21,15 +21,13 @@ SECONDS = 20.0
 
 
 def attitude(t_s: float) -> Array:
-    """A survey's turns with some wind."""
+    """Turns of a survey with some wind."""
     yaw = 1.2 * np.sin(0.35 * t_s) + 0.3 * np.sin(1.1 * t_s)
     tilt = np.array([0.12 * np.sin(0.9 * t_s), 0.1 * np.sin(0.7 * t_s + 1), 0.0])
     return yaw_rotation(yaw) @ rotation_from_vector(tilt)
 
 
-def estimated(
-    askew: Array, late_s: float, still: bool = False
-) -> MountEstimate | None:
+def estimated(askew: Array, late_s: float, still: bool = False) -> MountEstimate | None:
     rng = np.random.default_rng(2)
     history = AttitudeHistory()
     estimator = MountEstimator(DOWN_LOOKING)
@@ -50,7 +48,7 @@ def estimated(
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.06, -0.04])
-def test_a_mount_three_degrees_off_and_a_late_clock_are_found(late_s: float) -> None:
+def test_mount_error_and_delay_are_estimated(late_s: float) -> None:
     askew = np.radians([1.8, -2.0, 1.5])
     found = estimated(askew, late_s)
     assert found is not None
@@ -62,11 +60,11 @@ def test_a_mount_three_degrees_off_and_a_late_clock_are_found(late_s: float) -> 
     assert found.sigma_offset_s < 0.01
 
 
-def test_where_nothing_turns_nothing_is_claimed() -> None:
+def test_without_rotation_nothing_is_concluded() -> None:
     found = estimated(np.radians([3.0, 0, 0]), 0.05, still=True)
     assert found is not None
     assert not found.certain
 
 
-def test_too_little_says_nothing() -> None:
+def test_too_little_data_gives_none() -> None:
     assert MountEstimator(DOWN_LOOKING).estimate() is None
