@@ -251,7 +251,7 @@ class MapUpdate:
         others = [k for k in around if k != keyframe_id and self._with(place, k)]
         return {k: self._span(place, k) for k in others}
 
-    def stretch_of(self, keyframe_id: int, spans: Mapping[int, float]) -> float:
+    def local_scale_of(self, keyframe_id: int, spans: Mapping[int, float]) -> float:
         """By what factor measures about a keyframe are longer now than when it had these spans.
 
         The median of the spans, each with the weight of its length; 1 where none tells.

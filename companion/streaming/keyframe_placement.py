@@ -73,7 +73,7 @@ class Placing:
         for keyframe_id in keyframe_ids:
             spans = self._spans.get(keyframe_id)
             if spans:
-                self._stretch[keyframe_id] = update.stretch_of(keyframe_id, spans)
+                self._stretch[keyframe_id] = update.local_scale_of(keyframe_id, spans)
 
     def _told_of(
         self, t_ns: int, places: Mapping[int, Similarity | None], world: Similarity | None = None

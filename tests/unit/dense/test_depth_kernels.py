@@ -1,4 +1,4 @@
-"""Each kernel of the dense engine against the same in numpy, at sizes that fit no vector."""
+"""Kernels of the dense engine against numpy, at unaligned sizes."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_median(device: ComputeDevice, sweep: cl.Program, rng: np.random.Generat
     np.testing.assert_allclose(out, second / (4 * 1.95), atol=1e-6)
 
 
-def test_blocks_hold_the_planes_of_the_coarse_neighbours(
+def test_blocks_cover_the_planes_of_coarse_neighbours(
     device: ComputeDevice, sweep: cl.Program, rng: np.random.Generator
 ) -> None:
     coarse, fine = (17, 11), (33, 21)

@@ -1,4 +1,4 @@
-"""The online clock: how fast it converges, what it survives, and what it says of itself."""
+"""Online clock synchronisation: convergence, robustness, stated uncertainty."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MS = 1_000_000
 
 @dataclass
 class Peer:
-    """An autopilot's clock and wire; `run` tells the filter of them for some seconds."""
+    """Clock and link of an autopilot; `run` feeds the filter for some seconds."""
 
     drift_ppm: float = 0.0
     boot_s: float = 60.0
@@ -37,7 +37,7 @@ class Peer:
         return 1e-3 * (self.latency_ms + self.chance.expovariate(1 / self.jitter_ms))
 
     def run(self, clock: ClockFilter, seconds: float) -> Iterator[tuple[float, float]]:
-        """Time and error (ms) of what the filter says "now" is, after every message."""
+        """Time and error (ms) of the current time by the filter, after every message."""
         events: list[tuple[float, float | None, float]] = []
         for n in range(round(seconds * 50)):
             sent_s = self.now_s + n / 50
@@ -65,27 +65,27 @@ def worst_ms(peer: Peer, clock: ClockFilter, seconds: float, after_s: float) -> 
     return max(abs(error) for at_s, error in peer.run(clock, seconds) if at_s >= after_s)
 
 
-def test_a_simulator_that_runs_slow_by_a_percent() -> None:
+def test_simulator_slow_by_one_per_cent() -> None:
     clock, peer = ClockFilter(), Peer(drift_ppm=-12_000)
     assert worst_ms(peer, clock, 10, after_s=2) < 1
     assert clock.drift_ppm == pytest.approx(-12_000, abs=100)
     assert worst_ms(peer, clock, 20, after_s=0) < 0.5
 
 
-def test_a_crystal() -> None:
+def test_crystal() -> None:
     clock, peer = ClockFilter(), Peer(drift_ppm=14)
     assert worst_ms(peer, clock, 10, after_s=1) < 1
     assert worst_ms(peer, clock, 60, after_s=0) < 0.5
     assert clock.drift_ppm == pytest.approx(14, abs=5)
 
 
-def test_a_noisy_wire() -> None:
+def test_noisy_link() -> None:
     clock, peer = ClockFilter(), Peer(drift_ppm=14, jitter_ms=8, latency_ms=4)
     assert worst_ms(peer, clock, 30, after_s=10) < 2
     assert 1 * MS < clock.sigma_ns < 5 * MS
 
 
-def test_least_delays_where_nothing_is_answered() -> None:
+def test_minimum_delays_without_answers() -> None:
     clock, peer = ClockFilter(), Peer(drift_ppm=-12_000, answers=False)
     # half a millisecond of latency and as much of cut stamps cannot be seen from one side
     assert worst_ms(peer, clock, 20, after_s=2) < 2
@@ -95,7 +95,7 @@ def test_least_delays_where_nothing_is_answered() -> None:
 
 
 @pytest.mark.parametrize("jitter_ms", [0.3, 1.0, 3.0])
-def test_the_stated_error_is_about_the_true_one(jitter_ms: float) -> None:
+def test_sigma_matches_the_error(jitter_ms: float) -> None:
     clock = ClockFilter()
     peer = Peer(drift_ppm=50, jitter_ms=jitter_ms, latency_ms=1)
     ratios = [abs(error) * MS / clock.sigma_ns for at_s, error in peer.run(clock, 20) if at_s > 0.5]
@@ -104,7 +104,7 @@ def test_the_stated_error_is_about_the_true_one(jitter_ms: float) -> None:
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_time_never_goes_back_and_is_not_stretched_much(answers: bool) -> None:
+def test_time_is_monotonic_with_bounded_rate(answers: bool) -> None:
     clock, peer = ClockFilter(), Peer(drift_ppm=-12_000, jitter_ms=5, answers=answers)
     said = [HOST_NS / 1e9 + at_s + 1e-3 * error for at_s, error in peer.run(clock, 20)]
     known = [each for each in said if math.isfinite(each)]
@@ -112,7 +112,7 @@ def test_time_never_goes_back_and_is_not_stretched_much(answers: bool) -> None:
     assert all(later >= earlier - 1e-6 for earlier, later in pairwise(known))
 
 
-def test_a_reboot_begins_anew_within_two_seconds() -> None:
+def test_reboot_is_detected_within_two_seconds() -> None:
     for answers in (True, False):
         clock, peer = ClockFilter(), Peer(answers=answers)
         assert worst_ms(peer, clock, 5, after_s=1) < 2
@@ -124,7 +124,7 @@ def test_a_reboot_begins_anew_within_two_seconds() -> None:
         assert report is not None and report.n_reboots == 1
 
 
-def test_a_reboot_behind_a_silence_that_lasted_longer_than_the_time_before_it() -> None:
+def test_reboot_after_a_long_silence() -> None:
     clock, peer = ClockFilter(), Peer(boot_s=2)
     list(peer.run(clock, 3))
     peer.booted_s, peer.boot_s, peer.now_s = 40.0, 0.0, 100.0
@@ -132,7 +132,7 @@ def test_a_reboot_behind_a_silence_that_lasted_longer_than_the_time_before_it() 
     assert clock.n_reboots == 1
 
 
-def test_replayed_and_wild_stamps_are_refused_and_change_nothing() -> None:
+def test_replayed_and_corrupt_stamps_are_rejected() -> None:
     clock, peer = ClockFilter(), Peer()
     list(peer.run(clock, 5))
     worst = 0.0
@@ -146,7 +146,7 @@ def test_replayed_and_wild_stamps_are_refused_and_change_nothing() -> None:
     assert clock.n_reboots == 0 and clock.n_segments == 1
 
 
-def test_a_replay_while_the_autopilot_is_silent_is_no_reboot_at_once() -> None:
+def test_replay_during_silence_is_no_reboot() -> None:
     clock, peer = ClockFilter(), Peer()
     list(peer.run(clock, 5))
     for n in range(40):  # 0.8 s of the past, as it came
@@ -154,7 +154,7 @@ def test_a_replay_while_the_autopilot_is_silent_is_no_reboot_at_once() -> None:
     assert clock.n_reboots == 0
 
 
-def test_a_congested_link_is_no_reboot() -> None:
+def test_congested_link_is_no_reboot() -> None:
     clock, peer = ClockFilter(), Peer(answers=False)
     list(peer.run(clock, 5))
     for n in range(250):  # each message comes later than the one before it
@@ -163,7 +163,7 @@ def test_a_congested_link_is_no_reboot() -> None:
     assert clock.n_reboots == 0 and clock.n_segments == 1
 
 
-def test_nothing_is_said_before_it_is_known() -> None:
+def test_none_until_known() -> None:
     clock = ClockFilter()
     assert clock.host_ns(0) is None and clock.report() is None
     assert clock.one_way(10**9, HOST_NS)
@@ -172,7 +172,7 @@ def test_nothing_is_said_before_it_is_known() -> None:
     assert clock.host_ns(10**9 + 2 * MS) == pytest.approx(HOST_NS + 2 * MS, abs=0.1 * MS)
 
 
-def test_an_answer_from_the_future_is_none() -> None:
+def test_answer_from_the_future_is_ignored() -> None:
     clock = ClockFilter()
     clock.exchange(HOST_NS + 5, 10**9, HOST_NS)
     assert clock.host_ns(10**9) is None

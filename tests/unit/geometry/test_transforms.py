@@ -42,7 +42,7 @@ def test_body_axes_in_ned() -> None:
     assert (right_down @ [0, 1, 0])[2] == pytest.approx(0.5)
 
 
-def test_quaternion_there_and_back(rng: np.random.Generator) -> None:
+def test_quaternion_round_trip(rng: np.random.Generator) -> None:
     for q in rng.normal(size=(50, 4)):
         unit = q / np.linalg.norm(q)
         unit = unit if unit[0] >= 0 else -unit
@@ -53,13 +53,13 @@ def test_quaternion_there_and_back(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1]])
 def test_half_turns(axis: list[float]) -> None:
-    """Where the trace is least, and with it the care that a quaternion needs."""
+    """Where the trace is smallest, quaternion extraction is most delicate."""
     r = rotation_from_vector(np.pi * np.array(axis, float))
     np.testing.assert_allclose(rotation_from_quaternion(quaternion_from_rotation(r)), r, atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-4, 1.0, 3.1])
-def test_rotation_vector_there_and_back(angle: float) -> None:
+def test_rotation_vector_round_trip(angle: float) -> None:
     v = angle * np.array([0.6, -0.48, 0.64])
     np.testing.assert_allclose(vector_from_rotation(rotation_from_vector(v)), v, atol=1e-9)
 
@@ -69,7 +69,7 @@ def test_skew_is_the_cross_product(rng: np.random.Generator) -> None:
     np.testing.assert_allclose((skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-12)
 
 
-def test_poses_chain_as_their_matrices_do(rng: np.random.Generator) -> None:
+def test_pose_composition_matches_matrices(rng: np.random.Generator) -> None:
     a_from_b = Pose(rotation_from_vector(rng.normal(size=3)), rng.normal(size=3))
     b_from_c = Pose(rotation_from_vector(rng.normal(size=3)), rng.normal(size=3))
     points_c = rng.normal(size=(4, 3))
@@ -82,7 +82,7 @@ def test_poses_chain_as_their_matrices_do(rng: np.random.Generator) -> None:
     np.testing.assert_allclose((a_from_b @ a_from_b.inverse()).matrix(), np.eye(4), atol=1e-12)
 
 
-def test_similarities_chain_and_invert(rng: np.random.Generator) -> None:
+def test_similarity_composition_and_inverse(rng: np.random.Generator) -> None:
     a_from_b = Similarity(2.5, rotation_from_vector(rng.normal(size=3)), rng.normal(size=3))
     b_from_c = Similarity(0.3, rotation_from_vector(rng.normal(size=3)), rng.normal(size=3))
     points = rng.normal(size=(4, 3))
@@ -92,7 +92,7 @@ def test_similarities_chain_and_invert(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(a_from_b.inverse().apply(a_from_b.apply(points)), points, atol=1e-12)
 
 
-def test_interpolation_turns_evenly() -> None:
+def test_interpolation_is_uniform() -> None:
     a = rotation_from_vector(np.array([0.3, 0.1, -0.2]))
     b = rotation_from_vector(np.array([-0.5, 0.9, 0.4]))
     whole = angle_between(a, b)
@@ -101,7 +101,7 @@ def test_interpolation_turns_evenly() -> None:
         assert angle_between(a, turned) == pytest.approx(fraction * whole, abs=1e-9)
 
 
-def test_rounding_does_not_grow_in_a_long_product() -> None:
+def test_rounding_errors_do_not_accumulate() -> None:
     turn = rotation_from_vector(np.array([0.3, -0.2, 0.5]))
     spoilt = turn @ (np.eye(3) + 1e-3 * np.array([[1.0, 2, 0], [0, -1, 1], [1, 0, 2]]))
     mended = nearest_rotation(spoilt)

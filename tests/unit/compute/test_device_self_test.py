@@ -1,4 +1,4 @@
-"""Every OpenCL device that the choice takes computes what the program was shipped with."""
+"""Every selected OpenCL device passes the self-test."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def test_devices_pass(number: str) -> None:
     assert np.median(error) < 0.01 and (error < 0.03).mean() > 0.95
 
 
-def test_a_device_that_computes_wrongly_is_refused() -> None:
+def test_wrong_results_are_rejected() -> None:
     good = opencl_devices.best()
     with pytest.raises(DeviceError, match=r"self-test failed: only .* are right"):
         SelfTest(WrongDevice(good.device)).run()
 
 
-def test_without_a_linker_pocl_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_pocl_without_linker_is_rejected(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """It would end the process."""
     every = [
         each for each in opencl_devices.known() if each.platform == POCL and each.kind == PROCESSOR

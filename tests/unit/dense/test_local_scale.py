@@ -1,4 +1,4 @@
-"""A map whose scale is adjusted stretches what was measured in it."""
+"""Local scale correction of measurements after adjustment of the map."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.dense.local_scale import stretch_of_points
+from companion.dense.local_scale import local_scale_of_points
 from companion.geometry.transforms import Pose
 from companion.messages import MapUpdate, PointChunk
 from companion.products.flight_result import FlightResult
@@ -22,33 +22,33 @@ def update(scale: float = 1.0, unit: float = 1.0) -> MapUpdate:
     return MapUpdate(1, 0, places, np.zeros((0, 3)), None, units)
 
 
-def test_spans_tell_how_the_map_was_stretched() -> None:
+def test_spans_give_the_local_scale() -> None:
     spans = update().spans_of(8)
     assert set(spans) == {2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14}
-    assert update().stretch_of(8, spans) == 1.0
-    assert update(0.98).stretch_of(8, spans) == pytest.approx(0.98)
+    assert update().local_scale_of(8, spans) == 1.0
+    assert update(0.98).local_scale_of(8, spans) == pytest.approx(0.98)
 
 
-def test_another_unit_is_no_stretch() -> None:
-    assert update(unit=7.0).stretch_of(8, update().spans_of(8)) == pytest.approx(1.0)
+def test_another_unit_is_no_scale_change() -> None:
+    assert update(unit=7.0).local_scale_of(8, update().spans_of(8)) == pytest.approx(1.0)
 
 
-def test_keyframes_that_went_elsewhere_do_not_tell() -> None:
+def test_keyframes_moved_elsewhere_are_outliers() -> None:
     spans = update().spans_of(8)
     now = update(1.02)
     there = {**now.map_from_camera, 6: Pose(np.eye(3), np.full(3, 90.0))}
     del there[10]
     moved = replace(now, map_from_camera=there, unit_of={12: 3.0})
-    assert moved.stretch_of(8, spans) == pytest.approx(1.02)
+    assert moved.local_scale_of(8, spans) == pytest.approx(1.02)
 
 
-def test_what_nobody_tells_of_is_not_stretched() -> None:
-    assert update(2.0).stretch_of(8, {}) == 1.0
-    assert update(2.0).stretch_of(N + 50, {3: 1.0}) == 1.0
+def test_without_spans_scale_is_one() -> None:
+    assert update(2.0).local_scale_of(8, {}) == 1.0
+    assert update(2.0).local_scale_of(N + 50, {3: 1.0}) == 1.0
     assert update(2.0).spans_of(N + 50) == {}
 
 
-def test_points_of_the_cloud_are_stretched_with_the_map() -> None:
+def test_cloud_is_rescaled_with_the_map() -> None:
     points = np.random.default_rng(1).uniform(1, 3, (50, 3)).astype(np.float32)
     ones = np.ones(50, np.float32)
     chunk = PointChunk(
@@ -66,35 +66,37 @@ def test_points_of_the_cloud_are_stretched_with_the_map() -> None:
 
 
 def wall(n: int, seed: int, z: float = 8.0) -> np.ndarray:
-    """Points of a slanted wall as a camera sees them."""
+    """Points of a slanted wall in the camera frame."""
     rng = np.random.default_rng(seed)
     u, v = rng.uniform(-0.5, 0.5, (2, n))
     depth = z / (1.0 + 0.4 * u)
     return np.stack([u * depth, v * depth, depth], 1)
 
 
-def test_points_of_the_map_tell_the_stretch() -> None:
+def test_map_points_give_the_local_scale() -> None:
     dense, sparse = wall(40_000, 1), 1.03 * wall(600, 2)
     noise = np.random.default_rng(3).normal(0, 0.01, 600)
-    assert stretch_of_points(dense, sparse * (1 + noise)[:, None]) == pytest.approx(1.03, abs=2e-3)
+    assert local_scale_of_points(dense, sparse * (1 + noise)[:, None]) == pytest.approx(
+        1.03, abs=2e-3
+    )
 
 
-def test_what_lies_before_and_behind_does_not_count() -> None:
+def test_occluded_and_occluding_points_are_excluded() -> None:
     hidden, before = wall(400, 4, 9.0), wall(200, 5, 5.0)
     behind_us = -wall(300, 6)
     sparse = np.concatenate([0.98 * wall(500, 2), hidden, before, behind_us])
-    assert stretch_of_points(wall(40_000, 1), sparse) == pytest.approx(0.98, abs=3e-3)
+    assert local_scale_of_points(wall(40_000, 1), sparse) == pytest.approx(0.98, abs=3e-3)
 
 
-def test_too_few_points_tell_nothing() -> None:
-    assert stretch_of_points(wall(1000, 1), wall(20, 2)) is None
-    assert stretch_of_points(wall(1000, 1), np.zeros((0, 3))) is None
-    assert stretch_of_points(np.zeros((0, 3)), wall(100, 2)) is None
+def test_too_few_points_give_none() -> None:
+    assert local_scale_of_points(wall(1000, 1), wall(20, 2)) is None
+    assert local_scale_of_points(wall(1000, 1), np.zeros((0, 3))) is None
+    assert local_scale_of_points(np.zeros((0, 3)), wall(100, 2)) is None
     aside = wall(500, 2) + [50.0, 0.0, 0.0]
-    assert stretch_of_points(wall(1000, 1), aside) is None
+    assert local_scale_of_points(wall(1000, 1), aside) is None
 
 
-def test_the_cloud_goes_by_the_points_of_the_map_before_it_goes_by_keyframes() -> None:
+def test_map_points_take_precedence_over_spans() -> None:
     dense = wall(20_000, 1).astype(np.float32)
     ones = np.ones(len(dense), np.float32)
     chunk = PointChunk(

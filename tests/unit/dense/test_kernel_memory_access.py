@@ -1,4 +1,4 @@
-"""The kernels in a simulator that watches every access to memory (Price & McIntosh-Smith 2015)."""
+"""Kernels in a simulator that checks memory accesses (Price & McIntosh-Smith 2015)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def watched(log: Path, *command: str) -> tuple[str, list[str]]:
-    """What a command printed under the simulator, and what is wrong with its kernels."""
+    """Output of a command under the simulator, and the faults of its kernels."""
     done = subprocess.run(
         ["oclgrind", *WATCH, "--log", str(log), sys.executable, *command],
         capture_output=True, text=True, check=False, timeout=280,
@@ -38,7 +38,7 @@ def watched(log: Path, *command: str) -> tuple[str, list[str]]:
 @pytest.mark.parametrize(
     ("width", "height", "stride", "n_views"), [(64, 48, 2, 6), (65, 49, 1, 3), (101, 67, 2, 1)]
 )
-def test_no_kernel_reads_or_writes_what_it_must_not(
+def test_kernels_access_memory_within_bounds(
     tmp_path: Path, width: int, height: int, stride: int, n_views: int
 ) -> None:
     size = map(str, (width, height, stride, n_views))
@@ -70,6 +70,6 @@ queue.finish()
         ("if (x[i] > 3) x[i] = 1;", "uninitialized"),
     ],
 )
-def test_a_fault_is_found(tmp_path: Path, body: str, fault: str) -> None:
+def test_memory_fault_is_detected(tmp_path: Path, body: str, fault: str) -> None:
     _, wrong = watched(tmp_path / "log", "-c", BAD % body)
     assert any(fault in w for w in wrong)

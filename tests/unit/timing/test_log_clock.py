@@ -48,7 +48,7 @@ def test_exchanges_give_offset_and_drift(rng: np.random.Generator) -> None:
     assert np.abs(error_ms).mean() < 3 * clock.report.sigma_ms
 
 
-def test_a_loaded_link_delays_but_never_hastens(rng: np.random.Generator) -> None:
+def test_loaded_link(rng: np.random.Generator) -> None:
     """Stamps late by up to 80 ms: the least delays tell."""
     remote = stamps(60)
     delay = 0.002 + 0.08 * rng.random(len(remote)) ** 3
@@ -61,7 +61,7 @@ def test_a_loaded_link_delays_but_never_hastens(rng: np.random.Generator) -> Non
     assert clock.report.sigma_ms > 2.0  # and is admitted
 
 
-def test_a_slow_simulator_clock(rng: np.random.Generator) -> None:
+def test_slow_simulator_clock(rng: np.random.Generator) -> None:
     remote = stamps(80)
     delay = rng.exponential(0.01, len(remote))
     clock = estimate_clock([], one_way(remote, delay, ppm=-12_000))
@@ -71,7 +71,7 @@ def test_a_slow_simulator_clock(rng: np.random.Generator) -> None:
     assert clock.report.drift_ppm == pytest.approx(-12_000, rel=0.02)
 
 
-def test_a_clock_that_changes_its_rate(rng: np.random.Generator) -> None:
+def test_clock_with_varying_rate(rng: np.random.Generator) -> None:
     """A simulator on a loaded machine: no line fits, the curve does."""
     remote = stamps(100)
     bend_ns = (0.05 * S * np.sin((remote - remote[0]) / (20 * S))).astype(np.int64)
@@ -83,7 +83,7 @@ def test_a_clock_that_changes_its_rate(rng: np.random.Generator) -> None:
     assert np.abs(error_ms).max() < 6
 
 
-def test_messages_bound_what_slow_answers_say(rng: np.random.Generator) -> None:
+def test_messages_bound_the_offset_of_slow_answers(rng: np.random.Generator) -> None:
     """The autopilot answers late after taking its stamp; nothing arrives before it is sent."""
     remote = stamps(30, 10)
     small = np.full(len(remote), 1e-4)
@@ -109,7 +109,7 @@ def test_no_samples() -> None:
     assert clock_from_utc([]) is None
 
 
-def test_a_reboot_begins_a_segment(rng: np.random.Generator) -> None:
+def test_reboot_starts_a_segment(rng: np.random.Generator) -> None:
     before, after = stamps(40), stamps(20) - 82 * S
     segments = BootSegments()
     first = one_way(before, rng.exponential(0.003, len(before)))
@@ -125,12 +125,12 @@ def test_a_reboot_begins_a_segment(rng: np.random.Generator) -> None:
     assert np.abs(clock.host_ns(rows[:, 0], rows[:, 2]) - truth).max() < 3e6
 
 
-def test_messages_overtaken_are_no_reboot() -> None:
+def test_reordered_messages_are_no_reboot() -> None:
     segments = BootSegments()
     assert [segments.segment_of(t * S // 10) for t in (50, 51, 48, 52)] == [0, 0, 0, 0]
 
 
-def test_utc_of_a_log_is_older_than_its_stamp(rng: np.random.Generator) -> None:
+def test_utc_of_a_log(rng: np.random.Generator) -> None:
     remote = stamps(60, 5)
     utc = host_of(remote, 20) - (rng.exponential(0.02, len(remote)) * S).astype(np.int64)
     clock = clock_from_utc(np.c_[remote, utc])
@@ -141,7 +141,7 @@ def test_utc_of_a_log_is_older_than_its_stamp(rng: np.random.Generator) -> None:
     assert clock.report.offset_s == pytest.approx(OFFSET_NS / S, abs=0.01)
 
 
-def test_beyond_its_samples_the_line_goes_on() -> None:
+def test_extrapolation_is_linear() -> None:
     remote = stamps(60)
     clock = estimate_clock([], one_way(remote, np.zeros(len(remote)), ppm=500))
     assert clock is not None

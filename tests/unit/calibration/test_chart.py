@@ -1,4 +1,4 @@
-"""Boards: described, found, told apart, printed."""
+"""Boards: description, detection, identification, printing."""
 
 from __future__ import annotations
 
@@ -32,37 +32,37 @@ from tests.support.cameras.board_pictures import CHARUCO, CHESSBOARD, RADTAN, Bo
         ("chessboard:9x2:0.02", "3 to 50"),
     ],
 )
-def test_board_that_is_none(text: str, named: str) -> None:
+def test_invalid_board_description(text: str, named: str) -> None:
     with pytest.raises(InputError, match=re.escape(named)) as refused:
         parse_chart(text)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("board", [CHARUCO, CHESSBOARD])
-def test_corners_are_where_they_are(board: str) -> None:
+def test_corners_are_accurate(board: str) -> None:
     pictures = BoardPictures(RADTAN, board)
     placing = Placing(0.45, 0.55, 0.6, 20, -15, 10)
-    sighting = parse_chart(board).find(pictures.picture(placing))
-    assert sighting is not None
+    detection = parse_chart(board).find(pictures.picture(placing))
+    assert detection is not None
     chart = parse_chart(board)
-    assert len(sighting.ids) == chart.columns * chart.rows
+    assert len(detection.ids) == chart.columns * chart.rows
     # a board half a turn round is the same chessboard; each corner must be at one of these
     margin = 0.4 * chart.square_m
     rotation, shift = pictures.pose(placing)
-    true = RADTAN.project((sighting.board_m + [margin, margin, 0]) @ rotation.T + shift)
-    away = np.minimum(
-        np.linalg.norm(true - sighting.image_px, axis=1),
-        np.linalg.norm(true[::-1] - sighting.image_px, axis=1),
+    true = RADTAN.project((detection.board_m + [margin, margin, 0]) @ rotation.T + shift)
+    distance_px = np.minimum(
+        np.linalg.norm(true - detection.image_px, axis=1),
+        np.linalg.norm(true[::-1] - detection.image_px, axis=1),
     )
-    assert away.max() < 0.3 and away.mean() < 0.1
+    assert distance_px.max() < 0.3 and distance_px.mean() < 0.1
 
 
 def test_part_of_a_charuco_board_is_enough() -> None:
     picture = BoardPictures(RADTAN).picture(Placing(0.1, 0.4, 0.7))
-    sighting = parse_chart(CHARUCO).find(picture)
-    assert sighting is not None
-    assert 8 <= len(sighting.ids) < 24
-    assert (sighting.board_m[:, 0] >= 0.08).all()  # the left part is out of the picture
+    detection = parse_chart(CHARUCO).find(picture)
+    assert detection is not None
+    assert 8 <= len(detection.ids) < 24
+    assert (detection.board_m[:, 0] >= 0.08).all()  # the left part is out of the picture
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_part_of_a_charuco_board_is_enough() -> None:
         (CHESSBOARD, "chessboard:8x6:0.025", "9x6"),
     ],
 )
-def test_another_board_is_named(shown: str, given: str, said: str) -> None:
+def test_another_board_is_identified(shown: str, given: str, said: str) -> None:
     picture = BoardPictures(RADTAN, shown).picture(Placing(0.5, 0.5, 0.6, 10, 10))
     chart = parse_chart(given)
     assert chart.find(picture) is None
@@ -82,7 +82,7 @@ def test_another_board_is_named(shown: str, given: str, said: str) -> None:
     assert explained is not None and said in explained
 
 
-def test_nothing_is_not_explained() -> None:
+def test_blank_images_are_not_explained() -> None:
     empty = BoardPictures(RADTAN).picture(None)
     for board in (CHARUCO, CHESSBOARD):
         assert parse_chart(board).find(empty) is None
@@ -93,7 +93,7 @@ def test_nothing_is_not_explained() -> None:
     "board",
     [CHARUCO, "charuco:5x6:0.03:0.02:DICT_APRILTAG_36H11:legacy", CHESSBOARD],
 )  # fmt: skip
-def test_printed_board_is_found_and_to_scale(board: str) -> None:
+def test_printed_board_is_detected_and_to_scale(board: str) -> None:
     page, paper = board_page(parse_chart(board), "png")
     assert paper == "A4"
     grey = np.asarray(cv2.imdecode(np.frombuffer(page, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
@@ -101,10 +101,10 @@ def test_printed_board_is_found_and_to_scale(board: str) -> None:
     assert sorted(round(n / per_m, 3) for n in grey.shape) == [0.21, 0.297]
     half: Bytes = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     chart = parse_chart(board)
-    sighting = chart.find(half)
-    assert sighting is not None
-    assert len(sighting.ids) == chart.columns * chart.rows
-    step = np.linalg.norm(np.diff(sighting.image_px[: chart.columns], axis=0), axis=1)
+    detection = chart.find(half)
+    assert detection is not None
+    assert len(detection.ids) == chart.columns * chart.rows
+    step = np.linalg.norm(np.diff(detection.image_px[: chart.columns], axis=0), axis=1)
     assert np.allclose(2 * step / per_m, chart.square_m, rtol=2e-3)
 
 

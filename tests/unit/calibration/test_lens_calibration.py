@@ -1,4 +1,4 @@
-"""Boards rendered through lenses known exactly, and the lens that is found again."""
+"""Calibration of known lenses from rendered boards."""
 
 from __future__ import annotations
 
@@ -9,10 +9,24 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.calibration.board_views import Coverage, LitArea, View, choose, coverage, novelty
-from companion.calibration.calibration_verdict import MIN_TILT, advice, bare, faults, few, frontal
+from companion.calibration.board_views import (
+    Coverage,
+    IlluminatedArea,
+    View,
+    choose,
+    coverage,
+    novelty,
+)
+from companion.calibration.calibration_verdict import (
+    MIN_TILT,
+    advice,
+    faults,
+    low_coverage,
+    too_few_views,
+    too_frontal,
+)
 from companion.calibration.chart import parse_chart
-from companion.calibration.lens_calibration import Calibration, determine, folds
+from companion.calibration.lens_calibration import Calibration, calibrate_lens, folds
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array
 from tests.support.cameras.board_pictures import (
@@ -27,21 +41,21 @@ from tests.support.cameras.board_pictures import (
 
 
 @cache
-def found(camera: Camera, board: str, bend: float) -> tuple[tuple[View, ...], LitArea]:
-    lit, views = LitArea(), []
+def found(camera: Camera, board: str, bend: float) -> tuple[tuple[View, ...], IlluminatedArea]:
+    lit, views = IlluminatedArea(), []
     chart = parse_chart(board)
     for number, grey in enumerate(well_shown(camera, board, bend)):
         lit.see(grey)
-        sighting = chart.find(grey)
-        if sighting is not None:
-            views.append(View(number, sighting, camera.width, camera.height))
+        detection = chart.find(grey)
+        if detection is not None:
+            views.append(View(number, detection, camera.width, camera.height))
     return tuple(views), lit
 
 
 @cache
 def calibrated(camera: Camera, board: str, model: str, bend: float = 0.0) -> Calibration:
     views, lit = found(camera, board, bend)
-    made = determine(choose(views, 40), lit.mask(camera.width, camera.height), model)
+    made = calibrate_lens(choose(views, 40), lit.mask(camera.width, camera.height), model)
     assert made is not None
     return made
 
@@ -54,12 +68,12 @@ def lens_of(camera: Camera) -> Array:
     ("camera", "board", "model"),
     [(RADTAN, CHARUCO, "auto"), (RADTAN, CHESSBOARD, "radtan"), (FISHEYE, CHARUCO, "auto")],
 )
-def test_lens_is_found_again(camera: Camera, board: str, model: str) -> None:
+def test_lens_is_recovered(camera: Camera, board: str, model: str) -> None:
     made = calibrated(camera, board, model)
     assert made.camera.distortion is camera.distortion
-    away = np.abs(lens_of(made.camera) - lens_of(camera))
-    assert (away[:2] < 0.003 * lens_of(camera)[:2]).all(), away
-    assert (away[2:] < 1.0).all(), away
+    distance_px = np.abs(lens_of(made.camera) - lens_of(camera))
+    assert (distance_px[:2] < 0.003 * lens_of(camera)[:2]).all(), distance_px
+    assert (distance_px[2:] < 1.0).all(), distance_px
     assert made.rms_px < 0.1 and made.holdout_px < 0.1
     # what the lens does to places all over the picture, whatever each coefficient
     rays = camera.normalise(np.array([[60.0, 60], [580, 60], [60, 420], [580, 420], [320, 30]]))
@@ -69,18 +83,18 @@ def test_lens_is_found_again(camera: Camera, board: str, model: str) -> None:
         assert not [fault for fault in faults(made) if "corner of" not in fault]
 
 
-def test_standard_deviations_are_those_of_the_errors() -> None:
+def test_standard_deviations_match_the_errors() -> None:
     made = calibrated(RADTAN, CHARUCO, "auto")
-    away = np.abs(lens_of(made.camera) - lens_of(RADTAN)) / made.sigmas[:4]
-    assert (away < 4).all(), away
+    distance_px = np.abs(lens_of(made.camera) - lens_of(RADTAN)) / made.sigmas[:4]
+    assert (distance_px < 4).all(), distance_px
     assert (made.sigmas[:4] < 1.0).all() and (made.sigmas[:4] > 0.05).all()
 
 
 def test_same_as_opencv_where_the_board_is_flat() -> None:
     made = calibrated(RADTAN, CHARUCO, "auto")
     _, matrix, *_ = cv2.calibrateCamera(
-        [view.sighting.board_m.astype(np.float32) for view in made.views],
-        [view.sighting.image_px.astype(np.float32) for view in made.views],
+        [view.detection.board_m.astype(np.float32) for view in made.views],
+        [view.detection.image_px.astype(np.float32) for view in made.views],
         (640, 480), np.eye(3), np.zeros(5),
         flags=cv2.CALIB_FIX_K3,
     )  # fmt: skip
@@ -88,14 +102,14 @@ def test_same_as_opencv_where_the_board_is_flat() -> None:
     assert np.abs(lens_of(made.camera) - theirs).max() < 0.5
 
 
-def test_bowed_board_does_not_move_the_focal_length() -> None:
+def test_curved_board_does_not_bias_the_focal_length() -> None:
     made = calibrated(RADTAN, CHARUCO, "radtan", 0.006)
-    away = np.abs(lens_of(made.camera) - lens_of(RADTAN))
-    assert (away[:2] < 0.003 * lens_of(RADTAN)[:2]).all(), away
+    distance_px = np.abs(lens_of(made.camera) - lens_of(RADTAN))
+    assert (distance_px[:2] < 0.003 * lens_of(RADTAN)[:2]).all(), distance_px
     assert 0.002 < made.sag < 0.008
 
 
-def test_board_that_is_bowed_too_far() -> None:
+def test_board_with_too_much_curvature() -> None:
     made = calibrated(RADTAN, CHARUCO, "radtan", 0.006)
     assert not faults(made)
     lens = made.lens
@@ -104,40 +118,40 @@ def test_board_that_is_bowed_too_far() -> None:
     assert [fault for fault in faults(further) if "bowed" in fault]
 
 
-def test_radtan_does_not_do_for_a_fisheye() -> None:
+def test_radtan_is_rejected_for_a_fisheye() -> None:
     made = calibrated(FISHEYE, CHARUCO, "radtan")
     assert any("error" in fault for fault in faults(made))
 
 
-def test_views_that_fit_no_lens_are_left_out() -> None:
+def test_inconsistent_views_are_rejected() -> None:
     views = list(found(RADTAN, CHARUCO, 0.0)[0])
     rng = np.random.default_rng(3)
     for at in (4, 11):  # as a picture in which the board moved while its rows were read
-        sighting = views[at].sighting
-        sheared = sighting.image_px + 0.03 * (sighting.image_px[:, 1:] - 240) * [1, 0]
+        detection = views[at].detection
+        sheared = detection.image_px + 0.03 * (detection.image_px[:, 1:] - 240) * [1, 0]
         sheared += rng.normal(0, 1.5, sheared.shape)
         views[at] = dataclasses.replace(
-            views[at], sighting=dataclasses.replace(sighting, image_px=sheared)
+            views[at], detection=dataclasses.replace(detection, image_px=sheared)
         )
-    wrong = views[7].sighting.image_px.copy()
+    wrong = views[7].detection.image_px.copy()
     wrong[5] += [9.0, -6.0]
     views[7] = dataclasses.replace(
-        views[7], sighting=dataclasses.replace(views[7].sighting, image_px=wrong)
+        views[7], detection=dataclasses.replace(views[7].detection, image_px=wrong)
     )
-    made = determine(views, np.ones((48, 64), np.bool_), "radtan")
+    made = calibrate_lens(views, np.ones((48, 64), np.bool_), "radtan")
     assert made is not None
     assert {view.number for view in made.rejected} == {views[4].number, views[11].number}
     assert made.n_corners_rejected == 1
     assert np.abs(lens_of(made.camera) - lens_of(RADTAN)).max() < 1.6
 
 
-def test_lens_that_folds_over_is_known() -> None:
+def test_non_invertible_lens_is_detected() -> None:
     assert not folds(RADTAN)
     strong = dataclasses.replace(RADTAN, coefficients=(-0.7, 0.0, 0.0, 0.0, 0.0))
     assert folds(strong)
 
 
-def test_same_view_twice_is_one() -> None:
+def test_duplicate_view_is_not_novel() -> None:
     views = found(RADTAN, CHARUCO, 0.0)[0]
     assert novelty(views[3], views[:3]) > 0.03
     assert novelty(views[3], views[:4]) == 0.0
@@ -161,35 +175,35 @@ def test_blur_widens_edges() -> None:
     assert View(0, moved, 640, 480).blurred
 
 
-def test_dark_corners_of_a_fisheye_need_not_be_covered() -> None:
+def test_dark_corners_of_a_fisheye_need_no_coverage() -> None:
     lit = np.ones((48, 64), np.bool_)
     seen = lit.copy()
     seen[:12, :16] = False
-    assert Coverage(seen, lit).bare_corners() == ["upper left"]
+    assert Coverage(seen, lit).uncovered_corners() == ["upper left"]
     lit[:12, :16] = False
-    assert Coverage(seen, lit).bare_corners() == []
+    assert Coverage(seen, lit).uncovered_corners() == []
     assert Coverage(seen, lit).share == 1.0
 
 
-def test_what_is_lacking_is_said() -> None:
+def test_missing_views_are_reported() -> None:
     lit = np.ones((48, 64), np.bool_)
     left = lit.copy()
     left[:, 40:] = False
-    assert "upper right and lower right" in bare(Coverage(left, lit))[0]
+    assert "upper right and lower right" in low_coverage(Coverage(left, lit))[0]
     middle = lit.copy()
     middle[:, :13] = False
     middle[20:, 13:40] = False
-    assert any("left edge" in line for line in bare(Coverage(middle, lit)))
-    assert "3 views" in few(3)[0] and few(12) == []
+    assert any("left edge" in line for line in low_coverage(Coverage(middle, lit)))
+    assert "3 views" in too_few_views(3)[0] and too_few_views(12) == []
     square = np.full((12, 2), 0.05)
-    assert "squarely in all views" in frontal(square)[0]
+    assert "squarely in all views" in too_frontal(square)[0]
     square[:5, 0] = MIN_TILT + 0.1
-    assert "upper or lower side" in frontal(square)[0]
+    assert "upper or lower side" in too_frontal(square)[0]
     square[5, 1] = -MIN_TILT - 0.1
-    assert frontal(square) == []
+    assert too_frontal(square) == []
 
 
-def test_advice_ends_when_nothing_is_lacking() -> None:
+def test_advice_is_empty_when_complete() -> None:
     views, lit = found(RADTAN, CHARUCO, 0.0)
     covered = coverage(views, lit.mask(640, 480))
     assert advice(views[:2], coverage(views[:2], covered.lit), None)
