@@ -32,7 +32,7 @@ def say_on_stderr(remark: str) -> None:
 def remeasured_devices() -> list[MeasuredDevice]:
     """All devices, tested and timed now, and failing platforms; results are cached."""
     listed, failed = listed_devices()
-    return [*_measured(listed, {}, listed, say_on_stderr, told=False), *failed]
+    return [*_measured(listed, {}, listed, say_on_stderr, report=False), *failed]
 
 
 def known_devices(say: Say = say_on_stderr) -> list[MeasuredDevice]:
@@ -102,7 +102,7 @@ def _known(
 def _measured(
     wanted: Sequence[ListedDevice], known: dict[str, MeasuredDevice],
     listed: Sequence[ListedDevice], say: Say, program: Sequence[str] = PROGRAM,
-    told: bool = True,
+    report: bool = True,
 ) -> list[MeasuredDevice]:  # fmt: skip
     """The wanted devices, each with its cached result or measured now.
 
@@ -114,7 +114,7 @@ def _measured(
         if each.identity in known:
             continue
         found = known[each.identity] = probed(each, program)
-        if found.problem and told:
+        if found.problem and report:
             say(f"OpenCL: {found.named}: {found.problem}")
         why_not = _kept(verdict_path(), now, list(known.values()))
     if why_not:

@@ -38,12 +38,12 @@ MAP_FROM_NED = rotation_from_vector(np.array([0.0, 0.0, 1.1]))
 class Flight:
     """Warnings of a flight with their times; see `fly`."""
 
-    told: list[tuple[float, str]] = field(default_factory=list)
+    warned: list[tuple[float, str]] = field(default_factory=list)
     anew_s: list[float] = field(default_factory=list)
     used: bool = True
 
     def when(self, what: str) -> list[float]:
-        return [t_s for t_s, text in self.told if text == what]
+        return [t_s for t_s, text in self.warned if text == what]
 
 
 def euler(t_s: float) -> Array:
@@ -92,7 +92,7 @@ def fly(
         verdict.take(at_ns, camera, 0, camera)
         judged = verdict.check(at_ns, lambda _: np.eye(3), DOWN_LOOKING, ned_from_map)
         if judged is not None:
-            flight.told.append((t_s, judged.warning.what))
+            flight.warned.append((t_s, judged.warning.what))
             if judged.reinitialise:
                 flight.anew_s.append(t_s)
                 began_s = t_s
@@ -120,7 +120,7 @@ def test_late_and_jittery_frames_discard_no_map(late_s: float, jitter_s: float) 
         30.0, stamp=lambda t_s, rng: t_s + late_s + float(rng.uniform(-jitter_s, jitter_s))
     )
     assert flight.used
-    assert not flight.told
+    assert not flight.warned
 
 
 @pytest.mark.parametrize("off_deg", [3.0, 5.0, 8.0])

@@ -53,7 +53,7 @@ def held_bytes(of: object) -> int:
     return total
 
 
-def told(minutes: range) -> Iterator[Telemetry | Frame]:
+def messages(minutes: range) -> Iterator[Telemetry | Frame]:
     """Telemetry at 20 Hz, and occasional blank frames."""
     start_ns = START_NS + minutes.start * MINUTE_NS
     for t_ns in range(start_ns, START_NS + minutes.stop * MINUTE_NS, SAMPLE_NS):
@@ -75,7 +75,7 @@ def test_memory_of_localisation_is_bounded() -> None:
     stage = LocalisationStage(Config(), camera, StageTimes())
 
     def fly(minutes: range) -> int:
-        for message in told(minutes):
+        for message in messages(minutes):
             list(stage.step(message))
         return held_bytes(stage)
 

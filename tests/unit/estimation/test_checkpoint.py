@@ -119,13 +119,13 @@ def test_checkpoint_failure_does_not_stop_localisation(
     localisation = localisation_work.work(SETUP)
     list(localisation.step(KeepMap(path, take_up=False)))
     grey = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
-    told = [
+    messages = [
         message
         for k in range(1, 4)
         for message in localisation.step(Frame(k, k * SECOND_NS, grey, np.dstack([grey] * 3)))
     ]
-    assert len([m for m in told if isinstance(m, Odometry)]) == 3
-    (warned,) = (m for m in told if isinstance(m, Warned))
+    assert len([m for m in messages if isinstance(m, Odometry)]) == 3
+    (warned,) = (m for m in messages if isinstance(m, Warned))
     assert (warned.what, warned.detail) == (
         localisation_work.NOT_KEPT, "IndexError: index 2080 is out of bounds"
     )  # fmt: skip
@@ -353,7 +353,7 @@ def test_missing_attitude_is_waited_for(checkpoint: Checkpoint) -> None:
         for k in range(100 + MIN_FRAMES):
             pose, t_ns = Pose.identity(), k * 100_000_000
             track = Track(k, t_ns, TrackState.TRACKING, pose, 1, pose, 100, 100)
-            told = attitude if k >= 100 else None
-            found.append(resumption.check(t_ns, track, told, Pose.identity()))
+            measured = attitude if k >= 100 else None
+            found.append(resumption.check(t_ns, track, measured, Pose.identity()))
         assert set(found[:100]) == {Verdict.TRYING}
         assert found[-1] is verdict

@@ -133,13 +133,13 @@ def test_barometer_gives_scale_of_a_climb() -> None:
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=0.05)
 
 
-@pytest.mark.parametrize(("stretch", "known"), [(1.0, True), (1.4, False)])
-def test_rangefinder_contradicted_by_barometer_is_uncertain(stretch: float, known: bool) -> None:
+@pytest.mark.parametrize(("scale", "known"), [(1.0, True), (1.4, False)])
+def test_rangefinder_contradicted_by_barometer_is_uncertain(scale: float, known: bool) -> None:
     kept, ned = places()
     georeferencer = Georeferencer(GeoreferenceConfig(), None)
     for i in range(400):
         down = np.interp(i * 0.1, np.arange(len(ned)) * 0.5, ned[:, 2])
-        georeferencer.take(RangeSample(T0 + i * 100_000_000, 30.0 * stretch))
+        georeferencer.take(RangeSample(T0 + i * 100_000_000, 30.0 * scale))
         georeferencer.take(HeightSample(T0 + i * 100_000_000, 400.0 - down))
     assert (georeferencer.solve(kept) is not None) is known
 

@@ -39,7 +39,7 @@ class Flight:
         self.now_ns = 10**12
         self.sent: list[tuple[int, PoseToSend]] = []
         self.yaw_rate_rad_s = 0.0
-        self.told = True
+        self.has_attitude = True
         """Whether the autopilot says its attitude, and how late."""
         self.delay_ns = 0
 
@@ -50,7 +50,7 @@ class Flight:
         first = len(self.sent)
         for _ in range(round(seconds * 200)):
             self.now_ns += 5 * MS
-            if self.told and self.now_ns % (20 * MS) == 0:
+            if self.has_attitude and self.now_ns % (20 * MS) == 0:
                 at_ns = self.now_ns - self.delay_ns
                 attitude = quaternion_from_euler(0.1, -0.2, self.yaw(at_ns))
                 self.gate.take_attitude(AttitudeSample(at_ns, attitude))
@@ -216,7 +216,7 @@ def rolled_over(t_ns: int) -> Pose:
 
 def test_without_an_attitude_nothing_is_sent() -> None:
     flight = Flight()
-    flight.told = False
+    flight.has_attitude = False
     assert not flight.run(3)
     assert flight.gate.why_not == "no autopilot attitude"
     assert not flight.run(3, world_from_body=rolled_over(0))
@@ -226,12 +226,12 @@ def test_poses_stop_without_attitude() -> None:
     """And none is predicted unchecked: attitude is extrapolated by at most 120 ms."""
     flight = Flight()
     flight.run(2)
-    flight.told, silent_ns = False, flight.now_ns
+    flight.has_attitude, silent_ns = False, flight.now_ns
     flight.run(1, world_from_body=rolled_over(0))
     assert max(pose.t_ns for _, pose in flight.sent) <= silent_ns + 120 * MS
     assert not [at for at, _ in flight.sent if at > silent_ns + 300 * MS]
     assert not flight.gate.sending and flight.gate.why_not == "no autopilot attitude"
-    flight.told = True
+    flight.has_attitude = True
     assert not flight.run(0.9)
     assert flight.run(0.4)
 
@@ -239,10 +239,10 @@ def test_poses_stop_without_attitude() -> None:
 def test_attitudes_are_not_interpolated_over_gaps() -> None:
     flight = Flight()
     flight.run(2)
-    flight.told = False
+    flight.has_attitude = False
     lost_ns = flight.now_ns
     flight.run(0.45)
-    flight.told = True
+    flight.has_attitude = True
     flight.run(0.1)
     between = [p for _, p in flight.sent if lost_ns + 120 * MS < p.t_ns < lost_ns + 330 * MS]
     assert not between
@@ -261,7 +261,7 @@ def test_attitudes_may_arrive_after_the_frame(late_ms: int) -> None:
 )
 def test_invalid_attitude_is_ignored(quaternion: list[float]) -> None:
     flight = Flight()
-    flight.told = False
+    flight.has_attitude = False
     for _ in range(150):
         flight.gate.take_attitude(AttitudeSample(flight.now_ns, np.array(quaternion)))
         assert not flight.run(0.02)
@@ -270,7 +270,7 @@ def test_invalid_attitude_is_ignored(quaternion: list[float]) -> None:
 
 def test_invalid_rates_are_ignored() -> None:
     flight = Flight()
-    flight.told = False
+    flight.has_attitude = False
     for _ in range(150):
         rates = np.array([math.nan, 0.0, 0.0])
         flight.gate.take_attitude(AttitudeSample(flight.now_ns, ATTITUDE, rates))

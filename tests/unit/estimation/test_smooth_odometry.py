@@ -28,13 +28,13 @@ def track(k: int, off: float = 0.0, state: TrackState = TrackState.TRACKING) -> 
     )  # fmt: skip
 
 
-def give(odometry: SmoothOdometry, told: Track) -> Odometry:
-    return odometry.step(told, 0, PLACED, (np.array([SPEED, 0.0, 0.0]), 0.1))
+def give(odometry: SmoothOdometry, track: Track) -> Odometry:
+    return odometry.step(track, 0, PLACED, (np.array([SPEED, 0.0, 0.0]), 0.1))
 
 
-def north(told: Odometry) -> float:
-    assert told.world_from_body is not None
-    return float(told.world_from_body.translation[0])
+def north(odometry: Odometry) -> float:
+    assert odometry.world_from_body is not None
+    return float(odometry.world_from_body.translation[0])
 
 
 def test_map_correction_is_slew_limited() -> None:
@@ -101,17 +101,17 @@ def test_dead_reckoning_grows_uncertain_and_reacquires_without_a_jump() -> None:
     odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
     for k in range(10):
         give(odometry, track(k))
-    coasted = []
+    dead_reckoned = []
     for k in range(10, 30):
-        blind = replace(
+        lost = replace(
             track(k, state=TrackState.DEAD_RECKONING), sigma_position=0.01 + 0.02 * (k - 9)
         )
-        coasted.append(give(odometry, blind))
-    assert [o.state for o in coasted] == [TrackState.DEAD_RECKONING] * 20
-    assert {o.quality for o in coasted} == {1}
-    assert (np.diff([o.sigma_position_m for o in coasted]) > 0).all()
+        dead_reckoned.append(give(odometry, lost))
+    assert [o.state for o in dead_reckoned] == [TrackState.DEAD_RECKONING] * 20
+    assert {o.quality for o in dead_reckoned} == {1}
+    assert (np.diff([o.sigma_position_m for o in dead_reckoned]) > 0).all()
     seen = [give(odometry, track(k, off=0.3)) for k in range(30, 40)]
-    steps = np.diff([north(o) for o in [*coasted, *seen]])
+    steps = np.diff([north(o) for o in [*dead_reckoned, *seen]])
     assert np.abs(steps - 0.2).max() < 0.03
     assert seen[-1].reset_counter == 0
 

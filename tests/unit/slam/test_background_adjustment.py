@@ -91,7 +91,7 @@ def test_additions_during_adjustment_move_with_their_references() -> None:
     slam_map.alive[: slam_map.n_points][own] = True
     retire(slam_map, slam_map.keyframes[5], slam_map.keyframes[6])
     gone = slam_map.pose_of(5)
-    beside = slam_map.keyframes[6].camera_from_map
+    anchor = slam_map.keyframes[6].camera_from_map
     relative = newest.camera_from_map @ before.camera_from_map.inverse()
     fresh = np.flatnonzero(own)
     assert len(fresh) > 5
@@ -112,7 +112,7 @@ def test_additions_during_adjustment_move_with_their_references() -> None:
     now_gone = slam_map.pose_of(5)
     assert now_gone is not None
     kept = now_gone @ slam_map.keyframes[6].camera_from_map.inverse()
-    assert kept.matrix() == pytest.approx((gone @ beside.inverse()).matrix(), abs=1e-9)
+    assert kept.matrix() == pytest.approx((gone @ anchor.inverse()).matrix(), abs=1e-9)
     assert max(error_px(slam_map, slam_map.keyframes[k]) for k in range(2, N - 2) if k != 5) < 0.6
 
 
@@ -210,8 +210,8 @@ def test_live_flight_is_tracked_during_global_adjustment(
         grey, _ = world.render(SMALL, path(k))
         frame = Frame(k, k * 100_000_000, grey, np.zeros((1, 1, 3), np.uint8))
         with tracker.map_lock.tracking():
-            told = tracker.step(frame, Prior(pose, path(k).rotation))
-        for message in told:
+            out = tracker.step(frame, Prior(pose, path(k).rotation))
+        for message in out:
             if isinstance(message, Track) and message.map_from_camera is not None:
                 tracks[message.seq] = message
                 pose = message.map_from_camera

@@ -131,9 +131,11 @@ def test_two_views_initialise_a_map(rng: np.random.Generator, flat: bool, prior:
     xb = project(b, points) + rng.normal(scale=0.3 / FOCAL, size=(400, 2))
     xb[:60] += rng.uniform(-0.2, 0.2, (60, 2))
     turn = rotation_from_vector(np.radians([1.0, -0.7, 1.0])) @ b_from_a.rotation
-    told = (turn, np.eye(3)) if prior else None
+    attitudes = (turn, np.eye(3)) if prior else None
     index = np.arange(400)
-    result = initialise(features(xa), features(xb), index, index, FOCAL, 5, told, np.radians(1.0))
+    result = initialise(
+        features(xa), features(xb), index, index, FOCAL, 5, attitudes, np.radians(1.0)
+    )
     if flat and not prior:  # a plane allows two motions: none may be taken for certain
         assert result is None or angle_between(
             result.b_from_a.rotation, b_from_a.rotation
@@ -155,10 +157,17 @@ def test_measured_rotation_resolves_planar_ambiguity_at_low_resolution(
     xb = project(climb, points) + rng.normal(scale=1.0 / FOCAL, size=(140, 2))
     found = []
     for off_deg in (-0.5, 0.5):
-        told = rotation_from_vector(np.radians([off_deg, 0.0, 0.0])) @ climb.rotation
+        attitudes = rotation_from_vector(np.radians([off_deg, 0.0, 0.0])) @ climb.rotation
         index = np.arange(140)
         result = initialise(
-            features(xa), features(xb), index, index, FOCAL, 5, (told, np.eye(3)), np.radians(1.0)
+            features(xa),
+            features(xb),
+            index,
+            index,
+            FOCAL,
+            5,
+            (attitudes, np.eye(3)),
+            np.radians(1.0),
         )
         assert result is not None
         found.append(result.b_from_a.rotation)

@@ -26,7 +26,7 @@ def centres(cameras: list[Pose]) -> Array:
     return np.stack([p.inverse().translation for p in cameras])
 
 
-def told(cameras: list[Pose], rng: np.random.Generator, sigma_m: float) -> DisplacementFactor:
+def measured(cameras: list[Pose], rng: np.random.Generator, sigma_m: float) -> DisplacementFactor:
     """Displacement factor between consecutive cameras."""
     displacement_m = np.diff(centres(cameras), axis=0) @ TO_WORLD.T
     n = len(displacement_m)
@@ -38,7 +38,7 @@ def told(cameras: list[Pose], rng: np.random.Generator, sigma_m: float) -> Displ
 
 def test_gradient_matches_the_cost(rng: np.random.Generator) -> None:
     cameras = [Pose(rotation_from_vector(rng.normal(size=3)), rng.normal(size=3)) for _ in range(6)]
-    factor = told(cameras, rng, 0.2)
+    factor = measured(cameras, rng, 0.2)
     factor.displacement_m[1, 2] = np.nan
     factor.displacement_m[3] += 4.0
     rotation, translation = poses_of(cameras)
@@ -81,7 +81,7 @@ def test_scale_drift_with_few_points_is_held(rng: np.random.Generator, wrong: bo
     start[:2] = truth[:2]
     order = [*range(2, N), 0, 1]
     place = np.argsort(order)
-    factor = told(truth, rng, 0.03)
+    factor = measured(truth, rng, 0.03)
     factor = DisplacementFactor(
         place[factor.first], place[factor.second], factor.displacement_m, factor.sigma_m, TO_WORLD
     )
@@ -105,7 +105,7 @@ def test_scale_drift_with_few_points_is_held(rng: np.random.Generator, wrong: bo
 
 def test_displacements_that_do_not_fit_the_map_are_not_used(rng: np.random.Generator) -> None:
     cameras = [Pose(LOOKING_DOWN, np.array([0.4 * k, 0.1 * k, 4.0])) for k in range(N)]
-    factor = told(cameras, rng, 0.1)
+    factor = measured(cameras, rng, 0.1)
     error = typical_error(factor, *poses_of(cameras))
     assert error == pytest.approx(1.0, rel=0.4)
     factor.displacement_m[:] = -factor.displacement_m * 2 * MAX_TYPICAL_ERROR

@@ -43,8 +43,8 @@ def test_hovering_leaves_a_handful_of_keyframes() -> None:
     assert len(slam_map.keyframes) <= N_OLDEST_KEPT + N_NEWEST_KEPT + 4
     assert len(slam_map.keyframes) + len(gone) == 40
     assert sorted(gone) == sorted(slam_map.retired)
-    beside = {r.anchor_id for r in slam_map.retired.values()}
-    assert beside <= set(slam_map.keyframes)
+    anchors = {r.anchor_id for r in slam_map.retired.values()}
+    assert anchors <= set(slam_map.keyframes)
     seen = [slam_map.observations_of(k)[1] for k in slam_map.keyframes.values()]
     count = np.bincount(np.concatenate(seen), minlength=slam_map.n_points)
     assert (count[slam_map.alive[: slam_map.n_points]] >= 2).all()

@@ -22,7 +22,7 @@ SECOND = Pose(
 )
 
 
-def faint(picture: Bytes, seed: int) -> Bytes:
+def blurred(picture: Bytes, seed: int) -> Bytes:
     """Out of focus and noisy."""
     noise = np.random.default_rng(seed).normal(scale=3.0, size=picture.shape)
     blurred = cv2.GaussianBlur(picture, (0, 0), 3.0)
@@ -38,8 +38,8 @@ def seen(rng: np.random.Generator) -> Array:
 
 
 def test_low_contrast_image_from_much_closer_is_tracked(rng: np.random.Generator) -> None:
-    grey = faint(TERRAIN.picture(CAMERA, FIRST), 1)
-    next_grey = faint(TERRAIN.picture(CAMERA, SECOND), 2)
+    grey = blurred(TERRAIN.picture(CAMERA, FIRST), 1)
+    next_grey = blurred(TERRAIN.picture(CAMERA, SECOND), 2)
     guess = Pose(SECOND.rotation, SECOND.translation + [0.05, 0.08, -0.1]).inverse()
     found = track_points(CAMERA, seen(rng), grey, FIRST.inverse(), next_grey, guess)
     assert found is not None

@@ -67,9 +67,9 @@ def test_too_few_shared_points_or_inconsistent_depths_are_rejected() -> None:
     tracked.point_ids[start.features_first[MIN_SHARED - 1 :]] = -1
     assert continuation_of(slam_map, tracked, start) is None
     tracked.point_ids[start.features_first] = ids
-    stretch = np.random.default_rng(2).uniform(0.3, 3.0, (len(start.points_map), 1))
+    scatter = np.random.default_rng(2).uniform(0.3, 3.0, (len(start.points_map), 1))
     wrong = TwoViewReconstruction(
-        start.first, start.second, start.points_map * stretch, start.features_first,
+        start.first, start.second, start.points_map * scatter, start.features_first,
         start.features_second,
     )  # fmt: skip
     assert continuation_of(slam_map, tracked, wrong) is None

@@ -39,14 +39,14 @@ def images() -> list[np.ndarray]:
 
 
 def run(
-    images: list[np.ndarray], attitude: bool, blind: range = range(0)
+    images: list[np.ndarray], attitude: bool, dropout: range = range(0)
 ) -> tuple[Tracker, dict[int, Track], list[Track]]:
     tracker = Tracker(Config(), CAMERA, nothing)
     tracks: dict[int, Track] = {}
     every: list[Track] = []
     last: list[tuple[int, Pose]] = []
     for k, image in enumerate(images):
-        grey = np.full_like(image, 255) if k in blind else image
+        grey = np.full_like(image, 255) if k in dropout else image
         prior = None
         if len(last) == 2 and last[1][0] == k - 1:
             a, b = last[0][1], last[1][1]
@@ -108,10 +108,10 @@ def test_two_runs_give_the_same_poses_to_the_last_bit(images: list[np.ndarray]) 
 def test_image_dropout_is_reported_lost_and_relocalised_in_the_same_map(
     images: list[np.ndarray],
 ) -> None:
-    blind = range(22, 26)
-    tracker, tracks, every = run(images, attitude=True, blind=blind)
-    assert {t.seq for t in every if t.state is TrackState.LOST} >= set(blind)
-    assert not set(tracks) & set(blind)
+    dropout = range(22, 26)
+    tracker, tracks, every = run(images, attitude=True, dropout=dropout)
+    assert {t.seq for t in every if t.state is TrackState.LOST} >= set(dropout)
+    assert not set(tracks) & set(dropout)
     assert set(tracks) >= set(range(28, 40)), "found again within two frames of sight"
     assert len(tracker.segments) == 1
     error, _ = aligned_error(*positions(tracker, tracks))
