@@ -142,7 +142,7 @@ def test_failover_loses_nothing(
     fault: Callable[[Devices], None], in_words: str, undisturbed: list[Message],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(device_takeover, "TEST_EVERY_NS", 1)
+    monkeypatch.setattr(device_takeover, "TEST_PERIOD_NS", 1)
     devices = twice()
     out = fly(RADTAN, devices=devices, before=lambda k: fault(devices) if k == 18 else None)
     (warned,) = [m for m in out if isinstance(m, Warned)]
@@ -158,7 +158,7 @@ def test_failover_loses_nothing(
 def test_without_another_device_depth_ends_and_the_stage_continues(
     fault: Callable[[Devices], None], undisturbed: list[Message], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_takeover, "TEST_EVERY_NS", 1)
+    monkeypatch.setattr(device_takeover, "TEST_PERIOD_NS", 1)
     devices = twice()
     out = fly(RADTAN, devices=devices, before=lambda k: fault(devices) if k in (12, 26) else None)
     assert [m.what for m in out if isinstance(m, Warned)] == [FAILED_OVER, NO_DEVICE_LEFT]

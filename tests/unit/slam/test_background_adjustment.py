@@ -198,7 +198,7 @@ def test_live_flight_is_tracked_during_global_adjustment(
         n_adjusted += 1
         put(slam_map, problem, result)
 
-    monkeypatch.setattr(Atlas, "extend", extended)
+    monkeypatch.setattr(Atlas, "insert_keyframe", extended)
     monkeypatch.setattr("companion.slam.mapping.mapper.apply_result_later", counted)
     world = PlaneWorld(np.random.default_rng(7))
     tracker = Tracker(Config(), SMALL, lambda _: nullcontext(), background=True)
