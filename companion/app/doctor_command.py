@@ -234,7 +234,7 @@ def _document(found: Examination) -> dict[str, Any]:
 
 def _plain(finding: Finding) -> dict[str, Any]:
     document = dataclasses.asdict(finding)
-    del document["in_the_way"]
+    del document["blocking"]
     return document
 
 
