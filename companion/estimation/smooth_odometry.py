@@ -39,7 +39,7 @@ class _PathPoint(NamedTuple):
 
     t_ns: int
     position: Array
-    flown_m: float
+    path_length_m: float
     slewed: Array
 
 
@@ -163,18 +163,18 @@ class SmoothOdometry:
 
         Scale error, drift, and slew corrections, which moved the pose but not the body.
         """
-        flown_m = 0.0
+        path_length_m = 0.0
         if self._path:
-            flown_m = self._path[-1].flown_m + float(
+            path_length_m = self._path[-1].path_length_m + float(
                 np.linalg.norm(position - self._path[-1].position)
             )
-        self._path.append(_PathPoint(t_ns, position, flown_m, self._slewed))
+        self._path.append(_PathPoint(t_ns, position, path_length_m, self._slewed))
         while self._path[0].t_ns < t_ns - DRIFT_WINDOW_NS:
             self._path.popleft()
         since = self._path[0]
         return float(np.linalg.norm([
             sigma_scale * float(np.linalg.norm(position - since.position)),
-            SIGMA_DRIFT * (flown_m - since.flown_m),
+            SIGMA_DRIFT * (path_length_m - since.path_length_m),
             float(np.linalg.norm(self._slewed - since.slewed)) / np.sqrt(3.0),
         ]))  # fmt: skip
 
@@ -202,10 +202,10 @@ class SmoothOdometry:
         if self._last is None:
             return
         expected = self._last[2].translation + self._velocity * ((t_ns - self._last[0]) * 1e-9)
-        off = expected - (self._odometry_from_world @ raw).translation
-        if float(np.linalg.norm(off)) < self._max_jump_m:
+        correction = expected - (self._odometry_from_world @ raw).translation
+        if float(np.linalg.norm(correction)) < self._max_jump_m:
             before = self._odometry_from_world
-            self._odometry_from_world = Pose(before.rotation, before.translation + off)
+            self._odometry_from_world = Pose(before.rotation, before.translation + correction)
 
     def _unknown(self, track: Track) -> Odometry:
         return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
@@ -234,8 +234,10 @@ class SmoothOdometry:
         if self._last is not None:
             _, pose, placed = self._last
             raw = self._raw(georeference, pose)
-            turn = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
-            self._odometry_from_world = Pose(turn, placed.translation - turn @ raw.translation)
+            yaw_offset = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
+            self._odometry_from_world = Pose(
+                yaw_offset, placed.translation - yaw_offset @ raw.translation
+            )
         self._georeference = georeference
 
     @property
@@ -281,13 +283,13 @@ class SmoothOdometry:
         here = self._odometry_from_world @ raw
         yaw = _yaw(self._odometry_from_world.rotation)
         most = float(MAX_SLEW_RAD_S) * dt_s
-        turn = yaw_rotation(yaw - float(np.clip(yaw, -most, most)))
+        yaw_offset = yaw_rotation(yaw - float(np.clip(yaw, -most, most)))
         away = here.translation - raw.translation
         far = float(np.linalg.norm(away))
-        state = max(far - MAX_SLEW_M_S * dt_s, 0.0) / max(far, 1e-12)
-        at = raw.translation + state * away
+        remaining = max(far - MAX_SLEW_M_S * dt_s, 0.0) / max(far, 1e-12)
+        at = raw.translation + remaining * away
         self._slewed = self._slewed + at - here.translation
-        self._odometry_from_world = Pose(turn, at - turn @ raw.translation)
+        self._odometry_from_world = Pose(yaw_offset, at - yaw_offset @ raw.translation)
 
     def _within_gate(self, placed: Pose, t_ns: int) -> bool:
         """Innovation gate: whether motion can have brought the body here."""

@@ -283,7 +283,7 @@ class Tracker:
         """Whether tracking has been lost for long enough to initialise another map."""
         since = self._lost_since_ns
         if since is not None and t_ns < since:
-            return False  # one from before is looked for
+            return False  # relocalisation in a stored map is still being tried
         if since is None or len(self.map.keyframes) <= MAX_DISCARDED_KEYFRAMES:
             return True
         wait_s = self._config.restart_after_s * (ATTITUDE_RESTART_RATIO if has_attitude else 1.0)
@@ -313,10 +313,10 @@ class Tracker:
             )
             if not needs_keyframe(self._config, self.map, reference, view, since_ns):
                 return False
-        cover = equivalent_keyframe(self._config, self.map, view)
-        if cover is None:
+        equivalent = equivalent_keyframe(self._config, self.map, view)
+        if equivalent is None:
             return True
-        self._reference, self._reference_since_ns = cover, view.t_ns
+        self._reference, self._reference_since_ns = equivalent, view.t_ns
         return False
 
     def _insert(self, view: View) -> Keyframe:
