@@ -95,8 +95,8 @@ def choose(views: Sequence[View], n: int) -> list[View]:
             break
         taken.append(best)
         covered |= masks[best]
-        distance_px = [_distance(view, views[best]) for view in views]
-        nearest = np.minimum(nearest, distance_px)
+        distances = [_distance(view, views[best]) for view in views]
+        nearest = np.minimum(nearest, distances)
     return [views[i] for i in sorted(taken)]
 
 
@@ -185,8 +185,8 @@ def _distance(one: View, other: View) -> float:
     )
     if len(mine) < 4:
         return 1.0
-    distance_px: Array = one.detection.image_px[mine] - other.detection.image_px[theirs]
-    return min(1.0, float(np.sqrt((distance_px**2).sum(1).mean())) / one.diagonal_px)
+    difference_px: Array = one.detection.image_px[mine] - other.detection.image_px[theirs]
+    return min(1.0, float(np.sqrt((difference_px**2).sum(1).mean())) / one.diagonal_px)
 
 
 def _hull(view: View) -> NDArray[np.float32]:

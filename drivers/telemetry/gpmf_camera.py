@@ -35,8 +35,8 @@ def camera_fixes(name: str, payloads: Sequence[tuple[int, int, bytes]]) -> Telem
         step_ns = (end_ns - begin_ns) / max(len(rows), 1)
         for k, row in enumerate(rows):
             place = float(row[0]), float(row[1]), float(row[2])
-            valid_stamps = abs(place[0]) <= 90 and abs(place[1]) <= 180 and np.isfinite(row).all()
-            if valid_stamps and fix[k] >= FIX_3D and 0 < dilution[k] <= MAX_DILUTION:
+            believable = abs(place[0]) <= 90 and abs(place[1]) <= 180 and np.isfinite(row).all()
+            if believable and fix[k] >= FIX_3D and 0 < dilution[k] <= MAX_DILUTION:
                 sigma_m = METRES_PER_DILUTION * float(dilution[k])
                 at_ns = begin_ns + round((k + 0.5) * step_ns)
                 collected.add(

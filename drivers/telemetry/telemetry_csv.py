@@ -143,8 +143,8 @@ def _origin(words: list[str]) -> GeoOrigin | None:
         origin = GeoOrigin(*map(float, words[1:]))
     except ValueError:
         return None
-    valid_stamps = abs(origin.latitude_deg) <= 90 and abs(origin.longitude_deg) <= 180
-    return origin if valid_stamps and abs(origin.altitude_m) < 1e5 else None
+    believable = abs(origin.latitude_deg) <= 90 and abs(origin.longitude_deg) <= 180
+    return origin if believable and abs(origin.altitude_m) < 1e5 else None
 
 
 def _warning(line: str) -> list[Warned]:

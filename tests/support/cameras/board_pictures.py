@@ -111,8 +111,8 @@ class BoardPictures:
         for _ in range(5 if bend else 1):
             along = (depth - begin[2]) / ray[2]
             across, down = begin[0] + along * ray[0], begin[1] + along * ray[1]
-            distance_px = np.clip(across / self._size_m[0] - 0.5, -1, 1)
-            depth = bend * 4 * self._size_m[0] * distance_px**2
+            away = np.clip(across / self._size_m[0] - 0.5, -1, 1)
+            depth = bend * 4 * self._size_m[0] * away**2
         scale = PX_PER_SQUARE / self._square_m
         u, v = (np.clip(at * scale - 0.5, -99, 1e4) for at in (across, down))
         board = cv2.remap(
@@ -141,10 +141,10 @@ class BoardPictures:
         camera = self.camera
         middle = np.array([placing.u * camera.width, placing.v * camera.height])
         half = 0.5 * placing.width * min(camera.width, 1.4 * camera.height)
-        too_few_views = np.array([5.0, 0.0])
-        rays = camera.normalise(np.array([middle, middle - too_few_views, middle + too_few_views]))
+        few = np.array([5.0, 0.0])
+        rays = camera.normalise(np.array([middle, middle - few, middle + few]))
         ray = np.append(rays[0], 1.0)
-        angle = _angle(rays[1], rays[2]) * half / too_few_views[0]
+        angle = _angle(rays[1], rays[2]) * half / few[0]
         distance = self._size_m[0] / 2 / np.tan(angle / 2)
         # squarely to the ray, then tilted and turned
         forward = ray / np.linalg.norm(ray)
