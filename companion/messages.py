@@ -175,10 +175,10 @@ class KeyframeAdded:
 
 @dataclass(frozen=True, slots=True)
 class LoopClosed:
-    """Place recognised: keyframe `keyframe_id` shows what `other_id` showed before.
+    """A loop closure or map merge: keyframe `keyframe_id` observes what `other_id` did before.
 
-    With `same_map` a loop closure, which moved the newer end by `moved` map units; else a map
-    merge, the other map's unit being `scale` of this one's.
+    Within the same map a loop closed, which moved the newer end by `moved` map units; else two maps
+    were merged, the other's unit being `scale` of this one's.
     """
 
     t_ns: int
@@ -252,9 +252,9 @@ class MapUpdate:
         return {k: self._span(place, k) for k in others}
 
     def local_scale_of(self, keyframe_id: int, spans: Mapping[int, float]) -> float:
-        """Local scale correction about a keyframe since it had these spans.
+        """Local scale correction of measurements made about a keyframe when it had these spans.
 
-        The median ratio of the spans, weighted by length; 1 without any.
+        The median of the ratios of spans, weighted by length; 1 without any.
         """
         place = self.place_of(keyframe_id)
         if place is None:

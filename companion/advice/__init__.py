@@ -1,1 +1,1 @@
-"""What an autopilot's parameters must be for it to fly on our pose, and which of them are not."""
+"""Checks of autopilot parameters for flight on our pose."""

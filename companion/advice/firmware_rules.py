@@ -1,4 +1,4 @@
-"""A table for each firmware: what follows from how we send.
+"""Parameter rules per firmware, for the pose as we send it.
 
 That is the pose of the body, in metres, stamped at exposure, with covariances and a quality.
 """
@@ -8,16 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from companion.advice.wanted import ARDUPILOT, PX4, Among, Between, Bits, Near, Values, Wanted
+from companion.advice.wanted import ARDUPILOT, PX4, Between, Bits, Near, OneOf, Values, Wanted
 from companion.config import FeedbackConfig
 
 DELAY_TOLERANCE_MS = 15.0
-MOST_VISO_DELAY_MS = 250.0
+MAX_VISO_DELAY_MS = 250.0
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """What the advice is for. `latency_ms`: from exposure to sending, None where not measured."""
+class Context:
+    """Context of the rules. `latency_ms`: from exposure to sending, None where not measured."""
 
     feedback: FeedbackConfig
     mode: str
@@ -26,63 +26,63 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One row. `lacking` is what it means that a firmware has no such parameter; "" for nothing."""
+    """One rule. `lacking` is the consequence of a missing parameter; "" for none."""
 
     name: str
-    wanted: Callable[[Asked, Values], Wanted | None]
+    wanted: Callable[[Context, Values], Wanted | None]
     why: str
     reboot: bool = False
     lacking: str = ""
 
 
-def _always(wanted: Wanted) -> Callable[[Asked, Values], Wanted]:
-    return lambda asked, values: wanted
+def _always(wanted: Wanted) -> Callable[[Context, Values], Wanted]:
+    return lambda context, values: wanted
 
 
-def _same_as(other: str) -> Callable[[Asked, Values], Wanted]:
-    return lambda asked, values: Near(values.get(other, 0.0), 0.005)
+def _same_as(other: str) -> Callable[[Context, Values], Wanted]:
+    return lambda context, values: Near(values.get(other, 0.0), 0.005)
 
 
-def _quality(asked: Asked, values: Values) -> Wanted:
-    return Between(0, asked.feedback.min_quality)
+def _quality(context: Context, values: Values) -> Wanted:
+    return Between(0, context.feedback.min_quality)
 
 
-def _velocity(asked: Asked, values: Values) -> Wanted:
-    return Among((6, 0))
+def _velocity(context: Context, values: Values) -> Wanted:
+    return OneOf((6, 0))
 
 
-def _needs_compass(asked: Asked, values: Values) -> Wanted | None:
-    return Among((1,)) if values.get("EK3_SRC1_YAW") == 1 else None
+def _needs_compass(context: Context, values: Values) -> Wanted | None:
+    return OneOf((1,)) if values.get("EK3_SRC1_YAW") == 1 else None
 
 
-def _viso_delay(asked: Asked, values: Values) -> Wanted | None:
-    if asked.latency_ms is None:
+def _viso_delay(context: Context, values: Values) -> Wanted | None:
+    if context.latency_ms is None:
         return None
-    latency_ms = min(round(asked.latency_ms), MOST_VISO_DELAY_MS)
+    latency_ms = min(round(context.latency_ms), MAX_VISO_DELAY_MS)
     return Near(latency_ms, DELAY_TOLERANCE_MS)
 
 
-def _proximity(asked: Asked, values: Values) -> Wanted | None:
-    return Among((2,)) if asked.feedback.obstacle_distance else None
+def _proximity(context: Context, values: Values) -> Wanted | None:
+    return OneOf((2,)) if context.feedback.obstacle_distance else None
 
 
-def fused(asked: Asked, values: Values) -> Wanted:
-    """What EKF2 is to take of a pose."""
-    if asked.mode == "odometry":
+def fused(context: Context, values: Values) -> Wanted:
+    """Pose components that EKF2 is to fuse."""
+    if context.mode == "odometry":
         return Bits(0b111, "0, 1 and 2 (horizontal position, vertical position, velocity)")
     return Bits(0b011, "0 and 1 (horizontal and vertical position)")
 
 
-def _fused_before_1_14(asked: Asked, values: Values) -> Wanted:
-    if asked.mode == "odometry":
+def _fused_before_1_14(context: Context, values: Values) -> Wanted:
+    if context.mode == "odometry":
         return Bits(8 | 256, "3 and 8 (vision position and velocity)")
     return Bits(8, "3 (vision position)")
 
 
-def _delay_max(asked: Asked, values: Values) -> Wanted | None:
-    if asked.latency_ms is None:
+def _delay_max(context: Context, values: Values) -> Wanted | None:
+    if context.latency_ms is None:
         return None
-    return Between(round(asked.latency_ms + DELAY_TOLERANCE_MS), 1000)
+    return Between(round(context.latency_ms + DELAY_TOLERANCE_MS), 1000)
 
 
 OUR_BODY = (
@@ -92,27 +92,27 @@ OUR_BODY = (
 
 ARDUPILOT_RULES = (
     Rule(
-        "VISO_TYPE", _always(Among((1,))), "1 (MAVLink) takes our pose as it is; 0 takes none, 2 "
+        "VISO_TYPE", _always(OneOf((1,))), "1 (MAVLink) takes our pose as it is; 0 takes none, 2 "
         "ignores it for 1 s after a reset, and 3 (VOXL) moves our pose to zero by resets of its "
         "own: flown in ArduPilot's simulator, vehicles jumped by metres or fell with it",
         reboot=True,
         lacking="this firmware was built without visual odometry (HAL_VISUALODOM_ENABLED); boards "
         "with 1 MB of flash lack it",
     ),
-    Rule("EK3_ENABLE", _always(Among((1,))), "only EKF3 takes a position from vision", reboot=True,
+    Rule("EK3_ENABLE", _always(OneOf((1,))), "only EKF3 takes a position from vision", reboot=True,
          lacking="only EKF3 takes a position from vision, and this firmware has none"),
-    Rule("AHRS_EKF_TYPE", _always(Among((3,))), "the vehicle flies on what this EKF says"),
-    Rule("EK3_SRC1_POSXY", _always(Among((6,))), "6 takes the horizontal position from our pose",
+    Rule("AHRS_EKF_TYPE", _always(OneOf((3,))), "the vehicle flies on what this EKF says"),
+    Rule("EK3_SRC1_POSXY", _always(OneOf((6,))), "6 takes the horizontal position from our pose",
          lacking="ArduPilot before 4.1; it cannot be told to use vision beside a GPS"),
     Rule("EK3_SRC1_VELXY", _velocity, "6 takes the velocity that we send; 3 waits for a GPS"),
-    Rule("EK3_SRC1_POSZ", _always(Among((1, 6))), "1 is the barometer, 6 our height; 3 waits for "
+    Rule("EK3_SRC1_POSZ", _always(OneOf((1, 6))), "1 is the barometer, 6 our height; 3 waits for "
          "a GPS"),
     Rule("EK3_SRC1_VELZ", _velocity, "6 takes the vertical velocity that we send; 3 waits for a "
          "GPS"),
-    Rule("EK3_SRC1_YAW", _always(Among((1, 6))), "1 is the compass, which is best, since our "
+    Rule("EK3_SRC1_YAW", _always(OneOf((1, 6))), "1 is the compass, which is best, since our "
          "heading comes from the autopilot's own; 6 is ours"),
     Rule("COMPASS_ENABLE", _needs_compass, "EK3_SRC1_YAW takes the heading from the compass"),
-    Rule("VISO_ORIENT", _always(Among((0,))), OUR_BODY),
+    Rule("VISO_ORIENT", _always(OneOf((0,))), OUR_BODY),
     Rule("VISO_SCALE", _always(Near(1.0, 1e-3)), "our pose is in metres"),
     Rule("VISO_POS_X", _same_as("INS_POS1_X"), OUR_BODY),
     Rule("VISO_POS_Y", _same_as("INS_POS1_Y"), OUR_BODY),
@@ -126,28 +126,28 @@ ARDUPILOT_RULES = (
 )  # fmt: skip
 
 PX4_RULES = (
-    Rule("SYS_MC_EST_GROUP", _always(Among((2,))), "only EKF2 takes our pose", reboot=True),
-    Rule("EKF2_EN", _always(Among((1,))), "only EKF2 takes our pose", reboot=True),
+    Rule("SYS_MC_EST_GROUP", _always(OneOf((2,))), "only EKF2 takes our pose", reboot=True),
+    Rule("EKF2_EN", _always(OneOf((1,))), "only EKF2 takes our pose", reboot=True),
     Rule("EKF2_EV_CTRL", fused, "what is not enabled here is not fused; bit 3 (heading) may stay "
          "off, since our heading comes from the autopilot's own"),
     Rule("EKF2_AID_MASK", _fused_before_1_14, "what is not enabled here is not fused (PX4 before "
          "1.14)", reboot=True),
-    Rule("EKF2_HGT_REF", _always(Among((3, 0, 2))), "3 is vision, 0 the barometer; 1 waits for a "
+    Rule("EKF2_HGT_REF", _always(OneOf((3, 0, 2))), "3 is vision, 0 the barometer; 1 waits for a "
          "GPS", reboot=True),
-    Rule("EKF2_HGT_MODE", _always(Among((3, 0, 2))), "3 is vision, 0 the barometer; 1 waits for a "
+    Rule("EKF2_HGT_MODE", _always(OneOf((3, 0, 2))), "3 is vision, 0 the barometer; 1 waits for a "
          "GPS (PX4 before 1.14)", reboot=True),
     Rule("EKF2_EV_DELAY", _always(Near(0, 20)), "our stamps are those of the exposure, in "
          "PX4's own clock: nothing is left to take off", reboot=True),
     Rule("EKF2_DELAY_MAX", _delay_max, "older poses than this are not fused; ours were measured "
          "to be that old", reboot=True),
-    Rule("EKF2_EV_NOISE_MD", _always(Among((0,))), "1 would not use the uncertainty that we send"),
+    Rule("EKF2_EV_NOISE_MD", _always(OneOf((0,))), "1 would not use the uncertainty that we send"),
     Rule("EKF2_EV_QMIN", _quality, "above feedback.min_quality our poses would be ignored"),
     Rule("EKF2_EVP_NOISE", _always(Between(0.01, 1.0)), "the least uncertainty that a position "
          "is taken to have; above 1 m it hardly counts"),
     Rule("EKF2_EV_POS_X", _same_as("EKF2_IMU_POS_X"), OUR_BODY),
     Rule("EKF2_EV_POS_Y", _same_as("EKF2_IMU_POS_Y"), OUR_BODY),
     Rule("EKF2_EV_POS_Z", _same_as("EKF2_IMU_POS_Z"), OUR_BODY),
-    Rule("COM_ARM_WO_GPS", _always(Among((1, 2))), "0 refuses to arm without a GPS fix"),
+    Rule("COM_ARM_WO_GPS", _always(OneOf((1, 2))), "0 refuses to arm without a GPS fix"),
 )  # fmt: skip
 
 RULES = {ARDUPILOT: ARDUPILOT_RULES, PX4: PX4_RULES}
@@ -156,4 +156,4 @@ COMPARED = {
     PX4: ("EKF2_IMU_POS_X", "EKF2_IMU_POS_Y", "EKF2_IMU_POS_Z"),
 }
 EITHER_OF = (("EKF2_EV_CTRL", "EKF2_AID_MASK"),)
-"""One of each pair there must be: older firmware has the second."""
+"""One of each pair must exist: older firmware has the second."""

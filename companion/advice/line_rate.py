@@ -1,19 +1,19 @@
-"""Whether the serial line to an autopilot carries what is asked of it."""
+"""Capacity of the serial line to an autopilot."""
 
 from __future__ import annotations
 
 from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
 from companion.config import FeedbackConfig, LinkConfig
 
-BUSY = 0.6
-"""A line is not to be filled further than this, or stamps come late."""
+MAX_LOAD = 0.6
+"""Largest utilisation; beyond, stamps are delayed."""
 BITS_PER_BYTE = 10
 POSE_BYTES = {"odometry": 245, "vision_position": 129 + 69}
 OTHER_BYTES_PER_S = 700.0
-"""Heartbeat, time synchronisation and status of ours."""
+"""Our heartbeat, time synchronisation and status."""
 ATTITUDE_BYTES, IMU_BYTES, POSITION_BYTES, HEIGHT_BYTES = 44, 41, 40 + 40 + 64, 28 + 51
 USUAL_BAUDS = (115200, 230400, 460800, 921600, 1500000)
-OF_LINES = {
+LINE_PARAMETERS = {
     ARDUPILOT: tuple(f"SERIAL{n}_{what}" for n in range(1, 9) for what in ("BAUD", "PROTOCOL")),
     PX4: (
         *(f"MAV_{n}_{what}" for n in range(3) for what in ("CONFIG", "RATE")),
@@ -25,12 +25,12 @@ ARDUPILOT_MAVLINK = (1, 2)
 _BAUD_NAME = {ARDUPILOT: "SERIALn_BAUD", PX4: "SER_…_BAUD"}
 
 
-def names_of_lines(firmware: str) -> tuple[str, ...]:
-    """The parameters that this looks at."""
-    return OF_LINES[firmware]
+def line_parameters(firmware: str) -> tuple[str, ...]:
+    """Parameters read by this check."""
+    return LINE_PARAMETERS[firmware]
 
 
-def advise_on_line(
+def check_line(
     firmware: str,
     values: Values,
     link: LinkConfig,
@@ -38,7 +38,7 @@ def advise_on_line(
     mode: str,
     baud: int,
 ) -> list[Finding]:
-    """Whether a serial line carries both ways what is asked of it; PX4's own limit as well."""
+    """Findings on the capacity of a serial line both ways, and PX4's own rate limit."""
     up = feedback.rate_hz * POSE_BYTES[mode] + OTHER_BYTES_PER_S
     down = (
         link.attitude_hz * ATTITUDE_BYTES
@@ -47,7 +47,7 @@ def advise_on_line(
         + link.height_hz * HEIGHT_BYTES
         + OTHER_BYTES_PER_S
     )
-    needed_baud = max(up, down) * BITS_PER_BYTE / BUSY
+    needed_baud = max(up, down) * BITS_PER_BYTE / MAX_LOAD
     findings = []
     ports = _ports_at(firmware, values, baud)
     if baud < needed_baud:
@@ -66,7 +66,7 @@ def advise_on_line(
 
 
 def _ports_at(firmware: str, values: Values, baud: int) -> list[str]:
-    """The parameters of the ports that speak MAVLink at a baud rate."""
+    """Parameters of the ports that speak MAVLink at a baud rate."""
     if firmware == PX4:
         return [
             f"SER_{port}_BAUD"
@@ -98,6 +98,6 @@ def _px4_rate(values: Values, baud: int, down: float) -> list[Finding]:
             name, value, f"{down:.0f} or more",
             "bytes a second that PX4 sends here at most (0: half of the line); it slows all "
             "streams down to keep to it",
-            float(round(BUSY * baud / BITS_PER_BYTE)), True,
+            float(round(MAX_LOAD * baud / BITS_PER_BYTE)), True,
         )
     ]  # fmt: skip

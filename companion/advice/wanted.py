@@ -1,4 +1,4 @@
-"""What a value must be, and what is said of one that is not."""
+"""Conditions on parameter values, and findings."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import Protocol
 
 Values = Mapping[str, float]
-"""An autopilot's parameters, as far as they were read."""
+"""Parameters of an autopilot, as far as read."""
 ARDUPILOT, PX4 = "ardupilot", "px4"
 FIRMWARES = (ARDUPILOT, PX4)
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One parameter and what is said of it; `in_the_way`, or only to be known.
+    """A finding on one parameter; `blocking`, or for information.
 
-    `value` is None where the firmware has no such parameter, `set_to` where nothing can be set.
+    `value` is None where the firmware lacks the parameter, `set_to` where nothing can be set.
     """
 
     name: str
@@ -25,30 +25,30 @@ class Finding:
     why: str
     set_to: float | None = None
     reboot: bool = False
-    in_the_way: bool = True
+    blocking: bool = True
 
 
 class Wanted(Protocol):
-    """What a value must be."""
+    """Condition on a value."""
 
-    def met_by(self, value: float) -> bool:
-        """Whether a value will do."""
+    def accepts(self, value: float) -> bool:
+        """Whether a value is acceptable."""
 
-    def repaired(self, value: float) -> float:
-        """The nearest that will do."""
+    def corrected(self, value: float) -> float:
+        """The nearest acceptable value."""
 
 
 @dataclass(frozen=True, slots=True)
-class Among:
+class OneOf:
     """One of these; the first is the best."""
 
     values: tuple[float, ...]
 
-    def met_by(self, value: float) -> bool:
+    def accepts(self, value: float) -> bool:
         """See `Wanted`."""
         return any(abs(value - each) < 1e-6 for each in self.values)
 
-    def repaired(self, value: float) -> float:
+    def corrected(self, value: float) -> float:
         """See `Wanted`."""
         return self.values[0]
 
@@ -64,11 +64,11 @@ class Between:
     least: float
     most: float
 
-    def met_by(self, value: float) -> bool:
+    def accepts(self, value: float) -> bool:
         """See `Wanted`."""
         return self.least - 1e-6 <= value <= self.most + 1e-6
 
-    def repaired(self, value: float) -> float:
+    def corrected(self, value: float) -> float:
         """See `Wanted`."""
         return min(max(value, self.least), self.most)
 
@@ -78,16 +78,16 @@ class Between:
 
 @dataclass(frozen=True, slots=True)
 class Bits:
-    """All of these bits, whatever the others are."""
+    """All of these bits set, others arbitrary."""
 
     mask: int
     words: str
 
-    def met_by(self, value: float) -> bool:
+    def accepts(self, value: float) -> bool:
         """See `Wanted`."""
         return int(value) & self.mask == self.mask
 
-    def repaired(self, value: float) -> float:
+    def corrected(self, value: float) -> float:
         """See `Wanted`."""
         return int(value) | self.mask
 
@@ -97,16 +97,16 @@ class Bits:
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """A value, as nearly as matters."""
+    """A value within a tolerance."""
 
     value: float
     tolerance: float
 
-    def met_by(self, value: float) -> bool:
+    def accepts(self, value: float) -> bool:
         """See `Wanted`."""
         return abs(value - self.value) <= self.tolerance
 
-    def repaired(self, value: float) -> float:
+    def corrected(self, value: float) -> float:
         """See `Wanted`."""
         return self.value
 

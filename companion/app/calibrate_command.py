@@ -16,15 +16,15 @@ import numpy as np
 from companion.app.progress import Progress
 from companion.calibration.board_views import (
     Coverage,
-    LitArea,
+    IlluminatedArea,
     View,
     choose,
     coverage,
     novelty,
 )
-from companion.calibration.calibration_verdict import advice, faults, few
+from companion.calibration.calibration_verdict import advice, faults, too_few_views
 from companion.calibration.chart import Chart, parse_chart
-from companion.calibration.lens_calibration import MODELS, Calibration, determine
+from companion.calibration.lens_calibration import MODELS, Calibration, calibrate_lens
 from companion.errors import InputError
 from companion.messages import Bytes
 from companion.products.atomic_file import write_atomically
@@ -144,7 +144,7 @@ class _Gathered:
 
     chart: Chart
     views: list[View] = field(default_factory=list)
-    lit: LitArea = field(default_factory=LitArea)
+    lit: IlluminatedArea = field(default_factory=IlluminatedArea)
     size: tuple[int, int] = (0, 0)
     n_searched: int = 0
     n_found: int = 0
@@ -163,12 +163,12 @@ class _Gathered:
         self.size = width, height
         self.n_searched += 1
         self.lit.see(grey)
-        sighting = self.chart.find(grey)
-        if sighting is None:
+        detection = self.chart.find(grey)
+        if detection is None:
             self._keep_unfound(grey)
             return "the board is not to be seen"
         self.n_found += 1
-        view = View(number, sighting, width, height)
+        view = View(number, detection, width, height)
         if view.blurred:
             self.n_blurred += 1
             return "hold the board still"
@@ -251,7 +251,7 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
             n_new = len(gathered.views) - n_fitted
             if n_new >= (LIVE_FIT_EVERY if wanted else 1) and len(gathered.views) >= LEAST_FITTED:
                 n_fitted = len(gathered.views)
-                made = determine(choose(gathered.views, MAX_VIEWS), covered.lit, model)
+                made = calibrate_lens(choose(gathered.views, MAX_VIEWS), covered.lit, model)
                 wanted = advice(gathered.views, covered, made)
             if not wanted:
                 break
@@ -279,20 +279,20 @@ def _judged(gathered: _Gathered, called: str, model: str) -> Calibration:
             + (f"; {instead}" if instead else ": is it in view, lit, and the board that was given?")
         )
     views = choose(gathered.views, MAX_VIEWS)
-    if gathered.n_blurred > found / 2 and few(len(views)):
+    if gathered.n_blurred > found / 2 and too_few_views(len(views)):
         raise InputError(
             f"{refused}the board is blurred in {gathered.n_blurred} of the {found} pictures that "
             "show it: hold it still, give it more light, or focus the lens"
         )
-    if gathered.n_small > found / 2 and few(len(views)):
+    if gathered.n_small > found / 2 and too_few_views(len(views)):
         raise InputError(
             f"{refused}the board is too small in {gathered.n_small} of the {found} pictures that "
             "show it: bring it nearer"
         )
     lit = gathered.lit.mask(*gathered.size)
-    calibration = determine(views, lit, model)
+    calibration = calibrate_lens(views, lit, model)
     if calibration is None:
-        reasons = few(len(views)) or [
+        reasons = too_few_views(len(views)) or [
             f"no lens explains the {len(views)} views: is the board flat, and the one given?"
         ]
     else:

@@ -19,7 +19,7 @@ from companion.dense.engine import DepthEngine
 from companion.dense.fusion import Fusion, chunk_alone
 from companion.dense.opencl import ComputeDevice
 from companion.dense.undistortion import Undistortion
-from companion.dense.view_selection import LONGEST_BASELINE
+from companion.dense.view_selection import MAX_BASELINE
 from companion.errors import FlightError
 from companion.geometry.transforms import Pose
 from companion.messages import Bytes, DepthMap, MapUpdate, PixelState, PointChunk
@@ -174,7 +174,7 @@ def reconstruct(
         for n, reference in enumerate(references, 1):
             if wanted.range_m is None and n > 1:
                 range_m = work.found_range(reference, positions) or range_m
-            reach_m = np.inf if single else LONGEST_BASELINE * math.sqrt(range_m[0] * range_m[1])
+            reach_m = np.inf if single else MAX_BASELINE * math.sqrt(range_m[0] * range_m[1])
             others = _others(images, positions, reference, reach_m)
             work.load([reference, *others])
             depth_map, updates, spent = work.depth_map(reference, others, *range_m)

@@ -7,15 +7,15 @@ import json
 from itertools import groupby
 from typing import Any
 
-from companion.compute.compute_devices import measured_anew
+from companion.compute.compute_devices import remeasured_devices
 from companion.dense.device_choice import MeasuredDevice, in_order, why_taken
 from drivers.camera.camera_devices import CameraControl, CameraDevice, CameraFormat, cameras
 from drivers.system.serial_devices import SerialDevice, serial_devices
 
 
 def devices(as_json: bool, verbose: bool = False) -> str:
-    """Cameras, serial ports and OpenCL devices, as text or as JSON."""
-    found_cameras, found_ports, compute = cameras(), serial_devices(), measured_anew()
+    """Cameras, serial ports and OpenCL devices, as text for people or as JSON."""
+    found_cameras, found_ports, compute = cameras(), serial_devices(), remeasured_devices()
     if as_json:
         document = {
             "cameras": [_plain(each) for each in found_cameras],
@@ -37,8 +37,8 @@ def devices(as_json: bool, verbose: bool = False) -> str:
 
 
 def opencl_devices(as_json: bool, verbose: bool) -> tuple[str, bool]:
-    """OpenCL devices, and whether one of them works."""
-    compute = measured_anew()
+    """OpenCL devices only, and whether one of them works."""
+    compute = remeasured_devices()
     works = bool(in_order(compute))
     if as_json:
         return _as_json(_as_document(compute)), works

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TextIO
 
-from companion.advice.line_rate import advise_on_line, names_of_lines
+from companion.advice.line_rate import check_line, line_parameters
 from companion.advice.pose_parameters import advise, names_to_read
 from companion.advice.wanted import FIRMWARES, Finding
 from companion.config import Config, LinkConfig
@@ -50,9 +50,9 @@ class Examination:
     """Parameters that the autopilot refused, in words."""
 
     @property
-    def in_the_way(self) -> list[Finding]:
+    def blocking(self) -> list[Finding]:
         """Findings that prevent use of the pose."""
-        return [finding for finding in self.findings if finding.in_the_way]
+        return [finding for finding in self.findings if finding.blocking]
 
     @property
     def reboot_for(self) -> list[str]:
@@ -97,7 +97,7 @@ def doctor(
         print(json.dumps(_document(found), ensure_ascii=False), file=out)
     else:
         _print_outcome(found, write, out)
-    return IN_THE_WAY if found.in_the_way else GOOD
+    return IN_THE_WAY if found.blocking else GOOD
 
 
 async def _examine(
@@ -120,12 +120,12 @@ async def _examine(
         parameters = Parameters(link)
 
         async def look() -> tuple[list[Finding], int]:
-            ports = names_of_lines(firmware) if baud > 0 else ()
+            ports = line_parameters(firmware) if baud > 0 else ()
             read = await parameters.read([*names_to_read(firmware), *ports])
             values = {name: each.value for name, each in read.items()}
             findings = advise(firmware, values, feedback, mode, latency_ms)
             if baud:
-                findings += advise_on_line(firmware, values, config.link, feedback, mode, baud)
+                findings += check_line(firmware, values, config.link, feedback, mode, baud)
             return findings, len(values)
 
         findings, n_examined = await look()
@@ -163,7 +163,7 @@ async def _set(parameters: Parameters, finding: Finding, found: Examination) -> 
 
 
 def _to_set(found: Examination) -> list[Finding]:
-    return [finding for finding in found.in_the_way if finding.set_to is not None]
+    return [finding for finding in found.blocking if finding.set_to is not None]
 
 
 def _question(found: Examination) -> str:
@@ -223,8 +223,8 @@ def _document(found: Examination) -> dict[str, Any]:
         "link": found.where,
         "mode": found.mode,
         "n_examined": found.n_examined,
-        "in_the_way": [_plain(finding) for finding in found.in_the_way],
-        "notes": [_plain(finding) for finding in found.findings if not finding.in_the_way],
+        "in_the_way": [_plain(finding) for finding in found.blocking],
+        "notes": [_plain(finding) for finding in found.findings if not finding.blocking],
         "written": found.written,
         "refused": found.refused,
         "reboot_needed": bool(found.reboot_for),
@@ -233,7 +233,7 @@ def _document(found: Examination) -> dict[str, Any]:
 
 def _plain(finding: Finding) -> dict[str, Any]:
     document = dataclasses.asdict(finding)
-    del document["in_the_way"]
+    del document["blocking"]
     return document
 
 
@@ -241,16 +241,16 @@ def _print_findings(found: Examination, config: Config, out: TextIO) -> None:
     print(f"{found.vehicle}, by {found.where}", file=out)
     if config.feedback.mode == "off":
         print("feedback.mode is off; examined for odometry", file=out)
-    if found.in_the_way:
-        width = max(len(finding.name) for finding in found.in_the_way)
+    if found.blocking:
+        width = max(len(finding.name) for finding in found.blocking)
         print(f"\nThese stand in the way of {found.mode}:", file=out)
-        for finding in found.in_the_way:
+        for finding in found.blocking:
             value = "missing" if finding.value is None else f"is {_number(finding.value)}"
             wanted = f", wanted {finding.wanted}" if finding.wanted else ""
             print(f"  {finding.name:{width}}  {value}{wanted}", file=out)
             print(f"  {'':{width}}  {finding.why}", file=out)
     for finding in found.findings:
-        if not finding.in_the_way and finding.value is not None:
+        if not finding.blocking and finding.value is not None:
             print(
                 f"\nNot judged: {finding.name} is {_number(finding.value)}, wanted "
                 f"{finding.wanted}; {finding.why}",
@@ -268,10 +268,10 @@ def _print_outcome(found: Examination, write: bool, out: TextIO) -> None:
         print(f"not set: {refusal}", file=out)
     if found.reboot_for:
         print(f"Reboot the autopilot, for {', '.join(found.reboot_for)}", file=out)
-    if not found.in_the_way:
+    if not found.blocking:
         print(f"Nothing stands in the way of {found.mode} ({found.n_examined} examined)", file=out)
         return
-    n = len(found.in_the_way)
+    n = len(found.blocking)
     left = f"{_n(n, 'parameter')} {'stands' if n == 1 else 'stand'} in the way"
     if _to_set(found) and not write:
         left += "; `companion doctor --write` sets what can be set"

@@ -80,7 +80,9 @@ def replay(
                 notify(f"viewer: open {live.page}")
         depth = _depth_stage(config, flight, devices, times)
         pipeline = Pipeline(
-            LocalisationStage(config, flight.camera, times, beside=paced), depth, sinks,
+            LocalisationStage(config, flight.camera, times, background=paced),
+            depth,
+            sinks,
             lossless=not paced,
         )
         try:

@@ -1,1 +1,1 @@
-"""From views of a board to a lens: which views, which model, how good. Pure; no I/O, no clock."""
+"""Lens calibration from views of a board: view and model selection, quality. Pure."""

@@ -1,4 +1,4 @@
-"""The board's pose in one view under a known lens."""
+"""Pose of a planar board in one view, for a known lens."""
 
 from __future__ import annotations
 
@@ -7,32 +7,37 @@ import math
 import cv2
 import numpy as np
 
-from companion.calibration.board_image import LensModel, camera_of, imaged, unexplained
+from companion.calibration.board_image import (
+    LensModel,
+    camera_of,
+    project_corners,
+    reprojection_residual,
+)
 from companion.calibration.board_views import View
 from companion.geometry.transforms import Array
 
-MIRRORED = 25.0
-"""The second of the two poses that a flat board allows is not tried when it is so much worse."""
+MAX_AMBIGUITY_RATIO = 25.0
+"""Cost ratio above which the second planar pose solution is not refined."""
 
 
 def board_pose(view: View, model: LensModel, parameters: Array) -> Array | None:
-    """The board's pose under a known lens; of the two that a flat board allows, the better one."""
+    """Board pose for a known lens: the better of the two planar solutions (IPPE)."""
     camera = camera_of(model, parameters, view.width, view.height)
-    normalised = camera.normalise(view.sighting.image_px)
+    normalised = camera.normalise(view.detection.image_px)
     usable = np.isfinite(normalised).all(1)
     if usable.sum() < 6:
         return None
-    # far off the axis normalised coordinates stretch without end: look at the board instead
+    # normalised coordinates diverge far off axis: use a frame that faces the board
     rays = np.concatenate([normalised[usable], np.ones((int(usable.sum()), 1))], 1)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    facing = _facing(rays.mean(0))
+    facing = _look_at(rays.mean(0))
     faced = rays @ facing.T
     try:
         n, turns, shifts, _ = cv2.solvePnPGeneric(
-            view.sighting.board_m[usable], faced[:, :2] / faced[:, 2:], np.eye(3), None,
+            view.detection.board_m[usable], faced[:, :2] / faced[:, 2:], np.eye(3), None,
             flags=cv2.SOLVEPNP_IPPE,
         )  # fmt: skip
-    except cv2.error:  # corners in one line, or a lens guess that makes them so
+    except cv2.error:  # collinear corners, possibly by the lens guess
         return None
     found = []
     for turn, shift in list(zip(turns, shifts, strict=True))[:n]:
@@ -43,17 +48,17 @@ def board_pose(view: View, model: LensModel, parameters: Array) -> Array | None:
     found.sort(key=lambda one: one[0])
     best: tuple[float, Array] | None = None
     for before, pose in found:
-        if best is not None and before > MIRRORED * found[0][0]:
+        if best is not None and before > MAX_AMBIGUITY_RATIO * found[0][0]:
             break
-        refined = _refined_pose(view, model, parameters, pose)
+        refined = _refine_pose(view, model, parameters, pose)
         cost = _pose_cost(view, model, parameters, refined)
         if math.isfinite(cost) and (best is None or cost < best[0]):
             best = cost, refined
     return None if best is None else best[1]
 
 
-def _facing(direction: Array) -> Array:
-    """The rotation that brings a direction to the front onto the axis."""
+def _look_at(direction: Array) -> Array:
+    """Rotation of a direction onto the optical axis."""
     forward = direction / np.linalg.norm(direction)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
@@ -62,14 +67,14 @@ def _facing(direction: Array) -> Array:
 
 
 def _pose_cost(view: View, model: LensModel, parameters: Array, pose: Array) -> float:
-    return float((unexplained(view, model, parameters, pose) ** 2).sum())
+    return float((reprojection_residual(view, model, parameters, pose) ** 2).sum())
 
 
-def _refined_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
+def _refine_pose(view: View, model: LensModel, parameters: Array, pose: Array) -> Array:
     damping = 1e-3
     for _ in range(20):
-        pixels, _, by = imaged(view, model, parameters, pose)
-        residual = (view.sighting.image_px - pixels).reshape(-1)
+        pixels, _, by = project_corners(view, model, parameters, pose)
+        residual = (view.detection.image_px - pixels).reshape(-1)
         cost = float(residual @ residual)
         normal = by.T @ by
         damped = normal + damping * np.diag(np.diag(normal))

@@ -1,4 +1,4 @@
-"""Views of the board: what one is worth, which are taken, how much of the picture they cover."""
+"""Views of the board: quality, selection, image coverage."""
 
 from __future__ import annotations
 
@@ -9,58 +9,58 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.chart import Sighting
+from companion.calibration.chart import Detection
 from companion.geometry.transforms import Array
 from companion.messages import Bytes
 
 MIN_NOVELTY = 0.03
-"""Views whose corners lie closer to each other, in shares of the picture's diagonal, are one."""
+"""RMS corner distance below which views count as equal, relative to the image diagonal."""
 MIN_AREA = 0.01
-"""Of the picture, taken by the board."""
-MAX_EDGE_PX, MAX_EDGE_SHARE = 3.5, 0.003
-"""Wider edges, in pixels and in the picture's diagonal, are blurred by motion or out of focus."""
+"""Ratio of the image area covered by the board."""
+MAX_EDGE_PX, MAX_EDGE_RATIO = 3.5, 0.003
+"""Wider edges, in pixels and relative to the diagonal, are blurred by motion or defocus."""
 GRID_ACROSS = 64
-"""Cells of the coverage map in a row."""
+"""Columns of the coverage map."""
 CORNER_BOX = 0.22
-"""Side of the box in each corner of the picture in which the board must have been, as a share."""
+"""Side of the box in each image corner that the board must reach, as a ratio."""
 MIN_BOX_COVERED = 0.15
 MIN_COVERAGE = 0.60
-DARK = 16
-"""A place that is never brighter than this in any picture is not lit by the lens."""
+MAX_DARK_GREY = 16
+"""Cells never brighter than this are outside the image circle."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The board in one picture."""
+    """The board in one image."""
 
     number: int
-    """Of the picture in its source."""
-    sighting: Sighting
+    """Index of the image in its source."""
+    detection: Detection
     width: int
     height: int
 
     @property
     def n_corners(self) -> int:
-        """How many corners were found."""
-        return len(self.sighting.ids)
+        """Number of corners found."""
+        return len(self.detection.ids)
 
     @property
     def diagonal_px(self) -> float:
-        """The picture's."""
+        """Image diagonal."""
         return float(np.hypot(self.width, self.height))
 
     @property
     def area(self) -> float:
-        """Share of the picture between the outermost corners."""
+        """Ratio of the image within the outermost corners."""
         return float(cv2.contourArea(_hull(self))) / (self.width * self.height)
 
     @property
     def blurred(self) -> bool:
-        """Whether its edges are too wide to say where they are."""
-        limit_px = max(MAX_EDGE_PX, MAX_EDGE_SHARE * self.diagonal_px)
-        return self.sighting.edge_px > limit_px
+        """Whether edges are too wide for accurate corners."""
+        limit_px = max(MAX_EDGE_PX, MAX_EDGE_RATIO * self.diagonal_px)
+        return self.detection.edge_px > limit_px
 
     @property
     def small(self) -> bool:
@@ -69,22 +69,21 @@ class View:
 
 
 def novelty(view: View, others: Sequence[View]) -> float:
-    """How far the corners lie from where any other view has them; 1 where nothing is like it.
+    """Smallest RMS corner distance to other views, relative to the diagonal; 1 without any.
 
-    In shares of the picture's diagonal, root mean square. Moving, turning and tilting the board
-    all count.
+    Translation, rotation and tilt of the board all count.
     """
     return min((_distance(view, other) for other in others), default=1.0)
 
 
 def choose(views: Sequence[View], n: int) -> list[View]:
-    """At most `n` views, unlike each other, that cover the most; in order of their numbers."""
+    """At most `n` distinct views of largest coverage, ordered by number."""
     if not views:
         return []
     masks = [_mask(view) for view in views]
     covered = np.zeros_like(masks[0])
     nearest = np.ones(len(views))
-    edges = np.array([view.sighting.edge_px for view in views])
+    edges = np.array([view.detection.edge_px for view in views])
     bluntness = np.nan_to_num(edges / max(float(np.nanmin(edges)), 1e-6) - 1, nan=1.0)
     taken: list[int] = []
     while len(taken) < n:
@@ -96,19 +95,19 @@ def choose(views: Sequence[View], n: int) -> list[View]:
             break
         taken.append(best)
         covered |= masks[best]
-        away = [_distance(view, views[best]) for view in views]
-        nearest = np.minimum(nearest, away)
+        distances = [_distance(view, views[best]) for view in views]
+        nearest = np.minimum(nearest, distances)
     return [views[i] for i in sorted(taken)]
 
 
-class LitArea:
-    """Where the lens lets light through: a fisheye's picture may be a circle on black."""
+class IlluminatedArea:
+    """Area within the image circle of a fisheye."""
 
     def __init__(self) -> None:
         self._brightest: Bytes | None = None
 
     def see(self, grey: Bytes) -> None:
-        """Take a picture into account."""
+        """Add an image."""
         height, width = grey.shape
         small = np.asarray(
             cv2.resize(grey, grid_size(width, height), interpolation=cv2.INTER_AREA), np.uint8
@@ -121,28 +120,28 @@ class LitArea:
         across, down = grid_size(width, height)
         if self._brightest is None:
             return np.ones((down, across), np.bool_)
-        return self._brightest > DARK
+        return self._brightest > MAX_DARK_GREY
 
 
 def grid_size(width: int, height: int) -> tuple[int, int]:
-    """Columns and rows of the coverage map of such a picture."""
+    """Columns and rows of the coverage map for an image size."""
     return GRID_ACROSS, max(4, round(GRID_ACROSS * height / width))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coverage:
-    """Where the board was, of where it could have been."""
+    """Coverage map of the board, and the illuminated cells."""
 
     seen: Mask
     lit: Mask
 
     @property
     def share(self) -> float:
-        """Of the lit area."""
+        """Covered ratio of the illuminated area."""
         return float((self.seen & self.lit).sum() / max(self.lit.sum(), 1))
 
-    def bare_corners(self) -> list[str]:
-        """Corners of the picture in which the board never was."""
+    def uncovered_corners(self) -> list[str]:
+        """Image corners that the board never reached."""
         down, across = self.seen.shape
         rows, columns = round(CORNER_BOX * down), round(CORNER_BOX * across)
         out = []
@@ -156,8 +155,8 @@ class Coverage:
                     out.append(f"{upper} {left}")
         return out
 
-    def barest_edge(self) -> str:
-        """The side of the picture with the least of it covered."""
+    def least_covered_edge(self) -> str:
+        """Side of the image with least coverage."""
         down, across = self.seen.shape
         sides: dict[str, tuple[slice, slice]] = {
             "left": (slice(None), slice(0, across // 4)),
@@ -173,7 +172,7 @@ class Coverage:
 
 
 def coverage(views: Sequence[View], lit: Mask) -> Coverage:
-    """What the views cover between their outermost corners."""
+    """Coverage by the convex hulls of the corners of views."""
     seen = np.zeros_like(lit)
     for view in views:
         seen |= _mask(view)
@@ -182,16 +181,16 @@ def coverage(views: Sequence[View], lit: Mask) -> Coverage:
 
 def _distance(one: View, other: View) -> float:
     _, mine, theirs = np.intersect1d(
-        one.sighting.ids, other.sighting.ids, assume_unique=True, return_indices=True
+        one.detection.ids, other.detection.ids, assume_unique=True, return_indices=True
     )
     if len(mine) < 4:
         return 1.0
-    away: Array = one.sighting.image_px[mine] - other.sighting.image_px[theirs]
-    return min(1.0, float(np.sqrt((away**2).sum(1).mean())) / one.diagonal_px)
+    difference_px: Array = one.detection.image_px[mine] - other.detection.image_px[theirs]
+    return min(1.0, float(np.sqrt((difference_px**2).sum(1).mean())) / one.diagonal_px)
 
 
 def _hull(view: View) -> NDArray[np.float32]:
-    return np.asarray(cv2.convexHull(view.sighting.image_px.astype(np.float32)), np.float32)
+    return np.asarray(cv2.convexHull(view.detection.image_px.astype(np.float32)), np.float32)
 
 
 def _mask(view: View) -> Mask:

@@ -1,4 +1,4 @@
-"""Whether a calibration may be flown with, and what would make it better."""
+"""Acceptance of a calibration, and advice to improve it."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from companion.geometry.transforms import Array
 
 MIN_VIEWS = 12
 MAX_REJECTED = 0.25
-"""Of the views chosen."""
+"""Ratio of the chosen views."""
 MAX_SAG = 0.01
-"""Of the board's longer side; less than this the fit allows for."""
+"""Relative to the longer side of the board; smaller sags are modelled."""
 MIN_TILT = 0.3
-"""Sine of the angle between the board and the picture: about 17 degrees."""
+"""Sine of the angle between board and image plane: about 17 degrees."""
 MIN_TILTED = 4
-MAX_RMS_PX, MAX_RMS_SHARE = 0.7, 0.0006
-"""Larger errors, in pixels and in the picture's width, come of a bent board or a wrong one."""
+MAX_RMS_PX, MAX_RMS_RATIO = 0.7, 0.0006
+"""Larger errors, in pixels and relative to the image width, are due to a deformed or wrong board.
+"""
 MAX_HOLDOUT = 1.5
-"""Of the largest error allowed."""
+"""Relative to the largest error allowed."""
 MAX_SIGMA_FOCAL = 0.005
-"""Of the focal length."""
+"""Relative to the focal length."""
 MAX_SIGMA_CENTRE = 0.005
-"""Of the picture's width."""
+"""Relative to the image width."""
 
 
 def faults(calibration: Calibration) -> list[str]:
-    """Why it may not be used, each with what to do; none when it may."""
+    """Reasons for rejection, each with advice; none if accepted."""
     camera = calibration.camera
     out = []
     n = len(calibration.views)
@@ -55,8 +56,8 @@ def faults(calibration: Calibration) -> list[str]:
             f"the board is bowed by {calibration.sag_m * 1000:.1f} mm (at most "
             f"{MAX_SAG * calibration.sag_m / calibration.sag * 1000:.1f}): mount it flat"
         )
-    out += few(n) + bare(calibration.coverage)
-    out += frontal(calibration.lens.tilts()) or _uncertain(calibration)
+    out += too_few_views(n) + low_coverage(calibration.coverage)
+    out += too_frontal(calibration.lens.tilts()) or _uncertain(calibration)
     if folds(camera):
         out.append(
             "the lens model folds over within the picture: cover its corners with the board, or "
@@ -66,12 +67,12 @@ def faults(calibration: Calibration) -> list[str]:
 
 
 def max_rms_px(width: int) -> float:
-    """The largest reprojection error allowed for pictures of this width."""
-    return max(MAX_RMS_PX, MAX_RMS_SHARE * width)
+    """Largest reprojection error allowed at an image width."""
+    return max(MAX_RMS_PX, MAX_RMS_RATIO * width)
 
 
-def few(n_views: int) -> list[str]:
-    """Too few views."""
+def too_few_views(n_views: int) -> list[str]:
+    """Fault of too few views."""
     if n_views >= MIN_VIEWS:
         return []
     number = f"{n_views} views" if n_views != 1 else "1 view"
@@ -81,10 +82,10 @@ def few(n_views: int) -> list[str]:
     ]
 
 
-def bare(covered: Coverage) -> list[str]:
-    """Too much of the picture without the board."""
+def low_coverage(covered: Coverage) -> list[str]:
+    """Fault of too little coverage."""
     out = []
-    corners = covered.bare_corners()
+    corners = covered.uncovered_corners()
     if corners:
         out.append(
             f"the board was never in the {_and(corners)} corner of the picture: show it there"
@@ -92,13 +93,13 @@ def bare(covered: Coverage) -> list[str]:
     if covered.share < MIN_COVERAGE:
         out.append(
             f"the board covered {covered.share:.0%} of the picture (at least {MIN_COVERAGE:.0%}), "
-            f"least at the {covered.barest_edge()} edge: show it there"
+            f"least at the {covered.least_covered_edge()} edge: show it there"
         )
     return out
 
 
-def frontal(tilts: Array) -> list[str]:
-    """Too few views tilted, or all about one axis; `tilts` as `LensFit.tilts` has them."""
+def too_frontal(tilts: Array) -> list[str]:
+    """Fault of too few tilted views, or about one axis only; `tilts` as `LensFit.tilts`."""
     n_tilted = int((np.linalg.norm(tilts, axis=1) >= MIN_TILT).sum())
     if n_tilted < MIN_TILTED:
         squarely = f"all but {n_tilted}" if n_tilted else "all"
@@ -115,19 +116,19 @@ def frontal(tilts: Array) -> list[str]:
 
 
 def advice(views: Sequence[View], covered: Coverage, calibration: Calibration | None) -> str:
-    """What to do next in front of a live camera, in a few words; "" when nothing is lacking."""
+    """Next step in front of a live camera, in a few words; "" when complete."""
     if len(views) < 4:
         return "show the board in different places"
-    corners = covered.bare_corners()
+    corners = covered.uncovered_corners()
     if corners:
         return f"show it in the {corners[0]} corner"
     if covered.share < MIN_COVERAGE:
-        return f"cover the {covered.barest_edge()} edge"
+        return f"cover the {covered.least_covered_edge()} edge"
     if calibration is not None:
         tilts = calibration.lens.tilts()
         if (np.linalg.norm(tilts, axis=1) >= MIN_TILT).sum() < MIN_TILTED:
             return "tilt the board more"
-        if frontal(tilts):
+        if too_frontal(tilts):
             across, down = np.abs(tilts).max(0)
             return f"tilt it {'left and right' if across < down else 'forward and back'}"
     if len(views) < MIN_VIEWS:

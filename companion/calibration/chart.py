@@ -1,8 +1,8 @@
-"""The board that a camera is calibrated with: what it is, where a picture has it, what is printed.
+"""Calibration boards: description, detection, printing.
 
-Board coordinates are metres, x to the right and y down from the board's upper left corner, z = 0.
-Image points have pixel centres at integers. Only inner corners of the squares are used: they are
-found where they are to some hundredths of a pixel.
+Board coordinates are metres, x right and y down from the upper left corner of the board, z = 0.
+Pixel centres are at integers. Only inner corners are used, which are detected to some hundredths of
+a pixel.
 """
 
 from __future__ import annotations
@@ -27,51 +27,51 @@ CHART_FORMS = (
     "(inner corners counted)"
 )
 MIN_CORNERS = 8
-"""Fewer say too little of where the board is."""
+"""Corners required of a detection."""
 SEARCH_WIDTH_PX = 1600
-"""Larger pictures are searched for a chessboard at this width, then refined at their own."""
+"""Larger images are searched for a chessboard at this width, then refined at full size."""
 N_FIRST = 50
-"""So many markers of each dictionary are looked for, when it is asked which one a board is of."""
+"""Markers of each dictionary tried, to identify the one of a board."""
 MAX_TRIED = 4
-"""In so many pictures other boards are looked for, when the one asked for was not found."""
+"""Images searched for other boards, when the given one was not found."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
-    """A board found in a picture: its inner corners there, and where these are on the board."""
+class Detection:
+    """A detected board: inner corners in the image and on the board."""
 
     ids: NDArray[np.int64]
-    """Number of each corner, row by row."""
+    """Corner numbers, row by row."""
     image_px: Array
     """(N, 2)"""
     board_m: Array
     """(N, 3)"""
     edge_px: float
-    """Width of the edges between black and white, in the direction in which they are widest."""
+    """Width of black-white edges, in the direction where they are widest."""
 
 
 class Chart(Protocol):
     """A flat board."""
 
     name: str
-    """As given, which `parse_chart` reads."""
+    """As given, in the form read by `parse_chart`."""
     columns: int
     """Inner corners in a row."""
     rows: int
     square_m: float
 
-    def find(self, grey: Bytes) -> Sighting | None:
-        """The board in a picture, or None."""
+    def find(self, grey: Bytes) -> Detection | None:
+        """Detect the board in an image; None if not found."""
 
     def explain(self, greys: Sequence[Bytes]) -> str | None:
-        """What is to be seen in pictures in which the board was not found: another one, perhaps."""
+        """What images without the board show instead, perhaps another one."""
 
     def black_m(self) -> Array:
-        """What is black on it: rectangles (N, 4) x, y, width, height in metres."""
+        """Black rectangles (N, 4) x, y, width, height in metres."""
 
 
 def parse_chart(text: str) -> Chart:
-    """The board that a text describes; InputError where it does not."""
+    """The board of a description; InputError where invalid."""
     kind, *parts = text.strip().split(":")
     size = re.fullmatch(r"(\d+)x(\d+)", parts[0]) if parts else None
     if kind not in ("charuco", "chessboard") or size is None:
@@ -103,7 +103,7 @@ def parse_chart(text: str) -> Chart:
 
 
 class CharucoChart:
-    """A chessboard with markers in its white squares, so that a part of it in view is enough."""
+    """A chessboard with markers in its white squares: a partial view suffices."""
 
     def __init__(
         self, name: str, n_across: int, n_down: int, square_m: float, marker_m: float,
@@ -113,7 +113,7 @@ class CharucoChart:
         self.columns, self.rows = n_across - 1, n_down - 1
         self.square_m, self.marker_m = square_m, marker_m
         self._dictionary, self._legacy = dictionary, legacy
-        # OpenCV takes lengths as float32; in squares they are exact enough for any use
+        # OpenCV uses float32 lengths: in units of squares they are exact enough
         self._board = cv2.aruco.CharucoBoard(
             (n_across, n_down), 1.0, marker_m / square_m, _dictionary(dictionary)
         )
@@ -122,18 +122,18 @@ class CharucoChart:
         careful.tryRefineMarkers = True
         self._detector = cv2.aruco.CharucoDetector(self._board, careful)
 
-    def find(self, grey: Bytes) -> Sighting | None:
-        """The board in a picture, or None; a part of it will do."""
+    def find(self, grey: Bytes) -> Detection | None:
+        """Detect the board, possibly partly visible; None if not found."""
         corners, ids, _, _ = self._detector.detectBoard(grey)
         if ids is None or len(ids) < MIN_CORNERS:
             return None
         numbers = np.asarray(ids, np.int64).reshape(-1)
         order = np.argsort(numbers)
         image_px = np.asarray(corners, np.float64).reshape(-1, 2)[order]
-        return _sighting(self, grey, numbers[order], image_px)
+        return _detection(self, grey, numbers[order], image_px)
 
     def explain(self, greys: Sequence[Bytes]) -> str | None:
-        """What is to be seen instead of the board, as far as it can be told."""
+        """What the images show instead of the board."""
         tried = _spread(greys, MAX_TRIED)
         seen = _markers_seen(tried, self._dictionary)
         if not seen:
@@ -153,7 +153,7 @@ class CharucoChart:
         )
 
     def black_m(self) -> Array:
-        """What is black on it."""
+        """Black rectangles (N, 4), metres."""
         out = []
         corners = np.asarray(self._board.getObjPoints(), np.float64)[..., :2]  # (markers, 4, 2)
         numbers = np.ravel(np.asarray(self._board.getIds()))
@@ -170,7 +170,7 @@ class CharucoChart:
         return np.array(out, np.float64) * self.square_m
 
     def _variants(self) -> list[CharucoChart]:
-        """What is often mixed up."""
+        """Variants that are often confused."""
         across, down = self.columns + 1, self.rows + 1
         out = []
         for columns, rows, legacy in (
@@ -191,14 +191,14 @@ class CharucoChart:
 
 
 class ChessboardChart:
-    """A plain chessboard, which must be in view as a whole."""
+    """A plain chessboard, which must be fully visible."""
 
     def __init__(self, name: str, columns: int, rows: int, square_m: float) -> None:
         self.name = name
         self.columns, self.rows, self.square_m = columns, rows, square_m
 
-    def find(self, grey: Bytes) -> Sighting | None:
-        """The board in a picture, or None; all of it must be there."""
+    def find(self, grey: Bytes) -> Detection | None:
+        """Detect the board, fully visible; None if not found."""
         scale = max(1.0, grey.shape[1] / SEARCH_WIDTH_PX)
         small = grey
         if scale > 1:
@@ -213,15 +213,15 @@ class ChessboardChart:
             return None
         image_px = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
         image_px = _refined(grey, image_px, self.columns)
-        return _sighting(self, grey, np.arange(self.columns * self.rows), image_px)
+        return _detection(self, grey, np.arange(self.columns * self.rows), image_px)
 
     def explain(self, greys: Sequence[Bytes]) -> str | None:
-        """What is to be seen instead of the board, as far as it can be told."""
+        """What the images show instead of the board."""
         tried = _spread(greys, MAX_TRIED)
         return _other_dictionary(tried) or _chessboard_seen(tried, None)
 
     def black_m(self) -> Array:
-        """What is black on it."""
+        """Black rectangles (N, 4), metres."""
         squares = [
             [column, row, 1.0, 1.0]
             for row in range(self.rows + 1)
@@ -243,7 +243,7 @@ def _length(text: str, word: str) -> float:
 
 def _dictionaries() -> list[str]:
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_") and name == name.upper()]
-    # the smaller of two that share their first markers comes first
+    # of dictionaries with common first markers the smaller one first
     return sorted(
         names, key=lambda name: (name.rpartition("_")[0], len(_dictionary(name).bytesList))
     )
@@ -256,7 +256,7 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 def _marker(
     dictionary: cv2.aruco.Dictionary, number: int, first: Array, last: Array
 ) -> list[list[float]]:
-    """Black rectangles of a marker, in the units of its corners; each row's runs in one piece."""
+    """Black rectangles of a marker, in the units of its corners, merged by row."""
     n = dictionary.markerSize + 2
     black = dictionary.generateImageMarker(number, n) == 0
     step = (last - first) / n
@@ -271,19 +271,19 @@ def _marker(
     return out
 
 
-def _sighting(
+def _detection(
     chart: Chart, grey: Bytes, ids: NDArray[np.int64], image_px: Array
-) -> Sighting | None:
-    """None where the corners lie in one row, which says nothing."""
+) -> Detection | None:
+    """Detection from corners; None where they are in a single row."""
     column, row = ids % chart.columns, ids // chart.columns
     if len(np.unique(column)) < 2 or len(np.unique(row)) < 2:
         return None
     board_m = np.stack([column + 1.0, row + 1.0, 0.0 * row], 1) * chart.square_m
-    return Sighting(ids, image_px, board_m, _edge_px(grey, ids, image_px, chart.columns))
+    return Detection(ids, image_px, board_m, _edge_px(grey, ids, image_px, chart.columns))
 
 
 def _refined(grey: Bytes, image_px: Array, columns: int) -> Array:
-    """Corners where the edges cross, from a window that holds nothing but these edges."""
+    """Sub-pixel corners, from windows that contain their edges only."""
     grid = image_px.reshape(-1, columns, 2)
     gap_px = min(
         float(np.linalg.norm(np.diff(grid, axis=0), axis=-1).min()),
@@ -297,10 +297,10 @@ def _refined(grey: Bytes, image_px: Array, columns: int) -> Array:
 
 
 def _edge_px(grey: Bytes, ids: NDArray[np.int64], image_px: Array, columns: int) -> float:
-    """Contrast over the steepest slope, across the edges between neighbouring corners.
+    """Contrast over steepest slope, across edges between neighbouring corners.
 
-    Motion widens the edges that it crosses only, so both directions are looked at, and the worse
-    one counts. nan where no two neighbours were found.
+    Motion blur is directional, so both directions are measured, and the larger width counts. nan
+    without neighbouring corners.
     """
     place = {int(number): at for at, number in enumerate(ids)}
     widths = []
@@ -316,7 +316,7 @@ def _edge_px(grey: Bytes, ids: NDArray[np.int64], image_px: Array, columns: int)
 
 
 def _edge_width(grey: Bytes, ends_px: Array) -> float:
-    """Median over edges whose ends are given, (N, 2, 2)."""
+    """Median over edges with these end points, (N, 2, 2)."""
     along = ends_px[:, 1] - ends_px[:, 0]
     length = np.linalg.norm(along, axis=1)
     across = np.stack([-along[:, 1], along[:, 0]], 1) / length[:, None]
@@ -342,7 +342,7 @@ def _spread(greys: Sequence[Bytes], n: int) -> list[Bytes]:
 
 
 def _markers_seen(greys: Sequence[Bytes], dictionary: str) -> set[int]:
-    """Numbers of the markers in any picture that shows at least two."""
+    """Numbers of the markers in images that show at least two."""
     return _seen(greys, _dictionary(dictionary))
 
 
@@ -357,12 +357,12 @@ def _seen(greys: Sequence[Bytes], dictionary: cv2.aruco.Dictionary) -> set[int]:
 
 
 def _other_dictionary(greys: Sequence[Bytes]) -> str | None:
-    """A dictionary of which some picture shows enough not to be chance."""
+    """A dictionary of which an image shows enough markers not to be chance."""
     families: dict[str, tuple[str, cv2.aruco.Dictionary]] = {}
     for name in _dictionaries():
         stem, _, count = name.rpartition("_")
         full = _dictionary(name)
-        # the smallest of those that share their first markers, which are what boards are made of
+        # the smallest of those with common first markers, which boards use
         first = cv2.aruco.Dictionary(
             full.bytesList[:N_FIRST], full.markerSize, full.maxCorrectionBits
         )

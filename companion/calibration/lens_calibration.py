@@ -1,4 +1,4 @@
-"""The lens of a camera from views of a board: model chosen, outliers left out, errors stated."""
+"""Lens calibration: model selection, outlier rejection, uncertainty."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 
 from companion.calibration.board_image import LensModel
 from companion.calibration.board_views import Coverage, Mask, View, coverage
-from companion.calibration.chart import MIN_CORNERS, Sighting
+from companion.calibration.chart import MIN_CORNERS, Detection
 from companion.calibration.lens_fit import (
     LensFit,
-    first_lens,
     fit_lens,
+    initial_lens,
     residuals_of,
     rms_px,
     standard_deviations,
@@ -26,84 +26,84 @@ MODELS = {
     "radtan": (LensModel(Distortion.RADTAN, 4), LensModel(Distortion.RADTAN, 5)),
     "equidistant": (LensModel(Distortion.EQUIDISTANT, 2), LensModel(Distortion.EQUIDISTANT, 4)),
 }
-"""What each `--model` may be; the fewer coefficients are taken unless more of them serve."""
-WORTH = 0.98
-"""A model with more freedom must bring the held-out error under this share of the simpler one's."""
+"""Variants of each `--model`; more coefficients are used only where they improve the fit."""
+MIN_IMPROVEMENT = 0.98
+"""Ratio of held-out errors below which a more complex model is preferred."""
 N_FOLDS = 5
-ROUGH_SHARE = 0.002
-"""Of the picture's diagonal: residuals up to this may come of a lens not yet right."""
+ROUGH_RATIO = 0.002
+"""Relative to the image diagonal: residuals of an unconverged lens."""
 OUTLIER_SIGMAS = 5.0
-OUTLIER_LEAST_SHARE = 0.0005
-"""Of the diagonal: a corner or view no further off than this is no outlier."""
+MIN_OUTLIER_RATIO = 0.0005
+"""Relative to the diagonal: smaller residuals are no outliers."""
 VIEW_OUTLIER = 3.0
-"""A view whose error is more than this many times the median is left out."""
-MAX_LOST = 0.25
-"""A view that has lost more of its corners than this is left out."""
+"""Ratio to the median error above which a view is rejected."""
+MAX_CORNERS_LOST = 0.25
+"""Ratio of rejected corners above which a view is rejected."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A lens and what speaks for it."""
+    """A calibrated lens with its quality measures."""
 
     lens: LensFit
     views: tuple[View, ...]
-    """Those that the lens was fitted to, less corners that were outliers."""
+    """Views used, without outlier corners."""
     rejected: tuple[View, ...]
-    """Views that no lens explains together with the others."""
+    """Views inconsistent with the others."""
     n_corners_rejected: int
     holdout_px: float
-    """Root mean square error in views that the lens was not fitted to."""
+    """RMS error in held-out views."""
     sigmas: Array
-    """Standard deviations of the lens's parameters, fx fy cx cy k…"""
+    """Standard deviations of fx fy cx cy k..."""
     tried_px: dict[str, float]
-    """Held-out error of each model that was tried."""
+    """Held-out error of each candidate model."""
     coverage: Coverage
 
     @property
     def camera(self) -> Camera:
-        """The lens as the rest of the program has it."""
+        """Camera with this lens."""
         return self.lens.camera
 
     @property
     def rms_px(self) -> float:
-        """Root mean square error in the views that it was fitted to."""
+        """RMS error in the views used."""
         return self.lens.rms_px
 
     @property
     def sag_m(self) -> float:
-        """How far the board is from flat."""
+        """Deviation of the board from a plane."""
         return self.lens.sag_m(self._corners_m())
 
     @property
     def sag(self) -> float:
-        """The same as a share of the board's longer side."""
+        """The same relative to the longer side of the board."""
         return self.sag_m / float(np.ptp(self._corners_m()[:, :2], axis=0).max())
 
     def _corners_m(self) -> Array:
-        return np.concatenate([view.sighting.board_m for view in self.views])
+        return np.concatenate([view.detection.board_m for view in self.views])
 
     @property
     def views_px(self) -> list[float]:
-        """The same for each view."""
+        """RMS error of each view."""
         return [rms_px([residual]) for residual in self.lens.residuals_px]
 
 
-def determine(views: Sequence[View], lit: Mask, wanted: str) -> Calibration | None:
-    """The lens that explains the views; None where there is none.
+def calibrate_lens(views: Sequence[View], lit: Mask, wanted: str) -> Calibration | None:
+    """Calibrate from views; None without a solution.
 
-    `wanted` is a key of `MODELS`, or "auto" for whichever does better on views held out.
+    `wanted` is a key of `MODELS`, or "auto" for the one of least held-out error.
     """
     if len(views) < 4:
         return None
     names = list(MODELS) if wanted == "auto" else [wanted]
-    rough_px = ROUGH_SHARE * views[0].diagonal_px
+    rough_px = ROUGH_RATIO * views[0].diagonal_px
     starts: dict[Distortion, LensFit] = {}
     for name in names:
-        start = first_lens(views, MODELS[name][-1], rough_px)
+        start = initial_lens(views, MODELS[name][-1], rough_px)
         if start is not None:
             starts[start.model.distortion] = start
     models = [model for name in names for model in MODELS[name] if model.distortion in starts]
-    cleaned = _without_outliers(views, models, starts, rough_px)
+    cleaned = _reject_outliers(views, models, starts, rough_px)
     if cleaned is None:
         return None
     kept, rejected, n_corners = cleaned
@@ -115,11 +115,11 @@ def determine(views: Sequence[View], lit: Mask, wanted: str) -> Calibration | No
             fits[model] = lens
     if not fits:
         return None
-    # one that folds within the picture cannot be undone there, however well it fits
+    # a distortion not invertible within the image is useless, however well it fits
     sound = [model for model in fits if not folds(fits[model].camera)] or list(fits)
     chosen = sound[0]
     for model in sound[1:]:
-        if tried[model] < WORTH * tried[chosen]:
+        if tried[model] < MIN_IMPROVEMENT * tried[chosen]:
             chosen = model
     lens = fits[chosen]
     return Calibration(
@@ -130,9 +130,9 @@ def determine(views: Sequence[View], lit: Mask, wanted: str) -> Calibration | No
 
 
 def folds(camera: Camera) -> bool:
-    """Whether some place near the edge of the picture has no ray, or that of another place.
+    """Whether the distortion is not invertible within the image.
 
-    A fisheye's picture may end before its corners, so that only a radtan lens can be asked this.
+    The image circle of a fisheye may end before the corners, so only radtan lenses are checked.
     """
     if camera.distortion is not Distortion.RADTAN:
         return False
@@ -151,11 +151,11 @@ def folds(camera: Camera) -> bool:
     return bool((outward <= 0).any() or (turned <= 0).any())
 
 
-def _without_outliers(
+def _reject_outliers(
     views: Sequence[View], models: Sequence[LensModel], starts: dict[Distortion, LensFit],
     rough_px: float,
 ) -> tuple[list[View], list[View], int] | None:  # fmt: skip
-    """Views kept, views rejected, and how many corners of those kept; `starts` is improved."""
+    """Views kept, views rejected, number of corners rejected; `starts` is refined."""
     best: LensFit | None = None
     kept: list[View] = []
     for model in models:
@@ -165,7 +165,7 @@ def _without_outliers(
         if lens is None:
             continue
         starts[model.distortion] = lens
-        # a view that a model cannot even place counts as badly as can be
+        # a view without a pose has the largest cost
         cost = lens.cost + (len(views) - len(usable)) * 24 * rough_px**2
         if best is None or cost < best.cost:
             best, kept = dataclasses.replace(lens, cost=cost), usable
@@ -174,7 +174,7 @@ def _without_outliers(
     n_lost = 0
     for _ in range(5):
         before = [view.n_corners for view in kept]
-        kept, n_now = _one_cleaning(kept, best)
+        kept, n_now = _reject_once(kept, best)
         n_lost += n_now
         if len(kept) < 4:
             return None
@@ -189,37 +189,39 @@ def _without_outliers(
     return kept, [view for view in views if view.number not in numbers], n_lost
 
 
-def _one_cleaning(views: Sequence[View], lens: LensFit) -> tuple[list[View], int]:
-    away = [np.linalg.norm(residual, axis=1) for residual in lens.residuals_px]
-    every = np.concatenate(away)
-    least_px = OUTLIER_LEAST_SHARE * views[0].diagonal_px
+def _reject_once(views: Sequence[View], lens: LensFit) -> tuple[list[View], int]:
+    distance_px = [np.linalg.norm(residual, axis=1) for residual in lens.residuals_px]
+    every = np.concatenate(distance_px)
+    least_px = MIN_OUTLIER_RATIO * views[0].diagonal_px
     limit_px = max(OUTLIER_SIGMAS * float(np.median(every)) / 1.177, least_px)
-    errors = np.array([float(np.sqrt((one**2).mean())) for one in away])
+    errors = np.array([float(np.sqrt((one**2).mean())) for one in distance_px])
     view_limit_px = max(VIEW_OUTLIER * float(np.median(errors)), least_px)
     kept, n_lost = [], 0
-    for view, one in zip(views, away, strict=True):
+    for view, one in zip(views, distance_px, strict=True):
         good = one <= limit_px
         if good.all():
             kept.append(view)
             continue
         error = float(np.sqrt((one[good] ** 2).mean())) if good.any() else np.inf
-        if error > view_limit_px or good.sum() < max(MIN_CORNERS, (1 - MAX_LOST) * len(good)):
+        if error > view_limit_px or good.sum() < max(
+            MIN_CORNERS, (1 - MAX_CORNERS_LOST) * len(good)
+        ):
             continue
         n_lost += int((~good).sum())
-        kept.append(dataclasses.replace(view, sighting=_part(view.sighting, good)))
+        kept.append(dataclasses.replace(view, detection=_part(view.detection, good)))
     return kept, n_lost
 
 
-def _part(sighting: Sighting, good: Mask) -> Sighting:
-    return Sighting(
-        sighting.ids[good], sighting.image_px[good], sighting.board_m[good], sighting.edge_px
+def _part(detection: Detection, good: Mask) -> Detection:
+    return Detection(
+        detection.ids[good], detection.image_px[good], detection.board_m[good], detection.edge_px
     )
 
 
 def _held_out(
     views: Sequence[View], models: Sequence[LensModel], starts: dict[Distortion, LensFit]
 ) -> dict[LensModel, float]:
-    """For each model the error in views that it was not fitted to, where it could be fitted."""
+    """Cross-validated error of each model that could be fitted."""
     out = {}
     fold = np.arange(len(views)) % N_FOLDS
     for model in models:

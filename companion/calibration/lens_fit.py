@@ -1,12 +1,12 @@
-"""A lens and the board's poses that explain where corners were seen: least squares, robust at will.
+"""Least-squares fit of lens, board curvature and board poses, optionally robust.
 
-The board need not be flat: how it is bowed is solved for with the lens. A sag of half a
-hundredth of its width, as of paper on cardboard, would else move the focal length by one hundredth
-without showing in the residuals.
+The board need not be flat: its curvature is estimated. A sag of half a hundredth of its width, as
+of paper on cardboard, would otherwise bias the focal length by one hundredth without showing in the
+residuals.
 
-Both lens models go through the same solver (Levenberg-Marquardt, the poses eliminated view by
-view), so that their errors and standard deviations can be compared. OpenCV's own fisheye solver
-gives no deviations and stops on views near the edge.
+Both lens models use the same solver (Levenberg-Marquardt, poses eliminated per view), so that
+errors and standard deviations are comparable. OpenCV's fisheye solver gives no standard deviations
+and fails on views near the edge.
 """
 
 from __future__ import annotations
@@ -21,93 +21,95 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.board_image import (
-    N_BOW,
+    N_CURVATURE,
     LensModel,
     camera_of,
-    projected,
-    unexplained,
+    project_with_jacobians,
+    reprojection_residual,
 )
 from companion.calibration.board_pose import board_pose
 from companion.calibration.board_views import View
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Array
 
-FIRST_FOV_DEG = {
+INITIAL_FOV_DEG = {
     Distortion.RADTAN: (35, 60, 85, 110),
     Distortion.EQUIDISTANT: (40, 75, 110, 145, 180),
 }
-"""Horizontal fields of view that a fit is begun with; the one that comes furthest is kept."""
-FIRST_VIEWS = 12
-"""Views with which that is found out."""
+"""Horizontal fields of view tried as initial guesses; the best fit is kept."""
+N_INITIAL_VIEWS = 12
+"""Views used for that."""
 MAX_STEPS = 30
 CONVERGED = 1e-8
-"""Relative fall of the cost under which a fit is at its end."""
+"""Relative decrease of the cost at convergence."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensFit:
-    """A lens, the board's poses, and what they leave unexplained."""
+    """A lens, board poses and residuals."""
 
     model: LensModel
     width: int
     height: int
     parameters: Array
-    """fx fy cx cy k…, then a b c of the board's depth a x^2 + b x y + c y^2, in metres"""
+    """fx fy cx cy k..., then a b c of the board depth a x^2 + b x y + c y^2, in metres"""
     poses: tuple[Array, ...]
     """camera_from_board of each view: rotation vector and translation, (6,)."""
     residuals_px: tuple[Array, ...]
-    """Seen less computed, (N, 2) of each view."""
+    """Observed minus projected corners, (N, 2) of each view."""
     numbers: tuple[int, ...]
-    """Of the views."""
+    """Numbers of the views."""
     cost: float
 
     @property
     def camera(self) -> Camera:
-        """The lens as the rest of the program has it."""
+        """Camera with this lens."""
         return camera_of(self.model, self.parameters, self.width, self.height)
 
     def sag_m(self, board_m: Array) -> float:
-        """How far the board's sides stand before or behind its middle, given its corners (N, 3)."""
+        """Largest depth of the board sides against its middle, for corners (N, 3)."""
         half = np.ptp(board_m[:, :2], axis=0) / 2
-        a, b, c = self.parameters[-N_BOW:]
+        a, b, c = self.parameters[-N_CURVATURE:]
         depths = [a * x * x + b * x * y + c * y * y for x in (0, half[0]) for y in (0, half[1])]
         return float(max(np.abs(depths)))
 
     @property
     def rms_px(self) -> float:
-        """Root mean square distance of corners."""
+        """RMS reprojection error."""
         return rms_px(self.residuals_px)
 
     def tilts(self) -> Array:
-        """The board's normal across the optical axis in each view, (V, 2), as sines right, down."""
+        """Sines (V, 2) of the tilt of the board normal in each view, right and down."""
         normals = [cv2.Rodrigues(pose[:3])[0][:, 2] for pose in self.poses]
         return np.array([n[:2] * np.sign(n[2] or 1.0) for n in normals]).reshape(-1, 2)
 
 
 def rms_px(residuals_px: Sequence[Array]) -> float:
-    """Root mean square length of residuals (N, 2)."""
+    """RMS length of residuals (N, 2)."""
     every = np.concatenate(residuals_px)
     return float(np.sqrt((every**2).sum(1).mean()))
 
 
-def first_lens(views: Sequence[View], model: LensModel, huber_px: float) -> LensFit | None:
-    """A lens to begin with, from some of the views; None where no beginning leads anywhere.
+def initial_lens(views: Sequence[View], model: LensModel, huber_px: float) -> LensFit | None:
+    """Initial lens from some of the views; None without a solution.
 
-    Residuals beyond `huber_px` count linearly.
+    Residuals beyond `huber_px` have linear cost.
     """
     width, height = views[0].width, views[0].height
-    at = np.unique(np.linspace(0, len(views) - 1, min(FIRST_VIEWS, len(views))).round().astype(int))
-    rough = LensModel(model.distortion, min(2, model.n_free), bowed=False)
+    at = np.unique(
+        np.linspace(0, len(views) - 1, min(N_INITIAL_VIEWS, len(views))).round().astype(int)
+    )
+    rough = LensModel(model.distortion, min(2, model.n_free), curved=False)
     best: LensFit | None = None
-    for fov_deg in FIRST_FOV_DEG[model.distortion]:
+    for fov_deg in INITIAL_FOV_DEG[model.distortion]:
         half = math.radians(fov_deg) / 2
         focal = width / 2 / (math.tan(half) if model.distortion is Distortion.RADTAN else half)
-        guess = np.zeros(model.n_lens + N_BOW)
+        guess = np.zeros(model.n_lens + N_CURVATURE)
         guess[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
         some = [views[i] for i in at if board_pose(views[i], rough, guess) is not None]
         if len(some) < max(3, len(at) // 2):
             continue
-        tried = _solved(some, rough, guess, huber_px, 15)
+        tried = _solve(some, rough, guess, huber_px, 15)
         if tried is not None and (best is None or _mean_cost(tried) < _mean_cost(best)):
             best = tried
     return best
@@ -116,9 +118,9 @@ def first_lens(views: Sequence[View], model: LensModel, huber_px: float) -> Lens
 def fit_lens(
     views: Sequence[View], model: LensModel, start: LensFit, *, huber_px: float = math.inf
 ) -> LensFit | None:
-    """The lens that explains the views best, from one that is roughly right.
+    """Fit a lens to views from an initial one.
 
-    None where a view has no pose under `start`. Residuals beyond `huber_px` count linearly.
+    None where a view has no pose under `start`. Residuals beyond `huber_px` have linear cost.
     """
     if start.model.distortion is not model.distortion:
         raise ValueError("a lens of another kind is no beginning")
@@ -127,38 +129,38 @@ def fit_lens(
     kept[model.free] = False
     parameters[kept] = 0
     known = dict(zip(start.numbers, start.poses, strict=True))
-    return _solved(views, model, parameters, huber_px, MAX_STEPS, known)
+    return _solve(views, model, parameters, huber_px, MAX_STEPS, known)
 
 
 def residuals_of(lens: LensFit, view: View) -> Array:
-    """What a view leaves unexplained when only the board's pose is fitted; (N, 2)."""
+    """Residuals (N, 2) of a view with only the board pose fitted."""
     pose = board_pose(view, lens.model, lens.parameters)
     if pose is None:
         return np.full((view.n_corners, 2), np.nan)
-    return unexplained(view, lens.model, lens.parameters, pose)
+    return reprojection_residual(view, lens.model, lens.parameters, pose)
 
 
 def standard_deviations(lens: LensFit, views: Sequence[View]) -> Array:
-    """Of the lens's parameters, from the residuals and what each does to the corners; 0 if kept."""
+    """Standard deviations of the lens parameters from the residuals; 0 if fixed."""
     free = lens.model.free
     n_free = len(free)
     schur = np.zeros((n_free, n_free))
     for view, pose in zip(views, lens.poses, strict=True):
-        _, by_lens, by_pose = projected(view, lens.model, lens.parameters, pose)
+        _, by_lens, by_pose = project_with_jacobians(view, lens.model, lens.parameters, pose)
         a, b = by_lens[:, free], by_pose
         schur += a.T @ a - a.T @ b @ np.linalg.pinv(b.T @ b) @ b.T @ a
     n_measured = 2 * sum(view.n_corners for view in views)
     n_known = n_measured - n_free - 6 * len(views)
     squares = sum(float((r**2).sum()) for r in lens.residuals_px)
     variance = squares / max(n_known, 1)
-    scale = 1 / np.sqrt(np.maximum(np.diag(schur), 1e-300))  # coefficients and pixels differ much
+    scale = 1 / np.sqrt(np.maximum(np.diag(schur), 1e-300))  # parameters differ in magnitude
     covariance = np.linalg.pinv(schur * np.outer(scale, scale), rcond=1e-14, hermitian=True)
     out = np.zeros(len(lens.parameters))
     out[free] = scale * np.sqrt(np.maximum(np.diag(covariance), 0) * variance)
     return out
 
 
-def _solved(
+def _solve(
     views: Sequence[View], model: LensModel, parameters: Array, huber_px: float, max_steps: int,
     known_poses: Mapping[int, Array] = MappingProxyType({}),
 ) -> LensFit | None:  # fmt: skip
@@ -218,9 +220,9 @@ def _block(
     view: View, model: LensModel, parameters: Array, pose: Array, free: NDArray[np.int64],
     huber_px: float,
 ) -> Block:  # fmt: skip
-    """Normal equations of one view: lens, lens by pose, pose, and both right-hand sides."""
-    pixels, by_lens, by_pose = projected(view, model, parameters, pose)
-    residual = view.sighting.image_px - pixels
+    """Normal equations of one view: lens, lens-pose, pose, and both right-hand sides."""
+    pixels, by_lens, by_pose = project_with_jacobians(view, model, parameters, pose)
+    residual = view.detection.image_px - pixels
     weight = np.repeat(np.sqrt(_weights(residual, huber_px)), 2)
     a, b = by_lens[:, free] * weight[:, None], by_pose * weight[:, None]
     r = residual.reshape(-1) * weight
@@ -249,8 +251,8 @@ def _step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array]]:
 
 
 def _weights(residual: Array, huber_px: float) -> Array:
-    away = np.linalg.norm(residual, axis=1)
-    weights: Array = np.minimum(1.0, huber_px / np.maximum(away, 1e-12))
+    distance_px = np.linalg.norm(residual, axis=1)
+    weights: Array = np.minimum(1.0, huber_px / np.maximum(distance_px, 1e-12))
     return weights
 
 
@@ -259,14 +261,15 @@ def _mean_cost(lens: LensFit) -> float:
 
 
 def _cost(residuals: Sequence[Array], huber_px: float) -> float:
-    away = np.linalg.norm(np.concatenate(residuals), axis=1)
-    near = np.minimum(away, huber_px)
-    return float((near * (2 * away - near)).sum())
+    distance_px = np.linalg.norm(np.concatenate(residuals), axis=1)
+    near = np.minimum(distance_px, huber_px)
+    return float((near * (2 * distance_px - near)).sum())
 
 
 def _all_residuals(
     views: Sequence[View], model: LensModel, parameters: Array, poses: Sequence[Array]
 ) -> list[Array]:
     return [
-        unexplained(view, model, parameters, pose) for view, pose in zip(views, poses, strict=True)
+        reprojection_residual(view, model, parameters, pose)
+        for view, pose in zip(views, poses, strict=True)
     ]

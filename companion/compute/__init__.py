@@ -1,4 +1,4 @@
-"""The OpenCL devices of this computer: tried in processes of their own, chosen, remembered on disk.
+"""OpenCL devices of this computer: tested in separate processes, selected, cached on disk.
 
-Above `dense`, whose kernels are what is tried; below the stages that need a device.
+Above `dense`, whose kernels are tested; below the stages that need a device.
 """

@@ -1,7 +1,7 @@
-"""The OpenCL devices of this computer: which is taken, and which take over if it fails.
+"""Selection of OpenCL devices, with failover order.
 
-Every user of the dense engine chooses here. Devices are tested in processes of their own, see
-device_probe, and what that has shown is kept, see device_verdict.
+All users of the dense engine select here. Devices are tested in separate processes (device_probe),
+and results cached (device_verdict).
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from companion.compute.device_probe import PROGRAM, listed_devices, probed
 from companion.compute.device_verdict import circumstances, keep_verdict, kept_verdict, verdict_path
 from companion.config import OpenclConfig
 from companion.dense.device_choice import MeasuredDevice, in_order, why_taken
-from companion.dense.device_takeover import Devices, Watch, unwatched
+from companion.dense.device_takeover import Devices, Watch, unsupervised
 from companion.dense.opencl import WANT, ComputeDevice, ListedDevice, device_asked_for
 from companion.errors import DeviceError
 
 Say = Callable[[str], None]
-"""Hears, in a line, what the user should know of a choice."""
+"""Receives remarks on the selection for the user, a line each."""
 NO_FAILURES: Mapping[str, str] = {}
 
 
 def say_on_stderr(remark: str) -> None:
-    """One line."""
+    """Print a line."""
     print(f"companion: {remark}", file=sys.stderr, flush=True)
 
 
-def measured_anew() -> list[MeasuredDevice]:
-    """All devices there are, tested and measured now, and platforms that fail; it is kept."""
+def remeasured_devices() -> list[MeasuredDevice]:
+    """All devices, tested and timed now, and failing platforms; results are cached."""
     listed, failed = listed_devices()
-    return [*_measured(listed, {}, listed, say_on_stderr, told=False), *failed]
+    return [*_measured(listed, {}, listed, say_on_stderr, report=False), *failed]
 
 
 def known_devices(say: Say = say_on_stderr) -> list[MeasuredDevice]:
-    """All devices there are, as they are known, or else tested and measured now."""
+    """All devices with cached results, or tested and timed now."""
     listed, failed = listed_devices()
     return [*_measured(listed, _known(listed, listed), listed, say), *failed]
 
@@ -50,13 +50,13 @@ def choose_device(config: OpenclConfig, say: Say = say_on_stderr) -> ComputeDevi
 
 def choose_devices(
     config: OpenclConfig, say: Say = say_on_stderr, failed: Mapping[str, str] = NO_FAILURES,
-    watch: Watch = unwatched, program: Sequence[str] = PROGRAM,
+    watch: Watch = unsupervised, program: Sequence[str] = PROGRAM,
 ) -> Devices:  # fmt: skip
-    """The device that the configuration names, or those that compute right, in order.
+    """The configured device, or all working ones, in order of preference.
 
-    DeviceError where there is none, with what is wrong with each. `failed` says in words, by
-    identity, what has failed in this flight: it is passed over, and then none may be left.
-    `program` lists and measures.
+    DeviceError without any, with the reason for each. `failed` are reasons, by identity, of
+    failures in this flight: those are excluded, and then none may be left. `program` lists and
+    measures.
     """
     listed, unlisted = listed_devices(program)
     if not listed:
@@ -64,7 +64,7 @@ def choose_devices(
     asked_for = config.device != "auto"
     wanted = [device_asked_for(config.device, listed)] if asked_for else list(listed)
     wanted = [each for each in wanted if each.identity not in failed]
-    # in flight what was refused stays refused
+    # in flight rejected devices stay rejected
     known = _known(wanted if asked_for and not failed else listed, listed)
     found = [*_measured(wanted, known, listed, say, program), *([] if asked_for else unlisted)]
     order = in_order(found)
@@ -92,7 +92,7 @@ def _none(found: Sequence[MeasuredDevice]) -> str:
 def _known(
     wanted: Sequence[ListedDevice], listed: Sequence[ListedDevice]
 ) -> dict[str, MeasuredDevice]:
-    """What is kept; nothing where no device wanted works, as somebody may just have mended that."""
+    """Cached results; none where no wanted device works, since that may have been fixed."""
     kept = kept_verdict(verdict_path(), circumstances(listed))
     found = [kept[each.identity] for each in wanted if each.identity in kept]
     hopeless = len(found) == len(wanted) and not in_order(found)
@@ -102,18 +102,19 @@ def _known(
 def _measured(
     wanted: Sequence[ListedDevice], known: dict[str, MeasuredDevice],
     listed: Sequence[ListedDevice], say: Say, program: Sequence[str] = PROGRAM,
-    told: bool = True,
+    report: bool = True,
 ) -> list[MeasuredDevice]:  # fmt: skip
-    """Those wanted, each as it is known or else measured now.
+    """The wanted devices, each with its cached result or measured now.
 
-    What is new is kept at once: a service that is ended for taking long goes on there.
+    New results are cached at once: a service stopped for exceeding its start timeout continues
+    there.
     """
     now, why_not = circumstances(listed), ""
     for each in wanted:
         if each.identity in known:
             continue
         found = known[each.identity] = probed(each, program)
-        if found.problem and told:
+        if found.problem and report:
             say(f"OpenCL: {found.named}: {found.problem}")
         why_not = _kept(verdict_path(), now, list(known.values()))
     if why_not:
@@ -122,7 +123,7 @@ def _measured(
 
 
 def _kept(path: Path | None, now: Mapping[str, Any], found: Sequence[MeasuredDevice]) -> str:
-    """Keep it; "", or why that cannot be."""
+    """Cache results; "", or why that failed."""
     if path is None:
         return "neither $XDG_CACHE_HOME nor $HOME is set"
     try:

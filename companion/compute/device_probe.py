@@ -1,7 +1,7 @@
-"""OpenCL devices are listed and tested in processes of their own: a driver may end its process.
+"""Listing and testing of OpenCL devices in separate processes: a driver may end its process.
 
-As a program: `list FIRST` names platforms from a number on and their devices, `measure NUMBER`
-tests one device; what it says is JSON, a line for each.
+As a program: `list FIRST` lists platforms from a number on and their devices, `measure NUMBER`
+tests one device; output is JSON, one line each.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from companion.timing.clock import monotonic_s
 
 PROGRAM = (sys.executable, "-m", "companion.compute.device_probe")
 PATIENCE_S = 120.0
-"""The first build of the kernels on a small processor takes most of a minute."""
+"""The first build of the kernels takes most of a minute on a small processor."""
 LIST_PATIENCE_S = 30.0
-MOST_PLATFORMS = 32
-MOST_OF_A_LINE = 160
+MAX_PLATFORMS = 32
+MAX_LINE_CHARS = 160
 PR_SET_PDEATHSIG = 1
 """prctl(2)"""
 
@@ -32,11 +32,11 @@ PR_SET_PDEATHSIG = 1
 def listed_devices(
     program: Sequence[str] = PROGRAM, patience_s: float = LIST_PATIENCE_S
 ) -> tuple[list[ListedDevice], list[MeasuredDevice]]:
-    """All devices there are; and those platforms whose driver fails when it is asked for them."""
+    """All devices; and platforms whose driver fails on listing."""
     devices: list[ListedDevice] = []
     failed: list[MeasuredDevice] = []
     first, before = 0, -1
-    while before < first < MOST_PLATFORMS:
+    while before < first < MAX_PLATFORMS:
         before = first
         said, ended, detail = _said(["list", str(first)], program, patience_s)
         asked = ListedDevice(f"{first}:?", "", "a driver, when platforms are listed")
@@ -56,13 +56,13 @@ def listed_devices(
 def probed(
     listed: ListedDevice, program: Sequence[str] = PROGRAM, patience_s: float | None = None
 ) -> MeasuredDevice:
-    """A device as `program` finds it, or what became of that."""
+    """A device as measured by `program`, or how that failed."""
     said, ended, detail = _said(["measure", listed.number], program, patience_s or PATIENCE_S)
     for line in reversed(said):
         try:
             found = MeasuredDevice(**line)
         except TypeError:
-            continue  # nothing of ours
+            continue  # other output
         if found.identity == listed.identity:
             return found
     return measured(listed, None, ended, detail)
@@ -71,9 +71,9 @@ def probed(
 def _said(
     arguments: Sequence[str], program: Sequence[str], patience_s: float
 ) -> tuple[list[dict[str, Any]], str, str]:
-    """What the program said as JSON; how it ended, in words; and what it said of that."""
+    """JSON output of the program; how it ended, in words; and its error output."""
     try:
-        # Ctrl-C is for us, who end it
+        # Ctrl-C is handled by this process, which ends it
         ended = subprocess.run(
             [*program, *arguments], stdin=subprocess.DEVNULL, capture_output=True,
             timeout=patience_s, start_new_session=True,
@@ -82,12 +82,12 @@ def _said(
         return _lines(error.stdout), f"hangs for {patience_s:.0f} s", _text(error.stderr)
     said = _text(ended.stderr)
     problem = f"its driver ends the program ({_how(ended.returncode)})"
-    last = [line[:MOST_OF_A_LINE] for line in said.splitlines()[-1:]]
+    last = [line[:MAX_LINE_CHARS] for line in said.splitlines()[-1:]]
     return _lines(ended.stdout), ": ".join([problem, *last]), said
 
 
 def _lines(stdout: bytes | None) -> list[dict[str, Any]]:
-    """Drivers may write between them what they like."""
+    """JSON objects of the output; other output of drivers is ignored."""
     out = []
     for line in (stdout or b"").splitlines():
         try:
@@ -113,8 +113,8 @@ def _how(status: int) -> str:
 
 
 def main() -> int:
-    """List or measure; the exit status."""
-    # a driver that hangs must not outlive whoever asked
+    """List or measure; returns the exit status."""
+    # a hanging driver must not outlive its caller
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
     what, which = sys.argv[1:]
     if what == "list":

@@ -1,7 +1,7 @@
-"""What tests of OpenCL devices have shown, kept on disk for the next start.
+"""Cache of OpenCL device tests on disk.
 
-It counts as long as nothing has changed that could change it: drivers and their versions, the set
-of devices, the processor, what PoCL links with, our kernels and version.
+Valid while nothing relevant has changed: drivers and versions, the set of devices, the processor,
+linkers of PoCL, our kernels and version.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ CPU_FIELDS = (
     "CPU implementer", "CPU architecture", "CPU variant", "CPU part", "CPU revision",  # ARM
 )  # fmt: skip
 TESTED = (".cl", "self_test.py", "self_test.npz")
-"""Files of companion.dense on which a verdict depends."""
+"""Files of companion.dense on which results depend."""
 
 
 def verdict_path(environment: Mapping[str, str] = os.environ) -> Path | None:
-    """Where it is kept: in the service's cache or the user's; None for a user without a home."""
+    """Path of the cache, of the service or the user; None for a user without a home."""
     own = environment.get("CACHE_DIRECTORY", "").partition(":")[0]  # systemd.exec(5)
     if own:
         return Path(own, FILE)
@@ -43,7 +43,7 @@ def verdict_path(environment: Mapping[str, str] = os.environ) -> Path | None:
 
 
 def circumstances(listed: Sequence[ListedDevice]) -> dict[str, Any]:
-    """All that a verdict depends on."""
+    """Everything that results depend on."""
     return {
         "devices": sorted(each.identity for each in listed),
         "processor": processor(),
@@ -54,7 +54,7 @@ def circumstances(listed: Sequence[ListedDevice]) -> dict[str, Any]:
 
 
 def processor(path: Path = CPUINFO) -> list[str]:
-    """What tells one kind of processor from another; of all cores, each kind once."""
+    """Identification of the processor; each kind of core once."""
     try:
         lines = path.read_text(errors="replace").splitlines()
     except OSError:
@@ -76,9 +76,9 @@ def _kernels() -> str:
 
 
 def kept_verdict(path: Path | None, now: Mapping[str, Any]) -> dict[str, MeasuredDevice]:
-    """By identity, what is known of devices under these circumstances; {} where that is nothing.
+    """Cached results by identity under these circumstances; {} without any.
 
-    A file that is damaged or not ours is as good as none.
+    A corrupt file counts as none.
     """
     if path is None:
         return {}
@@ -103,13 +103,13 @@ def _checked(fields: Mapping[str, Any]) -> MeasuredDevice:
 
 
 def keep_verdict(path: Path, now: Mapping[str, Any], measured: Sequence[MeasuredDevice]) -> None:
-    """Put it in the place of what was there, in one step; OSError where that cannot be."""
+    """Replace the cache atomically; OSError on failure."""
     document = {
         "circumstances": dict(now),
         "measured": [dataclasses.asdict(each) for each in measured],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    # a name of its own: several processes may measure at once
+    # unique name: several processes may measure concurrently
     number, part = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     try:
         with open(number, "w", encoding="utf-8") as file:

@@ -1,1 +1,1 @@
-"""Dense depth of a keyframe on OpenCL, and its fusion into a cloud. Pure: no I/O, no clock."""
+"""Dense multi-view stereo on OpenCL: plane sweep, regularisation, consistency, fusion."""

@@ -1,4 +1,4 @@
-"""Between which depths a reference's scene lies, from a few hundred points that can be followed."""
+"""Depth range of a reference image from a few hundred tracked corners."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from companion.geometry.transforms import Array, Pose
 from companion.messages import Bytes, Floats
 
 MAX_POINTS = 600
-LEAST_POINTS = 20
-OFF_LINE_PX = 1.5
-"""A point that was followed to further from its epipolar line was lost."""
-LEAST_PARALLAX_PX = 2.0
+MIN_POINTS = 20
+MAX_EPIPOLAR_PX = 1.5
+"""Tracked points further from their epipolar line are outliers."""
+MIN_PARALLAX_PX = 2.0
 QUANTILE = 0.02
-NEARER, FARTHER = 0.6, 2.0
-"""What lies nearer or farther than all points that were followed."""
+NEAR_MARGIN, FAR_MARGIN = 0.6, 2.0
+"""Margins for points nearer or farther than those tracked."""
 
 
 def depth_range(
     reference: Bytes, others: Iterable[tuple[Bytes, Pose]], intrinsics: Intrinsics
 ) -> tuple[float, float] | None:
-    """Least and greatest depth, generously; None where too little can be told.
+    """Minimum and maximum depth with margins; None with too few points.
 
-    `others` are images (H, W) with poses current_from_reference, the nearest in time first: corners
-    are followed from each to the next (Lucas & Kanade 1981) and triangulated.
+    `others` are images (H, W) with poses current_from_reference, nearest in time first: corners are
+    tracked from each to the next (Lucas & Kanade 1981) and triangulated.
     """
     corners = cv2.goodFeaturesToTrack(reference, MAX_POINTS, 0.01, 8)
     if corners is None:
@@ -41,23 +41,23 @@ def depth_range(
         moved, found, _ = cv2.calcOpticalFlowPyrLK(last, grey, before, before.copy())
         at, last = np.asarray(moved, np.float32).reshape(-1, 2), grey
         alive &= np.asarray(found).ravel() > 0
-        measured, off_px, length_px = _triangulate(start, at, pose, intrinsics)
-        alive &= (off_px < OFF_LINE_PX) | (length_px < LEAST_PARALLAX_PX)
+        measured, epipolar_px, length_px = _triangulate(start, at, pose, intrinsics)
+        alive &= (epipolar_px < MAX_EPIPOLAR_PX) | (length_px < MIN_PARALLAX_PX)
         better = alive & (length_px > parallax) & (measured > 0)
         rho[better], parallax[better] = measured[better], length_px[better]
-        if alive.sum() < LEAST_POINTS:
+        if alive.sum() < MIN_POINTS:
             break
-    known = rho[parallax >= LEAST_PARALLAX_PX]
-    if len(known) < LEAST_POINTS:
+    known = rho[parallax >= MIN_PARALLAX_PX]
+    if len(known) < MIN_POINTS:
         return None
     far, near = 1.0 / np.quantile(known, [QUANTILE, 1 - QUANTILE])
-    return NEARER * float(near), FARTHER * float(far)
+    return NEAR_MARGIN * float(near), FAR_MARGIN * float(far)
 
 
 def _triangulate(
     start: Floats, at: Floats, pose: Pose, k: Intrinsics
 ) -> tuple[Array, Array, Array]:
-    """Inverse depth, distance from the epipolar line, and parallax (both pixels) of each point."""
+    """Inverse depth, epipolar distance and parallax (pixels) of each point."""
     centre, focal = np.array([k.cx, k.cy]), np.array([k.fx, k.fy])
     rays = np.c_[(start - centre) / focal, np.ones(len(start))] @ pose.rotation.T
     z = np.where(np.abs(rays[:, 2]) > 1e-6, rays[:, 2], 1e-6)
@@ -66,9 +66,9 @@ def _triangulate(
     # a point at inverse depth rho is seen at (rays + rho t), divided by its third component
     t = pose.translation
     along = (t[:2] - at_infinity * t[2]) / z[:, None]
-    way = seen - at_infinity
+    displacement = seen - at_infinity
     # seen (1 + rho t_z / z) = at_infinity + rho t_xy / z
-    slope = along - way * (t[2] / z)[:, None]
-    rho = (way * slope).sum(1) / np.maximum((slope * slope).sum(1), 1e-18)
-    off = (way - rho[:, None] * slope) * focal
-    return rho, np.linalg.norm(off, axis=1), np.linalg.norm(way * focal, axis=1)
+    slope = along - displacement * (t[2] / z)[:, None]
+    rho = (displacement * slope).sum(1) / np.maximum((slope * slope).sum(1), 1e-18)
+    residual = (displacement - rho[:, None] * slope) * focal
+    return rho, np.linalg.norm(residual, axis=1), np.linalg.norm(displacement * focal, axis=1)

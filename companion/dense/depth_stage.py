@@ -1,7 +1,7 @@
-"""The depth stage: keyframes and the frames around them become depth maps and points.
+"""Depth stage: depth maps and points from keyframes and the frames around them.
 
-A keyframe waits until some later ones have come, so that its frames' poses are adjusted and both
-sides are at hand. Images wait undistorted, and no more of them than a bound.
+A keyframe waits for some later ones, so that poses are adjusted and views on both sides exist.
+Undistorted frames are buffered up to a bound.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from companion.messages import (
 )
 from companion.timing.clock import Timer
 
-MAX_HELD = 100
+MAX_FRAMES = 100
 FIRST_BASELINE = 0.01
-"""Share of the median depth: the first frame has a short search, which is hardly ambiguous."""
+"""Ratio of the median depth: with a short baseline the search is hardly ambiguous."""
 
 
 @dataclass(slots=True, eq=False)
-class _Held:
+class _BufferedFrame:
     grey: Bytes
     rgb: Bytes | None
     track: Track | None = None
@@ -45,7 +45,7 @@ class _Held:
 class DepthStage:
     """Frames, tracks, keyframes and map updates in; DepthMaps and PointChunks out.
 
-    A Warned says when its device has failed, and which one has taken over if one was left.
+    A Warned reports failure of the device, and which one replaces it, if any.
     """
 
     def __init__(
@@ -67,26 +67,26 @@ class DepthStage:
             ),
         )
         self._times = times
-        self._held: OrderedDict[int, _Held] = OrderedDict()
+        self._frames: OrderedDict[int, _BufferedFrame] = OrderedDict()
         self._waiting: list[KeyframeAdded] = []
         self._update: MapUpdate | None = None
         self._last_reference: int | None = None
-        self._share, self._credit = 1.0, 0.0
+        self._load_ratio, self._credit = 1.0, 0.0
         self._half_view_rad = float(np.arctan(0.5 * camera.width / intrinsics.fx))
 
     def set_share(self, share: float) -> None:
-        """Give only this share of the keyframes a depth map from now on, 0 to 1."""
-        self._share = share
+        """Compute depth for only this ratio of the keyframes from now on, 0 to 1."""
+        self._load_ratio = share
 
     def step(self, message: Message) -> list[Message]:
-        """Take one message, in order of time."""
+        """Process one message, in order of time."""
         if isinstance(message, Frame):
             if not self._engine.off:
-                self._hold(message)
+                self._buffer(message)
         elif isinstance(message, Track):
-            held = self._held.get(message.seq)
-            if held is not None:
-                held.track = message
+            buffered = self._frames.get(message.seq)
+            if buffered is not None:
+                buffered.track = message
         elif isinstance(message, KeyframeAdded):
             self._waiting.append(message)
         elif isinstance(message, MapUpdate):
@@ -99,7 +99,7 @@ class DepthStage:
         return []
 
     def flush(self) -> list[Message]:
-        """Process the keyframes that still wait."""
+        """Process pending keyframes."""
         out: list[Message] = []
         for keyframe in self._waiting:
             with self._times("depth"):
@@ -110,56 +110,56 @@ class DepthStage:
             out += self._engine.announced(self._update.t_ns)
         return out
 
-    def _hold(self, frame: Frame) -> None:
-        self._held[frame.seq] = _Held(self._undistortion.image(frame.grey), frame.rgb)
-        if len(self._held) > MAX_HELD:
-            # thin out the older half; what a waiting keyframe needs stays
+    def _buffer(self, frame: Frame) -> None:
+        self._frames[frame.seq] = _BufferedFrame(self._undistortion.image(frame.grey), frame.rgb)
+        if len(self._frames) > MAX_FRAMES:
+            # thin out the older half, except frames of pending keyframes
             needed = {k.seq for k in self._waiting}
-            old = list(self._held)[: MAX_HELD // 2]
+            old = list(self._frames)[: MAX_FRAMES // 2]
             for seq in old[::2]:
                 if seq not in needed:
-                    del self._held[seq]
+                    del self._frames[seq]
 
     def _process(self, keyframe: KeyframeAdded) -> list[Message]:
-        update, held = self._update, self._held.get(keyframe.seq)
+        update, buffered = self._update, self._frames.get(keyframe.seq)
         place = None if update is None else update.place_of(keyframe.keyframe_id)
-        if update is None or held is None or place is None or len(keyframe.points_camera) < 20:
+        if update is None or buffered is None or place is None or len(keyframe.points_camera) < 20:
             return []
         z = keyframe.points_camera[:, 2]
         z = z[z > 0]
-        if not self._view_has_moved(keyframe, place, float(np.median(z))):
+        if not self._sees_new_area(keyframe, place, float(np.median(z))):
             return []
         near, far = 0.5 * float(np.quantile(z, 0.02)), 2.5 * float(np.quantile(z, 0.98))
         chosen = self._choose(keyframe, update, place, float(np.median(z)))
-        if len(chosen) < 3 or not self._may():
+        if len(chosen) < 3 or not self._scheduled():
             return []
         self._last_reference = keyframe.keyframe_id
-        assert held.rgb is not None
-        rgb = self._undistortion.image(held.rgb)
+        assert buffered.rgb is not None
+        rgb = self._undistortion.image(buffered.rgb)
 
         def depth(engine: DepthEngine) -> DepthMap:
-            engine.begin(held.grey, near, far)
+            engine.begin(buffered.grey, near, far)
             for seq, current_from_reference in chosen:
-                engine.update(self._held[seq].grey, current_from_reference)
+                engine.update(self._frames[seq].grey, current_from_reference)
             return engine.finish(keyframe.keyframe_id, keyframe.t_ns, rgb)
 
         found = self._engine.run(keyframe.t_ns, depth)
-        self._forget(keyframe)
+        self._drop_frames(keyframe)
         if found is None:
             return []
         depth_map = measured_only(found)
         chunks: list[PointChunk] = self._fusion.add(depth_map, update)
         return [depth_map, *chunks]
 
-    def _may(self) -> bool:
-        """Whether it is this keyframe's turn, where not all are to have depth."""
-        self._credit = min(self._credit + self._share, 1.0)
+    def _scheduled(self) -> bool:
+        """Whether this keyframe is due, under a reduced load ratio."""
+        self._credit = min(self._credit + self._load_ratio, 1.0)
         if self._credit < 1.0 - 1e-9:
             return False
         self._credit -= 1.0
         return True
 
-    def _view_has_moved(
+    def _sees_new_area(
         self, keyframe: KeyframeAdded, place: Similarity, median_depth: float
     ) -> bool:
         """Whether a keyframe sees enough that the last reference did not."""
@@ -170,29 +170,29 @@ class DepthStage:
             return True
         relative = before.inverse() @ place
         step = float(np.linalg.norm(relative.translation)) / relative.scale / median_depth
-        turn = float(np.arccos(np.clip(relative.rotation[2, 2], -1, 1)))
-        # a turn by so much shows a sixth of the image anew
-        return step > self._config.reference_step or turn > 0.35 * self._half_view_rad
+        rotation_rad = float(np.arccos(np.clip(relative.rotation[2, 2], -1, 1)))
+        # such a rotation brings a sixth of the image into view
+        return step > self._config.reference_step or rotation_rad > 0.35 * self._half_view_rad
 
     def _choose(
         self, keyframe: KeyframeAdded, update: MapUpdate, place: Similarity, median_depth: float
     ) -> list[tuple[int, Pose]]:
-        """Frames in order of use: baselines from short to long, both sides in turn."""
+        """Frames in order of use: baselines ascending, alternating sides."""
         candidates = []
-        for seq, held in self._held.items():
-            track = held.track
+        for seq, buffered in self._frames.items():
+            track = buffered.track
             if seq == keyframe.seq or track is None or track.keyframe_id is None:
                 continue
-            theirs = update.place_of(track.keyframe_id)
-            if theirs is None or track.keyframe_from_camera is None:
+            other_place = update.place_of(track.keyframe_id)
+            if other_place is None or track.keyframe_from_camera is None:
                 continue
-            relative = place.inverse() @ theirs
+            relative = place.inverse() @ other_place
             if abs(relative.scale - 1.0) > 1e-9:
                 continue  # another segment
             reference_from_current = relative.apply_to_pose(track.keyframe_from_camera)
             baseline = float(np.linalg.norm(reference_from_current.translation)) / median_depth
-            turn = np.arccos(np.clip(reference_from_current.rotation[2, 2], -1, 1))
-            if baseline <= self._config.max_baseline and turn < np.radians(35):
+            rotation_rad = np.arccos(np.clip(reference_from_current.rotation[2, 2], -1, 1))
+            if baseline <= self._config.max_baseline and rotation_rad < np.radians(35):
                 candidates.append((baseline, seq, reference_from_current.inverse()))
         candidates.sort(key=lambda c: (c[0], c[1]))
         if not candidates:
@@ -220,13 +220,13 @@ class DepthStage:
         baselines = {seq: b for b, seq, _ in candidates}
         return sorted(chosen, key=lambda c: (baselines[c[0]], c[0]))
 
-    def _forget(self, keyframe: KeyframeAdded) -> None:
-        """Let go of images from before the keyframes that can still use them."""
+    def _drop_frames(self, keyframe: KeyframeAdded) -> None:
+        """Drop frames older than pending keyframes can use."""
         first_needed = keyframe.seq
         for k in self._waiting[:1]:
             first_needed = min(first_needed, k.seq)
-        # one keyframe interval back stays: the next references look back too
+        # keep one keyframe interval: the next references use earlier views too
         span = (self._waiting[0].seq - keyframe.seq) if self._waiting else 0
         oldest = first_needed - max(2 * span, 10)
-        for seq in [s for s in self._held if s < oldest]:
-            del self._held[seq]
+        for seq in [s for s in self._frames if s < oldest]:
+            del self._frames[seq]

@@ -1,4 +1,4 @@
-"""Which devices the dense engine may run on, and in which order: the fastest of the right ones."""
+"""Selection and order of devices for the dense engine: the fastest correct one first."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from companion.dense.self_test import SelfTest, frames_per_s
 from companion.errors import DeviceError
 
 Clock = Callable[[], float]
-AS_FAST = 1.2
-"""Devices whose speeds differ by less count as equally fast: two measurements of the same device
-differ by so much where other programs run beside them."""
+SPEED_TOLERANCE = 1.2
+"""Devices within this speed ratio count as equally fast: measurements under load vary by as much.
+"""
 KINDS = (GPU, ACCELERATOR, PROCESSOR)
-"""Of equally fast ones the first: what is left of the processor is the pose's."""
+"""Preference among equally fast ones: the processor is needed for the pose."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredDevice(ListedDevice):
-    """A device after its test; `frames_per_s` is None where it failed, and `problem` says how."""
+    """A tested device; `frames_per_s` is None where it failed, for the reason `problem`."""
 
     frames_per_s: float | None = None
     problem: str = ""
     """In words, on one line."""
     detail: str = ""
-    """What driver and compiler said."""
+    """Output of driver and compiler."""
 
     @property
     def listed(self) -> ListedDevice:
-        """What is known of it without a test."""
+        """The device without test results."""
         return ListedDevice(self.number, self.name, self.platform, self.kind, self.driver)
 
 
 def measured(
     listed: ListedDevice, frames_per_s: float | None, problem: str = "", detail: str = ""
 ) -> MeasuredDevice:
-    """A device with what its test has shown; a problem is one line without a semicolon.
+    """A device with its test results; a problem is one line without a semicolon.
 
     Semicolons stand between devices, for `companion status` to tell them apart.
     """
@@ -49,7 +49,7 @@ def measured(
 
 
 def measured_device(listed: ListedDevice, seconds: Clock) -> MeasuredDevice:
-    """Test and measure a device in this process, which its driver may end; `seconds` is a clock."""
+    """Test and time a device in this process, which its driver may end; `seconds` is a clock."""
     try:
         device = open_device(listed)
         SelfTest(device).run()
@@ -62,30 +62,29 @@ def measured_device(listed: ListedDevice, seconds: Clock) -> MeasuredDevice:
 
 
 def in_order(devices: Sequence[MeasuredDevice]) -> list[MeasuredDevice]:
-    """Those that are right, the one to be taken first, then what takes over if that fails.
+    """Working devices, in order of preference.
 
-    The fastest first; between those within `AS_FAST` of it a fixed order decides, so that two
-    starts choose alike.
+    Fastest first; within `SPEED_TOLERANCE` of it a fixed order, so that the choice is reproducible.
     """
     left = [(each.frames_per_s, each) for each in devices if each.frames_per_s is not None]
     out = []
     while left:
         fastest = max(speed for speed, _ in left)
-        alike = [entry for entry in left if entry[0] * AS_FAST >= fastest]
-        first = min(alike, key=lambda entry: _fixed_order(entry[1]))
+        equally_fast = [entry for entry in left if entry[0] * SPEED_TOLERANCE >= fastest]
+        first = min(equally_fast, key=lambda entry: _fixed_order(entry[1]))
         left.remove(first)
         out.append(first[1])
     return out
 
 
 def _fixed_order(device: MeasuredDevice) -> tuple[int, str, str, str, str]:
-    """Its number comes last: it depends on the order in which a folder lists drivers."""
+    """Its number comes last: it depends on the listing order of driver files."""
     kind = KINDS.index(device.kind)
     return kind, device.platform, device.name, device.driver, device.number
 
 
 def why_taken(taken: ListedDevice, devices: Sequence[MeasuredDevice]) -> str:
-    """Why a device comes first, in words."""
+    """Reason for the choice of a device, in words."""
     if len(devices) == 1:
         return "the only one"
     speeds = {each.number: each.frames_per_s for each in devices if each.frames_per_s is not None}

@@ -1,4 +1,4 @@
-"""The device in use, tested now and then, and what takes over when it fails in flight."""
+"""Device failover: the device in use is tested periodically, and replaced on failure."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from companion.dense.self_test import SelfTest
 from companion.errors import DeviceError
 from companion.messages import DepthMap, Warned
 
-TEST_EVERY_NS = 10_000_000_000
-"""What a device has done wrong since its last test is in the map. The test takes a fifth of the
-time of a depth map of 640 x 480 (37 and 185 ms of PoCL on a Cascade Lake), of which there are some
-ten meanwhile: 2 % of the work."""
-TOOK_OVER = "dense map on another OpenCL device"
-NONE_LEFT = "dense map off: no OpenCL device"
-"""Short: the autopilot's messages have 50 characters."""
+TEST_PERIOD_NS = 10_000_000_000
+"""Depth since the last test may be wrong when a test fails. A test takes a fifth of the time of a
+depth map of 640 x 480 (37 and 185 ms of PoCL on a Cascade Lake), of which there are some ten per
+period: 2 % of the work."""
+FAILED_OVER = "dense map on another OpenCL device"
+NO_DEVICE_LEFT = "dense map off: no OpenCL device"
+"""Short: autopilot messages have 50 characters."""
 FAULTS = (DeviceError, cl.Error)
 
 Watch = Callable[[ListedDevice], AbstractContextManager[None]]
-"""Given a device: a context in which its driver is at work."""
+"""Context for work of the driver of a device, for supervision."""
 
 
-def unwatched(device: ListedDevice) -> AbstractContextManager[None]:
-    """Nobody sees to it that drivers come back."""
+def unsupervised(device: ListedDevice) -> AbstractContextManager[None]:
+    """Context without supervision."""
     return nullcontext()
 
 
 class Devices:
-    """Devices in order, the first that passes its test in use; `current` is None once none is left.
+    """Devices in order of preference; `current` is the first that passes its test, or None.
 
-    `failed` says in words what has failed in this flight before; where nothing has and no device
-    works, making this raises DeviceError.
+    `failed` are failures earlier in this flight; without any, DeviceError is raised where no device
+    works.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Devices:
         order: Sequence[ListedDevice],
         why_taken: Callable[[ListedDevice], str],
         failed: Sequence[str] = (),
-        watch: Watch = unwatched,
+        watch: Watch = unsupervised,
     ) -> None:
         self._left = deque(order)
         self._why_taken = why_taken
@@ -52,29 +52,29 @@ class Devices:
         self._taken: tuple[ListedDevice, SelfTest] | None = None
         self.current: ComputeDevice | None = None
         self.failures = list(failed)
-        """Devices that have failed, and how."""
+        """Failed devices, with reasons."""
         self._take_next()
         if self.current is None and not failed:
             raise DeviceError("; ".join(self.failures))
 
     @property
     def described(self) -> str:
-        """The one in use, why it was taken, and what has failed before."""
+        """The current device, why it was chosen, and earlier failures."""
         parts = [self.current.described if self.current is not None else "none is left"]
         return "; failed: ".join([*parts, *self.failures])
 
     def at_work(self) -> AbstractContextManager[None]:
-        """A context for work of the current one."""
+        """Supervision context for work of the current device."""
         return self._watch(self._taken[0]) if self._taken is not None else nullcontext()
 
     def test(self) -> None:
-        """Test the current one again; raises one of FAULTS."""
+        """Test the current device again; raises one of FAULTS."""
         if self._taken is not None:
             with self.at_work():
                 self._taken[1].run()
 
     def fail(self, error: Exception) -> None:
-        """The current one has failed; the next that works takes its place, if one is left."""
+        """Replace the current device after a failure, if another works."""
         if self.current is not None:
             self.failures.append(in_words(error, self.current.name))
         self._take_next()
@@ -96,23 +96,23 @@ class Devices:
 
 
 def in_words(error: Exception, named: str) -> str:
-    """A fault on one line that begins with the device's name."""
+    """A fault on one line, starting with the device name."""
     text = str(error) if isinstance(error, DeviceError) else f"fails while it computes: {error}"
     first = next(iter(text.splitlines()), "")
     return first if first.startswith(named) else f"{named}: {first}"
 
 
 class TestedEngine:
-    """An engine on the device in use; on another where that fails, and on none in the end."""
+    """An engine on the current device, with failover; eventually off."""
 
     def __init__(self, devices: Devices, make: Callable[[ComputeDevice], DepthEngine]) -> None:
         self._devices, self._make = devices, make
         self._tested_ns: int | None = None
         self._engine: DepthEngine | None = None
         self._n_announced = 0
-        began_well = not devices.failures
-        self._begin()
-        if self.off and began_well:
+        no_failures = not devices.failures
+        self._start()
+        if self.off and no_failures:
             raise DeviceError("; ".join(devices.failures))
 
     @property
@@ -121,16 +121,15 @@ class TestedEngine:
         return self._engine is None
 
     def run(self, t_ns: int, job: Callable[[DepthEngine], DepthMap]) -> DepthMap | None:
-        """What `job` does with an engine, from its beginning on each device that it takes.
+        """Run `job` with the engine, restarted on each failover.
 
-        None where no device is left. `t_ns` is the time of the flight; the test of a device is due
-        by that.
+        None where no device is left. `t_ns` is flight time, by which tests are scheduled.
         """
         if self._tested_ns is None:
             self._tested_ns = t_ns
         while self._engine is not None:
             try:
-                if t_ns - self._tested_ns >= TEST_EVERY_NS:
+                if t_ns - self._tested_ns >= TEST_PERIOD_NS:
                     self._test(t_ns - self._tested_ns)
                     self._tested_ns = t_ns
                 with self._devices.at_work():
@@ -138,27 +137,27 @@ class TestedEngine:
             except FAULTS as error:
                 self._devices.fail(error)
                 self._engine, self._tested_ns = None, t_ns
-                self._begin()
+                self._start()
         return None
 
     def announced(self, t_ns: int) -> list[Warned]:
-        """What has become of devices since this was last asked."""
+        """Warnings about failures since the last call."""
         failures, current = self._devices.failures, self._devices.current
         if len(failures) == self._n_announced:
             return []
         new, self._n_announced = failures[self._n_announced :], len(failures)
         if current is None:
-            return [Warned(t_ns, NONE_LEFT, "; ".join(new))]
-        return [Warned(t_ns, TOOK_OVER, "; ".join([current.name, *new]))]
+            return [Warned(t_ns, NO_DEVICE_LEFT, "; ".join(new))]
+        return [Warned(t_ns, FAILED_OVER, "; ".join([current.name, *new]))]
 
     def _test(self, since_ns: int) -> None:
         try:
             self._devices.test()
         except DeviceError as error:
-            doubt = f"depth of the {since_ns * 1e-9:.0f} s before may be wrong"
-            raise DeviceError(f"{error}; {doubt}") from error
+            consequence = f"depth of the {since_ns * 1e-9:.0f} s before may be wrong"
+            raise DeviceError(f"{error}; {consequence}") from error
 
-    def _begin(self) -> None:
+    def _start(self) -> None:
         while self._engine is None and self._devices.current is not None:
             try:
                 with self._devices.at_work():

@@ -1,4 +1,4 @@
-"""Dense depth of one reference image from images with known poses."""
+"""Dense depth of a reference image from images with known poses."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ from companion.geometry.transforms import Pose
 from companion.messages import Bytes, DepthMap, Floats, PixelState
 
 STEP_PX = 0.75
-"""From plane to plane, in the image where points move most: nearer ones look the same."""
-LEAST_PLANES = 8
-LEAST_VIEWS = 3
+"""Disparity between planes in the image of largest parallax: smaller steps are indistinguishable.
+"""
+MIN_PLANES = 8
+MIN_VIEWS = 3
 FIRST_SPREAD, NEXT_SPREAD = 0.07, 3.0
-"""A sweep is due when the kept images lie so far apart, as a share of the depth; then whenever they
-lie so many times as far apart as they did."""
+"""Spread of the kept views, relative to depth, at the first sweep; then the factor between sweeps.
+"""
 
 
 SMOOTHING_SCALE = 8.0
-"""What the regulariser sees the range of inverse depths as."""
+"""Range of inverse depths after scaling for the regulariser."""
 
 
 class DepthEngine:
-    """Depth of references of one size and camera. `begin`, some `update`s, `finish`.
+    """Depth of reference images of one size and camera: `begin`, several `update`s, `finish`.
 
-    Where `eager`, an estimate is there as soon as there are images for one, and is made anew as
-    better ones come; else all is done in `finish`.
+    If `eager`, estimates are computed as images arrive and refined with better ones; else all is
+    done in `finish`.
     """
 
     def __init__(
@@ -65,21 +66,21 @@ class DepthEngine:
 
     @property
     def n_novel(self) -> int:
-        """Images of this reference that were worth a thought; the others were passed over."""
+        """Images of this reference that were considered; the others were redundant."""
         return self._views.n_novel
 
     @property
     def n_searched(self) -> int:
-        """Images of this reference that depth was looked for in, in any sweep."""
+        """Images of this reference used in any sweep."""
         return len(self._searched)
 
     @property
     def labels(self) -> Bytes:
-        """`PixelState` of each grid pixel (H, W) as far as is known."""
+        """`PixelState` of each grid pixel (H, W) so far."""
         return self._labels
 
     def begin(self, grey: Bytes, near: float, far: float) -> None:
-        """Start on an image (H, W) whose depths lie between `near` and `far` (map units)."""
+        """Start a reference image (H, W) with depths between `near` and `far`, map units."""
         self._events = []
         self._device.copies.clear()
         self._grey, self._noise_grey = grey, image_noise(grey)
@@ -91,15 +92,15 @@ class DepthEngine:
         self._n_taken, self._n_swept, self._due = 0, 0, FIRST_SPREAD
 
     def update(self, grey: Bytes, current_from_reference: Pose) -> int:
-        """Take another image (H, W); returns how many pixels have not converged.
+        """Add an image (H, W); returns the number of pixels not converged.
 
-        An image from about the place of another says nothing new and is passed over.
+        Images from nearly the same position as another are skipped.
         """
         self._n_taken += 1
         view = self._views.consider(current_from_reference)
         if view is not None:
             self._sweep.set_image(view.slot, grey)
-            if self._eager and len(self._views.kept) >= LEAST_VIEWS:
+            if self._eager and len(self._views.kept) >= MIN_VIEWS:
                 spread = self._views.spread()
                 if spread >= self._due:
                     self._due = NEXT_SPREAD * spread
@@ -110,7 +111,7 @@ class DepthEngine:
         projections = self._views.projections()
         self._searched.update(self._views.kept)
         wanted = math.ceil(self._views.parallax_px() / STEP_PX) + 1
-        n_planes = min(max(wanted, LEAST_PLANES), PLANES[-1])
+        n_planes = min(max(wanted, MIN_PLANES), PLANES[-1])
         step = (self._rho[1] - self._rho[0]) / (n_planes - 1)
         self._sweep.run(projections, self._rho[0], step, n_planes, self._run)
         self._verification.run(projections, step, self._noise_grey, self._run)
@@ -118,9 +119,9 @@ class DepthEngine:
         self._n_swept = self._views.n_kept
 
     def finish(self, keyframe_id: int, t_ns: int, rgb: Bytes) -> DepthMap:
-        """The depth so far, regularised; 0 where nothing is known of it.
+        """The regularised depth map; 0 where unknown.
 
-        What has not converged is filled in from around it: see `state`, and `measured_only`.
+        Pixels not converged are filled in by regularisation: see `state`, and `measured_only`.
         """
         if self._views.n_kept > self._n_swept:
             self._estimate()
@@ -174,15 +175,15 @@ class DepthEngine:
         self._events.append((name, event))
 
     def n_commands(self) -> int:
-        """Commands given to the device since `begin`, copies included."""
+        """Commands enqueued since `begin`, copies included."""
         self._events.extend(self._device.copies)
         self._device.copies.clear()
         return len(self._events)
 
     def device_ms(self, first: int = 0, beyond: int | None = None) -> dict[str, float]:
-        """What commands took on the device, by the kernel's name, or `UPLOAD` or `READ_BACK`.
+        """Device time by kernel name, or `UPLOAD` or `READ_BACK`.
 
-        `first` and `beyond` are what `n_commands` was; waits until all is done.
+        `first` and `beyond` are values of `n_commands`; waits for completion.
         """
         self.n_commands()
         out: dict[str, float] = {}

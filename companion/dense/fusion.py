@@ -1,4 +1,4 @@
-"""Depth maps that agree become points."""
+"""Fusion of agreeing depth maps into point chunks."""
 
 from __future__ import annotations
 
@@ -13,69 +13,69 @@ from companion.config import CloudConfig
 from companion.dense.local_scale import typical_ratio
 from companion.dense.normals import MAX_STEP, normals
 from companion.geometry.transforms import Array, Similarity
-from companion.geometry.voxel import thin_by_voxel
+from companion.geometry.voxel import voxel_downsample
 from companion.messages import DepthMap, Floats, MapUpdate, PixelState, PointChunk
 
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
-N_HELD = 7
+N_MAPS = 7
 MAX_SIGMA = 0.01
-"""Relative standard deviation of depth that a point of the cloud, or its witness, has at most."""
+"""Largest relative standard deviation of depth used in the cloud."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Held:
+class _RecentMap:
     map: DepthMap
     normals: Floats
     spans: Mapping[int, float]
-    """of its keyframe when its depth was measured"""
+    """of its keyframe at measurement"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Witness:
-    """What another map says of points: which it agrees with; of these only the rest.
+class _Agreement:
+    """Agreement of another map with points: mask, and for agreeing points only the rest.
 
-    How much further away they are and how sure it is, both in proportion; their normals, turned.
+    Relative depth difference and sigma; rotated normals.
     """
 
     agrees: Mask
-    off: Array
+    difference: Array
     sigma: Array
     normals: Array
 
 
 class Fusion:
-    """Holds the last depth maps; turns each into points once its neighbours are there."""
+    """Buffers depth maps; fuses each once its neighbours have arrived."""
 
     def __init__(self, config: CloudConfig, wait_for: int = 2) -> None:
         self._config = config
         self._wait_for = wait_for
-        self._held: OrderedDict[int, _Held] = OrderedDict()
-        self._open: list[int] = []
+        self._recent: OrderedDict[int, _RecentMap] = OrderedDict()
+        self._pending: list[int] = []
 
     def add(self, depth_map: DepthMap, update: MapUpdate) -> list[PointChunk]:
-        """Take a depth map; chunks of those that have waited long enough."""
+        """Add a depth map; chunks of those that are complete."""
         sure = measured_only(depth_map, MAX_SIGMA)
-        self._held[depth_map.keyframe_id] = _Held(
+        self._recent[depth_map.keyframe_id] = _RecentMap(
             sure, normals(sure.depth, sure.intrinsics), update.spans_of(depth_map.keyframe_id)
         )
-        self._open.append(depth_map.keyframe_id)
+        self._pending.append(depth_map.keyframe_id)
         out = []
-        while len(self._open) > self._wait_for:
-            out.append(self._fuse(self._open.pop(0), update))
-        while len(self._held) > N_HELD:
-            self._held.popitem(last=False)
+        while len(self._pending) > self._wait_for:
+            out.append(self._fuse(self._pending.pop(0), update))
+        while len(self._recent) > N_MAPS:
+            self._recent.popitem(last=False)
         return [chunk for chunk in out if chunk is not None]
 
     def flush(self, update: MapUpdate) -> list[PointChunk]:
-        """Chunks of all that still wait."""
-        out = [self._fuse(k, update) for k in self._open]
-        self._open.clear()
+        """Chunks of all pending maps."""
+        out = [self._fuse(k, update) for k in self._pending]
+        self._pending.clear()
         return [chunk for chunk in out if chunk is not None]
 
     def _fuse(self, keyframe_id: int, update: MapUpdate) -> PointChunk | None:
-        held = self._held[keyframe_id]
-        depth_map, facing = held.map, held.normals
+        recent = self._recent[keyframe_id]
+        depth_map, facing = recent.map, recent.normals
         place = update.place_of(keyframe_id)
         if place is None:
             return None
@@ -83,27 +83,27 @@ class Fusion:
         if len(rows) == 0:
             return None
         points = points_of(depth_map, rows, columns)
-        points *= _stretch(held, place, update)
+        points *= _local_scale(recent, place, update)
         depth = depth_map.depth[rows, columns]
         sigma = (depth_map.sigma[rows, columns] / depth).astype(np.float64)
         n_maps = np.ones(len(points), np.int64)
         further, scatter, variance = np.zeros(len(points)), np.zeros(len(points)), sigma**2
         normal: Array = facing[rows, columns].astype(np.float64)
-        for other_id, other in self._held.items():
+        for other_id, other in self._recent.items():
             other_place = update.place_of(other_id)
             if other_id == keyframe_id or other_place is None:
                 continue
-            stretch = _stretch(other, other_place, update)
-            witness = self._witness(points, other_place.inverse() @ place, other, stretch)
-            n_maps += witness.agrees
-            further[witness.agrees] += witness.off
-            scatter[witness.agrees] += witness.off**2
-            variance[witness.agrees] += witness.sigma**2
-            normal[witness.agrees] += witness.normals
+            local_scale = _local_scale(other, other_place, update)
+            agreement = self._agreement(points, other_place.inverse() @ place, other, local_scale)
+            n_maps += agreement.agrees
+            further[agreement.agrees] += agreement.difference
+            scatter[agreement.agrees] += agreement.difference**2
+            variance[agreement.agrees] += agreement.sigma**2
+            normal[agreement.agrees] += agreement.normals
         keep = n_maps > self._config.min_agreeing
         if not keep.any():
             return None
-        # each map that agrees has the same say in how far away a point is
+        # agreeing maps have equal weight in the depth
         further /= n_maps
         points *= (1.0 + further)[:, None]
         scatter = np.maximum(scatter / n_maps - further**2, 0.0)
@@ -113,7 +113,7 @@ class Fusion:
         fused = np.sqrt(variance / n_maps / 2 + scatter / n_maps) * points[:, 2]
         kept = np.flatnonzero(keep)
         voxel = self._voxel(points[kept], place, update)
-        kept = kept[thin_by_voxel(points[kept], confidence[kept], voxel)]
+        kept = kept[voxel_downsample(points[kept], confidence[kept], voxel)]
         return PointChunk(
             keyframe_id, depth_map.t_ns, points[kept].astype(np.float32),
             np.ascontiguousarray(depth_map.rgb[rows[kept], columns[kept]]),
@@ -122,15 +122,15 @@ class Fusion:
         )  # fmt: skip
 
     def _voxel(self, points: Array, place: Similarity, update: MapUpdate) -> float:
-        """Size of a voxel in the chunk's units."""
+        """Voxel size in the units of the chunk."""
         if update.georeference is None:
             return 0.01 * float(np.median(points[:, 2]))
         return self._config.voxel_m / (update.georeference.world_from_map.scale * place.scale)
 
-    def _witness(
-        self, points: Array, other_from_here: Similarity, other: _Held, stretch: float
-    ) -> _Witness:
-        """What the other, whose depths are to be stretched, sees of points (N, 3)."""
+    def _agreement(
+        self, points: Array, other_from_here: Similarity, other: _RecentMap, local_scale: float
+    ) -> _Agreement:
+        """Agreement of another map, its depths scaled by `local_scale`, with points (N, 3)."""
         p = other_from_here.apply(points)
         fx, fy, cx, cy = other.map.intrinsics
         height, width = other.map.depth.shape
@@ -141,11 +141,11 @@ class Fusion:
         inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
         row, column = (np.where(inside, x, 0).astype(np.int64) for x in (v, u))
         seen = np.where(inside, other.map.depth[row, column], 0.0)
-        off: Array = stretch * seen / z - 1.0
-        agrees: Mask = (seen > 0) & (np.abs(off) < self._config.agreement)
+        difference: Array = local_scale * seen / z - 1.0
+        agrees: Mask = (seen > 0) & (np.abs(difference) < self._config.agreement)
         row, column = row[agrees], column[agrees]
-        return _Witness(
-            agrees, off[agrees], other.map.sigma[row, column] / seen[agrees],
+        return _Agreement(
+            agrees, difference[agrees], other.map.sigma[row, column] / seen[agrees],
             other.normals[row, column] @ other_from_here.rotation,
         )  # fmt: skip
 
@@ -158,7 +158,7 @@ def points_of(depth_map: DepthMap, rows: Indices, columns: Indices) -> Array:
 
 
 def chunk_alone(depth_map: DepthMap) -> PointChunk:
-    """All that has converged of the only map there is: no other can agree or disagree."""
+    """Converged pixels of a single map, without agreement."""
     known = measured_only(depth_map)
     rows, columns = np.nonzero(known.depth)
     return PointChunk(
@@ -170,7 +170,7 @@ def chunk_alone(depth_map: DepthMap) -> PointChunk:
 
 
 def measured_only(depth_map: DepthMap, max_sigma: float = np.inf) -> DepthMap:
-    """The same without what was filled in, or has a larger relative standard deviation."""
+    """The map without filled-in pixels and those of larger relative standard deviation."""
     known = depth_map.state == PixelState.CONVERGED.value
     if np.isfinite(max_sigma):
         known &= depth_map.sigma <= max_sigma * depth_map.depth
@@ -181,9 +181,9 @@ def measured_only(depth_map: DepthMap, max_sigma: float = np.inf) -> DepthMap:
     )  # fmt: skip
 
 
-def _stretch(held: _Held, place: Similarity, update: MapUpdate) -> float:
-    """By what factor the map's points are further away now than the depths; by spans if too few."""
-    depth_map = held.map
+def _local_scale(recent: _RecentMap, place: Similarity, update: MapUpdate) -> float:
+    """Local scale correction of the depths by map points; by keyframe spans if too few."""
+    depth_map = recent.map
     points = place.inverse().apply(update.points_map)
     points = points[points[:, 2] > 1e-6]
     fx, fy, cx, cy = depth_map.intrinsics
@@ -194,7 +194,7 @@ def _stretch(held: _Held, place: Similarity, update: MapUpdate) -> float:
     depth = depth_map.depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
     known = depth > 0
     ratio = typical_ratio(points[inside][known, 2] / depth[known])
-    return update.local_scale_of(depth_map.keyframe_id, held.spans) if ratio is None else ratio
+    return update.local_scale_of(depth_map.keyframe_id, recent.spans) if ratio is None else ratio
 
 
 def _unit(vectors: Array) -> Array:
@@ -203,7 +203,7 @@ def _unit(vectors: Array) -> Array:
 
 
 def _smooth(depth: Floats) -> Mask:
-    """Pixels with depth that have a neighbour on the same surface, and none on another."""
+    """Pixels with a neighbour on the same surface, and none on another."""
     ok = np.zeros(depth.shape, bool)
     edge = np.zeros(depth.shape, bool)
     for axis in (0, 1):

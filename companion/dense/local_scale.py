@@ -1,8 +1,8 @@
-"""By how much what was measured in a map has to be stretched to fit the map as it is now.
+"""Local scale correction of measurements to the map as it is now.
 
-Dense depth comes in the unit that the map had about a keyframe when it was made. As the map is
-adjusted, places move and turn against each other, and depth that was right does not fit any more.
-The map's own points, which are adjusted with it, tell by how much.
+Dense depth has the local scale of the map at its measurement. Adjustment of the map changes
+positions and scale, so that depth has to be rescaled. The sparse points, which are adjusted with
+it, give the factor.
 """
 
 from __future__ import annotations
@@ -12,20 +12,19 @@ import numpy as np
 from companion.geometry.transforms import Array
 
 CELL = 0.006
-"""Side of the cells of the image, as tangents, in which points are compared."""
-FURTHEST = 0.15
-"""Natural logarithm of a ratio beyond which a point does not lie on the same surface."""
+"""Side of the image cells, as tangents, in which points are compared."""
+MAX_LOG_RATIO = 0.15
+"""Larger logarithmic ratios are not of the same surface."""
 WINDOW = 0.05
-"""Relative difference from the typical ratio up to which others are counted."""
-LEAST_POINTS = 30
-"""Fewer than this tell nothing."""
+"""Relative deviation from the typical ratio up to which others are averaged."""
+MIN_POINTS = 30
+"""Points required."""
 
 
-def stretch_of_points(points_camera: Array, map_points_camera: Array) -> float | None:
-    """By what factor points (N, 3) are nearer than the map's points (M, 3); None if too few meet.
+def local_scale_of_points(points_camera: Array, map_points_camera: Array) -> float | None:
+    """Ratio of the depths of map points (M, 3) to points (N, 3); None with too few.
 
-    Both are in the frame that the first were seen from. Of the first, at most one is looked at in
-    each direction.
+    Both are in the frame of the camera that measured the points, of which one per cell is compared.
     """
     if len(points_camera) == 0:
         return None
@@ -45,17 +44,17 @@ def stretch_of_points(points_camera: Array, map_points_camera: Array) -> float |
 
 
 def typical_ratio(ratios: Array) -> float | None:
-    """The median (N,) of those that lie about it; None if there are too few.
+    """Robust median of ratios (N,); None with too few.
 
-    What is hidden from where the depth was measured, and what lies before it, counts as none.
+    Occluded points and those in front are excluded.
     """
-    near = ratios[np.abs(np.log(np.maximum(ratios, 1e-9))) < FURTHEST]
-    if len(near) < LEAST_POINTS:
+    near = ratios[np.abs(np.log(np.maximum(ratios, 1e-9))) < MAX_LOG_RATIO]
+    if len(near) < MIN_POINTS:
         return None
     middle = float(np.median(near))
     for _ in range(5):
         about = near[np.abs(near / middle - 1.0) < WINDOW]
-        if len(about) < LEAST_POINTS:
+        if len(about) < MIN_POINTS:
             return None
         middle = float(np.median(about))
     return middle

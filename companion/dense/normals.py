@@ -1,4 +1,4 @@
-"""Which way the surfaces of a depth map face."""
+"""Surface normals of a depth map."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import numpy as np
 from companion.messages import Floats
 
 MAX_STEP = 0.04
-"""Relative step of depth from a pixel to its neighbour at which a surface ends."""
-AROUND = ((1, 1), (-1, 1), (2, 0), (0, 2), (2, 2), (-2, 2))
-"""Offsets of neighbours looked at, and their opposites: nearer ones share their noise."""
+"""Relative depth step between neighbours at a depth edge."""
+OFFSETS = ((1, 1), (-1, 1), (2, 0), (0, 2), (2, 2), (-2, 2))
+"""Offsets of the neighbours used, with their opposites: nearer ones share noise."""
 
 
 def normals(depth: Floats, intrinsics: tuple[float, float, float, float]) -> Floats:
-    """Unit normals (H, W, 3), towards the camera; zero where depth (H, W) is 0 or has no around.
+    """Unit normals (H, W, 3) towards the camera; zero where depth (H, W) is 0 or isolated.
 
-    Over a plane inverse depth is linear in the image, so that its gradient, by least squares over
-    the neighbours on the same surface, gives the plane.
+    Inverse depth of a plane is linear in the image: its least-squares gradient over neighbours on
+    the same surface gives the plane.
     """
     fx, fy, cx, cy = intrinsics
     known = depth > 0
     rho = np.where(known, 1.0 / np.where(known, depth, np.float32(1)), np.float32(0))
     xx, xy, yy, xr, yr = (np.zeros(depth.shape, np.float32) for _ in range(5))
-    for dx, dy in AROUND:
+    for dx, dy in OFFSETS:
         steps = max(abs(dx), abs(dy))
         here, there = _pair(rho, dx, dy)
         rise = there - here
@@ -30,7 +30,7 @@ def normals(depth: Floats, intrinsics: tuple[float, float, float, float]) -> Flo
         same = (np.abs(rise) < steps * MAX_STEP * lesser).astype(np.float32)
         rise *= same
         for end in (0, 1):
-            # seen from the other end both step and rise change sign: their products do not
+            # from the other end both step and rise change sign: products do not
             at = _part(depth.shape, dx, dy)[end]
             xx[at] += dx * dx * same
             xy[at] += dx * dy * same
@@ -53,7 +53,7 @@ def normals(depth: Floats, intrinsics: tuple[float, float, float, float]) -> Flo
 
 
 def _part(shape: tuple[int, ...], dx: int, dy: int) -> tuple[tuple[slice, slice], ...]:
-    """Where pixels lie that have one at the offset, and where these lie; dy is not negative."""
+    """Slices of pixels that have one at the offset, and of these; dy is not negative."""
     height, width = shape
     rows, columns = max(0, height - dy), max(0, width - abs(dx))
     left, right = slice(0, columns), slice(width - columns, width)

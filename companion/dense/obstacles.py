@@ -1,10 +1,10 @@
-"""How far it is to the nearest obstacle in each direction, out of the newest part of the map.
+"""Distance to the nearest obstacle per sector, from the newest part of the map.
 
-Directions are sectors of a circle around the vehicle, level, the first centred on straight ahead,
-clockwise as seen from above. What the camera has not seen is unknown, not free: a sector is free
-only where lines of sight lead through it, at the vehicle's height, to something farther away.
+Sectors are horizontal, around the vehicle, the first centred on straight ahead, clockwise in plan
+view. Unseen space is unknown, not free: a sector is free only where lines of sight pass through it,
+at the height of the vehicle, to something farther away.
 
-What stands still is found; what moves, and what has no texture, is not.
+Static textured obstacles are detected; moving or untextured ones are not.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ N_SECTORS = 72
 SECTOR_DEG = 5.0
 UNKNOWN_CM = 65535
 MIN_POINTS = 3
-"""Fewer points than this in a sector are taken for errors."""
+"""Fewer points in a sector count as outliers."""
 NEAR_SIGHT_M = 1.0
-"""A line of sight counts for the vehicle's surroundings where it passes so near to it."""
+"""Largest distance of a line of sight from the vehicle to count for its surroundings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Where obstacles are looked for: nearer than `min_m` is the vehicle itself.
+    """Volume searched for obstacles; nearer than `min_m` is the vehicle itself.
 
-    Heights are above and below the vehicle, in the world, whatever its attitude.
+    Heights are relative to the vehicle, along the vertical.
     """
 
     min_m: float = 0.3
@@ -42,7 +42,7 @@ class Reach:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Obstacles:
-    """Distances (72,) in centimetres: `max_cm` + 1 where it is free, UNKNOWN_CM where not seen."""
+    """Distances (72,) in centimetres: `max_cm` + 1 where free, UNKNOWN_CM where unseen."""
 
     t_ns: int
     distances_cm: NDArray[np.uint16]
@@ -57,9 +57,9 @@ def obstacles_around(
     seen_from_world_m: Array,
     reach: Reach = Reach(),
 ) -> Obstacles:
-    """Distances from a pose, of points (N, 3) that were seen from the places (N, 3).
+    """Distances from a pose to points (N, 3) seen from camera positions (N, 3).
 
-    The pose must be of the map that the points are of: one that is smoothed lies beside it.
+    The pose must be by the map of the points: a slewed one is offset.
     """
     position = world_from_body.translation
     finite = np.isfinite(points_world_m).all(1) & np.isfinite(seen_from_world_m).all(1)
@@ -81,7 +81,7 @@ def obstacles_around(
     order = np.lexsort((hit_m, hit_sector))
     hit_m, hit_sector = hit_m[order], hit_sector[order]
     found, first, n = np.unique(hit_sector, return_index=True, return_counts=True)
-    # Not the very nearest of a sector, which may be an error.
+    # not the very nearest point of a sector, which may be an outlier
     enough = n >= MIN_POINTS
     nearest_m = hit_m[first[enough] + MIN_POINTS - 1]
     distances_cm[found[enough]] = np.clip((nearest_m * 100).astype(np.int64), min_cm, max_cm)
@@ -97,9 +97,9 @@ def _sector(points: Array, world_from_body: Pose) -> NDArray[np.int64]:
 
 
 def _seen_through(points: Array, eyes: Array, reach: Reach) -> NDArray[np.bool_]:
-    """Which of these points beyond reach end a line of sight that keeps to the vehicle's height.
+    """Points beyond reach whose line of sight stays at the height of the vehicle.
 
-    The line begins at the eye and passes near to the vehicle, which is at the origin.
+    The line starts at the camera and passes close to the vehicle, at the origin.
     """
     line = points - eyes
     length_m = np.linalg.norm(line, axis=1)
@@ -119,7 +119,7 @@ def _seen_through(points: Array, eyes: Array, reach: Reach) -> NDArray[np.bool_]
 
 
 class RecentCloud:
-    """The newest chunks of the cloud, thinned; what is older than `max_age_s` no longer counts."""
+    """The newest chunks of the cloud, subsampled; older than `max_age_s` are ignored."""
 
     def __init__(
         self, max_age_s: float = 15.0, max_chunks: int = 12, max_points: int = 2000
@@ -130,7 +130,7 @@ class RecentCloud:
         self._chunks: OrderedDict[int, PointChunk] = OrderedDict()
 
     def add(self, chunk: PointChunk) -> None:
-        """Take a new chunk, or a new one of a keyframe that had one."""
+        """Add a chunk, replacing one of the same keyframe."""
         step = -(-len(chunk.points_camera) // self._max_points) or 1
         thinned = PointChunk(
             chunk.keyframe_id,
@@ -147,7 +147,7 @@ class RecentCloud:
             self._chunks.popitem(last=False)
 
     def in_world(self, t_ns: int, update: MapUpdate) -> tuple[Array, Array] | None:
-        """Points (N, 3) and the places (N, 3) that they were seen from, in metres.
+        """Points (N, 3) and the camera positions (N, 3) that saw them, in metres.
 
         None without a metric scale.
         """

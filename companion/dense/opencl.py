@@ -1,4 +1,4 @@
-"""OpenCL devices: listed, opened, programs built for them."""
+"""OpenCL devices: listing, opening, building programs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from companion.errors import DeviceError
 # Both are read by libraries when they are first called.
 # PoCL: one thread of work per core, and no spinning while waiting.
 os.environ.setdefault("POCL_AFFINITY", "0")
-# ocl-icd would begin every driver's devices to sort platforms by them, and one of them may abort.
+# ocl-icd would initialise every driver to sort platforms, and one of them may abort.
 os.environ.setdefault("OCL_ICD_PLATFORM_SORT", "none")
 
 WANT = (
@@ -51,28 +51,28 @@ class ListedDevice:
 
     @property
     def identity(self) -> str:
-        """Told apart from every other device there is, and from itself after an update."""
+        """Distinguishes devices, and driver versions of the same device."""
         return f"{self.number} {self.kind} {self.named} {self.driver}"
 
 
 class ComputeDevice:
-    """A device with its context and one in-order queue that measures."""
+    """A device with its context and one in-order profiling queue."""
 
     def __init__(self, device: cl.Device) -> None:
         self.device = device
         self.why = ""
-        """Why it was taken, where it was chosen among others."""
+        """Why it was chosen, where among others."""
         self.name = f"{device.name.strip()} ({device.platform.name.strip()})"
         self.context = cl.Context([device])
         self.queue = cl.CommandQueue(
             self.context, properties=cl.command_queue_properties.PROFILING_ENABLE
         )
         self.copies: deque[tuple[str, cl.Event]] = deque(maxlen=MAX_COPIES)
-        """The last ones, as `UPLOAD` or `READ_BACK`, for who wants to know their times."""
+        """The latest copies, as `UPLOAD` or `READ_BACK`, for timing."""
 
     @property
     def described(self) -> str:
-        """Its name, and why it was taken."""
+        """Its name, and why it was chosen."""
         return f"{self.name}, {self.why}" if self.why else self.name
 
     def build(self, source_name: str, constants: dict[str, int]) -> cl.Program:
@@ -80,7 +80,7 @@ class ComputeDevice:
         source = (resources.files("companion.dense") / "kernels" / source_name).read_text()
         options = [f"-D{name}={value}" for name, value in constants.items()]
         try:
-            with warnings.catch_warnings():  # a compiler's remarks on a build that went well
+            with warnings.catch_warnings():  # compiler remarks on a successful build
                 warnings.simplefilter("ignore", cl.CompilerWarning)
                 program: cl.Program = cl.Program(self.context, source).build(options=options)
                 return program
@@ -109,21 +109,21 @@ class ComputeDevice:
 
 
 def event_ms(event: cl.Event) -> float:
-    """How long a finished command ran on the device."""
+    """Device time of a finished command."""
     event.wait()
     return float(event.profile.end - event.profile.start) * 1e-6
 
 
 def platform_names() -> list[str]:
-    """All platforms, without a look at their devices."""
+    """All platforms, without opening their devices."""
     try:
         return [platform.name.strip() for platform in cl.get_platforms()]
     except cl.Error:
-        return []  # which is how a loader without a driver answers
+        return []  # the answer of a loader without drivers
 
 
 def devices_of(platform: int) -> list[ListedDevice]:
-    """All devices of a platform by its number; no other driver's are begun."""
+    """Devices of a platform by its number, without initialising other drivers."""
     try:
         return [
             _listed(f"{platform}:{i}", device)
@@ -147,7 +147,7 @@ def _kind(device: cl.Device) -> str:
 
 
 def device_asked_for(asked: str, listed: Sequence[ListedDevice]) -> ListedDevice:
-    """The one that `opencl.device` names; DeviceError if none is."""
+    """The device that `opencl.device` names; DeviceError if none."""
     wanted = asked.lower()
     for each in listed:
         if wanted == each.number or wanted in each.name.lower() or wanted in each.platform.lower():
@@ -157,7 +157,7 @@ def device_asked_for(asked: str, listed: Sequence[ListedDevice]) -> ListedDevice
 
 
 def open_device(listed: ListedDevice) -> ComputeDevice:
-    """Open it in this process; DeviceError where it is not there as listed, or lacks something."""
+    """Open a device in this process; DeviceError where it is missing, changed or unusable."""
     try:
         platform, device = (int(part) for part in listed.number.split(":"))
         found = cl.get_platforms()[platform].get_devices()[device]
@@ -169,12 +169,12 @@ def open_device(listed: ListedDevice) -> ComputeDevice:
 
 
 def linkers() -> list[str]:
-    """Which of the linkers that PoCL can use are installed, by their paths."""
+    """Paths of installed linkers that PoCL can use."""
     return [path for path in map(shutil.which, LINKERS) if path is not None]
 
 
 def _usable(device: cl.Device) -> ComputeDevice:
-    """PoCL ends the whole process where it finds no linker: better to say so before."""
+    """Check for a linker: PoCL ends the process without one."""
     if POCL in device.platform.name and _kind(device) == PROCESSOR and not linkers():
         raise DeviceError(
             f"{device.name.strip()} ({device.platform.name.strip()}): PoCL links kernels with "

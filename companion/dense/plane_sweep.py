@@ -1,4 +1,4 @@
-"""Depth of every pixel at once: planes swept through several images, costs summed along paths."""
+"""Multi-view plane sweep with semi-global aggregation of census costs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from companion.geometry.transforms import Array
 from companion.messages import Bytes
 
 PLANES = (32, 64, 128)
-"""Numbers of planes that there are kernels for; each is a multiple of 16."""
+"""Plane counts that kernels exist for; multiples of 16."""
 BLOCK = 8
 SMALL, LARGE = 3.5, 27.0
-"""Penalties of a step by one plane and by more, in bits for each image that counts."""
-SOFT_GREY = 16
-"""Grey levels of an edge at which a large step costs half."""
-UNLOOKED = 18
-"""Bits for each image that a plane costs which is not looked at: more than what does not fit."""
+"""Penalties of steps by one plane and by more, bits per counted image."""
+EDGE_GREY = 16
+"""Grey-level difference at which the large penalty is halved."""
+SKIPPED_COST = 18
+"""Bits per image of planes not evaluated: more than those of a mismatch."""
 COARSE_PATHS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 PATHS = (*COARSE_PATHS, (1, 1), (-1, -1), (1, -1), (-1, 1))
 
@@ -29,10 +29,10 @@ Run = Callable[..., None]
 
 
 class PlaneSweep:
-    """Buffers and kernels of a sweep for images of one size; results stay on the device.
+    """Buffers and kernels of a sweep for one image size; results stay on the device.
 
-    `rho` and `margin` hold, after `run`, inverse depth f32 on the grid (a median of 3 x 3) and by
-    how much, in proportion, the next best plane is worse; `noise` how rough the depth is there.
+    After `run`, `rho` is inverse depth f32 on the grid (3 x 3 median), `margin` the relative cost
+    excess of the next best plane, and `noise` the local roughness of depth.
     """
 
     def __init__(self, device: ComputeDevice, width: int, height: int, stride: int) -> None:
@@ -62,22 +62,22 @@ class PlaneSweep:
         self.rho, self.margin, self.noise = (device.buffer(4 * n) for _ in range(3))
 
     def set_reference(self, grey: Bytes, run: Run) -> None:
-        """Take the reference image (H, W)."""
+        """Set the reference image (H, W)."""
         self._device.write(self.reference, np.ascontiguousarray(grey))
         self._census(self.reference, self._words_r, 0, run)
 
     def set_image(self, slot: int, grey: Bytes) -> None:
-        """Take an image (H, W) into a slot; it is looked at when next a sweep runs."""
+        """Set an image (H, W) in a slot; transformed at the next sweep."""
         self._device.write(self.images[slot], np.ascontiguousarray(grey))
         self._stale.add(slot)
 
     def run(self, projections: Array, rho_low: float, step: float, n_planes: int, run: Run) -> None:
         """Sweep planes rho_low + k * step, at most `PLANES[-1]` of them.
 
-        `projections` (n, 12) are those of the images in slots 0 to n - 1.
+        `projections` (n, 12) are of the images in slots 0 to n - 1.
         """
         planes = next(n for n in PLANES if n >= n_planes)
-        looked_at = (1 << -(-n_planes // BLOCK)) - 1
+        all_blocks = (1 << -(-n_planes // BLOCK)) - 1
         n = len(projections)
         for slot in sorted(self._stale):
             self._census(self.images[slot], self._words, slot * self._n_pixels, run)
@@ -86,13 +86,13 @@ class PlaneSweep:
         self._device.write(self._views, np.ascontiguousarray(projections, np.float32))
         for coarse in (True, False):
             if coarse:
-                everywhere = np.full(self._coarse[0] * self._coarse[1], looked_at, np.uint32)
+                everywhere = np.full(self._coarse[0] * self._coarse[1], all_blocks, np.uint32)
                 self._device.write(self._blocks, everywhere)
             else:
                 run(
                     "blocks", self._kernels[planes]["blocks_about"], self.grid, (64, 1), self.rho,
                     *map(np.int32, self._coarse), np.float32(rho_low), np.float32(step),
-                    np.uint32(looked_at), self._blocks, *map(np.int32, self.grid),
+                    np.uint32(all_blocks), self._blocks, *map(np.int32, self.grid),
                 )  # fmt: skip
             self._level(coarse, self._kernels[planes], n, dropped, rho_low, step, run)
 
@@ -109,13 +109,14 @@ class PlaneSweep:
         run(
             f"costs-{level}", kernels["costs"], grid, (16, 1), self._words_r, self._words,
             width, height, self._views, np.int32(n), np.int32(dropped), np.float32(rho_low),
-            np.float32(step), self._blocks, np.int32(UNLOOKED * counted), self._cost, *grid, stride,
+            np.float32(step), self._blocks, np.int32(SKIPPED_COST * counted), self._cost, *grid,
+            stride,
         )  # fmt: skip
         for k, (dx, dy) in enumerate(COARSE_PATHS if coarse else PATHS):
             run(
                 f"aggregate-{level}", kernels["aggregate"], (grid[0] if dy else grid[1],),
                 (8,), self._cost, self._sum, self.reference, width, *grid, stride, np.int32(dx),
-                np.int32(dy), np.int32(small), np.int32(large), np.int32(SOFT_GREY),
+                np.int32(dy), np.int32(small), np.int32(large), np.int32(EDGE_GREY),
                 np.int32(k == 0),
             )  # fmt: skip
         n_cells = grid[0] * grid[1]

@@ -1,4 +1,4 @@
-"""Huber total variation of inverse depth, weighted by confidence and by the image's edges."""
+"""Huber total variation of inverse depth, weighted by confidence and image edges."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Regularisation:
         self._p = device.buffer(8 * n)
 
     def run(self, data: Floats, weight: Floats, edge: Floats, iterations: int, run: Run) -> Floats:
-        """The smooth version of `data` (H, W), all f32 of that shape; weight 0 is filled in."""
+        """Smoothed `data` (H, W), all f32 of that shape; pixels of weight 0 are filled in."""
         device, (width, height) = self._device, self._grid
         for buffer, array in (
             (self._x, data), (self._x_bar, data), (self._data, data), (self._weight, weight),
@@ -51,7 +51,7 @@ class Regularisation:
 
 
 def edges(grey: Floats) -> Floats:
-    """How much smoothing an image (H, W) allows at each pixel, 0 to 1: little across its edges."""
+    """Edge weight of each pixel of an image (H, W), 0 to 1: small across edges."""
     gradient = np.zeros_like(grey)
     gradient[:, :-1] += np.abs(np.diff(grey, axis=1))
     gradient[:-1] += np.abs(np.diff(grey, axis=0))

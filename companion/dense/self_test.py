@@ -1,4 +1,4 @@
-"""Whether a device computes what it should, and how fast: a small scene with a known answer."""
+"""Self-test and benchmark of a device on a small scene of known depth."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from companion.messages import Bytes, DepthMap
 
 VALUES = "self_test.npz"
 SIZE = (97, 65)
-"""Odd, so that rows and vectors do not line up."""
+"""Odd, so that rows are not vector-aligned."""
 FAR, NEAR = 10.0, 5.0
 SHIFTS_PX = ((4, 0), (-4, 0), (0, 4), (6, 4), (-6, -4), (8, -4))
-"""By how much the far plane moves in each image; the near one moves by twice that."""
+"""Disparity of the far plane in each image; that of the near one is twice as large."""
 NOISE = 0.005
-"""Relative difference of depth up to which two devices agree: they round differently."""
-LEAST_AGREEING = 0.99
+"""Relative depth difference allowed for rounding."""
+MIN_AGREEING = 0.99
 SPEED_SIZE = (640, 480)
 SPEED_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Images of a square before a wall, the first the reference, and the others' poses."""
+    """Images of a square in front of a wall, the first the reference, and poses of the others."""
 
     images: tuple[Bytes, ...]
     poses: tuple[Pose, ...]
@@ -40,7 +40,7 @@ class Scene:
 
 
 def scene(width: int, height: int) -> Scene:
-    """Made of whole numbers and moved by whole pixels: the same to the last bit everywhere."""
+    """Scene of integer values and disparities: bit-exact everywhere."""
     margin = 16
     pattern = _pattern(width + 4 * margin, height + 4 * margin)
     v, u = np.indices((height, width))
@@ -60,7 +60,7 @@ def scene(width: int, height: int) -> Scene:
 
 
 def _pattern(width: int, height: int) -> Bytes:
-    """Detail at several scales from a linear congruence."""
+    """Multi-scale texture by a linear congruential generator."""
     side = max(width, height)
     out = np.zeros((side, side), np.int64)
     seed = 12345
@@ -77,13 +77,13 @@ def _pattern(width: int, height: int) -> Bytes:
 def engine_for(device: ComputeDevice, it: Scene) -> DepthEngine:
     """An engine for every pixel of the scene."""
     height, width = it.images[0].shape
-    # so small an image tells depths no better than by some percent
+    # so small an image determines depth to some per cent only
     config = DepthConfig(stride=1, converged_sigma=0.1)
     return DepthEngine(device, width, height, it.intrinsics, config, eager=False)
 
 
 def reconstruct(engine: DepthEngine, it: Scene) -> DepthMap:
-    """The scene's depth by this engine."""
+    """Depth of the scene by an engine."""
     engine.begin(it.images[0], 0.7 * NEAR, 2.0 * FAR)
     for image, pose in zip(it.images[1:], it.poses, strict=True):
         engine.update(image, pose)
@@ -91,7 +91,7 @@ def reconstruct(engine: DepthEngine, it: Scene) -> DepthMap:
 
 
 class SelfTest:
-    """The small scene on a device, as often as wanted. Raises DeviceError where it cannot be."""
+    """Repeatable self-test of a device. Raises DeviceError where it cannot run."""
 
     def __init__(self, device: ComputeDevice) -> None:
         self._device = device
@@ -102,23 +102,23 @@ class SelfTest:
             self._depth, self._state = values["depth"].astype(np.float64), values["state"]
 
     def run(self) -> None:
-        """DeviceError where the result is not the one that the program is shipped with."""
+        """DeviceError where the result differs from the stored one."""
         found = reconstruct(self._engine, self._scene)
         failed = f"{self._device.name}: self-test failed"
         if not np.isfinite(found.depth).all() or not np.isfinite(found.sigma).all():
             raise DeviceError(f"{failed}: results that are not numbers")
         near = np.abs(found.depth - self._depth) <= NOISE * self._depth
         worst = float(min(near.mean(), (found.state == self._state).mean()))
-        if worst < LEAST_AGREEING:
+        if worst < MIN_AGREEING:
             raise DeviceError(f"{failed}: only {100 * worst:.1f} % of its depths are right")
 
 
 def frames_per_s(device: ComputeDevice, seconds: Callable[[], float]) -> float:
-    """Images of 640 x 480 per second that it makes depth of, at every second pixel, for 2 s."""
+    """Throughput for images of 640 x 480 at every second pixel, over 2 s."""
     it = scene(*SPEED_SIZE)
     height, width = it.images[0].shape
     engine = DepthEngine(device, width, height, it.intrinsics, DepthConfig(), eager=False)
-    reconstruct(engine, it)  # compilers are done after the first
+    reconstruct(engine, it)  # warm-up: kernels are compiled
     begun, n = seconds(), 0
     while seconds() - begun < SPEED_S:
         reconstruct(engine, it)

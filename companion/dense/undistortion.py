@@ -1,4 +1,4 @@
-"""From a camera's images to those of an ideal pinhole camera."""
+"""Undistortion of images to a pinhole camera."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ MAX_HFOV_RAD = np.radians(110.0)
 
 
 class Undistortion:
-    """Remaps images of one camera to an ideal pinhole camera's of the same size.
+    """Remaps images of one camera to a pinhole camera of the same size.
 
-    The focal length is kept, unless the field of view would be too wide for a plane.
+    The focal length is kept, unless the field of view is too wide for a plane.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -44,7 +44,7 @@ class Undistortion:
         return np.asarray(cv2.cvtColor(self.image(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
 
     def nearest(self, values: NDArray[Any]) -> Floats:
-        """Values (H, W) that must not be mixed, such as depths; 0 outside."""
+        """Nearest-neighbour remap of values (H, W), such as depths; 0 outside."""
         out = cv2.remap(values, self._map_u, self._map_v, cv2.INTER_NEAREST)
         return np.asarray(out, np.float32)
 

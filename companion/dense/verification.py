@@ -1,4 +1,4 @@
-"""Whether images fit the depths that are believed, and what is to be thought of each pixel."""
+"""Photo-consistency check of swept depth, and classification of pixels."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from companion.dense.plane_sweep import PlaneSweep, Run
 from companion.geometry.transforms import Array
 from companion.messages import Bytes
 
-FURTHEST_PX = 1.5
-"""An image that would have a pixel further away than this does not fit."""
+MAX_DISTANCE_PX = 1.5
+"""Larger offsets in an image are mismatches."""
 DIVERGED_RATIO = 0.2
 AREA = 25
-"""Pixels of the window that is compared."""
+"""Pixels of the compared window."""
 NOISE_BOUND = 1.8
-"""Times the noise expected of a window that 1 % of them are above (chi squared, 24 degrees)."""
+"""99 % quantile of window noise relative to its expectation (chi squared, 24 degrees of freedom).
+"""
 NOISE_BLOCK, NOISE_QUANTILE = 16, 0.1
-"""Side in pixels of the blocks that noise is measured in, and which of them is believed."""
-MOST_NOISE_GREY = 6.0
-"""No camera that is of use has more; what looks like more is texture."""
+"""Side in pixels of the blocks in which noise is measured, and the quantile used."""
+MAX_NOISE_GREY = 6.0
+"""Larger values are texture, not noise."""
 BORDER = 2
 
 
 class Verification:
-    """Counts, on the device, which images fit each grid pixel; judges it by that and the margin."""
+    """Counts consistent images per grid pixel on the device; classifies by count and margin."""
 
     def __init__(self, device: ComputeDevice, sweep: PlaneSweep, config: DepthConfig) -> None:
         self._device = device
@@ -37,7 +38,7 @@ class Verification:
         names = ("follow", "to_grid", "verify", "judge")
         self._kernels = {name: cl.Kernel(program, name) for name in names}
         n = sweep.grid[0] * sweep.grid[1]
-        self._grey, self._value, self._change, self._good, self._bad, self._alike = (
+        self._grey, self._value, self._change, self._good, self._bad, self._similar = (
             device.buffer(4 * n) for _ in range(6)
         )
         self.sigma, self.ratio, self.weight = (device.buffer(4 * n) for _ in range(3))
@@ -45,22 +46,24 @@ class Verification:
         self._zeros = np.zeros(n, np.float32)
 
     def run(self, projections: Array, step: float, noise_grey: float, run: Run) -> None:
-        """Verify the sweep's result in the images that it was made of; `step` as there.
+        """Verify the result of the sweep in its images; `step` as there.
 
-        `noise_grey` is what `image_noise` says of the reference.
+        `noise_grey` is `image_noise` of the reference.
         """
         sweep, config = self._sweep, self._config
         grid = tuple(map(np.int32, sweep.grid))
         width, height = map(np.int32, sweep.size)
         stride = np.int32(sweep.stride)
-        for counts in (self._good, self._bad, self._alike):
+        for counts in (self._good, self._bad, self._similar):
             self._device.write(counts, self._zeros)
         run(
             "grey", self._kernels["to_grid"], grid, (64, 1), sweep.reference, width, self._grey,
             *grid, stride,
         )  # fmt: skip
-        alike = NOISE_BOUND * AREA * 2.0 * noise_grey**2
-        limits = np.array([config.min_zncc, config.noise_grey, FURTHEST_PX, alike], np.float32)
+        max_similar = NOISE_BOUND * AREA * 2.0 * noise_grey**2
+        limits = np.array(
+            [config.min_zncc, config.noise_grey, MAX_DISTANCE_PX, max_similar], np.float32
+        )
         for slot, rows in enumerate(projections.astype(np.float32).reshape(-1, 3, 4)):
             run(
                 "follow", self._kernels["follow"], grid, (64, 1), sweep.images[slot], width, height,
@@ -69,7 +72,7 @@ class Verification:
             )  # fmt: skip
             run(
                 "verify", self._kernels["verify"], (-(-sweep.grid[0] // 8), sweep.grid[1]), (16, 1),
-                self._grey, self._value, self._change, self._good, self._bad, self._alike, limits,
+                self._grey, self._value, self._change, self._good, self._bad, self._similar, limits,
                 *grid,
             )  # fmt: skip
         accept = (
@@ -78,23 +81,23 @@ class Verification:
         )  # fmt: skip
         run(
             "judge", self._kernels["judge"], grid, (64, 1), sweep.rho, sweep.margin, self._good,
-            self._bad, self._alike, sweep.noise, np.float32(step),
+            self._bad, self._similar, sweep.noise, np.float32(step),
             np.array(accept, np.float32), np.int32(BORDER), self.sigma, self.ratio, self.label,
             self.weight, *grid,
         )  # fmt: skip
 
 
 def image_noise(grey: Bytes) -> float:
-    """One standard deviation of an image's (H, W) noise, in grey levels (Immerkaer 1996).
+    """Standard deviation of the noise of an image (H, W), grey levels (Immerkaer 1996).
 
-    From where it is smoothest, as texture adds to it; 0 where a tenth of it does not vary at all,
-    `MOST_NOISE_GREY` at most.
+    Measured in the smoothest blocks, as texture adds to it; 0 where a tenth of them is constant, at
+    most `MAX_NOISE_GREY`.
     """
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     rough = np.abs(cv2.filter2D(grey, cv2.CV_32F, mask))
     height, width = grey.shape
     blocks = (max(1, width // NOISE_BLOCK), max(1, height // NOISE_BLOCK))
     means = cv2.resize(rough, blocks, interpolation=cv2.INTER_AREA)
-    # the mask's weights have a norm of 6; the mean of |x| of a Gaussian is 0.798 of its deviation
+    # the mask has norm 6; the mean of |x| of a Gaussian is 0.798 standard deviations
     found = float(np.quantile(means, NOISE_QUANTILE)) * float(np.sqrt(np.pi / 2)) / 6.0
-    return min(found, MOST_NOISE_GREY)
+    return min(found, MAX_NOISE_GREY)

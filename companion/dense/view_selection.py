@@ -1,4 +1,4 @@
-"""Which images are worth their time: the few that see a reference from places far apart."""
+"""View selection: a few images of a reference with well-spread baselines."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from companion.geometry.transforms import Array, Pose
 
 MAX_VIEWS = 6
-"""Images that a depth is made of."""
-LEAST_BASELINE = 0.015
-"""Of the middle depth; an image from nearer by says nothing."""
-NOVEL = 0.2
-"""Of its baseline; an image nearer than this to one already taken says nothing new."""
-SHORT = 0.2
-"""Of the middle depth; shorter baselines than this count as alike."""
-LEAST_OVERLAP = 0.5
-"""Share of the reference that an image must see, at the middle depth."""
-LONGEST_BASELINE = 0.6
-"""Of the middle depth; from further away things look different."""
-MAX_TURN_RAD = np.radians(35.0)
+"""Images used for a depth map."""
+MIN_BASELINE = 0.015
+"""Ratio of the middle depth below which an image is useless."""
+MIN_NOVELTY = 0.2
+"""Ratio of its baseline; images nearer to one already used are redundant."""
+SHORT_BASELINE = 0.2
+"""Ratio of the middle depth; shorter baselines count as equal."""
+MIN_OVERLAP = 0.5
+"""Ratio of the reference that an image must see, at the middle depth."""
+MAX_BASELINE = 0.6
+"""Ratio of the middle depth; beyond, appearance changes too much."""
+MAX_ROTATION_RAD = np.radians(35.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """An ideal pinhole camera, in pixels."""
+    """A pinhole camera, in pixels."""
 
     fx: float
     fy: float
@@ -39,16 +39,16 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A kept image: the slot that it lies in, and where it was taken from."""
+    """A kept image: its slot and pose."""
 
     slot: int
     current_from_reference: Pose
     centre: Array
-    """(3,) in the reference's frame."""
+    """(3,) in the frame of the reference."""
 
 
 class Views:
-    """The images kept for one reference, at most `MAX_VIEWS`; a better one takes another's slot."""
+    """Images kept for one reference, at most `MAX_VIEWS`; better ones replace others."""
 
     def __init__(self, intrinsics: Intrinsics, width: int, height: int) -> None:
         self._k = intrinsics
@@ -61,13 +61,13 @@ class Views:
         self._rho, self._range = 1.0, (1.0, 1.0)
         self.kept: list[View] = []
         self.n_novel = 0
-        """Images since `begin` that were worth a thought, whether they were kept or not."""
+        """Images since `begin` that were not redundant, kept or not."""
         self.n_kept = 0
-        """Of them those that were kept, whether they still are or not."""
+        """Images since `begin` that were kept at any time."""
         self._seen: list[Array] = []
 
     def begin(self, rho_low: float, rho_high: float) -> None:
-        """Forget all; depths of the new reference have inverses between these two."""
+        """Reset for a reference with inverse depths between these."""
         self._rho = 0.5 * (rho_low + rho_high)
         self._range = (rho_high, rho_low)
         self.kept = []
@@ -75,20 +75,21 @@ class Views:
         self._seen = [np.zeros(3)]
 
     def consider(self, current_from_reference: Pose) -> View | None:
-        """The view under which an image is to be kept; None if it is not worth it.
+        """The view to keep an image as; None if rejected.
 
-        An image without parallax, from about where another was taken, from very far away, or that
-        sees less than half, is not.
+        Rejected without parallax, near another one, too far away, or with too little overlap.
         """
         pose = current_from_reference
         centre = pose.inverse().translation
         if not (np.isfinite(centre).all() and np.isfinite(pose.rotation).all()):
             return None
         baseline = float(np.linalg.norm(centre)) * self._rho
-        if baseline > LONGEST_BASELINE:
+        if baseline > MAX_BASELINE:
             return None
-        apart = np.linalg.norm(np.array(self._seen) - centre, axis=1) * self._rho
-        if float(apart.min()) < max(LEAST_BASELINE, NOVEL * baseline) or not self._overlaps(pose):
+        distance = np.linalg.norm(np.array(self._seen) - centre, axis=1) * self._rho
+        if float(distance.min()) < max(MIN_BASELINE, MIN_NOVELTY * baseline) or not self._overlaps(
+            pose
+        ):
             return None
         self._seen.append(centre)
         self.n_novel += 1
@@ -97,7 +98,7 @@ class Views:
             self.kept.append(view)
             self.n_kept += 1
             return view
-        out = self._least_needed([*self.kept, view])
+        out = self._most_redundant([*self.kept, view])
         if out == MAX_VIEWS:
             return None
         view = View(self.kept[out].slot, pose, centre)
@@ -106,7 +107,7 @@ class Views:
         return view
 
     def _overlaps(self, pose: Pose) -> bool:
-        if np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0)) > MAX_TURN_RAD:
+        if np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0)) > MAX_ROTATION_RAD:
             return False
         points = pose.apply(self._rays / self._rho)
         front = points[:, 2] > 1e-6
@@ -115,33 +116,33 @@ class Views:
         v = self._k.fy * points[:, 1] / z + self._k.cy
         width, height = self._size
         seen = front & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-        return float(seen.mean()) >= LEAST_OVERLAP
+        return float(seen.mean()) >= MIN_OVERLAP
 
     def spread(self) -> float:
-        """How far apart the kept images and the reference are, as a share of the middle depth."""
+        """RMS distance of the kept views and the reference, relative to the middle depth."""
         centres = np.array([np.zeros(3), *(view.centre for view in self.kept)])
-        apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-        return float(np.sqrt((apart**2).mean())) * self._rho
+        distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+        return float(np.sqrt((distance**2).mean())) * self._rho
 
-    def _least_needed(self, views: list[View]) -> int:
-        """Index of the view that has another nearest to it, in proportion to their baselines.
+    def _most_redundant(self, views: list[View]) -> int:
+        """Index of the view nearest to another, relative to their baselines.
 
-        The shortest baselines, which hide least behind edges, so stay among the longest.
+        So the shortest baselines, with least occlusion, are kept among the longest.
         """
         centres = np.array([view.centre for view in views])
         length = np.linalg.norm(centres, axis=1)
-        apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+        distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
         longer = np.maximum(length[:, None], length[None])
-        relative = apart / np.maximum(longer, SHORT / self._rho)
+        relative = distance / np.maximum(longer, SHORT_BASELINE / self._rho)
         np.fill_diagonal(relative, np.inf)
         order = np.sort(relative, axis=1)
-        # of the nearest two the one whose next neighbour is nearer
+        # of the nearest pair the one whose second neighbour is nearer
         return int(np.lexsort((order[:, 1], order[:, 0]))[0])
 
     def parallax_px(self) -> float:
-        """By how many pixels a point moves between the least and the greatest depth, at most.
+        """Largest disparity between minimum and maximum depth, over the kept views.
 
-        Of the kept images the one where it moves most, and there the median over the image.
+        Per view the median over the image.
         """
         most = 0.0
         for view in self.kept:

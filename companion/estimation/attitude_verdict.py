@@ -1,8 +1,8 @@
-"""Is the attitude the camera's, and is the map level: what each says of the other in flight.
+"""Consistency of the measured attitude with the camera and the map in flight.
 
-Where the map's vertical moves against the autopilot's, one of three is wrong. The map, if it is
-young: it begins anew. The camera's mount, which is constant and is fitted. Or the attitude is not
-the camera's, because a gimbal turns it: it is left aside, and used again once turns agree.
+Where the vertical of the map moves against the autopilot, one of three is wrong: a young map, which
+is reinitialised; the mount, which is constant and estimated; or the assumption that the attitude is
+that of the camera (gimbal): then attitude is ignored until rotations agree again.
 """
 
 from __future__ import annotations
@@ -11,202 +11,205 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.estimation.attitude_following import Following, FollowingTest
+from companion.estimation.attitude_following import RotationAgreement, RotationComparison
 from companion.estimation.map_tilt import MapTilt, RotationOf
 from companion.estimation.motion_filter import AttitudeHistory
 from companion.geometry.transforms import Array, angle_between
 from companion.messages import AttitudeSample, Warned
 
 CHECK_NS, CHECK_OLD_NS = 200_000_000, 1_000_000_000
-"""How often the vertical is looked at, in a map that is not yet known to be straight and later."""
-TURNS_NS = 2_000_000_000
-"""How often turns are compared."""
+"""Period of tilt checks, in maps not yet known to be consistent, and later."""
+ROTATION_CHECK_NS = 2_000_000_000
+"""Period of rotation comparisons."""
 MAX_TILT_RAD = np.radians(6.4)
-"""What a vertical may move by: a pose that is tilted by more is not begun to be sent."""
-BENT_NS = 500_000_000
-"""A keyframe or two of a young map are often tilted until they are adjusted; so few take less."""
-STRAIGHT_NS = 10_000_000_000
-"""A map that was straight for so long is not the one that is wrong."""
-MOST_ANEW = 3
-"""So many maps in a row that disagree with an attitude are right, and it is not theirs."""
-AGREEING = 2
-"""Comparisons of turns, one after the other, that speak for the same."""
-WAIT_NS, MAX_WAIT_NS = 10_000_000_000, 160_000_000_000
-"""An attitude that was left aside is not used again sooner; twice as long each time."""
+"""Largest change of the vertical: poses tilted by more are not sent."""
+MIN_TILTED_NS = 500_000_000
+"""Single keyframes of young maps are often tilted until adjusted, which takes less."""
+CONSISTENT_NS = 10_000_000_000
+"""A map consistent for so long is not the one that is wrong."""
+MAX_REINITIALISATIONS = 3
+"""Successive inconsistent maps after which the attitude is held to be wrong."""
+N_AGREEING = 2
+"""Successive rotation comparisons with the same result that are required."""
+RETRY_NS, MAX_RETRY_NS = 10_000_000_000, 160_000_000_000
+"""Time before an ignored attitude is used again; doubled each time."""
 
-BEGUN_ANEW = "map tilted against the autopilot's attitude: begun anew"
-NOT_FOLLOWED = "camera does not turn with the body: attitude not used, no vision position"
+REINITIALISED = "map tilted against the autopilot's attitude: begun anew"
+NOT_BODY_FIXED = "camera does not turn with the body: attitude not used, no vision position"
 MOUNT_DISAGREES = "camera mount disagrees with the autopilot's attitude: no vision position"
-FOLLOWED_AGAIN = "camera turns with the body again: attitude used"
+BODY_FIXED_AGAIN = "camera turns with the body again: attitude used"
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What is to be done: a word to whom it concerns, and what becomes of map and attitudes.
+    """A warning, and what to do with map and attitudes.
 
-    The map in use begins anew with `begin_anew`, the `n_anew`th in a row, and is of no use at all
-    if it is `young`. Attitudes since `disowned_since_ns` were not the camera's. With `mount` it is,
-    or was until now, how the camera sits on the body that was wrong.
+    With `reinitialise` the active map is discarded, for the `n_reinitialised`th time in a row,
+    entirely if it is `young`. Attitudes since `invalid_since_ns` were not those of the camera. With
+    `mount` the cause is, or was until now, the mount.
     """
 
     warning: Warned
-    begin_anew: bool = False
+    reinitialise: bool = False
     young: bool = True
-    disowned_since_ns: int | None = None
+    invalid_since_ns: int | None = None
     mount: bool = False
 
 
 class AttitudeVerdict:
-    """Takes attitudes and tracked frames, judges every so often, and can change its mind."""
+    """Checks attitudes and tracked frames periodically; the verdict can be revised."""
 
     def __init__(self, history: AttitudeHistory) -> None:
         self.used = True
-        """Whether the attitude is the camera's."""
-        self.n_anew = 0
-        """Maps that have begun anew since the last that was straight."""
+        """Whether the attitude is that of the camera."""
+        self.n_reinitialised = 0
+        """Maps reinitialised since the last consistent one."""
         self._history = history
-        self._turns, self._tilt = FollowingTest(), MapTilt()
-        self._check_due_ns = self._turns_due_ns = 0
-        self._following: Following | None = None
-        self._n_held = self._n_alone = self._n_follows = 0
+        self._rotations, self._tilt = RotationComparison(), MapTilt()
+        self._check_due_ns = self._rotations_due_ns = 0
+        self._agreement: RotationAgreement | None = None
+        self._n_stabilised = self._n_independent = self._n_body_fixed = 0
         self._agreed_ns: int | None = None
-        """When the attitude was last known to be the camera's."""
+        """Time at which the attitude was last known to be that of the camera."""
         self._tilted_since_ns: int | None = None
-        self._straight = False
-        """Whether the map in use was straight for long."""
-        self._wait_ns = WAIT_NS
+        self._consistent = False
+        """Whether the active map has been consistent for long."""
+        self._retry_ns = RETRY_NS
         self._not_before_ns = 0
         self._mount = False
-        """Whether the mount is why the attitude is left aside."""
+        """Whether the attitude is ignored because of the mount."""
 
     def add(self, sample: AttitudeSample) -> None:
-        """Take the autopilot's attitude, which the history has too."""
-        self._turns.add(sample)
+        """Add an attitude of the autopilot, which is in the history too."""
+        self._rotations.add(sample)
 
     def take(
         self, t_ns: int, map_from_camera: Array, keyframe_id: int, keyframe_from_camera: Array
     ) -> None:
-        """Take the rotations (3, 3) of a tracked frame, in the map and against its keyframe."""
-        self._turns.take(t_ns, map_from_camera)
-        self.take_earlier(t_ns, keyframe_id, keyframe_from_camera)
+        """Add the rotations (3, 3) of a tracked frame, in the map and relative to its keyframe."""
+        self._rotations.take(t_ns, map_from_camera)
+        self.take_backfilled(t_ns, keyframe_id, keyframe_from_camera)
 
-    def take_earlier(self, t_ns: int, keyframe_id: int, keyframe_from_camera: Array) -> None:
-        """Take a frame from before the map began, which was placed in it later."""
+    def take_backfilled(self, t_ns: int, keyframe_id: int, keyframe_from_camera: Array) -> None:
+        """Add a frame from before initialisation, tracked afterwards."""
         if self.used:
             self._tilt.take(t_ns, keyframe_id, keyframe_from_camera, self._history)
 
-    def forget(self) -> None:
-        """Another map is in use."""
-        self._turns.forget()
-        self._forget_tilt()
+    def reset(self) -> None:
+        """Clear state after another map became active."""
+        self._rotations.reset()
+        self._reset_tilt()
 
-    def _forget_tilt(self) -> None:
-        self._tilt.forget()
-        self._straight, self._tilted_since_ns = False, None
+    def _reset_tilt(self) -> None:
+        self._tilt.reset()
+        self._consistent, self._tilted_since_ns = False, None
 
     def due(self, t_ns: int) -> bool:
-        """Whether it is time to judge."""
-        return t_ns >= self._turns_due_ns or (self.used and t_ns >= self._check_due_ns)
+        """Whether a check is due."""
+        return t_ns >= self._rotations_due_ns or (self.used and t_ns >= self._check_due_ns)
 
-    def judge(
+    def check(
         self, t_ns: int, rotation_of: RotationOf, body_from_camera: Array,
         ned_from_map: Array | None,
     ) -> Verdict | None:  # fmt: skip
-        """See what is to be done, if anything.
+        """Check; a verdict if something is to be done.
 
-        `ned_from_map` (3, 3) is how the map is placed in the world, None where it is not.
+        `ned_from_map` (3, 3) is the georeference rotation, None where unknown.
         """
-        if t_ns >= self._turns_due_ns:
-            self._turns_due_ns = t_ns + TURNS_NS
-            self._following = self._turns.result(body_from_camera)
-            verdict = self._judge_turns(t_ns, self._following)
+        if t_ns >= self._rotations_due_ns:
+            self._rotations_due_ns = t_ns + ROTATION_CHECK_NS
+            self._agreement = self._rotations.result(body_from_camera)
+            verdict = self._check_rotations(t_ns, self._agreement)
             if verdict is not None:
                 return verdict
         if self.used and t_ns >= self._check_due_ns:
-            self._check_due_ns = t_ns + (CHECK_OLD_NS if self._straight else CHECK_NS)
-            return self._judge_tilt(t_ns, rotation_of, body_from_camera, ned_from_map)
+            self._check_due_ns = t_ns + (CHECK_OLD_NS if self._consistent else CHECK_NS)
+            return self._check_tilt(t_ns, rotation_of, body_from_camera, ned_from_map)
         return None
 
-    def _judge_turns(self, t_ns: int, found: Following | None) -> Verdict | None:
+    def _check_rotations(self, t_ns: int, found: RotationAgreement | None) -> Verdict | None:
         if found is None:
             return None
-        self._n_held = self._n_held + 1 if found.held else 0
-        self._n_follows = self._n_follows + 1 if found.follows else 0
-        # a young map that bends turns the camera alone, too
-        alone = found.turns_alone and self._straight
-        self._n_alone = self._n_alone + 1 if alone else 0
+        self._n_stabilised = self._n_stabilised + 1 if found.stabilised else 0
+        self._n_body_fixed = self._n_body_fixed + 1 if found.body_fixed else 0
+        # rotation relative to a young, bending map looks independent, too
+        independent = found.rotates_independently and self._consistent
+        self._n_independent = self._n_independent + 1 if independent else 0
         if self.used:
-            if found.follows:
+            if found.body_fixed:
                 self._agreed_ns = t_ns
-            if max(self._n_held, self._n_alone) >= AGREEING:
-                return self._drop(t_ns, NOT_FOLLOWED)
-        elif self._n_follows >= AGREEING and t_ns >= self._not_before_ns:
-            self.used, self.n_anew = True, 0
-            self._forget_tilt()  # the turns until now were not all the camera's
-            return Verdict(Warned(t_ns, FOLLOWED_AGAIN, good=True), mount=self._mount)
+            if max(self._n_stabilised, self._n_independent) >= N_AGREEING:
+                return self._reject(t_ns, NOT_BODY_FIXED)
+        elif self._n_body_fixed >= N_AGREEING and t_ns >= self._not_before_ns:
+            self.used, self.n_reinitialised = True, 0
+            self._reset_tilt()  # earlier attitudes were not all those of the camera
+            return Verdict(Warned(t_ns, BODY_FIXED_AGAIN, good=True), mount=self._mount)
         return None
 
-    def _judge_tilt(
+    def _check_tilt(
         self, t_ns: int, rotation_of: RotationOf, body_from_camera: Array,
         ned_from_map: Array | None,
     ) -> Verdict | None:  # fmt: skip
         found = self._tilt.result(rotation_of, body_from_camera)
         if found is None:
             return None
-        follows = self._following is not None and self._following.follows
-        bent_rad = found.spread_rad if follows else found.beside_gimbal_rad()
-        placed_rad = 0.0
+        body_fixed = self._agreement is not None and self._agreement.body_fixed
+        moved_rad = found.spread_rad if body_fixed else found.spread_with_gimbal_rad()
+        absolute_rad = 0.0
         if ned_from_map is not None and found.mount_rad < float(MAX_TILT_RAD):
             cosine = float((ned_from_map @ found.map_from_ned)[2, 2])
-            placed_rad = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        if max(bent_rad, placed_rad) < float(MAX_TILT_RAD):
+            absolute_rad = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        if max(moved_rad, absolute_rad) < float(MAX_TILT_RAD):
             self._tilted_since_ns = None
             if found.spread_rad < float(MAX_TILT_RAD):
                 self._agreed_ns = t_ns
-                if found.span_ns > STRAIGHT_NS:
-                    self._straight, self.n_anew, self._wait_ns = True, 0, WAIT_NS
+                if found.span_ns > CONSISTENT_NS:
+                    self._consistent, self.n_reinitialised, self._retry_ns = True, 0, RETRY_NS
             return None
         if self._tilted_since_ns is None:
             self._tilted_since_ns = t_ns
-        if t_ns - self._tilted_since_ns < BENT_NS:
+        if t_ns - self._tilted_since_ns < MIN_TILTED_NS:
             return None
-        bent = bent_rad >= float(MAX_TILT_RAD)
-        if bent and self._straight:
-            return self._drop(t_ns, NOT_FOLLOWED)
-        if self.n_anew >= MOST_ANEW:
-            return self._drop(t_ns, MOUNT_DISAGREES)
-        self.n_anew += 1
-        off_deg = np.degrees(max(bent_rad, placed_rad))
-        young = not self._straight
-        self.forget()
-        detail = f"by {off_deg:.0f} degrees, number {self.n_anew} of {MOST_ANEW} in a row"
-        return Verdict(Warned(t_ns, BEGUN_ANEW, detail), begin_anew=True, young=young)
+        moved = moved_rad >= float(MAX_TILT_RAD)
+        if moved and self._consistent:
+            return self._reject(t_ns, NOT_BODY_FIXED)
+        if self.n_reinitialised >= MAX_REINITIALISATIONS:
+            return self._reject(t_ns, MOUNT_DISAGREES)
+        self.n_reinitialised += 1
+        off_deg = np.degrees(max(moved_rad, absolute_rad))
+        young = not self._consistent
+        self.reset()
+        detail = (
+            f"by {off_deg:.0f} degrees, number {self.n_reinitialised} of "
+            f"{MAX_REINITIALISATIONS} in a row"
+        )
+        return Verdict(Warned(t_ns, REINITIALISED, detail), reinitialise=True, young=young)
 
-    def _drop(self, t_ns: int, what: str) -> Verdict:
-        """Leave the attitude aside until turns agree again."""
+    def _reject(self, t_ns: int, what: str) -> Verdict:
+        """Ignore the attitude until rotations agree again."""
         since_ns = self._agreed_ns if self._agreed_ns is not None else 0
         self.used, self._mount = False, what == MOUNT_DISAGREES
-        self._not_before_ns = t_ns + self._wait_ns
-        self._wait_ns = min(2 * self._wait_ns, MAX_WAIT_NS)
-        self._n_held = self._n_alone = self._n_follows = 0
-        self._forget_tilt()
-        warning = Warned(t_ns, what, _described(self._following))
-        return Verdict(warning, disowned_since_ns=since_ns, mount=self._mount)
+        self._not_before_ns = t_ns + self._retry_ns
+        self._retry_ns = min(2 * self._retry_ns, MAX_RETRY_NS)
+        self._n_stabilised = self._n_independent = self._n_body_fixed = 0
+        self._reset_tilt()
+        warning = Warned(t_ns, what, _description(self._agreement))
+        return Verdict(warning, invalid_since_ns=since_ns, mount=self._mount)
 
 
-def _described(found: Following | None) -> str:
-    """What turns show, and what to look at."""
+def _description(found: RotationAgreement | None) -> str:
+    """Findings of the rotation comparison in words, with advice."""
     if found is None:
         return "check how the camera is mounted, and mount.* in the configuration"
-    if found.turned_mount is not None and not found.follows:
-        off_deg = np.degrees(angle_between(found.turned_mount, np.eye(3)))
+    if found.mount_correction is not None and not found.body_fixed:
+        off_deg = np.degrees(angle_between(found.mount_correction, np.eye(3)))
         return f"it sits turned by {off_deg:.0f} degrees from what is stated; check mount.*"
     gains = ", ".join(
         f"{name} {gain:.1f}"
         for name, gain in zip(("roll", "pitch", "yaw"), found.gain, strict=True)
         if np.isfinite(gain)
     )
-    alone_deg = np.degrees(found.alone_rad)
+    alone_deg = np.degrees(found.residual_rad)
     return (
         f"of the body's turns it makes this share: {gains or 'unknown'}; turned by "
         f"{alone_deg:.1f} degrees in half a second by itself; is there a gimbal?"

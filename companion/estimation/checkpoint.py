@@ -1,7 +1,7 @@
-"""What localisation needs to go on after its process was lost: a value, and its bytes.
+"""Checkpoint of localisation, to resume after loss of its process: a value and its bytes.
 
-A file holds a magic number with the format's version, the CRC-32 of all that follows, and numpy's
-.npz of plain arrays (no pickles), of which `head` is JSON.
+A file holds a magic number with the format version, the CRC-32 of the rest, and numpy's .npz of
+plain arrays (no pickles), of which `head` is JSON.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from companion.slam.map.map_part import MapPart
 from companion.slam.map.sparse_map import Keyframe, PointArrays
 
 MAGIC = b"COMPMAP\x01"
-"""Its last byte is the version of the format."""
+"""The last byte is the format version."""
 CHECK_BYTES = 4
-MOST_BYTES = 4_000_000
+MAX_BYTES = 4_000_000
 """Of keyframes and points: the surroundings of some 20 keyframes, and 4 ms to copy."""
 _FEATURES: dict[str, Any] = {
     "pixels": np.float32, "octaves": np.uint8, "angles_deg": np.float32, "descriptors": np.uint8,
@@ -44,20 +44,20 @@ _POINTS: dict[str, Any] = {
     "first_seen": np.int64, "first_unproject": np.float32, "patch_centre": np.float32,
     "patch_level": np.int8, "patch_grey": np.uint8,
 }  # fmt: skip
-"""Types in a file; in the map they are wider."""
+"""Types in a file; wider in the map."""
 
 
 class CheckpointError(CompanionError):
-    """A checkpoint cannot be used: why, in words."""
+    """A checkpoint cannot be used; the reason in words."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checkpoint:
-    """A place in a map, and what is known of both.
+    """State of localisation around a position in the map.
 
-    `t_ns` is the time of the last frame that was tracked; `ned_from_map` (3, 3) how the map's axes
-    lay to the autopilot's in it, None where no attitude was told. `body_from_camera` (3, 3) and
-    `late_ns` are the mount and the delay of stamps as found in flight.
+    `t_ns` is the time of the last tracked frame; `ned_from_map` (3, 3) the rotation of the map
+    against the attitude in it, None without. `body_from_camera` (3, 3) and `delay_ns` are mount and
+    stamp delay as estimated in flight.
     """
 
     t_ns: int
@@ -67,26 +67,26 @@ class Checkpoint:
     georeference: Georeference | None
     odometry: OdometryState | None
     body_from_camera: Array
-    late_ns: int
+    delay_ns: int
 
 
 def fingerprint(config: Config, camera: Camera) -> str:
-    """What must be the same for a map to be taken up: camera, features, who tells the scale."""
+    """Hash of what must be equal for a map to be resumed: camera, features, source of scale."""
     mount = camera.body_from_camera
     features = config.features
-    told = (
+    identity = (
         camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
         camera.distortion.value, camera.coefficients, features.n_levels, features.scale_factor,
         None if mount is None else mount.matrix().tolist(), config.feedback.mode != "off",
     )  # fmt: skip
-    return hashlib.sha256(repr(told).encode()).hexdigest()
+    return hashlib.sha256(repr(identity).encode()).hexdigest()
 
 
 def encode(checkpoint: Checkpoint, remarks: dict[str, Any]) -> tuple[bytes, bytes]:
-    """The bytes of a file, in two parts; `remarks` is what its writer has to say, as JSON."""
+    """Bytes of a file, in two parts; `remarks` are from its writer, as JSON."""
     part, found, odometry = checkpoint.part, checkpoint.georeference, checkpoint.odometry
     head: dict[str, Any] = {
-        "remarks": remarks, "t_ns": checkpoint.t_ns, "late_ns": checkpoint.late_ns,
+        "remarks": remarks, "t_ns": checkpoint.t_ns, "late_ns": checkpoint.delay_ns,
         "next_keyframe_id": checkpoint.next_keyframe_id,
         "first_keyframe_id": part.first_keyframe_id, "level": part.level,
     }  # fmt: skip
@@ -103,7 +103,7 @@ def encode(checkpoint: Checkpoint, remarks: dict[str, Any]) -> tuple[bytes, byte
     if odometry is not None:
         head["anchored"] = odometry.anchored
         arrays["odometry_from_world"] = odometry.odometry_from_world.matrix()
-        arrays["motion"] = np.stack([odometry.place_m, odometry.velocity_m_s])
+        arrays["motion"] = np.stack([odometry.position_m, odometry.velocity_m_s])
     arrays |= _keyframe_arrays(part.keyframes)
     for name, values in part.points._asdict().items():
         arrays[f"point_{name}"] = values.astype(_POINTS[name])
@@ -115,14 +115,14 @@ def encode(checkpoint: Checkpoint, remarks: dict[str, Any]) -> tuple[bytes, byte
 
 
 def _keyframe_arrays(keyframes: tuple[Keyframe, ...]) -> dict[str, Any]:
-    untold = np.full((3, 3), np.nan)
-    turns = [untold if k.ned_from_camera is None else k.ned_from_camera for k in keyframes]
+    missing = np.full((3, 3), np.nan)
+    attitudes = [missing if k.ned_from_camera is None else k.ned_from_camera for k in keyframes]
     arrays: dict[str, Any] = {
         "keyframes": np.array(
             [[k.keyframe_id, k.seq, k.t_ns, len(k.features)] for k in keyframes], np.int64
         ),
         "camera_from_map": np.stack([k.camera_from_map.matrix() for k in keyframes]),
-        "ned_from_camera": np.stack(turns),
+        "ned_from_camera": np.stack(attitudes),
     }
     for name, kind in _FEATURES.items():
         arrays[name] = np.concatenate([getattr(k.features, name).astype(kind) for k in keyframes])
@@ -131,26 +131,26 @@ def _keyframe_arrays(keyframes: tuple[Keyframe, ...]) -> dict[str, Any]:
     return arrays
 
 
-def opened(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a file's writer said, and its arrays; CheckpointError where it is damaged."""
-    begin = len(MAGIC) + CHECK_BYTES
+def read_arrays(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The writer's remarks and the arrays of a file; CheckpointError where damaged."""
+    start = len(MAGIC) + CHECK_BYTES
     if data[: len(MAGIC)] != MAGIC:
         raise CheckpointError("it is of another version, or no checkpoint")
-    if zlib.crc32(memoryview(data)[begin:]) != int.from_bytes(data[len(MAGIC) : begin], "little"):
+    if zlib.crc32(memoryview(data)[start:]) != int.from_bytes(data[len(MAGIC) : start], "little"):
         raise CheckpointError("it is damaged")
     try:
-        with np.load(io.BytesIO(data[begin:]), allow_pickle=False) as file:
+        with np.load(io.BytesIO(data[start:]), allow_pickle=False) as file:
             arrays = dict(file)
-        said: dict[str, Any] = json.loads(bytes(arrays["head"]))["remarks"]
+        remarks: dict[str, Any] = json.loads(bytes(arrays["head"]))["remarks"]
     except (ValueError, KeyError, TypeError, OSError, zipfile.BadZipFile) as error:
         raise CheckpointError(f"it cannot be read ({error})") from error
-    return said, arrays
+    return remarks, arrays
 
 
 def decode(arrays: dict[str, Any], camera: Camera, scale_factor: float) -> Checkpoint:
-    """The checkpoint in a file's arrays, which is of this camera; CheckpointError if there is none.
+    """Checkpoint from the arrays of a file, for this camera; CheckpointError where invalid.
 
-    `scale_factor` is that between the octaves of features.
+    `scale_factor` is that between feature octaves.
     """
     try:
         return _decoded(arrays, camera, scale_factor)
@@ -162,9 +162,9 @@ def _decoded(arrays: dict[str, Any], camera: Camera, scale_factor: float) -> Che
     head = json.loads(bytes(arrays["head"]))
     georeference, odometry = None, None
     if "georeference" in head:
-        scale, *told = head["georeference"]
+        scale, *identity = head["georeference"]
         to_world = arrays["world_from_map"]
-        georeference = Georeference(Similarity(scale, to_world[:3, :3], to_world[:3, 3]), *told)
+        georeference = Georeference(Similarity(scale, to_world[:3, :3], to_world[:3, 3]), *identity)
     if "motion" in arrays:
         place_m, velocity_m_s = arrays["motion"]
         odometry_from_world = Pose.from_matrix(arrays["odometry_from_world"])
@@ -188,11 +188,11 @@ def _keyframes(
     if rows[:, 3].sum() != len(pixels) or max(point_ids.max(), refined_for.max()) >= n_points:
         raise ValueError("features, keyframes and points do not fit together")
     normalised = camera.normalise(pixels)
-    out, begin = [], 0
+    out, start = [], 0
     for n, (keyframe_id, seq, t_ns, size) in enumerate(rows.tolist()):
-        own = slice(begin, begin + size)
-        begin += size
-        turn = arrays["ned_from_camera"][n]
+        own = slice(start, start + size)
+        start += size
+        attitude = arrays["ned_from_camera"][n]
         features = features_of(
             camera, scale_factor, pixels[own], normalised[own], octaves[own],
             arrays["angles_deg"][own], arrays["descriptors"][own],
@@ -201,6 +201,6 @@ def _keyframes(
             keyframe_id, seq, t_ns, Pose.from_matrix(arrays["camera_from_map"][n]), features,
             point_ids[own], arrays["normalised"][own].astype(np.float64),
             arrays["whitening"][own].astype(np.float64), refined_for[own],
-            ned_from_camera=None if np.isnan(turn).any() else turn,
+            ned_from_camera=None if np.isnan(attitude).any() else attitude,
         ))  # fmt: skip
     return tuple(out)

@@ -1,4 +1,4 @@
-"""What is believed of the camera's motion between images: attitude history and motion filter.
+"""Attitude history and constant-velocity motion filter.
 
 The only file that knows filterpy.
 """
@@ -24,18 +24,19 @@ from companion.messages import AttitudeSample
 
 MAX_GAP_NS = 500_000_000
 MAX_EXTRAPOLATION_NS = 120_000_000
-"""Beyond, a craft in gusts turns otherwise by degrees, and what images tell goes on more truly."""
+"""Beyond, in gusts, extrapolation errs by degrees, more than prediction from images."""
 ACCELERATION, SIGMA_POSITION = 0.3, 0.003
-ACCELERATION_UNTOLD, SIGMA_POSITION_UNTOLD = 1.5, 0.002
-"""In map units, one of which is about the distance of what is seen, with and without attitude."""
+ACCELERATION_NO_ATTITUDE, SIGMA_POSITION_NO_ATTITUDE = 1.5, 0.002
+"""Process and measurement noise in map units, one of which is about the scene distance, with and
+without attitude."""
 
 
-VARIANCE_TIED_RAD2 = 1e-4
-"""Of how the map's axes lie to the autopilot's, when one image has told: 0.6 degrees."""
+VARIANCE_ALIGNMENT_RAD2 = 1e-4
+"""Of `map_from_ned` after one image: 0.6 degrees."""
 
 
 class AttitudeHistory:
-    """The recent past of the autopilot's attitude, read at any time within it."""
+    """Recent attitudes of the autopilot, interpolated."""
 
     def __init__(self, keep: int = 4000, max_gap_ns: int = MAX_GAP_NS) -> None:
         self._keep, self._max_gap_ns = keep, max_gap_ns
@@ -43,7 +44,7 @@ class AttitudeHistory:
         self._times: list[int] = []
 
     def add(self, sample: AttitudeSample) -> None:
-        """Take a sample; late ones are put in their place, doubles ignored."""
+        """Add a sample; late ones are inserted in order, duplicates ignored."""
         if not self._times or sample.t_ns > self._times[-1]:
             self._times.append(sample.t_ns)
             self._samples.append(sample)
@@ -62,7 +63,7 @@ class AttitudeHistory:
         return self._times[-1] if self._times else 0
 
     def with_rates_at(self, t_ns: int, step_ns: int) -> tuple[Array, Array] | None:
-        """`ned_from_body` (3, 3) and body rates (3,) in rad/s from a step before to one after."""
+        """`ned_from_body` (3, 3) and mean body rates (3,), rad/s, over a step before and after."""
         here = self.at(t_ns)
         before, after = self.at(t_ns - step_ns), self.at(t_ns + step_ns)
         if here is None or before is None or after is None:
@@ -91,18 +92,18 @@ class AttitudeHistory:
         rotation = rotation_from_quaternion(nearest.ned_from_body)
         if nearest.rates_body_rad_s is None:
             return rotation
-        turned: Array = rotation @ rotation_from_vector(nearest.rates_body_rad_s * (gap_ns * 1e-9))
-        return turned
+        rotated: Array = rotation @ rotation_from_vector(nearest.rates_body_rad_s * (gap_ns * 1e-9))
+        return rotated
 
 
 class MotionFilter:
-    """Error-state Kalman filter over position, velocity (map units) and the attitude's error.
+    """Error-state Kalman filter over position, velocity (map units) and attitude error.
 
-    Constant velocity, and a rotation `map_from_ned` that wanders slowly, by which the autopilot's
-    attitude predicts the camera's rotation even where its yaw has drifted. That rotation is kept
-    apart; x = [position (3), velocity (3), turn (3)] holds what an update turns it by, a rotation
-    vector (rad) in the map's axes: composed with it, and zero again (Sola, Quaternion kinematics
-    for the error-state Kalman filter, 2017). Without attitude the last turn rate is held.
+    Constant velocity, and a slowly drifting rotation `map_from_ned`, by which the attitude of the
+    autopilot predicts that of the camera even where its yaw has drifted. That rotation is kept
+    outside the state; x = [position (3), velocity (3), rotation vector (3), rad, map axes] holds
+    its correction, which is composed with it and reset to zero (Sola, Quaternion kinematics for the
+    error-state Kalman filter, 2017). Without attitude the last angular rate is held.
     """
 
     def __init__(self) -> None:
@@ -110,19 +111,19 @@ class MotionFilter:
         self._poses: deque[tuple[int, Pose]] = deque(maxlen=2)
         self._filter: KalmanFilter | None = None
         self._map_from_ned = np.eye(3)
-        self._tied = False
-        """Whether `map_from_ned` is known: how the map's axes lie to the autopilot's."""
+        self._aligned = False
+        """Whether `map_from_ned` is known."""
         self.unit = 1.0
 
     def reset(self) -> None:
-        """Forget everything but what is known of the autopilot's attitude."""
-        self._t_ns, self._filter, self._tied = None, None, False
+        """Reset all but the attitude alignment itself."""
+        self._t_ns, self._filter, self._aligned = None, None, False
         self._poses.clear()
 
     @property
-    def tied(self) -> bool:
-        """Whether it is known how the map's axes lie to the autopilot's."""
-        return self._tied
+    def aligned(self) -> bool:
+        """Whether `map_from_ned` is known."""
+        return self._aligned
 
     @property
     def velocity(self) -> tuple[Array, float] | None:
@@ -133,68 +134,68 @@ class MotionFilter:
         return self._filter.x.ravel()[3:6].copy(), float(np.sqrt(max(variance, 0.0)))
 
     def predict(self, t_ns: int, ned_from_camera: Array | None) -> Pose | None:
-        """Predicted `map_from_camera`; None when nothing is known."""
+        """Predicted `map_from_camera`; None when unknown."""
         if self._filter is None or self._t_ns is None:
             return None
         dt = (t_ns - self._t_ns) * 1e-9
         x = self._filter.x.ravel()
         position = x[:3] + np.clip(dt, 0.0, 1.0) * x[3:6]
-        if ned_from_camera is not None and self._tied:
+        if ned_from_camera is not None and self._aligned:
             return Pose(self._map_from_ned @ ned_from_camera, position)
         (t0, a), (t1, b) = self._poses[0], self._poses[-1]
         if t1 == t0 or dt > 1.0:
             return Pose(b.rotation, position)
         return Pose(interpolate_rotation(a.rotation, b.rotation, (t_ns - t0) / (t1 - t0)), position)
 
-    def map_moved(self, before: Pose, after: Pose, scale: float = 1.0) -> None:
-        """The map was corrected: the last `map_from_camera` was `before` and is now `after`."""
+    def correct_map(self, before: Pose, after: Pose, scale: float = 1.0) -> None:
+        """Apply a correction of the map that moved the last `map_from_camera`."""
         if self._filter is None:
             return
-        turn = nearest_rotation(after.rotation @ before.rotation.T)
+        correction = nearest_rotation(after.rotation @ before.rotation.T)
         x = self._filter.x.ravel().copy()
-        x[:3] = after.translation + scale * turn @ (x[:3] - before.translation)
-        x[3:6] = scale * turn @ x[3:6]
-        self._map_from_ned = nearest_rotation(turn @ self._map_from_ned)
+        x[:3] = after.translation + scale * correction @ (x[:3] - before.translation)
+        x[3:6] = scale * correction @ x[3:6]
+        self._map_from_ned = nearest_rotation(correction @ self._map_from_ned)
         self._filter.x = x.reshape(-1, 1)
         change = np.zeros((9, 9))
-        change[:3, :3] = change[3:6, 3:6] = scale * turn
-        change[6:, 6:] = turn
+        change[:3, :3] = change[3:6, 3:6] = scale * correction
+        change[6:, 6:] = correction
         self._filter.P = change @ self._filter.P @ change.T
         moved = [
             (t_ns, Pose(
-                turn @ pose.rotation,
-                after.translation + scale * turn @ (pose.translation - before.translation),
+                correction @ pose.rotation,
+                after.translation + scale * correction @ (pose.translation - before.translation),
             ))
             for t_ns, pose in self._poses
         ]  # fmt: skip
         self._poses.clear()
         self._poses.extend(moved)
 
-    def attitude_corrected(self, old_from_new: Array) -> None:
-        """The attitude was given as `old`; what it is now takes this turn before the old error."""
+    def correct_attitude(self, old_from_new: Array) -> None:
+        """Apply a change of the attitude to `map_from_ned`."""
         self._map_from_ned = nearest_rotation(self._map_from_ned @ old_from_new)
 
-    def untie(self) -> None:
-        """The attitude so far was not the camera's: how the map lies to it is not known."""
-        self._tied = False
+    def discard_alignment(self) -> None:
+        """Invalidate `map_from_ned`: the attitude was not that of the camera."""
+        self._aligned = False
 
     def correct(self, t_ns: int, map_from_camera: Pose, ned_from_camera: Array | None) -> None:
-        """Take the pose that the image gave."""
+        """Update with the pose of an image."""
         seen = np.eye(3)
         if ned_from_camera is not None:
             seen = nearest_rotation(map_from_camera.rotation @ ned_from_camera.T)
         if self._filter is None or self._t_ns is None or t_ns - self._t_ns > 2_000_000_000:
-            self._filter = self._fresh(map_from_camera.translation)
-            self._map_from_ned, self._tied = seen, ned_from_camera is not None
+            self._filter = self._initial_filter(map_from_camera.translation)
+            self._map_from_ned, self._aligned = seen, ned_from_camera is not None
         else:
             dt = max((t_ns - self._t_ns) * 1e-9, 1e-3)
             f = self._filter
             f.F = np.eye(9)
             f.F[:3, 3:6] = dt * np.eye(3)
             q = np.zeros((9, 9))
-            told = ned_from_camera is not None
-            accel = (ACCELERATION if told else ACCELERATION_UNTOLD) * self.unit
-            sigma = (SIGMA_POSITION if told else SIGMA_POSITION_UNTOLD) * self.unit
+            has_attitude = ned_from_camera is not None
+            accel = (ACCELERATION if has_attitude else ACCELERATION_NO_ATTITUDE) * self.unit
+            sigma = (SIGMA_POSITION if has_attitude else SIGMA_POSITION_NO_ATTITUDE) * self.unit
             q[:3, :3] = np.eye(3) * accel**2 * dt**4 / 4
             q[:3, 3:6] = q[3:6, :3] = np.eye(3) * accel**2 * dt**3 / 2
             q[3:6, 3:6] = np.eye(3) * accel**2 * dt**2
@@ -209,22 +210,22 @@ class MotionFilter:
             if ned_from_camera is not None:
                 h[3:, 6:] = np.eye(3)
                 r[3:, 3:] = np.eye(3) * np.radians(0.3) ** 2
-                if not self._tied:  # told for the first time in this map
-                    self._map_from_ned, self._tied = seen, True
+                if not self._aligned:  # first attitude in this map
+                    self._map_from_ned, self._aligned = seen, True
                     f.P[6:], f.P[:, 6:] = 0.0, 0.0
-                    f.P[6:, 6:] = VARIANCE_TIED_RAD2 * np.eye(3)
-                turn = vector_from_rotation(seen @ self._map_from_ned.T)
-                z = np.r_[z, turn]
+                    f.P[6:, 6:] = VARIANCE_ALIGNMENT_RAD2 * np.eye(3)
+                correction = vector_from_rotation(seen @ self._map_from_ned.T)
+                z = np.r_[z, correction]
             f.update(z.reshape(-1, 1), R=r, H=h)
-            turned = rotation_from_vector(f.x[6:9, 0])
-            self._map_from_ned = nearest_rotation(turned @ self._map_from_ned)
+            rotated = rotation_from_vector(f.x[6:9, 0])
+            self._map_from_ned = nearest_rotation(rotated @ self._map_from_ned)
             f.x[6:9] = 0.0
         self._t_ns = t_ns
         self._poses.append((t_ns, map_from_camera))
 
-    def _fresh(self, position: Array) -> KalmanFilter:
+    def _initial_filter(self, position: Array) -> KalmanFilter:
         f = KalmanFilter(dim_x=9, dim_z=6)
         f.x = np.r_[position, np.zeros(6)].reshape(-1, 1)
         lengths = np.r_[np.full(3, 1e-4), np.ones(3)] * self.unit**2
-        f.P = np.diag(np.r_[lengths, np.full(3, VARIANCE_TIED_RAD2)])
+        f.P = np.diag(np.r_[lengths, np.full(3, VARIANCE_ALIGNMENT_RAD2)])
         return f

@@ -1,10 +1,9 @@
-"""Which poses the autopilot is given: those that it may fly on, and none else.
+"""Gate of poses sent to the autopilot.
 
-A pose must be metric, of a tracked frame, certain and good enough, as level as the autopilot itself
-finds its body, and young. What cannot be checked is not sent. All that must have held for a while
-before the first is sent; afterwards a gap is bridged by prediction, shorter than an autopilot takes
-to notice, and then nothing is sent until belief has held again. So it is after every discontinuity,
-whatever led to it: nothing of the new place is sent before that.
+A pose must be metric, tracked, certain, of sufficient quality, level by the autopilot's own
+attitude, and recent. What cannot be checked is not sent. All conditions must hold for a while
+before the first pose is sent; gaps shorter than an autopilot's timeout are bridged by prediction,
+after longer ones and after every discontinuity the conditions must hold again.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from companion.estimation.reset_counter import ResetCounter
 from companion.geometry.transforms import Array, Pose
 from companion.messages import AttitudeSample, Odometry, TrackState
 
-MAX_TILT_APART_RAD = np.radians(8.0)
+MAX_TILT_ERROR_RAD = np.radians(8.0)
 MAX_AGE_NS = 300_000_000
-"""A pose this old when it comes is of no use to an autopilot."""
-EASE = 0.8
-"""To begin, a pose must be better than the limits by this factor."""
+"""An older pose is of no use to an autopilot."""
+HYSTERESIS = 0.8
+"""To start sending, a pose must be better than the limits by this factor."""
 MAX_EXTENT_M = 1e5
 MIN_SPACING_NS = 4_000_000
-STEADY_PERIODS = 20
+N_PERIODS = 20
 MAX_ATTITUDE_GAP_NS = 2 * MAX_EXTRAPOLATION_NS
-"""Between two samples of attitude: no time between them is further from one than extrapolation."""
+"""Between two attitude samples: no time is further from one than extrapolation reaches."""
 
 OFF = "off"
 NOT_YET = "no pose yet"
@@ -43,7 +42,7 @@ TILTED = "tilt differs from the autopilot's"
 LATE = "poses come too late"
 SILENT = "no frames"
 NO_ATTITUDE = "no autopilot attitude"
-BEGUN_ANEW = "localisation begins anew"
+RESTARTED = "localisation begins anew"
 RESET = "position reset"
 REBOOTED = "autopilot rebooted"
 NO_HEIGHT = "no autopilot height"
@@ -52,9 +51,9 @@ PROVING = "belief must hold first"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseToSend:
-    """A pose for the autopilot, at `t_ns`, in NED-aligned metres; see Odometry.
+    """A pose for the autopilot at `t_ns`, in NED-aligned metres; see Odometry.
 
-    Its down axis may be shifted against that of an Odometry, so that it begins at the autopilot's.
+    Its down axis may be offset against that of an Odometry, to start at that of the autopilot.
     """
 
     t_ns: int
@@ -72,9 +71,9 @@ class PoseToSend:
 class PoseGate:
     """Odometry and attitude in; poses to send out. `now_ns` is the time of the call.
 
-    `start_down_m` gives the autopilot's own place along the world's down axis at the time of a
-    frame, None where poses must not begin for want of it; without it poses stay in our world.
-    `may_begin` gives what else stands against the first pose of a row, "" if nothing does.
+    `start_down_m` gives the autopilot's own down coordinate at the time of a frame, None to
+    withhold poses for want of it; without it poses stay in our world. `may_start` gives other
+    reasons not to start sending, "" if none.
     """
 
     def __init__(
@@ -82,58 +81,58 @@ class PoseGate:
         config: FeedbackConfig,
         counter: ResetCounter | None = None,
         start_down_m: Callable[[int], float | None] | None = None,
-        may_begin: Callable[[int], str] = lambda _now_ns: "",
+        may_start: Callable[[int], str] = lambda _now_ns: "",
     ) -> None:
         self._config = config
         self._attitude = AttitudeHistory(400, MAX_ATTITUDE_GAP_NS)
         self._counter = counter or ResetCounter()
-        self._start_down_m, self._may_begin = start_down_m, may_begin
+        self._start_down_m, self._may_start = start_down_m, may_start
         self._down_shift_m: float | None = None
         """Added to our down axis; fixed with the first pose, until a discontinuity."""
         self._resets_seen: int | None = None
-        self._good: Odometry | None = None
-        self._good_at_ns = 0
-        self._believed_since_ns: int | None = None
+        self._accepted: Odometry | None = None
+        self._accepted_at_ns = 0
+        self._accepted_since_ns: int | None = None
         self._last_stamp_ns = 0
         self._n_predicted = 0
-        self._periods_ns: deque[int] = deque(maxlen=STEADY_PERIODS)
+        self._periods_ns: deque[int] = deque(maxlen=N_PERIODS)
         self._newest_ns = 0
-        self._last_doubt = ""
+        self._last_rejection = ""
         self.sending = False
         self.why_not = NOT_YET
 
     @property
     def n_resets(self) -> int:
-        """Discontinuities that the autopilot has been told of, or will be with the next pose."""
+        """Discontinuities reported to the autopilot, or to be with the next pose."""
         return self._counter.value
 
     def restart(self) -> None:
-        """Localisation begins anew: nothing ties its poses to those before."""
+        """Restart after a restart of localisation, whose poses are unrelated to earlier ones."""
         if self.sending:
-            self._stop(BEGUN_ANEW)
+            self._stop(RESTARTED)
         self._discontinuity()
         self._resets_seen = None
-        self._good, self._believed_since_ns = None, None
+        self._accepted, self._accepted_since_ns = None, None
         self._periods_ns.clear()
         self._newest_ns = 0
 
     def autopilot_booted(self, last_sent: int | None) -> None:
-        """Another boot of the autopilot: the reset counter that it was last sent, None if none."""
+        """Handle a boot of the autopilot: the reset counter last sent to it, None if none."""
         self._counter.booted(last_sent)
         self._down_shift_m = None
         self._stop(REBOOTED if self.sending else self.why_not)
 
     def reconfigure(self, config: FeedbackConfig) -> None:
-        """Take over other limits; what is believed and what was sent stay as they are."""
+        """Change limits; the state is kept."""
         self._config = config
 
     def withhold(self, why_not: str) -> None:
-        """Send nothing more until belief has held anew."""
+        """Stop sending until the conditions have held anew."""
         self._stop(why_not)
 
     def take_attitude(self, sample: AttitudeSample) -> None:
-        """Take the autopilot's attitude: poses are checked against it, predictions turn with it."""
-        if not 0.5 < float(np.linalg.norm(sample.ned_from_body)) < 2.0:  # nan neither
+        """Add an attitude of the autopilot, for checks and predictions."""
+        if not 0.5 < float(np.linalg.norm(sample.ned_from_body)) < 2.0:  # rejects nan too
             return
         rates = sample.rates_body_rad_s
         if rates is not None and not np.isfinite(rates).all():
@@ -141,7 +140,7 @@ class PoseGate:
         self._attitude.add(sample)
 
     def take(self, odometry: Odometry, now_ns: int) -> PoseToSend | None:
-        """Take the odometry of a frame; the pose to send at once, or None."""
+        """Process the odometry of a frame; the pose to send at once, or None."""
         if odometry.t_ns <= self._newest_ns:
             return None
         if self._newest_ns:
@@ -153,47 +152,47 @@ class PoseGate:
             self._discontinuity()
             self._stop(RESET)
             return None
-        if now_ns - self._good_at_ns > self._max_gap_ns:
-            self._cease()
-        why_not = self._doubt(odometry, now_ns)
+        if now_ns - self._accepted_at_ns > self._max_gap_ns:
+            self._time_out()
+        why_not = self._rejection_reason(odometry, now_ns)
         if why_not:
-            self._believed_since_ns = None
+            self._accepted_since_ns = None
             self.why_not = why_not if not self.sending else ""
-            self._last_doubt = why_not
+            self._last_rejection = why_not
             return None
-        self._good, self._good_at_ns, self._n_predicted = odometry, now_ns, 0
-        self._last_doubt = ""
+        self._accepted, self._accepted_at_ns, self._n_predicted = odometry, now_ns, 0
+        self._last_rejection = ""
         if not self.sending:
-            if self._believed_since_ns is None:
-                self._believed_since_ns = now_ns
-            proven = now_ns - self._believed_since_ns >= self._config.resume_after_s * 1e9
-            self.why_not = self._begin(odometry, now_ns) if proven else PROVING
+            if self._accepted_since_ns is None:
+                self._accepted_since_ns = now_ns
+            proven = now_ns - self._accepted_since_ns >= self._config.resume_after_s * 1e9
+            self.why_not = self._start_sending(odometry, now_ns) if proven else PROVING
             if self.why_not:
                 return None
         return self._stamped(self._pose_of(odometry))
 
     def due(self, now_ns: int) -> PoseToSend | None:
-        """A predicted pose, where the camera is slower than the rate wanted, or a frame is late.
+        """A predicted pose, where the camera is slower than the output rate, or a frame is late.
 
-        To be asked every few milliseconds; this also notices that poses have ceased.
+        To be polled every few milliseconds; also detects timeouts.
         """
-        good = self._good
-        if not self.sending or good is None:
+        accepted = self._accepted
+        if not self.sending or accepted is None:
             return None
-        since_ns = now_ns - self._good_at_ns
+        since_ns = now_ns - self._accepted_at_ns
         if since_ns > self._max_gap_ns:
-            self._cease()
+            self._time_out()
             return None
         period_ns = self._period_ns()
         n_steps = max(1, int(np.ceil(period_ns * 1e-9 * self._config.rate_hz - 0.1)))
         step_ns = period_ns // n_steps
         number = self._n_predicted + 1
-        # where the next frame itself is due it is given some time
+        # give a frame that is due itself some slack
         slack_ns = step_ns // 2 if number >= n_steps else 0
         if since_ns < number * step_ns + slack_ns:
             return None
         self._n_predicted = number
-        predicted = self._predicted(good, number * step_ns)
+        predicted = self._predicted(accepted, number * step_ns)
         return self._stamped(predicted) if predicted is not None else None
 
     @property
@@ -205,22 +204,22 @@ class PoseGate:
             return int(1e9 / self._config.rate_hz)
         return int(np.median(self._periods_ns))
 
-    def _doubt(self, odometry: Odometry, now_ns: int) -> str:
-        """Why a frame's pose is not believed; "" if it is."""
+    def _rejection_reason(self, odometry: Odometry, now_ns: int) -> str:
+        """Why a pose is rejected; "" if accepted."""
         pose, velocity = odometry.world_from_body, odometry.velocity_world_m_s
         if odometry.state is TrackState.INITIALISING:
             return INITIALISING
         if odometry.state is not TrackState.TRACKING:
             return LOST
         if pose is None or velocity is None:
-            return NO_SCALE if self._good is None else LOST
+            return NO_SCALE if self._accepted is None else LOST
         numbers = np.r_[pose.rotation.ravel(), pose.translation, velocity]
         if not np.isfinite(numbers).all() or np.abs(pose.translation).max() > MAX_EXTENT_M:
             return UNCERTAIN
-        ease = 1.0 if self.sending else EASE
-        if not odometry.sigma_position_m <= ease * self._config.max_sigma_m:
+        hysteresis = 1.0 if self.sending else HYSTERESIS
+        if not odometry.sigma_position_m <= hysteresis * self._config.max_sigma_m:
             return UNCERTAIN
-        if odometry.quality * ease < self._config.min_quality:
+        if odometry.quality * hysteresis < self._config.min_quality:
             return POOR
         if now_ns - odometry.t_ns > MAX_AGE_NS:
             return LATE
@@ -228,12 +227,12 @@ class PoseGate:
         if attitude is None:
             return NO_ATTITUDE
         cosine = float(np.clip(attitude[2] @ pose.rotation[2], -1.0, 1.0))
-        if not np.arccos(cosine) <= MAX_TILT_APART_RAD * ease:
+        if not np.arccos(cosine) <= MAX_TILT_ERROR_RAD * hysteresis:
             return TILTED
         return ""
 
-    def _begin(self, odometry: Odometry, now_ns: int) -> str:
-        """Begin to send with a pose that has been proven; why not, if it may not be."""
+    def _start_sending(self, odometry: Odometry, now_ns: int) -> str:
+        """Start sending with a proven pose; the reason where it may not."""
         assert odometry.world_from_body is not None
         shift_m = self._down_shift_m
         if shift_m is None and self._start_down_m is not None:
@@ -241,7 +240,7 @@ class PoseGate:
             if start_m is None or not np.isfinite(start_m):
                 return NO_HEIGHT
             shift_m = start_m - float(odometry.world_from_body.translation[2])
-        why_not = self._may_begin(now_ns)
+        why_not = self._may_start(now_ns)
         if not why_not:
             self._down_shift_m = shift_m or 0.0
             self.sending = self._counter.sent = True
@@ -251,15 +250,15 @@ class PoseGate:
         self._counter.discontinuity()
         self._down_shift_m = None
 
-    def _cease(self) -> None:
-        """No pose has been believed for too long."""
+    def _time_out(self) -> None:
+        """Stop sending: no pose was accepted for too long."""
         if self.sending:
-            self._stop(self._last_doubt or SILENT)
-        self._believed_since_ns = None
+            self._stop(self._last_rejection or SILENT)
+        self._accepted_since_ns = None
 
     def _stop(self, why_not: str) -> None:
         self.sending, self.why_not = False, why_not
-        self._believed_since_ns = None
+        self._accepted_since_ns = None
 
     def _pose_of(self, odometry: Odometry) -> PoseToSend:
         assert odometry.world_from_body is not None and odometry.velocity_world_m_s is not None
@@ -271,16 +270,16 @@ class PoseGate:
             self._counter.value & 0xFF,
         )  # fmt: skip
 
-    def _predicted(self, good: Odometry, ahead_ns: int) -> PoseToSend | None:
-        """The pose a while after a good one: on by its velocity, turned as the autopilot turned.
+    def _predicted(self, accepted: Odometry, ahead_ns: int) -> PoseToSend | None:
+        """A pose extrapolated by velocity, and rotated by measured attitude.
 
-        None where nobody knows how it turned.
+        None where the attitude is unknown.
         """
-        before, now = self._attitude.at(good.t_ns), self._attitude.at(good.t_ns + ahead_ns)
+        before, now = self._attitude.at(accepted.t_ns), self._attitude.at(accepted.t_ns + ahead_ns)
         if before is None or now is None:
-            self._last_doubt = self._last_doubt or NO_ATTITUDE
+            self._last_rejection = self._last_rejection or NO_ATTITUDE
             return None
-        pose = replace(self._pose_of(good), t_ns=good.t_ns + ahead_ns, predicted=True)
+        pose = replace(self._pose_of(accepted), t_ns=accepted.t_ns + ahead_ns, predicted=True)
         rotation = pose.world_from_body.rotation @ before.T @ now
         ahead_s = ahead_ns * 1e-9
         position = pose.world_from_body.translation + pose.velocity_world_m_s * ahead_s
@@ -288,7 +287,7 @@ class PoseGate:
         return replace(pose, world_from_body=Pose(rotation, position), sigma_position_m=sigma_m)
 
     def _stamped(self, pose: PoseToSend) -> PoseToSend | None:
-        """The same, if its stamp is later than the last that was sent."""
+        """The same, if its stamp is later than the last sent."""
         if pose.t_ns < self._last_stamp_ns + MIN_SPACING_NS:
             return None
         self._last_stamp_ns = pose.t_ns

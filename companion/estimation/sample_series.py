@@ -1,4 +1,4 @@
-"""What an autopilot said over time, read at any time between."""
+"""Time series of measurements, with interpolation."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from companion.geometry.transforms import Array
 
 MAX_GAP_NS = 1_500_000_000
 SAME_TIME_NS = 1_000_000
-"""A sample of a frame's own time, as photographs have one, needs no other beside it."""
+"""A sample at the time of a frame, as of photographs, needs no neighbour."""
 MIN_SPACING_NS = 45_000_000
 
 
 class SampleSeries:
-    """Samples over time, not closer together than needed."""
+    """Samples over time with a minimum spacing."""
 
     def __init__(self) -> None:
         self._n = 0
@@ -28,7 +28,7 @@ class SampleSeries:
         return (int(self._times[last]), self._values[last]) if self._n else None
 
     def add(self, t_ns: int, value: Array, horizontal_only: bool = False) -> None:
-        """Take a sample, of any shape; not finite or too soon after the last it is left out."""
+        """Add a sample of any shape; invalid or too closely spaced ones are dropped."""
         known = value[..., :2] if horizontal_only else value
         early = self._n > 0 and t_ns - self._times[self._n - 1] < MIN_SPACING_NS
         if early or not np.isfinite(known).all():
@@ -41,32 +41,32 @@ class SampleSeries:
         self._times[self._n], self._values[self._n] = t_ns, value
         self._n += 1
 
-    def let_go(self, before_ns: int, but_at: Array) -> None:
-        """Drop samples from before a time, save those next to the times `but_at` (N,), sorted.
+    def prune(self, before_ns: int, keep_at: Array) -> None:
+        """Drop samples before a time, except those around the times `keep_at` (N,), sorted.
 
-        At these times, and after `before_ns`, all reads as before.
+        At these times, and after `before_ns`, interpolation is unchanged.
         """
         times = self._times[: self._n]
-        old = int(np.searchsorted(times, before_ns)) - 1  # what follows may lie between two
+        old = int(np.searchsorted(times, before_ns)) - 1  # later times may lie between two
         if old <= 0:
             return
         keep = np.zeros(self._n, bool)
         keep[old:] = True
-        i = np.clip(np.searchsorted(times, but_at), 1, max(self._n - 1, 1))
+        i = np.clip(np.searchsorted(times, keep_at), 1, max(self._n - 1, 1))
         keep[i] = keep[i - 1] = True
         n = int(np.count_nonzero(keep))
         self._times[:n], self._values[:n] = times[keep], self._values[: self._n][keep]
         self._n = n
 
     def at(self, t_ns: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Interpolated values, and where samples on both sides are near enough."""
+        """Interpolated values, and a mask of times with samples near enough on both sides."""
         times, values = self._times[: self._n], self._values[: self._n]
         i = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)
         span = times[i] - times[i - 1]
         f = ((t_ns - times[i - 1]) / np.maximum(span, 1)).reshape(-1, *([1] * (values.ndim - 1)))
         nearest = np.minimum(np.abs(t_ns - times[i - 1]), np.abs(times[i] - t_ns))
-        told = (span < MAX_GAP_NS) | (nearest <= SAME_TIME_NS)
-        inside = (t_ns >= times[0]) & (t_ns <= times[-1]) & told
+        covered = (span < MAX_GAP_NS) | (nearest <= SAME_TIME_NS)
+        inside = (t_ns >= times[0]) & (t_ns <= times[-1]) & covered
         return values[i - 1] * (1 - f) + values[i] * f, inside
 
     def __len__(self) -> int:

@@ -1,8 +1,7 @@
-"""Where the body is, smoothly: the pose that an autopilot can fly on.
+"""Smooth odometry of the body, for an autopilot to fly on.
 
-The map keeps learning: its scale, its heading and its place in the world are refined all the time,
-and each refinement moves the pose of a camera that has not moved. Here the pose goes on from where
-it was, and what was learned is worked in as slowly as an autopilot can follow.
+Scale, heading and position of the map are refined continuously, and each refinement moves the pose
+of a stationary camera. Here the pose is continuous, and corrections are slew-limited.
 """
 
 from __future__ import annotations
@@ -16,61 +15,61 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
 
-MAX_WORKED_IN_M_S = 0.15
-MAX_WORKED_IN_RAD_S = np.radians(0.5)
+MAX_SLEW_M_S = 0.15
+MAX_SLEW_RAD_S = np.radians(0.5)
 MAX_ACCELERATION_M_S2 = 4.0
-DOUBTED_NS, MIN_DOUBTED_FRAMES = 500_000_000, 3
-"""Poses where motion cannot have brought the body are believed, as a reset, when they have agreed
-with each other for so long: longer than any gap is bridged (feedback.max_gap_ms is 300 at most),
-whatever the rate of the camera; and never by fewer frames."""
-WAY_KEPT_NS = 10_000_000_000
-SIGMA_COASTING_M_S = 0.3
-"""Of the velocity by which a pose is carried on where nothing is recognised."""
+MIN_CONSISTENT_NS, MIN_CONSISTENT_FRAMES = 500_000_000, 3
+"""Poses outside the innovation gate are accepted, as a reset, after agreeing with each other for so
+long: longer than any gap bridged (feedback.max_gap_ms is at most 300), at any frame rate; and never
+with fewer frames."""
+DRIFT_WINDOW_NS = 10_000_000_000
+SIGMA_DEAD_RECKONING_M_S = 0.3
+"""Of the velocity used in dead reckoning."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
 SIGMA_DRIFT = 0.005
-"""Of the way: what a map that is not adjusted yet may be off by."""
-SIGMAS_BEYOND_NOISE = 3.0
-"""How much more matches of one image err together than each by itself says."""
+"""Ratio of path length: drift of a map before adjustment."""
+NOISE_INFLATION = 3.0
+"""Inflation for correlated errors of the matches of one image."""
 FULL_COUNT = 150
 GRID = 4
 
 
-class _Waypoint(NamedTuple):
-    """Where the body was, how far it had flown, and what had been worked into its pose by then."""
+class _PathPoint(NamedTuple):
+    """Position, path length, and accumulated slew correction at a time."""
 
     t_ns: int
-    place: Array
-    flown_m: float
-    worked_in: Array
+    position: Array
+    path_length_m: float
+    slewed: Array
 
 
-class _Doubt(NamedTuple):
-    """Poses where motion cannot have brought the body, since the last that was believed.
+class _RejectedPoses(NamedTuple):
+    """Poses outside the innovation gate since the last accepted one.
 
     The newest `n` of them, from `agreed_since_ns` to `t_ns`, agree with each other; the newest is
-    at `place`.
+    at `position`.
     """
 
     since_ns: int
     agreed_since_ns: int
     t_ns: int
-    place: Array
+    position: Array
     n: int
 
 
 class OdometryState(NamedTuple):
-    """What another odometry needs to go on in the same frame: see `SmoothOdometry.take_up`."""
+    """State to continue in the same frame: see `SmoothOdometry.resume`."""
 
     odometry_from_world: Pose
     anchored: bool
-    place_m: Array
-    """(3,) of the body in the frame of odometry, when last seen,"""
+    position_m: Array
+    """(3,) of the body in the odometry frame, when last tracked,"""
     velocity_m_s: Array
     """and its velocity (3,)."""
 
 
 class SmoothOdometry:
-    """Tracks of the newest map and its georeference in, Odometry out; one for each frame."""
+    """Tracks of the active map and its georeference in, Odometry out; one per frame."""
 
     def __init__(self, camera: Camera, max_jump_m: float) -> None:
         mount = camera.body_from_camera
@@ -81,13 +80,13 @@ class SmoothOdometry:
         self._georeference: Georeference | None = None
         self._odometry_from_world = Pose.identity()
         self._last: tuple[int, Pose, Pose] | None = None
-        """time, `map_from_camera`, `odometry_from_body` of the last frame that was believed"""
+        """time, `map_from_camera`, `odometry_from_body` of the last accepted frame"""
         self._anchored = False
         self._velocity = np.zeros(3)
-        self._doubt: _Doubt | None = None
-        self._coasting = False
-        self._way: deque[_Waypoint] = deque()
-        self._worked_in = np.zeros(3)
+        self._rejected: _RejectedPoses | None = None
+        self._dead_reckoning = False
+        self._path: deque[_PathPoint] = deque()
+        self._slewed = np.zeros(3)
         self.reset_counter = 0
 
     def step(
@@ -99,34 +98,34 @@ class SmoothOdometry:
     ) -> Odometry:
         """Odometry of a frame.
 
-        `segment` names the map that the track is in, `georeference` is that map's own, and
-        `velocity_map` the camera's velocity in it with its standard deviation.
+        `segment` identifies the map of the track, `georeference` is that of this map, and
+        `velocity_map` the camera velocity in it with its standard deviation.
         """
         pose = track.map_from_camera
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None or georeference is None:
             return self._unknown(track)
         if segment != self._segment or self._georeference is None:
-            self._begin(segment, georeference, pose)
+            self._start_map(segment, georeference, pose)
         elif georeference is not self._georeference:
-            self._change(georeference)
+            self._update_georeference(georeference)
         raw = self._raw(georeference, pose)
         if track.state is TrackState.DEAD_RECKONING:
-            return self._coast(track, raw)
-        if self._coasting:
-            self._land(raw, track.t_ns)
-        before = self._odometry_from_world, self._worked_in
-        self._work_in(raw, track.t_ns)
+            return self._dead_reckon(track, raw)
+        if self._dead_reckoning:
+            self._reacquire(raw, track.t_ns)
+        before = self._odometry_from_world, self._slewed
+        self._slew(raw, track.t_ns)
         placed = self._odometry_from_world @ raw
-        believable = self._believable(placed, track.t_ns)
-        if not believable and not self._agreed(placed, track.t_ns):
-            self._odometry_from_world, self._worked_in = before
+        within_gate = self._within_gate(placed, track.t_ns)
+        if not within_gate and not self._consistent(placed, track.t_ns):
+            self._odometry_from_world, self._slewed = before
             return self._unknown(track)
-        doubted_ns = track.t_ns - self._doubt.since_ns if self._doubt is not None else 0
-        if not believable or doubted_ns >= DOUBTED_NS:
+        rejected_ns = track.t_ns - self._rejected.since_ns if self._rejected is not None else 0
+        if not within_gate or rejected_ns >= MIN_CONSISTENT_NS:
             self.reset_counter += 1
-            self._way.clear()
-        self._doubt = None
+            self._path.clear()
+        self._rejected = None
         sigma_velocity = float("inf")
         if velocity_map is not None:
             to_world = georeference.world_from_map
@@ -138,109 +137,112 @@ class SmoothOdometry:
             )
             sigma_velocity = velocity_map[1] * to_world.scale
         self._last = (track.t_ns, pose, placed)
-        noise_m = SIGMAS_BEYOND_NOISE * track.sigma_position * georeference.world_from_map.scale
-        way_sigma_m = self._way_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
+        noise_m = NOISE_INFLATION * track.sigma_position * georeference.world_from_map.scale
+        drift_sigma_m = self._drift_sigma_m(
+            track.t_ns, placed.translation, georeference.sigma_scale
+        )
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter, self._quality(track), placed,
             self._velocity.copy(),
-            float(np.linalg.norm([FLOOR_M, noise_m, way_sigma_m])),
+            float(np.linalg.norm([FLOOR_M, noise_m, drift_sigma_m])),
             sigma_velocity,
-            float(np.hypot(FLOOR_RAD, SIGMAS_BEYOND_NOISE * track.sigma_rotation_rad)),
-            self._sigma_yaw_rad(georeference, SIGMAS_BEYOND_NOISE * track.sigma_rotation_rad),
+            float(np.hypot(FLOOR_RAD, NOISE_INFLATION * track.sigma_rotation_rad)),
+            self._sigma_yaw_rad(georeference, NOISE_INFLATION * track.sigma_rotation_rad),
         )  # fmt: skip
 
     def _sigma_yaw_rad(self, georeference: Georeference, noise_rad: float) -> float:
-        """What the heading is off by from north.
+        """Standard deviation of the heading against north.
 
-        How well the map's is known, how far ours is known to be from the map's, by what was not
-        worked in, and noise.
+        Of the georeference, of the difference to it that is not slewed yet, and noise.
         """
         apart_rad = _yaw(self._odometry_from_world.rotation)
-        return float(
-            np.linalg.norm([FLOOR_RAD, noise_rad, georeference.sigma_yaw_rad, apart_rad])
-        )
+        return float(np.linalg.norm([FLOOR_RAD, noise_rad, georeference.sigma_yaw_rad, apart_rad]))
 
-    def _way_sigma_m(self, t_ns: int, place: Array, sigma_scale: float) -> float:
-        """What the way of the last seconds is off by, along each axis.
+    def _drift_sigma_m(self, t_ns: int, position: Array, sigma_scale: float) -> float:
+        """Drift standard deviation over the last seconds, along each axis.
 
-        Its scale, drift, and what was worked in, which moved the pose and not the body.
+        Scale error, drift, and slew corrections, which moved the pose but not the body.
         """
-        flown_m = 0.0
-        if self._way:
-            flown_m = self._way[-1].flown_m + float(np.linalg.norm(place - self._way[-1].place))
-        self._way.append(_Waypoint(t_ns, place, flown_m, self._worked_in))
-        while self._way[0].t_ns < t_ns - WAY_KEPT_NS:
-            self._way.popleft()
-        since = self._way[0]
+        path_length_m = 0.0
+        if self._path:
+            path_length_m = self._path[-1].path_length_m + float(
+                np.linalg.norm(position - self._path[-1].position)
+            )
+        self._path.append(_PathPoint(t_ns, position, path_length_m, self._slewed))
+        while self._path[0].t_ns < t_ns - DRIFT_WINDOW_NS:
+            self._path.popleft()
+        since = self._path[0]
         return float(np.linalg.norm([
-            sigma_scale * float(np.linalg.norm(place - since.place)),
-            SIGMA_DRIFT * (flown_m - since.flown_m),
-            float(np.linalg.norm(self._worked_in - since.worked_in)) / np.sqrt(3.0),
+            sigma_scale * float(np.linalg.norm(position - since.position)),
+            SIGMA_DRIFT * (path_length_m - since.path_length_m),
+            float(np.linalg.norm(self._slewed - since.slewed)) / np.sqrt(3.0),
         ]))  # fmt: skip
 
-    def _coast(self, track: Track, raw: Pose) -> Odometry:
-        """Carried on without seeing: of the lowest quality, and ever less certain."""
+    def _dead_reckon(self, track: Track, raw: Pose) -> Odometry:
+        """Odometry by dead reckoning: of lowest quality and growing uncertainty."""
         assert track.map_from_camera is not None
         placed = self._odometry_from_world @ raw
         if self._last is not None:
             dt_s = max((track.t_ns - self._last[0]) * 1e-9, 1e-3)
             self._velocity = (placed.translation - self._last[2].translation) / dt_s
-        self._coasting = True
+        self._dead_reckoning = True
         self._last = (track.t_ns, track.map_from_camera, placed)
         assert self._georeference is not None
         scale = self._georeference.world_from_map.scale
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter, 1, placed,
             self._velocity.copy(), max(FLOOR_M, scale * track.sigma_position),
-            SIGMA_COASTING_M_S, float(np.hypot(FLOOR_RAD, track.sigma_rotation_rad)),
+            SIGMA_DEAD_RECKONING_M_S, float(np.hypot(FLOOR_RAD, track.sigma_rotation_rad)),
             self._sigma_yaw_rad(self._georeference, track.sigma_rotation_rad),
         )  # fmt: skip
 
-    def _land(self, raw: Pose, t_ns: int) -> None:
-        """See again: go on from where coasting led, as long as that is not far off."""
-        self._coasting = False
+    def _reacquire(self, raw: Pose, t_ns: int) -> None:
+        """Reacquisition after dead reckoning: continue from its pose, if close enough."""
+        self._dead_reckoning = False
         if self._last is None:
             return
         expected = self._last[2].translation + self._velocity * ((t_ns - self._last[0]) * 1e-9)
-        off = expected - (self._odometry_from_world @ raw).translation
-        if float(np.linalg.norm(off)) < self._max_jump_m:
+        correction = expected - (self._odometry_from_world @ raw).translation
+        if float(np.linalg.norm(correction)) < self._max_jump_m:
             before = self._odometry_from_world
-            self._odometry_from_world = Pose(before.rotation, before.translation + off)
+            self._odometry_from_world = Pose(before.rotation, before.translation + correction)
 
     def _unknown(self, track: Track) -> Odometry:
         return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
 
     def _raw(self, georeference: Georeference, map_from_camera: Pose) -> Pose:
-        """`world_from_body` as the map has it now."""
+        """`world_from_body` by the map at present."""
         return georeference.world_from_map.apply_to_pose(map_from_camera) @ self._camera_from_body
 
-    def _begin(self, segment: int, georeference: Georeference, pose: Pose) -> None:
-        """Another map than before, or the first: nothing ties its poses to those of the last."""
+    def _start_map(self, segment: int, georeference: Georeference, pose: Pose) -> None:
+        """Start in another map, or the first one; poses are unrelated to the last."""
         offset = np.zeros(3)
         if self._last is not None:
             self.reset_counter += 1
-            if not georeference.has_origin:  # go on from the place last known
+            if not georeference.has_origin:  # continue from the last known position
                 offset = self._last[2].translation - self._raw(georeference, pose).translation
         self._odometry_from_world = Pose(np.eye(3), offset)
         self._anchored = georeference.has_origin
         self._segment, self._georeference = segment, georeference
         self._last = None
-        self._doubt = None
-        self._coasting = False
-        self._way.clear()
+        self._rejected = None
+        self._dead_reckoning = False
+        self._path.clear()
 
-    def _change(self, georeference: Georeference) -> None:
-        """The same map, better placed: the last pose stays where it was."""
+    def _update_georeference(self, georeference: Georeference) -> None:
+        """Change the georeference of the same map, keeping the last pose."""
         if self._last is not None:
             _, pose, placed = self._last
             raw = self._raw(georeference, pose)
-            turn = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
-            self._odometry_from_world = Pose(turn, placed.translation - turn @ raw.translation)
+            yaw_offset = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
+            self._odometry_from_world = Pose(
+                yaw_offset, placed.translation - yaw_offset @ raw.translation
+            )
         self._georeference = georeference
 
     @property
-    def kept(self) -> OdometryState | None:
-        """What it takes to go on from here; None before there was a pose."""
+    def state(self) -> OdometryState | None:
+        """State to continue from; None before the first pose."""
         if self._last is None:
             return None
         return OdometryState(
@@ -248,64 +250,73 @@ class SmoothOdometry:
             self._velocity.copy(),
         )  # fmt: skip
 
-    def take_up(self, segment: int, georeference: Georeference, kept: OdometryState) -> None:
-        """Go on in a frame from before; `segment` and `georeference` are of the map kept with it.
+    def resume(self, segment: int, georeference: Georeference, state: OdometryState) -> None:
+        """Continue in a stored frame; `segment` and `georeference` are of the map stored with it.
 
-        The next pose is taken as it is: nothing tells how the body moved meanwhile.
+        The next pose is taken as is, since the motion meanwhile is unknown.
         """
         self._segment, self._georeference = segment, georeference
-        self._odometry_from_world, self._anchored = kept.odometry_from_world, kept.anchored
-        self._last, self._doubt, self._coasting = None, None, False
-        self._way.clear()
+        self._odometry_from_world, self._anchored = state.odometry_from_world, state.anchored
+        self._last, self._rejected, self._dead_reckoning = None, None, False
+        self._path.clear()
 
-    def map_moved(self, map_from_camera: Pose) -> None:
-        """The map was corrected: where in it the last believed frame is now.
+    def correct_map(self, map_from_camera: Pose) -> None:
+        """Apply a correction of the map: `map_from_camera` of the last accepted frame now.
 
-        What was given stays where it was; the rest is worked in as slowly as anything learned.
+        The output stays continuous; the difference is slewed.
         """
         if self._last is None or self._georeference is None:
             return
         t_ns, _, placed = self._last
         self._last = (t_ns, map_from_camera, placed)
-        self._change(self._georeference)
+        self._update_georeference(self._georeference)
 
-    def _work_in(self, raw: Pose, t_ns: int) -> None:
-        """Move towards the pose that the map has, where it began with a place in the world.
+    def _slew(self, raw: Pose, t_ns: int) -> None:
+        """Slew towards the pose by the map, where that started with a world position.
 
-        A map that began without one goes on as it began: the way to a place found out later may be
-        long, and an autopilot would fly it.
+        A map that started without one stays in its frame: the correction may be large, and an
+        autopilot would fly it.
         """
         if self._last is None or not self._anchored:
             return
         dt_s = min((t_ns - self._last[0]) * 1e-9, 1.0)
         here = self._odometry_from_world @ raw
         yaw = _yaw(self._odometry_from_world.rotation)
-        most = float(MAX_WORKED_IN_RAD_S) * dt_s
-        turn = yaw_rotation(yaw - float(np.clip(yaw, -most, most)))
+        most = float(MAX_SLEW_RAD_S) * dt_s
+        yaw_offset = yaw_rotation(yaw - float(np.clip(yaw, -most, most)))
         away = here.translation - raw.translation
         far = float(np.linalg.norm(away))
-        kept = max(far - MAX_WORKED_IN_M_S * dt_s, 0.0) / max(far, 1e-12)
-        at = raw.translation + kept * away
-        self._worked_in = self._worked_in + at - here.translation
-        self._odometry_from_world = Pose(turn, at - turn @ raw.translation)
+        remaining = max(far - MAX_SLEW_M_S * dt_s, 0.0) / max(far, 1e-12)
+        at = raw.translation + remaining * away
+        self._slewed = self._slewed + at - here.translation
+        self._odometry_from_world = Pose(yaw_offset, at - yaw_offset @ raw.translation)
 
-    def _believable(self, placed: Pose, t_ns: int) -> bool:
-        """Whether motion can have brought the body here."""
+    def _within_gate(self, placed: Pose, t_ns: int) -> bool:
+        """Innovation gate: whether motion can have brought the body here."""
         if self._last is None:
             return True
-        return self._reached(self._last[2].translation, placed.translation, t_ns - self._last[0])
+        return self._reachable(self._last[2].translation, placed.translation, t_ns - self._last[0])
 
-    def _agreed(self, placed: Pose, t_ns: int) -> bool:
-        """Take a pose where motion cannot have brought the body; whether enough others agree."""
-        place, doubt = placed.translation, self._doubt
-        if doubt is None or not self._reached(doubt.place, place, t_ns - doubt.t_ns):
-            self._doubt = _Doubt(doubt.since_ns if doubt else t_ns, t_ns, t_ns, place, 1)
+    def _consistent(self, placed: Pose, t_ns: int) -> bool:
+        """Add a pose outside the gate; whether enough of them agree."""
+        position, rejected = placed.translation, self._rejected
+        if rejected is None or not self._reachable(
+            rejected.position, position, t_ns - rejected.t_ns
+        ):
+            self._rejected = _RejectedPoses(
+                rejected.since_ns if rejected else t_ns, t_ns, t_ns, position, 1
+            )
             return False
-        self._doubt = doubt = doubt._replace(t_ns=t_ns, place=place, n=doubt.n + 1)
-        return t_ns - doubt.agreed_since_ns >= DOUBTED_NS and doubt.n >= MIN_DOUBTED_FRAMES
+        self._rejected = rejected = rejected._replace(
+            t_ns=t_ns, position=position, n=rejected.n + 1
+        )
+        return (
+            t_ns - rejected.agreed_since_ns >= MIN_CONSISTENT_NS
+            and rejected.n >= MIN_CONSISTENT_FRAMES
+        )
 
-    def _reached(self, before: Array, after: Array, dt_ns: int) -> bool:
-        """Whether motion can have brought the body from one place (3,) to another in a time."""
+    def _reachable(self, before: Array, after: Array, dt_ns: int) -> bool:
+        """Whether the body can have moved between two positions (3,) in a time."""
         dt_s = dt_ns * 1e-9
         expected = before + self._velocity * min(dt_s, 1.0)
         away_m = float(np.linalg.norm(after - expected))
@@ -314,7 +325,7 @@ class SmoothOdometry:
         return away_m < self._max_jump_m + 0.5 * MAX_ACCELERATION_M_S2 * dt_s**2 + speed * beyond_s
 
     def _quality(self, track: Track) -> int:
-        """1..100: how many map points were found, over how much of the image, by how many tries."""
+        """1..100, from the number, image coverage and match ratio of inliers."""
         if track.keypoints_px is None or not len(track.keypoints_px):
             return 1
         cells = np.clip((track.keypoints_px / self._size * GRID).astype(int), 0, GRID - 1)

@@ -1,8 +1,7 @@
-"""A map laid over the autopilot's positions, whose errors wander: generalised least squares.
+"""Alignment of a map with measured positions by generalised least squares.
 
-Position errors of a GPS are modelled as an Ornstein-Uhlenbeck process, so that a metre of drift
-over a minute does not pass for scale; ways travelled by velocity, whose errors do not add up, are
-used beside them.
+GPS errors are modelled as an Ornstein-Uhlenbeck process, so that a metre of drift over a minute
+does not bias the scale; displacements by velocity, with uncorrelated errors, are added.
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ SIGMA_WHITE_M = 0.15
 SIGMA_VELOCITY_M_S = 0.15
 VELOCITY_TAU_S = 1.0
 MAX_STEP_S = 5.0
-"""Between two places, for velocity to tell how far that is."""
+"""Between two positions, for velocity to give the displacement."""
 SIGMA_TILT_RAD = np.radians(0.5)
 SIGMA_YAW_RAD = np.radians(6.0)
-ITERATIONS, OUTLIERS_AT = 12, 6
+ITERATIONS, OUTLIER_ITERATION = 12, 6
 DISAGREE = 3.0
-"""Standard deviations by which two scales differ that cannot both be right."""
+"""Standard deviations beyond which two scales contradict."""
 
 
 class Scale(NamedTuple):
-    """Metres per map unit, its relative standard deviation, and what told it."""
+    """Metres per map unit, relative standard deviation, method, and number of measurements."""
 
     scale: float
     sigma: float
@@ -45,8 +44,8 @@ class Scale(NamedTuple):
     n: int
 
 
-def agreed(first: Scale, second: Scale) -> Scale:
-    """The better of two, no surer than they agree: a rangefinder may see what the map does not."""
+def reconciled(first: Scale, second: Scale) -> Scale:
+    """The more certain of two scales; where they contradict, sigma is their difference."""
     best = min(first, second, key=lambda scale: scale.sigma)
     apart = abs(float(np.log(first.scale / second.scale)))
     if apart < DISAGREE * float(np.hypot(first.sigma, second.sigma)):
@@ -55,111 +54,121 @@ def agreed(first: Scale, second: Scale) -> Scale:
 
 
 class _Equations:
-    """Normal equations of (log scale, turn (3), origin (3)), and what they leave unexplained."""
+    """Normal equations of (log scale, rotation (3), origin (3)), and the residual cost."""
 
     def __init__(self) -> None:
         self.information = np.zeros((7, 7))
         self.gradient = np.zeros(7)
         self.chi2, self.n_rows = 0.0, 0
 
-    def add(self, jacobian: Array, residual: Array, n_told: int) -> None:
-        """Add rows (N, 7) and (N,), weighted already, `n_told` of which say anything."""
+    def add(self, jacobian: Array, residual: Array, n_measured: int) -> None:
+        """Add weighted rows (N, 7) and (N,), `n_measured` of which are measurements."""
         self.information += jacobian.T @ jacobian
         self.gradient += jacobian.T @ residual
         self.chi2 += float(residual @ residual)
-        self.n_rows += n_told
+        self.n_rows += n_measured
 
 
 def fit_map(
-    t_s: Array, mapped: Array, target: Array, way: Array, level: Array | None, scale: Scale | None
+    t_s: Array,
+    mapped: Array,
+    target: Array,
+    travelled_m: Array,
+    level: Array | None,
+    scale: Scale | None,
 ) -> tuple[Similarity, Array, float] | None:
-    """Generalised least squares over (log scale, turn (3), origin (3)), N places of which.
+    """Generalised least squares over (log scale, rotation (3), origin (3)) of N positions.
 
-    `mapped` (N, 3) in map units are to lie on `target` (N, 3) in metres; `way` (N, 3) is what was
-    travelled so far, nan where it is not known; `level` the rotation world_from_map by attitude;
-    `scale` what others say of it. Gives the similarity, its covariance (7, 7) and the residual,
-    RMS in metres; None where nothing fits.
+    `mapped` (N, 3), map units, are fitted to `target` (N, 3), metres; `travelled_m` (N, 3) is
+    integrated velocity, nan where missing; `level` the rotation world_from_map by attitude; `scale`
+    a prior on the scale. Returns the similarity, its covariance (7, 7) and the RMS residual in
+    metres; None where nothing fits.
     """
-    guess = _start(mapped, target, level)
-    if not np.isfinite(guess.scale) or guess.scale <= 0:
+    estimate = _initial_guess(mapped, target, level)
+    if not np.isfinite(estimate.scale) or estimate.scale <= 0:
         return None
-    keep, root, equations = np.ones(len(t_s), bool), np.eye(len(t_s)), _Equations()
+    keep, cholesky, equations = np.ones(len(t_s), bool), np.eye(len(t_s)), _Equations()
     for iteration in range(ITERATIONS):
-        turned = guess.scale * mapped @ guess.rotation.T
-        residual = target - turned - guess.translation
-        if iteration == OUTLIERS_AT:  # positions that no drift explains
+        rotated = estimate.scale * mapped @ estimate.rotation.T
+        residual = target - rotated - estimate.translation
+        if iteration == OUTLIER_ITERATION:  # outliers beyond drift
             size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
             keep = size < max(5.0 * float(np.median(size)), 3.0)
-        if iteration in (0, OUTLIERS_AT):
-            root = _drift_root(t_s[keep])
-        # derivative of the prediction: scale, turn, origin
+        if iteration in (0, OUTLIER_ITERATION):
+            cholesky = _drift_cholesky(t_s[keep])
+        # Jacobian of the prediction: scale, rotation, origin
         jacobian = np.zeros((len(t_s), 3, 7))
-        jacobian[:, :, 0] = turned
-        jacobian[:, :, 1:4] = -skew(turned)
+        jacobian[:, :, 0] = rotated
+        jacobian[:, :, 1:4] = -skew(rotated)
         jacobian[:, :, 4:] = np.eye(3)
         equations = _Equations()
         for axis in range(3):
-            j = solve_triangular(root, jacobian[keep, axis], lower=True)
-            r = solve_triangular(root, residual[keep, axis], lower=True)
+            j = solve_triangular(cholesky, jacobian[keep, axis], lower=True)
+            r = solve_triangular(cholesky, residual[keep, axis], lower=True)
             equations.add(j, r, len(r))
-        _add_ways(equations, t_s, jacobian, turned, way, keep)
-        _add_priors(equations, guess, level, scale)
+        _add_displacements(equations, t_s, jacobian, rotated, travelled_m, keep)
+        _add_priors(equations, estimate, level, scale)
         try:
             solved = np.linalg.solve(equations.information, equations.gradient)
         except np.linalg.LinAlgError:
             return None
         delta = np.asarray(solved, np.float64)
         delta[:4] = np.clip(delta[:4], -0.5, 0.5)
-        guess = Similarity(
-            guess.scale * float(np.exp(delta[0])),
-            rotation_from_vector(delta[1:4]) @ guess.rotation,
-            guess.translation + delta[4:],
+        estimate = Similarity(
+            estimate.scale * float(np.exp(delta[0])),
+            rotation_from_vector(delta[1:4]) @ estimate.rotation,
+            estimate.translation + delta[4:],
         )
     inflation = max(equations.chi2 / max(equations.n_rows - 7, 1), 1.0)
     covariance = np.asarray(np.linalg.inv(equations.information) * inflation, np.float64)
-    error = target - guess.apply(mapped)
-    return guess, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))
+    error = target - estimate.apply(mapped)
+    return estimate, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))
 
 
-def _add_ways(
-    equations: _Equations, t_s: Array, jacobian: Array, turned: Array, way: Array, keep: Bools
+def _add_displacements(
+    equations: _Equations,
+    t_s: Array,
+    jacobian: Array,
+    rotated: Array,
+    travelled_m: Array,
+    keep: Bools,
 ) -> None:
-    """From one place to the next, where velocity tells how far that was; robust (Huber)."""
+    """Displacements between successive positions by velocity; robust (Huber)."""
     dt = np.diff(t_s)
-    known = np.isfinite(way[1:, :2] - way[:-1, :2]).all(1)
+    known = np.isfinite(travelled_m[1:, :2] - travelled_m[:-1, :2]).all(1)
     use = known & (dt > 0) & (dt < MAX_STEP_S) & keep[1:] & keep[:-1]
     if not use.any():
         return
     j = (jacobian[1:] - jacobian[:-1])[use]
-    r = ((way[1:] - way[:-1]) - (turned[1:] - turned[:-1]))[use]
-    told = np.isfinite(r)
-    j, r = j * told[..., None], np.where(told, r, 0.0)
+    r = ((travelled_m[1:] - travelled_m[:-1]) - (rotated[1:] - rotated[:-1]))[use]
+    measured = np.isfinite(r)
+    j, r = j * measured[..., None], np.where(measured, r, 0.0)
     sigma_m = SIGMA_VELOCITY_M_S * np.sqrt(dt[use] * np.maximum(dt[use], VELOCITY_TAU_S))
     weight = 1.0 / sigma_m
     length = np.linalg.norm(r, axis=1) * weight
     weight = weight * np.sqrt(np.minimum(1.0, 3.0 / np.maximum(length, 1e-9)))
     equations.add(
         (j * weight[:, None, None]).reshape(-1, 7), (r * weight[:, None]).reshape(-1),
-        int(told.sum()),
+        int(measured.sum()),
     )  # fmt: skip
 
 
 def _add_priors(
-    equations: _Equations, guess: Similarity, level: Array | None, scale: Scale | None
+    equations: _Equations, estimate: Similarity, level: Array | None, scale: Scale | None
 ) -> None:
     if scale is not None:
         equations.information[0, 0] += scale.sigma**-2
-        equations.gradient[0] += np.log(scale.scale / guess.scale) / scale.sigma**2
+        equations.gradient[0] += np.log(scale.scale / estimate.scale) / scale.sigma**2
     weight = np.full(3, 1e-6)
     if level is not None:
         weight = np.array([SIGMA_TILT_RAD, SIGMA_TILT_RAD, SIGMA_YAW_RAD]) ** -2
-        turn = vector_from_rotation(guess.rotation @ level.T)
-        equations.gradient[1:4] -= weight * turn
+        rotation_error = vector_from_rotation(estimate.rotation @ level.T)
+        equations.gradient[1:4] -= weight * rotation_error
     equations.information[1:4, 1:4] += np.diag(weight)
 
 
-def _start(mapped: Array, target: Array, level: Array | None) -> Similarity:
-    """Closed form (Umeyama 1991); about the vertical only where the level is known."""
+def _initial_guess(mapped: Array, target: Array, level: Array | None) -> Similarity:
+    """Closed form (Umeyama 1991); rotation fixed where the level is known."""
     ma, mb = mapped.mean(0), target.mean(0)
     a, b = mapped - ma, target - mb
     if level is None:
@@ -174,8 +183,8 @@ def _start(mapped: Array, target: Array, level: Array | None) -> Similarity:
     return Similarity(scale, rotation, mb - scale * rotation @ ma)
 
 
-def _drift_root(t_s: Array) -> Array:
-    """Cholesky factor of the covariance of slowly wandering positions, for one axis."""
+def _drift_cholesky(t_s: Array) -> Array:
+    """Cholesky factor of the covariance of drifting positions, for one axis."""
     gap = np.abs(t_s[:, None] - t_s[None, :])
     covariance = SIGMA_DRIFT_M**2 * np.exp(-gap / DRIFT_TAU_S) + SIGMA_WHITE_M**2 * np.eye(len(gap))
     return np.asarray(np.linalg.cholesky(covariance), np.float64)

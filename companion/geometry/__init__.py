@@ -1,1 +1,1 @@
-"""Rotations, rigid transforms, camera models, geodesy. numpy only; imports no other room."""
+"""Rotations, rigid transforms, camera models, geodesy. numpy only; imports no other package."""

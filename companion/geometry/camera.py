@@ -1,6 +1,6 @@
-"""Camera models: pixels to rays and back. numpy only, pure.
+"""Camera models: projection and its inverse. numpy only, pure.
 
-A ray is kept as `normalised` image coordinates (x/z, y/z), so that solvers know no lens.
+Rays are `normalised` image coordinates (x/z, y/z), so that solvers are independent of the lens.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from companion.geometry.transforms import Array, Pose
 
 MAX_OFF_AXIS_RAD = np.radians(80.0)
-"""Beyond this angle from the optical axis a pixel has no usable normalised coordinates."""
-EXACT = 1e-12
+"""Larger angles from the optical axis have no usable normalised coordinates."""
+CONVERGED = 1e-12
 """In normalised coordinates."""
 
 
@@ -32,10 +32,10 @@ class Distortion(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """Intrinsics of a camera and its place on the body.
+    """Intrinsics and mount of a camera.
 
-    `coefficients` has the length that the model asks for. `body_from_camera` is None when it is
-    not known (a gimbal, a hand-held video): then attitude can level nothing.
+    `coefficients` has the length that the model requires. `body_from_camera` is None when unknown
+    (gimbal, hand-held): attitude then does not apply to the camera.
     """
 
     width: int
@@ -48,7 +48,7 @@ class Camera:
     coefficients: tuple[float, ...] = ()
     body_from_camera: Pose | None = None
     assumed: bool = field(default=False)
-    """True when no calibration was given and the intrinsics are a guess."""
+    """Whether the intrinsics are a guess, without calibration."""
 
     @property
     def focal_px(self) -> float:
@@ -60,7 +60,7 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def pinhole(self) -> Camera:
-        """The same camera without distortion, same size and focal length."""
+        """The same camera without distortion."""
         return Camera(
             self.width, self.height, self.fx, self.fy, self.cx, self.cy,
             body_from_camera=self.body_from_camera, assumed=self.assumed,
@@ -100,7 +100,7 @@ class Camera:
         return np.stack([self.fx * d[..., 0] + self.cx, self.fy * d[..., 1] + self.cy], -1)
 
     def normalise(self, pixels: NDArray[Any]) -> Array:
-        """Ideal normalised coordinates (N, 2) of distorted pixels (N, 2); nan where none."""
+        """Ideal normalised coordinates (N, 2) of distorted pixels (N, 2); nan where undefined."""
         px = np.asarray(pixels, np.float64)
         d = np.stack([(px[..., 0] - self.cx) / self.fx, (px[..., 1] - self.cy) / self.fy], -1)
         if self.distortion is Distortion.NONE:
@@ -110,7 +110,7 @@ class Camera:
         n = d.copy()
         for _ in range(8):  # Newton on the 2-D model: converges also where plain iteration does not
             error = self.distort(n) - d
-            if np.abs(error).max(initial=0.0, where=np.isfinite(error)) < EXACT:
+            if np.abs(error).max(initial=0.0, where=np.isfinite(error)) < CONVERGED:
                 break
             j = self._distortion_jacobian(n)
             (a, b), (c, e) = (j[..., 0, 0], j[..., 0, 1]), (j[..., 1, 0], j[..., 1, 1])

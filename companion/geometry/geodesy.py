@@ -1,4 +1,4 @@
-"""Latitude, longitude and altitude to local NED and back (WGS84 ellipsoid)."""
+"""Conversion between geodetic coordinates and local NED (WGS84 ellipsoid)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ECCENTRICITY_2 = FLATTENING * (2 - FLATTENING)
 
 @dataclass(frozen=True, slots=True)
 class GeoOrigin:
-    """Where local NED has its zero (WGS84; altitude above mean sea level)."""
+    """Origin of local NED (WGS84; altitude above mean sea level)."""
 
     latitude_deg: float
     longitude_deg: float
@@ -26,7 +26,7 @@ class GeoOrigin:
 def ned_from_geodetic(
     latitude_deg: float, longitude_deg: float, altitude_m: float, origin: GeoOrigin
 ) -> Array:
-    """Position (3,) in the tangent frame at `origin`; the geoid is taken as level there."""
+    """Position (3,) in the tangent frame at `origin`; the geoid is assumed level there."""
     ecef = _ecef(latitude_deg, longitude_deg, altitude_m)
     zero = _ecef(origin.latitude_deg, origin.longitude_deg, origin.altitude_m)
     ned: Array = _ned_from_ecef(origin.latitude_deg, origin.longitude_deg) @ (ecef - zero)
@@ -34,60 +34,60 @@ def ned_from_geodetic(
 
 
 def geodetic_from_ned(points_ned_m: Array, origin: GeoOrigin) -> Array:
-    """Latitude, longitude (degrees) and altitude (m) (N, 3) of places (N, 3) about `origin`.
+    """Latitude, longitude (degrees) and altitude (m) (N, 3) of positions (N, 3) in NED at `origin`.
 
-    The exact inverse of `ned_from_geodetic`, to micrometres (Bowring 1976, repeated).
+    The exact inverse of `ned_from_geodetic`, to micrometres (Bowring 1976, iterated).
     """
-    turn = _ned_from_ecef(origin.latitude_deg, origin.longitude_deg)
+    rotation = _ned_from_ecef(origin.latitude_deg, origin.longitude_deg)
     zero = _ecef(origin.latitude_deg, origin.longitude_deg, origin.altitude_m)
-    x, y, z = (np.asarray(points_ned_m, np.float64) @ turn + zero).T
-    across = np.hypot(x, y)
+    x, y, z = (np.asarray(points_ned_m, np.float64) @ rotation + zero).T
+    equatorial_m = np.hypot(x, y)
     semi_minor_m = SEMI_MAJOR_M * (1 - FLATTENING)
     second = ECCENTRICITY_2 / (1 - ECCENTRICITY_2)
-    reduced = np.arctan2(z, across * (1 - FLATTENING))
+    reduced = np.arctan2(z, equatorial_m * (1 - FLATTENING))
     latitude = np.zeros_like(reduced)
     for _ in range(3):
         latitude = np.arctan2(
             z + second * semi_minor_m * np.sin(reduced) ** 3,
-            across - ECCENTRICITY_2 * SEMI_MAJOR_M * np.cos(reduced) ** 3,
+            equatorial_m - ECCENTRICITY_2 * SEMI_MAJOR_M * np.cos(reduced) ** 3,
         )
         reduced = np.arctan2((1 - FLATTENING) * np.sin(latitude), np.cos(latitude))
     sine, cosine = np.sin(latitude), np.cos(latitude)
     radius_m = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * sine**2)
-    # of both forms the one that is not divided by next to nothing at the poles or the equator
-    altitude = across * cosine + z * sine - radius_m * (1 - ECCENTRICITY_2 * sine**2)
+    # this form is well-conditioned at the poles and the equator
+    altitude = equatorial_m * cosine + z * sine - radius_m * (1 - ECCENTRICITY_2 * sine**2)
     return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], 1)
 
 
 def origin_of(
     latitude_deg: float, longitude_deg: float, altitude_m: float, position_ned_m: Array
 ) -> GeoOrigin:
-    """The origin of the local NED in which a place known in both has this position.
+    """Origin of the local NED in which a geodetic position has the given coordinates.
 
-    Good to millimetres within some kilometres: the curvature is taken at the place itself.
+    Accurate to millimetres within some kilometres: the curvature is evaluated at the position.
     """
     here = GeoOrigin(latitude_deg, longitude_deg, altitude_m)
     for _ in range(3):
-        miss = ned_from_geodetic(latitude_deg, longitude_deg, altitude_m, here) - position_ned_m
+        error = ned_from_geodetic(latitude_deg, longitude_deg, altitude_m, here) - position_ned_m
         sine = np.sin(np.radians(here.latitude_deg))
         shrink = 1 - ECCENTRICITY_2 * sine**2
         north_m = SEMI_MAJOR_M * (1 - ECCENTRICITY_2) / shrink**1.5
         east_m = SEMI_MAJOR_M / np.sqrt(shrink) * np.cos(np.radians(here.latitude_deg))
         here = GeoOrigin(
-            here.latitude_deg + float(np.degrees(miss[0] / north_m)),
-            here.longitude_deg + float(np.degrees(miss[1] / east_m)),
-            here.altitude_m - float(miss[2]),
+            here.latitude_deg + float(np.degrees(error[0] / north_m)),
+            here.longitude_deg + float(np.degrees(error[1] / east_m)),
+            here.altitude_m - float(error[2]),
         )
     return here
 
 
 def _ecef(latitude_deg: float, longitude_deg: float, altitude_m: float) -> NDArray[np.float64]:
     lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
-    across = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
+    equatorial_m = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
     out = np.array([
-        (across + altitude_m) * np.cos(lat) * np.cos(lon),
-        (across + altitude_m) * np.cos(lat) * np.sin(lon),
-        (across * (1 - ECCENTRICITY_2) + altitude_m) * np.sin(lat),
+        (equatorial_m + altitude_m) * np.cos(lat) * np.cos(lon),
+        (equatorial_m + altitude_m) * np.cos(lat) * np.sin(lon),
+        (equatorial_m * (1 - ECCENTRICITY_2) + altitude_m) * np.sin(lat),
     ])  # fmt: skip
     return out
 

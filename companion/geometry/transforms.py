@@ -88,7 +88,7 @@ class Similarity:
         )
 
     def apply_to_pose(self, pose: Pose) -> Pose:
-        """Return the pose in a of a frame given in b: its position scaled, its axes turned."""
+        """Return the pose in a of a frame given in b: position scaled, axes rotated."""
         return Pose(self.rotation @ pose.rotation, self.apply(pose.translation))
 
     def inverse(self) -> Similarity:
@@ -108,7 +108,7 @@ def skew(v: Array) -> Array:
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The rotation nearest to what is one but for rounding, which products of many gather."""
+    """The nearest rotation to a matrix (3, 3), to remove accumulated rounding errors."""
     u, _, vt = np.linalg.svd(matrix)
     out: Array = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     return out
@@ -142,7 +142,7 @@ def vector_from_rotation(rotation: Array) -> Array:
 
 
 def vectors_from_rotations(rotations: Array) -> Array:
-    """Rotation vectors (N, 3) of rotations (N, 3, 3) that are no half turns."""
+    """Rotation vectors (N, 3) of rotations (N, 3, 3) by less than half a turn."""
     off = 0.5 * np.stack(
         [
             rotations[:, 2, 1] - rotations[:, 1, 2],
@@ -220,5 +220,5 @@ def yaw_rotation(yaw_rad: float) -> Array:
 
 
 def angle_between(rotation_a: Array, rotation_b: Array) -> float:
-    """Angle in radians that turns a into b."""
+    """Angle in radians of the rotation from a to b."""
     return float(np.linalg.norm(vector_from_rotation(rotation_a.T @ rotation_b)))

@@ -1,4 +1,4 @@
-"""Thinning a cloud: one point for each cube of space."""
+"""Voxel-grid downsampling of point clouds."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from companion.geometry.transforms import Array
 
 
-def thin_by_voxel(
+def voxel_downsample(
     points: NDArray[np.floating], confidence: NDArray[np.floating], voxel: float,
     low: Array | None = None,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Indices, ascending, of the most confident point (N, 3) of each cube of side `voxel`.
+    """Indices, ascending, of the most confident point (N, 3) of each voxel of side `voxel`.
 
-    The cubes have a corner at `low` (3,), by default the lowest corner of the points. Equal
-    confidence goes to the earlier point, so that the result depends on nothing else.
+    The grid has a corner at `low` (3,), by default the lowest corner of the points. Ties resolve to
+    the earlier point, so that the result is deterministic.
     """
     if len(points) == 0:
         return np.zeros(0, np.int64)

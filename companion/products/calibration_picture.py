@@ -71,10 +71,10 @@ def _draw_coverage(axes: Axes, calibration: Calibration) -> None:
         shade, extent=(-0.5, camera.width - 0.5, camera.height - 0.5, -0.5), vmin=0, vmax=2,
         cmap=ListedColormap([CARD, "#fae6cf", "#3c3f44"]), interpolation="nearest", aspect="auto",
     )  # fmt: skip
-    points = np.concatenate([view.sighting.image_px for view in calibration.views])
+    points = np.concatenate([view.detection.image_px for view in calibration.views])
     axes.plot(*points.T, ".", ms=3.5, mew=0, color=PATH)
     for view in calibration.rejected:
-        axes.plot(*view.sighting.image_px.T, "x", ms=3.5, mew=0.8, color=BAD)
+        axes.plot(*view.detection.image_px.T, "x", ms=3.5, mew=0.8, color=BAD)
     axes.set_title(f"Corners of {len(calibration.views)} views, {covered.share:.0%} covered")
     notes = ["orange: the board never was there"]
     if not covered.lit.all():
@@ -87,15 +87,15 @@ def _draw_coverage(axes: Axes, calibration: Calibration) -> None:
 
 def _draw_residuals(axes: Axes, calibration: Calibration) -> None:
     camera = calibration.camera
-    points = np.concatenate([view.sighting.image_px for view in calibration.views])
+    points = np.concatenate([view.detection.image_px for view in calibration.views])
     residuals = np.concatenate(calibration.lens.residuals_px)
-    away = np.linalg.norm(residuals, axis=1)
-    magnified = _round(LONGEST_ARROW * camera.width / max(float(np.percentile(away, 98)), 1e-6))
+    error_px = np.linalg.norm(residuals, axis=1)
+    magnified = _round(LONGEST_ARROW * camera.width / max(float(np.percentile(error_px, 98)), 1e-6))
     lines = LineCollection(
-        list(np.stack([points, points + magnified * residuals], 1)), array=away, linewidths=0.9,
+        list(np.stack([points, points + magnified * residuals], 1)), array=error_px, linewidths=0.9,
         cmap=matplotlib.colormaps["viridis_r"],
     )  # fmt: skip
-    lines.set_clim(0, float(np.percentile(away, 98)))
+    lines.set_clim(0, float(np.percentile(error_px, 98)))
     axes.add_collection(lines)
     bar = axes.figure.colorbar(lines, ax=axes, pad=0.01, fraction=0.035)
     bar.set_label("px")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from companion.dense.local_scale import stretch_of_points
+from companion.dense.local_scale import local_scale_of_points
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose, Similarity
@@ -267,5 +267,5 @@ def _local_scale(chunk: PointChunk, update: MapUpdate) -> float:
     if place is None:
         return 1.0
     in_camera = place.inverse().apply(update.points_map)
-    ratio = stretch_of_points(chunk.points_camera.astype(np.float64), in_camera)
+    ratio = local_scale_of_points(chunk.points_camera.astype(np.float64), in_camera)
     return update.local_scale_of(chunk.keyframe_id, chunk.spans) if ratio is None else ratio

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array
-from companion.geometry.voxel import thin_by_voxel
+from companion.geometry.voxel import voxel_downsample
 from companion.messages import Floats
 from companion.products.cloud import Cloud, joined, no_cloud
 
@@ -68,5 +68,5 @@ class VoxelCloud:
 
     def _thinned(self, parts: list[Cloud]) -> Cloud:
         together = joined(parts)
-        kept = thin_by_voxel(together.points, together.confidence, self._voxel, self._low)
+        kept = voxel_downsample(together.points, together.confidence, self._voxel, self._low)
         return together.part(kept)

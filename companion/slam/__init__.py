@@ -1,1 +1,1 @@
-"""Where the camera is: features, tracking, mapping. Pure: no I/O, no clock, no event loop."""
+"""Monocular visual SLAM. Pure: no I/O, no clock, no event loop."""

@@ -12,7 +12,7 @@ from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, Message, Warned
 from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
-from companion.slam.compiled.compiling import not_kept
+from companion.slam.compiled.compiling import cache_errors
 from companion.stages.map_keeper import Kept, MapKeeper
 from companion.timing.clock import since_boot_ns
 
@@ -25,14 +25,15 @@ class _Localisation(Work):
 
     def __init__(self, setup: Setup) -> None:
         super().__init__()
-        if not_kept:
+        if cache_errors:
             print(
-                f"companion: {len(not_kept)} compiled loops cannot be kept ({not_kept[0]}): every "
-                "start compiles them; NUMBA_CACHE_DIR names a folder for them",
+                f"companion: {len(cache_errors)} compiled loops cannot be kept "
+                f"({cache_errors[0]}): every start compiles them; NUMBA_CACHE_DIR names a folder "
+                "for them",
                 file=sys.stderr,
             )
         self._setup = setup
-        self._stage = LocalisationStage(setup.config, setup.camera, self.times, beside=True)
+        self._stage = LocalisationStage(setup.config, setup.camera, self.times, background=True)
         self._keeper: MapKeeper | None = None
         self._to_take_up: Kept | None = None
         self._reported_fault = ""
@@ -65,7 +66,7 @@ class _Localisation(Work):
         if self._to_take_up is not None:
             kept, tracked_ns = self._to_take_up
             self._to_take_up = None
-            self._stage.take_up(kept, frame.t_ns, since_boot_ns() - tracked_ns)
+            self._stage.resume(kept, frame.t_ns, since_boot_ns() - tracked_ns)
         yield from self._stage.step(frame)
         keeper = self._keeper
         if keeper is None or keeper.busy or frame.t_ns - self._kept_ns < KEEP_EVERY_NS:

@@ -20,9 +20,9 @@ from companion.estimation.checkpoint import (
     decode,
     encode,
     fingerprint,
-    opened,
+    read_arrays,
 )
-from companion.estimation.resumption import MOST_ABSENT_NS
+from companion.estimation.resumption import MAX_ABSENT_NS
 from companion.products.atomic_file import write_atomically
 from companion.runtime.stage_protocol import Setup
 from companion.timing.clock import since_boot_ns
@@ -89,13 +89,13 @@ class MapKeeper:
             raise CheckpointError(f"{self._path}: {error}") from error
 
     def _checked(self, data: bytes) -> Kept:
-        said, arrays = opened(data)
+        said, arrays = read_arrays(data)
         if said["boot"] != self._same["boot"]:
             raise CheckpointError("the computer was started anew since")
         if said["fingerprint"] != self._same["fingerprint"]:
             raise CheckpointError("camera, calibration or feedback.mode are others now")
         age_ns = since_boot_ns() - said["tracked_ns"]
-        if not 0 <= age_ns <= MOST_ABSENT_NS:
+        if not 0 <= age_ns <= MAX_ABSENT_NS:
             raise CheckpointError(f"it is {age_ns * 1e-9:.0f} s old")
         features = self._setup.config.features
         checkpoint = decode(arrays, self._setup.camera, features.scale_factor)

@@ -1,1 +1,1 @@
-"""Clocks and their alignment: boot time to flight time, of logs, live links and videos."""
+"""Clock synchronisation: boot time to flight time, of logs, live links and videos."""

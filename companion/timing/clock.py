@@ -1,4 +1,4 @@
-"""The only file of the package that asks the time."""
+"""Clocks and durations: the only file of the package that reads the time."""
 
 from __future__ import annotations
 
@@ -13,72 +13,71 @@ from contextlib import AbstractContextManager, contextmanager
 import numpy as np
 
 Timer = Callable[[str], AbstractContextManager[None]]
-"""What a stage is handed to have its parts timed, without knowing a clock."""
+"""Times a named part of a stage, which itself reads no clock."""
 
 
 class FlightClock:
-    """The time of a live flight: monotonic, counted from the Unix time at which this was made.
+    """Clock of a live flight: monotonic, offset to the Unix time at construction.
 
-    It looks like Unix time and never jumps, whatever is done to the system's clock meanwhile.
+    It resembles Unix time and never jumps, however the system clock is set meanwhile.
     """
 
     def __init__(self, epoch_ns: int | None = None) -> None:
         self.epoch_ns = time.time_ns() - time.monotonic_ns() if epoch_ns is None else epoch_ns
-        """Unix time at which the monotonic clock was zero, as far as was known."""
+        """Unix time of the zero of the monotonic clock, as known at construction."""
 
     def now_ns(self) -> int:
-        """Now."""
+        """Current time."""
         return time.monotonic_ns() + self.epoch_ns
 
     def behind_ns(self) -> int:
-        """By how much the system's clock has been set forward since, or the other way round."""
+        """Time by which the system clock has been set forward since."""
         return time.time_ns() - self.now_ns()
 
     def from_monotonic_ns(self, monotonic_ns: int) -> int:
-        """The time of the flight at a time by CLOCK_MONOTONIC."""
+        """Flight time of a CLOCK_MONOTONIC time."""
         return monotonic_ns + self.epoch_ns
 
 
 STEP = 1.02
-"""Ratio of a bin's ends: a percentile is known to within one percent."""
-LEAST_MS, MOST_MS = 1e-3, 1e7
-"""A microsecond to some hours; what is shorter or longer counts to the first or last bin."""
-N_BINS = math.ceil(math.log(MOST_MS / LEAST_MS) / math.log(STEP)) + 1
+"""Ratio of bin limits: percentiles are accurate to one per cent."""
+MIN_MS, MAX_MS = 1e-3, 1e7
+"""A microsecond to some hours; values beyond count to the first or last bin."""
+N_BINS = math.ceil(math.log(MAX_MS / MIN_MS) / math.log(STEP)) + 1
 
 
 class _Durations:
-    """A histogram of durations with bins of equal ratio, and their sum: as large at any length."""
+    """Histogram of durations with logarithmic bins, and their sum; of constant size."""
 
     def __init__(self) -> None:
         self.counts = array("q", bytes(8 * N_BINS))
         self.n = 0
         self.total_ms = 0.0
-        self.least_ms, self.most_ms = math.inf, 0.0
+        self.min_ms, self.max_ms = math.inf, 0.0
 
     def add(self, ms: float) -> None:
-        place = math.log(max(ms, LEAST_MS) / LEAST_MS) / math.log(STEP)
-        self.counts[min(int(place), N_BINS - 1)] += 1
+        position = math.log(max(ms, MIN_MS) / MIN_MS) / math.log(STEP)
+        self.counts[min(int(position), N_BINS - 1)] += 1
         self.n += 1
         self.total_ms += ms
-        self.least_ms, self.most_ms = min(self.least_ms, ms), max(self.most_ms, ms)
+        self.min_ms, self.max_ms = min(self.min_ms, ms), max(self.max_ms, ms)
 
     def percentiles_ms(self, percents: tuple[float, ...]) -> list[float]:
-        """To within one percent; between two durations linear, as numpy's are."""
+        """Accurate to one per cent; interpolated linearly, as in numpy."""
         ranks = [(self.n - 1) * percent / 100 for percent in percents]
         wanted = [whole for rank in ranks for whole in (math.floor(rank), math.ceil(rank))]
         bins = np.searchsorted(np.cumsum(np.frombuffer(self.counts, np.int64)), wanted, "right")
-        values = np.clip(LEAST_MS * STEP ** (bins + 0.5), self.least_ms, self.most_ms)
+        values = np.clip(MIN_MS * STEP ** (bins + 0.5), self.min_ms, self.max_ms)
         shares = np.array(ranks) - wanted[::2]
         found: list[float] = (values[::2] + shares * (values[1::2] - values[::2])).tolist()
         return found
 
 
 class StageTimes:
-    """How long each named piece of work took, in milliseconds.
+    """Durations of named parts of the work, in milliseconds.
 
-    A stage gets one and wraps its parts in `with times("features"):`; the stage itself never sees a
-    clock, so its results cannot depend on one. It needs the same memory and time however long a
-    flight is; may be used from any thread.
+    A stage wraps its parts in `with times("features"):` and reads no clock, so that its results
+    cannot depend on one. Memory and time are independent of the length of a flight; thread-safe.
     """
 
     def __init__(self) -> None:
@@ -95,12 +94,12 @@ class StageTimes:
             self.add(name, (time.perf_counter() - start) * 1e3)
 
     def add(self, name: str, ms: float) -> None:
-        """Record a duration that was measured elsewhere (an OpenCL event)."""
+        """Record a duration measured elsewhere (an OpenCL event)."""
         with self._lock:
             self._by_name[name].add(ms)
 
     def total_ms(self, name: str) -> float:
-        """All of it so far under one name."""
+        """Total so far under a name."""
         with self._lock:
             return self._by_name[name].total_ms if name in self._by_name else 0.0
 
@@ -118,21 +117,21 @@ class StageTimes:
 
 
 def monotonic_s() -> float:
-    """Seconds on a clock that never jumps."""
+    """Seconds of a monotonic clock."""
     return time.monotonic()
 
 
 def since_boot_ns() -> int:
-    """Time since the computer was switched on, sleep included: the same for all processes."""
+    """Time since boot, sleep included: the same for all processes."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
 def wait_s(stop: threading.Event, seconds: float) -> None:
-    """Wait for a while, or until `stop` is set."""
+    """Wait for a time, or until `stop` is set."""
     if seconds > 0:
         stop.wait(seconds)
 
 
 def cpu_s() -> float:
-    """Seconds of all processors that this process has used."""
+    """CPU seconds used by this process."""
     return time.process_time()

@@ -27,7 +27,7 @@ from companion.messages import (
     Warned,
 )
 from companion.timing.log_clock import clock_from_utc
-from companion.timing.stamp_filter import MAX_BOOT_NS, believable
+from companion.timing.stamp_filter import MAX_BOOT_NS, valid_stamps
 from drivers.telemetry.dataflash_records import DataflashRecords
 from drivers.telemetry.mavlink_samples import FIX_3D, GPS_RANGE_ERROR_M
 from drivers.telemetry.telemetry_log import GeodeticFix, LogContent, TelemetryCollector
@@ -63,7 +63,7 @@ def read_dataflash(path: Path) -> LogContent:
     has_arm = counts["ARM"] > 0
     stamps_ns = _boot_times_ns(rows)
     utc: list[tuple[int, int]] = []
-    good = believable(stamps_ns, 0, MAX_BOOT_NS)
+    good = valid_stamps(stamps_ns, 0, MAX_BOOT_NS)
     for (name, values), boot_ns, believed in zip(rows, stamps_ns, good, strict=True):
         if not believed:
             collected.count("records with an impossible time left out")

@@ -26,7 +26,7 @@ from companion.messages import (
     Telemetry,
     Warned,
 )
-from companion.timing.stamp_filter import MAX_BOOT_NS, believable
+from companion.timing.stamp_filter import MAX_BOOT_NS, valid_stamps
 from drivers.telemetry.gpmf_camera import HEIGHTS, camera_fixes
 from drivers.telemetry.gpmf_records import GpmfError, read_streams
 from drivers.telemetry.gpmf_track import blocks_of
@@ -54,7 +54,7 @@ def read_gpmf(video: Path, host_from_file_ns: Callable[[Times], Times]) -> LogCo
             rows += _rows(number, payload)
         except GpmfError:
             n_damaged += 1
-    good = believable([row.remote_ns for row in rows], 0, MAX_BOOT_NS)
+    good = valid_stamps([row.remote_ns for row in rows], 0, MAX_BOOT_NS)
     stamps: dict[int, list[int]] = {}
     for row in compress(rows, good):
         stamps.setdefault(row.payload, []).append(row.remote_ns)

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import ArmedSample, Warned
 from companion.timing.log_clock import BootSegments, estimate_clock
-from companion.timing.stamp_filter import believable
+from companion.timing.stamp_filter import valid_stamps
 from drivers.telemetry.mavlink_samples import (
     ATTITUDE_IDS,
     HEIGHT_IDS,
@@ -38,7 +38,7 @@ def read_tlog(path: Path) -> LogContent:
     packets = TlogRecords(log)
     found = list(packets)
     times_ns = [record.unix_us * 1000 for record in found]
-    good = believable(times_ns, LEAST_US * 1000, MOST_US * 1000)
+    good = valid_stamps(times_ns, LEAST_US * 1000, MOST_US * 1000)
     records = list(compress(found, good))
     warnings = []
     first_ns = records[0].unix_us * 1000 if records else 0

@@ -28,7 +28,7 @@ from companion.messages import (
     Warned,
 )
 from companion.timing.log_clock import clock_from_utc
-from companion.timing.stamp_filter import believable
+from companion.timing.stamp_filter import valid_stamps
 from drivers.telemetry.mavlink_samples import FIX_3D, UNIX_SINCE_NS
 from drivers.telemetry.telemetry_log import GeodeticFix, HostTimes, LogContent, TelemetryCollector
 
@@ -127,7 +127,7 @@ def _stamps_ns(columns: Columns) -> list[int]:
     """
     published = columns["timestamp"].tolist()
     sampled = columns["timestamp_sample"].tolist() if "timestamp_sample" in columns else published
-    good = believable([us * 1000 for us in published], 0, LATEST_NS)
+    good = valid_stamps([us * 1000 for us in published], 0, LATEST_NS)
     out = []
     for us, sampled_us, believed in zip(published, sampled, good, strict=True):
         near = 0 <= us - sampled_us <= MAX_LATENCY_US

@@ -19,7 +19,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, rotation_from_quaternion, vector_from_rotation
 from companion.messages import AttitudeSample, ClockReport, Frame, ImuSample, Telemetry, Warned
 from companion.timing.image_rotation import RotationMeter
-from companion.timing.turn_alignment import TimeAlignment, TurnRecord, align_turns
+from companion.timing.rotation_alignment import RotationRecord, TimeAlignment, align_rotations
 from drivers.telemetry.gpmf_gyro import gyro_rotation
 from drivers.telemetry.gpmf_track import blocks_of
 from drivers.telemetry.telemetry_folder import aligned, read_log_file, read_telemetry
@@ -58,7 +58,7 @@ def read_unaligned(
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rotation:
     by_what: str
-    record: TurnRecord
+    record: RotationRecord
     body_from_camera: Array | None
     """Rotation (3, 3), if it and the axes are known."""
 
@@ -76,7 +76,7 @@ def _best(
         step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
         by_turns = None
         if step_s > 0:
-            by_turns = align_turns(seen.record, logged, step_s, seen.body_from_camera)
+            by_turns = align_rotations(seen.record, logged, step_s, seen.body_from_camera)
         if by_turns is None:
             reasons.append(f"{path.name}: too little is in both")
         elif by_turns.why_not is not None:
@@ -115,7 +115,7 @@ def _from_gyro(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotation 
     host_ns = pictures.host_from_file_ns(np.rint(turns.t_ns).astype(np.int64))
     t_s = np.asarray((host_ns - pictures.start_ns) * 1e-9, np.float64)
     mount = _mount(camera) if turns.axes_known else None
-    return _Rotation("the camera's gyro", TurnRecord(t_s, turns.angle_rad), mount)
+    return _Rotation("the camera's gyro", RotationRecord(t_s, turns.angle_rad), mount)
 
 
 def _from_images(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotation:
@@ -127,17 +127,17 @@ def _from_images(camera: Camera, frames: Frames, pictures: Pictures) -> _Rotatio
     for frame in frames():
         if not isinstance(frame, Frame):
             continue
-        turn = meter.turn(frame)
+        turn = meter.rotation(frame)
         angle = angle if turn is None else angle + turn
         times_s.append((frame.t_ns - pictures.start_ns) * 1e-9)
         angles.append(angle)
         if len(times_s) == MAX_FRAMES:
             break
-    record = TurnRecord(np.array(times_s), np.array(angles).reshape(-1, 3))
+    record = RotationRecord(np.array(times_s), np.array(angles).reshape(-1, 3))
     return _Rotation("the pictures", record, _mount(camera))
 
 
-def _from_log(samples: Sequence[Telemetry], start_ns: int) -> TurnRecord | None:
+def _from_log(samples: Sequence[Telemetry], start_ns: int) -> RotationRecord | None:
     """Rotation by the most frequent kind of sample; times after `start_ns`."""
     rates = [(s.t_ns, s.gyro_rad_s) for s in samples if isinstance(s, ImuSample)]
     attitudes = [s for s in samples if isinstance(s, AttitudeSample)]
@@ -155,7 +155,7 @@ def _from_log(samples: Sequence[Telemetry], start_ns: int) -> TurnRecord | None:
         turns = np.array([
             vector_from_rotation(a.T @ b) for a, b in pairwise(turned)
         ])  # fmt: skip
-    return TurnRecord(t_s, np.vstack([np.zeros(3), np.cumsum(turns, axis=0)]))
+    return RotationRecord(t_s, np.vstack([np.zeros(3), np.cumsum(turns, axis=0)]))
 
 
 def _ascending(t_s: Sequence[float], values: Sequence[Array]) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ import numpy as np
 from companion.config import Config
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.motion_filter import AttitudeHistory
-from companion.estimation.pose_gate import MAX_TILT_APART_RAD
+from companion.estimation.pose_gate import MAX_TILT_ERROR_RAD
 from companion.messages import AttitudeSample, Frame, Odometry, TrackState, Warned
 from companion.runtime.pipeline import in_order_of_time
 from drivers.open_flight import open_flight
@@ -51,7 +51,7 @@ def fly(path: Path, kind: str, tilt_deg: float, seconds: float, maps: int) -> st
                     if out.world_from_body is not None and attitude is not None:
                         cosine = attitude[2] @ out.world_from_body.rotation[2]
                         tilts.append((t_s, float(np.arccos(np.clip(cosine, -1, 1)))))
-    off = [t_s for t_s, tilt in tilts if tilt > MAX_TILT_APART_RAD]
+    off = [t_s for t_s, tilt in tilts if tilt > MAX_TILT_ERROR_RAD]
     return (
         f"{path.name} {kind} {tilt_deg:g}: {len(begun)} tilted, tracking from {tracked_s}, poses "
         f"from {tilts[0][0] if tilts else None}, tilted until {max(off, default=None)}, at the end "

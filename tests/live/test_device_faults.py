@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from companion.config import Config
-from companion.dense.device_takeover import NONE_LEFT, TOOK_OVER
+from companion.dense.device_takeover import FAILED_OVER, NO_DEVICE_LEFT
 from companion.geometry.camera import Camera, Distortion
 from companion.messages import DepthMap, Frame, Warned
 from companion.pilot_messages import MAP_OTHER_DEVICE
@@ -105,7 +105,10 @@ def test_a_driver_that_ends_or_hangs_the_stage_is_named_and_passed_over(
         stage.feed(0, N)
         stage.until(lambda: bool(stage.of(DepthMap) and stage.of(Warned)))
         (warned,) = stage.of(Warned)
-        assert (warned.what, warned.detail) == (TOOK_OVER, f"{second.named}; {first.named}: {why}")
+        assert (warned.what, warned.detail) == (
+            FAILED_OVER,
+            f"{second.named}; {first.named}: {why}",
+        )
     finally:
         for each in stages:
             each.process.kill()
@@ -146,7 +149,7 @@ def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
         now.touch()
         flying.daemon.line("started again: depth: killed by SIGABRT", LONG_S, failed_ns)
         flying.until_stage("depth", lambda it: it["detail"].startswith(second.named), LONG_S)
-        flying.daemon.line(TOOK_OVER, LONG_S, failed_ns)
+        flying.daemon.line(FAILED_OVER, LONG_S, failed_ns)
         flying.until_told(MAP_OTHER_DEVICE.text, failed_ns)
         health = flying.until_stage("depth", lambda it: it["alive"] and it["rate_hz"] > 0, LONG_S)
         assert health["n_restarted"] == 1
@@ -162,4 +165,4 @@ def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
     )  # fmt: skip
     recording.close()
     assert f"{second.named}; {first.named}: killed by SIGABRT".encode() in events
-    assert events.count(TOOK_OVER.encode()) == 1 and NONE_LEFT.encode() not in events
+    assert events.count(FAILED_OVER.encode()) == 1 and NO_DEVICE_LEFT.encode() not in events

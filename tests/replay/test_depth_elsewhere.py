@@ -20,7 +20,7 @@ from companion.topics.envelope import unpack
 from companion.topics.gatherer import Gatherer
 from companion.topics.keyframe_bundle import MapMirror, bundle_of, frame_of
 from drivers.open_flight import open_flight
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
 STOP_S = 8.0
@@ -54,7 +54,7 @@ def made() -> Made:
     config = Config()
     flight = open_flight(FLIGHT, config.camera, config.telemetry)
     stop_ns = flight.start_ns + int(STOP_S * 1e9)
-    devices = at_hand.devices()
+    devices = opencl_devices.devices()
     here, there = (
         _Stage(DepthStage(config.depth, config.cloud, flight.camera, devices, StageTimes()))
         for _ in range(2)

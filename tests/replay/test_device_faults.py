@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.dense.device_takeover import NONE_LEFT, TOOK_OVER
+from companion.dense.device_takeover import FAILED_OVER, NO_DEVICE_LEFT
 from tests.support.processes.program import Run, replay
 from tests.support.reference.failing_driver import fail, two_devices
 
@@ -29,7 +29,7 @@ def test_the_next_device_takes_over_and_each_run_is_the_same(
     runs = [replay(FLIGHT, tmp_path / name, "--stop", STOP_S) for name in ("a", "b")]
     for run in runs:
         assert run.status == 0, run.stderr
-        assert told(run)[TOOK_OVER].startswith(f"{second.named}; {first.named}: fails")
+        assert told(run)[FAILED_OVER].startswith(f"{second.named}; {first.named}: fails")
         assert run.report["device"].startswith(second.named)
         assert f"failed: {first.named}" in run.report["device"]
         assert f"failed: {first.named}" in run.stdout
@@ -46,7 +46,7 @@ def test_without_another_device_path_and_report_are_whole(
     asked_for = f"opencl.device={first.number}"  # so that no other may take over
     run = replay(FLIGHT, tmp_path / "a", "--stop", STOP_S, "--set", asked_for)
     assert run.status == 0, run.stderr
-    assert told(run)[NONE_LEFT].startswith(f"{first.named}: fails while it computes")
+    assert told(run)[NO_DEVICE_LEFT].startswith(f"{first.named}: fails while it computes")
     assert run.report["device"].startswith("none is left; failed: ")
     assert "dense map: none is left" in run.stdout
     n_placed = len((run.out / "trajectory.tum").read_text().splitlines())

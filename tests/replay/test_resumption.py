@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from companion.config import Config
-from companion.estimation.checkpoint import MOST_BYTES, Checkpoint, decode, encode, opened
-from companion.estimation.localisation import NOT_TAKEN_UP, TAKEN_UP, LocalisationStage
-from companion.estimation.resumption import TRIED_NS
+from companion.estimation.checkpoint import MAX_BYTES, Checkpoint, decode, encode, read_arrays
+from companion.estimation.localisation import MAP_NOT_RECOGNISED, MAP_RESUMED, LocalisationStage
+from companion.estimation.resumption import TIMEOUT_NS
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (
     quaternion_from_rotation,
@@ -70,7 +70,7 @@ def left() -> Left:
     checkpoint = stage.checkpoint()
     assert checkpoint is not None
     data = b"".join(encode(checkpoint, {}))
-    _, arrays = opened(data)
+    _, arrays = read_arrays(data)
     read = decode(arrays, flight.camera, CONFIG.features.scale_factor)
     return Left(read, data, flight.camera, frames, telemetry, last, poses[-1])
 
@@ -113,9 +113,7 @@ class Resumed:
     first_ns: int
 
 
-def resumed(
-    left: Left, places: slice, change: Change = unchanged, kept: bool = True
-) -> Resumed:
+def resumed(left: Left, places: slice, change: Change = unchanged, kept: bool = True) -> Resumed:
     stage = LocalisationStage(CONFIG, left.camera, lambda _: nullcontext())
     out = Resumed(stage, [], [], 0)
     shown = list(back_and_forth(places.start, places.stop - 1, 1000))
@@ -123,7 +121,7 @@ def resumed(
         if isinstance(message, Frame) and not out.first_ns:
             out.first_ns = message.t_ns
             if kept:
-                stage.take_up(left.checkpoint, message.t_ns, round(ABSENT_S * 1e9))
+                stage.resume(left.checkpoint, message.t_ns, round(ABSENT_S * 1e9))
         for given in stage.step(message):
             if isinstance(given, Odometry):
                 after_s = (given.t_ns - out.first_ns) * 1e-9
@@ -154,7 +152,9 @@ def test_hovering_where_it_was_it_has_a_metric_pose_again_within_a_second(left: 
     assert len(metric) > 0.9 * len([s for s, _, _ in found.poses if s >= first_s])
     assert error_m.max() < np.linalg.norm(was_off) + 0.3
     assert all(o.sigma_position_m < 1.0 for _, o, _ in metric)
-    assert [w.what for w in found.said if w.what in (TAKEN_UP, NOT_TAKEN_UP)] == [TAKEN_UP]
+    assert [w.what for w in found.said if w.what in (MAP_RESUMED, MAP_NOT_RECOGNISED)] == [
+        MAP_RESUMED
+    ]
 
 
 def test_without_what_was_kept_hovering_tells_no_scale(left: Left) -> None:
@@ -164,17 +164,15 @@ def test_without_what_was_kept_hovering_tells_no_scale(left: Left) -> None:
 
 @pytest.mark.parametrize(
     ("places", "change"),
-    [
-        ("elsewhere", unchanged), ("here", turned(0.0, 0.0, 25.0)), ("here", turned(20.0, 0.0, 0.0))
-    ],
+    [("elsewhere", unchanged), ("here", turned(0.0, 0.0, 25.0)), ("here", turned(20.0, 0.0, 0.0))],
     ids=["over other ground", "under another heading", "under another vertical"],
 )
 def test_what_does_not_agree_is_never_taken_up(left: Left, places: str, change: Change) -> None:
     found = resumed(left, ELSEWHERE if places == "elsewhere" else over(left), change)
     assert all(o.world_from_body is None for _, o, _ in found.poses)
-    (said,) = (w for w in found.said if w.what in (TAKEN_UP, NOT_TAKEN_UP))
-    assert said.what == NOT_TAKEN_UP
-    assert said.t_ns - found.first_ns < TRIED_NS + 2e9  # another map has begun by then
+    (said,) = (w for w in found.said if w.what in (MAP_RESUMED, MAP_NOT_RECOGNISED))
+    assert said.what == MAP_NOT_RECOGNISED
+    assert said.t_ns - found.first_ns < TIMEOUT_NS + 2e9  # another map has begun by then
     print(said.detail)
 
 
@@ -187,14 +185,14 @@ def test_a_map_in_question_that_is_given_up_lends_the_next_no_scale(left: Left) 
     for message in hovering(left, over(left), unchanged):
         if isinstance(message, Frame):
             if not n_frames:
-                stage.take_up(kept, message.t_ns, round(ABSENT_S * 1e9))
+                stage.resume(kept, message.t_ns, round(ABSENT_S * 1e9))
             n_frames += 1
             if n_frames == 3:
-                stage._tracker.begin_anew(0, keep=True)
+                stage._tracker.reinitialise(0, keep=True)
         for out in stage.step(message):
             assert not (isinstance(out, Odometry) and out.world_from_body is not None)
             said += [out.what] if isinstance(out, Warned) else []
-    assert NOT_TAKEN_UP in said and TAKEN_UP not in said
+    assert MAP_NOT_RECOGNISED in said and MAP_RESUMED not in said
     assert stage.n_segments == 1
 
 
@@ -214,11 +212,11 @@ def test_the_process_takes_up_what_another_kept_and_keeps_its_own(
     given = [out for m in hovering(left, over(left), unchanged) for out in process.step(m)]
     metric = [o for o in given if isinstance(o, Odometry) and o.world_from_body is not None]
     said = [w.what for w in given if isinstance(w, Warned)]
-    assert (TAKEN_UP in said, bool(metric)) == (take_up, take_up)
+    assert (MAP_RESUMED in said, bool(metric)) == (take_up, take_up)
     list(process.finish(Finish(hurry=True, keep_map=take_up)))
     assert path.exists() == take_up
 
 
 def test_what_is_kept_is_bounded(left: Left) -> None:
-    assert len(left.data) < 1.05 * MOST_BYTES
+    assert len(left.data) < 1.05 * MAX_BYTES
     assert len(left.checkpoint.part.keyframes) >= 10

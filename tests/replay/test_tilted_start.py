@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.config import Config
-from companion.estimation.attitude_verdict import BEGUN_ANEW
+from companion.estimation.attitude_verdict import REINITIALISED
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.motion_filter import AttitudeHistory
 from companion.geometry.transforms import (
@@ -106,7 +106,7 @@ def test_a_map_that_the_vertical_leaves_begins_anew(
         return replace(message, ned_from_body=quaternion_from_rotation(attitude))
 
     flown = fly(flight, frames, [tilted(s) for s in samples])
-    anew_s = [t_s for t_s, what in flown.warned.items() if what == BEGUN_ANEW]
+    anew_s = [t_s for t_s, what in flown.warned.items() if what == REINITIALISED]
     assert anew_s
     assert anew_s[0] < 4.0
     assert flown.worst_deg(SECONDS - 1.0) < MAX_TILT_DEG

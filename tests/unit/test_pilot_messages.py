@@ -122,14 +122,14 @@ def test_every_warning_has_its_words() -> None:
     whats = {
         *phrases(camera_feed), *phrases(disk_writer), *phrases(live_samples),
         link_watch.DAMAGED, link_watch.REFUSED, link_watch.FLOODS, link_watch.SLOW,
-        localisation.TAKEN_UP, localisation.NOT_TAKEN_UP, localisation_work.NOT_KEPT,
+        localisation.MAP_RESUMED, localisation.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
         link_watch.NO_MAVLINK, live_flight.RESTARTED, live_flight.LOCALISATION_DIED,
         live_flight.NOT_FINISHED,
         viewing.SHOWN, viewing.NO_VIEWER, viewing.GONE, viewing.BEHIND, viewing.CLOSED,
         recording_recovery.CUT_SHORT, ground_requests.TOO_MANY,
         topics_work.MALFORMED, topics_work.TAKEN,
         topics_work.NOT_TAKEN, flight_result.GIVEN_UP, armed_settings.NOT_KEPT,
-        localisation.TAKEN_UP, localisation.NOT_TAKEN_UP, localisation_work.NOT_KEPT,
+        localisation.MAP_RESUMED, localisation.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
     }  # fmt: skip
     for module in ("drivers/mavlink/autopilot_link.py", "companion/estimation/camera_attitude.py"):
         for node in ast.walk(ast.parse((ROOT / module).read_text("utf-8"))):

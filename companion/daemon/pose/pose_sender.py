@@ -45,7 +45,7 @@ class PoseSender:
         self._config, self._link, self._clock = config, link, clock
         counter, height = ResetCounter(), AutopilotHeight(link)
         self._counter = SentCounter(counter_path, counter, height, link, clock, warn)
-        self._gate = PoseGate(config, counter, height.down_m, self._counter.may_begin)
+        self._gate = PoseGate(config, counter, height.down_m, self._counter.may_start)
         self._rate, self._latency = RateMeter(), LatencyMeter()
         self._n_sent = 0
         self._last_text: str | None = None

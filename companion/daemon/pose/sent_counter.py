@@ -8,11 +8,11 @@ from pathlib import Path
 from companion.daemon.pose.kept_counter import CounterFile, KeptCounter, read_counter
 from companion.estimation.pose_gate import PoseGate
 from companion.estimation.reset_counter import (
-    BACK_S,
+    MAX_BACKWARD_S,
     BootIdentity,
     ResetCounter,
+    initial_counter,
     same_boot,
-    unlike_any,
 )
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
@@ -66,7 +66,7 @@ class SentCounter:
         self._boot = now
         if before is None:
             gate.autopilot_booted(self._kept_for(now))
-        elif now.autopilot_s < before.autopilot_s - BACK_S:
+        elif now.autopilot_s < before.autopilot_s - MAX_BACKWARD_S:
             self._height.forget()
             gate.autopilot_booted(None)
         elif not same_boot(before, now):  # it stood still, or is one that nobody heard begin
@@ -74,7 +74,7 @@ class SentCounter:
         if self._counter.sent:
             self._ask()
 
-    def may_begin(self, now_ns: int) -> str:
+    def may_start(self, now_ns: int) -> str:
         """Reason why no first pose of a sequence may be sent now; "" if it may."""
         if self._boot is None:
             return NO_CLOCK
@@ -107,14 +107,14 @@ class SentCounter:
         """Counter last sent to this boot by a process before; None without one."""
         if self._unreadable:
             self._say(self._unreadable)
-            return unlike_any(self._clock.now_ns() * 1e-9) - 1
+            return initial_counter(self._clock.now_ns() * 1e-9) - 1
         if self._kept is None or not same_boot(self._kept.boot, boot):
             return None
         self._height.resume(self._kept.home_down_m)
         return self._kept.reset_counter
 
     def _begin_unlike_any(self) -> None:
-        self._counter.booted(unlike_any(self._clock.now_ns() * 1e-9) - 1)
+        self._counter.booted(initial_counter(self._clock.now_ns() * 1e-9) - 1)
 
     def _identity(self) -> BootIdentity | None:
         vehicle, report = self._link.vehicle, self._link.clock_filter.report()

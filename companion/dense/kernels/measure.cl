@@ -1,16 +1,16 @@
-/* How well each image fits the depths that are believed, and what is to be thought of them.
+/* Photo-consistency of the images with the swept depth, and classification of the pixels.
  *
  * An image is sampled at the projection of every grid pixel by its own inverse depth, half a pixel
- * before and behind along its epipolar line, so that a window of samples follows the surface whatever
- * its slope. Over a 5 x 5 window the reference is then fitted by gain * value + slope * change +
- * offset (Lucas & Kanade 1981 in one dimension, with gain): slope / gain is how many pixels away the
- * image would rather have it.
+ * before and behind along its epipolar line, so that a window of samples follows a slanted surface.
+ * Over a 5 x 5 window the reference is then fitted by gain * value + slope * change +
+ * offset (Lucas & Kanade 1981 in one dimension, with gain): slope / gain is the
+ * disparity error in pixels.
  */
 
 #define WINDOW 2
 #define AREA 25.0f
 #define UNSEEN -1e4f
-/* How much of the noise of neighbours counts. */
+/* Weight of the noise of neighbours. */
 #define ROUGH 1.0f
 
 typedef float8 float8_anywhere __attribute__((aligned(4)));
@@ -61,12 +61,12 @@ __kernel void to_grid(__global const uchar *image, const int width, __global flo
         out[gy * grid_width + gx] = image[gy * stride * width + gx * stride];
 }
 
-/* Counts for each grid pixel whether one more image fits. Grid: (grid_width + 7) / 8 x grid_height, 8
- * pixels each; the outermost two pixels get nothing, and grids narrower than 12 pixels neither.
- *   good, bad  how many images fit, and how many do not; blank windows count as neither
- *   alike      how many of those that do not differ by no more than noise does
- *   limits     least correlation; grey levels below which a window is blank; furthest way in pixels; sum
- *              of squared differences up to which images are alike */
+/* Counts consistent images per grid pixel, one image at a time. Grid: (grid_width + 7) / 8 x grid_height, 8
+ * pixels each; not computed on a border of two pixels, nor on grids narrower than 12 pixels.
+ *   good, bad  images that are consistent, and that are not; blank windows count as neither
+ *   alike      inconsistent images whose difference is within the noise
+ *   limits     least correlation; grey levels below which a window is blank; largest offset in pixels; sum
+ *              of squared differences within the noise */
 __kernel void verify(__global const float *reference, __global const float *value,
                      __global const float *change, __global float *good, __global float *bad,
                      __global float *alike, const float4 limits, const int grid_width, const int grid_height)
@@ -75,7 +75,7 @@ __kernel void verify(__global const float *reference, __global const float *valu
     const int y = get_global_id(1);
     if (x >= grid_width || y < WINDOW || y >= grid_height - WINDOW || grid_width < 12)
         return;
-    /* the last work-item of a row steps back, and leaves alone what is another's */
+    /* the last work-item of a row overlaps its neighbour, and does not write its pixels */
     const int last = grid_width - WINDOW - 8, first = x < WINDOW ? WINDOW : x;
     x = first < last ? first : last;
     const int8 lane = (int8)(0, 1, 2, 3, 4, 5, 6, 7) + x;
@@ -91,7 +91,7 @@ __kernel void verify(__global const float *reference, __global const float *valu
         for (int i = -WINDOW; i <= WINDOW; ++i) {
             const int at = cell + j * grid_width + i;
             const float8 raw = *(__global const float8_anywhere *)(value + at);
-            /* about the middle's grey, so that float32 does */
+            /* relative to the grey level of the centre, for float32 accuracy */
             const float8 t = *(__global const float8_anywhere *)(reference + at) - t0, w = raw - w0;
             const float8 d = *(__global const float8_anywhere *)(change + at);
             least = least < raw ? least : raw;
@@ -127,7 +127,7 @@ __kernel void verify(__global const float *reference, __global const float *valu
                       & (way < limits.z) & (way > -limits.z);
     const float8 zero = 0.0f, one = 1.0f;
     const float8 more_good = fits ? one : zero, more_bad = (seen & ~fits) ? one : zero;
-    /* 0 counts none: less than nothing is rounding */
+    /* clamped at 0: negative values are rounding errors */
     const float8 more_alike = (seen & ~fits & (tt + ww - 2.0f * tw < limits.w)) ? one : zero;
     if (x == 8 * (int)get_global_id(0)) {
         *(__global float8_anywhere *)(good + cell) += more_good;
@@ -171,7 +171,7 @@ __kernel void judge(__global const float *rho, __global const float *margin, __g
     const float unsure = 0.2f / (margin[cell] > 0.01f ? margin[cell] : 0.01f);
     const float rough = ROUGH * noise[cell] / step;
     const float s = step * sqrt(0.0225f + unsure * unsure + rough * rough);
-    /* what noise hides says nothing against a pixel, and holds it no better against its neighbours */
+    /* differences within the noise neither reject a pixel nor add to its weight */
     const float share = (g + a + 1.0f) / (g + b + 2.0f), correlated = (g + 1.0f) / (g + b + 2.0f);
     const bool outer = x < border || y < border || x >= grid_width - border || y >= grid_height - border;
     const bool done = g + a >= accept.w && share >= accept.y && s < accept.x * r;

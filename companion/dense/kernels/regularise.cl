@@ -17,7 +17,7 @@ __kernel void dual(__global const float *x_bar, __global const float *edge, __gl
 }
 
 /* Primal step: x <- (x + step * (div(edge p) + weight * data)) / (1 + step * weight).
- * `weight` is 0 where there is no measurement. Dual and primal are launched apart: no race. */
+ * `weight` is 0 where there is no measurement. Dual and primal are separate launches: no race. */
 __kernel void primal(__global float *x_now, __global float *x_bar, __global const float *edge,
                      __global const float2 *p, __global const float *data, __global const float *weight,
                      const int width, const int height, const float step)

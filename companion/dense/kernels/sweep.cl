@@ -1,5 +1,5 @@
-/* A sweep of planes of equal depth through several images: census costs (Zabih & Woodfill 1994),
- * the worst views left out at each plane, semi-global aggregation (Hirschmueller 2008).
+/* Plane sweep through several images: census costs (Zabih & Woodfill 1994),
+ * the worst views dropped at each plane, semi-global aggregation (Hirschmueller 2008).
  *
  * Images are uchar, row-major. Census words have 24 bits of a 5 x 5 window. A grid pixel (x, y) is
  * image pixel stride * (x, y). Costs are uchar, sums ushort, both [y][x][plane]. Plane k lies at
@@ -15,7 +15,7 @@
 #define BLOCK 8
 #define BLOCKS (PLANES / BLOCK)
 #define LANES (PLANES / 16)
-/* Of 24 bits: what two patches that have nothing in common differ by. */
+/* Expected difference of unrelated patches, of 24 bits. */
 #ifndef UNRELATED
 #define UNRELATED 12
 #endif
@@ -75,7 +75,7 @@ static uchar8 differing(__global const uint *words, uint word, float8 rho, float
     const float8 scale = 1.0f / z;
     const float8 x = (base.x + rho * shift.x) * scale + 0.5f, y = (base.y + rho * shift.y) * scale + 0.5f;
     const int8 seen = (z > 1e-6f) & (x >= 0.0f) & (x < (float)width) & (y >= 0.0f) & (y < (float)height);
-    /* what is not seen may not even fit an int */
+    /* invisible projections may overflow an int */
     const float8 safe_x = seen ? x : 0.0f, safe_y = seen ? y : 0.0f;
     const int8 at = convert_int8(safe_y) * width + convert_int8(safe_x);
     uint8 bits = (uint8)(words[at.s0], words[at.s1], words[at.s2], words[at.s3], words[at.s4],
@@ -93,9 +93,9 @@ static uchar8 differing(__global const uint *words, uint word, float8 rho, float
  *   views           per image 12 numbers: rows of (3 x 3 | 3), pixel (x, y) at inverse depth rho is
  *                   seen at (M (x, y, 1) + rho m), to be divided by its third component
  *   blocks          per grid pixel a bit for each block of 8 planes
- *   n_dropped       views left out at each plane, those that fit worst: 0, 1 or 2
- * Where fewer views see a plane than should count, their mean stands for the others: else planes would
- * win for being seen by more. */
+ *   n_dropped       worst views dropped at each plane: 0, 1 or 2
+ * Where fewer views see a plane than should count, their mean substitutes the others: otherwise
+ * planes seen by more views would be favoured. */
 __kernel void costs(__global const uint *words_r, __global const uint *words, const int width,
                     const int height, __global const float *views, const int n_views,
                     const int n_dropped, const float rho0, const float step,
@@ -150,8 +150,8 @@ static uchar lowest(uchar16 v)
 }
 
 /* Adds one direction (dx, dy) of paths to the sums, or begins them. Grid: a work-item for each path:
- * each row where dy is 0, else each column; a slanted path that leaves at one side begins anew at the
- * other. small: penalty of a step by one plane; large: of any other, less where the image has an edge
+ * each row where dy is 0, else each column; a diagonal path that leaves at one side continues at
+ * the other. small: penalty of a step by one plane; large: of any other, less where the image has an edge
  * of many times `soft` grey levels. No cost may be above 255 - small - large. */
 __kernel void aggregate(__global const uchar *cost, __global ushort *sum, __global const uchar *image,
                         const int width, const int grid_width, const int grid_height, const int stride,
@@ -222,8 +222,8 @@ static ushort lowest16(ushort16 v)
     return c.x < c.y ? c.x : c.y;
 }
 
-/* The plane of the least sum, made finer by a parabola, as inverse depth; and how much worse, in
- * proportion, the best plane is that lies more than two away. Grid: one work-item per grid pixel. */
+/* Inverse depth of the plane of minimum sum, refined by a parabola; and the relative excess of the
+ * best plane more than two away. Grid: one work-item per grid pixel. */
 __kernel void winner(__global const ushort *sum, const int n, const float rho0, const float step,
                      __global float *rho, __global float *margin)
 {
@@ -257,8 +257,8 @@ __kernel void winner(__global const ushort *sum, const int n, const float rho0, 
     margin[cell] = (float)(second - best) / (best + 1.0f);
 }
 
-/* Blocks of planes that a fine grid pixel should look at: those about the planes of the coarse grid
- * pixels around it, of those allowed. Grid: fine pixels. */
+/* Blocks of planes to evaluate for a fine grid pixel: those around the planes of the surrounding
+ * coarse grid pixels, among those allowed. Grid: fine pixels. */
 __kernel void blocks_about(__global const float *rho, const int coarse_width, const int coarse_height,
                            const float rho0, const float step, const uint allowed,
                            __global uint *blocks,
@@ -280,8 +280,8 @@ __kernel void blocks_about(__global const float *rho, const int coarse_width, co
     blocks[gy * grid_width + gx] = bits & allowed;
 }
 
-/* Median of 3 x 3, and the noise there as one standard deviation: from second differences, which a
- * slope does not raise. Grid: width x height. */
+/* Median of 3 x 3, and the local noise as one standard deviation: from second differences, which
+ * are insensitive to slope. Grid: width x height. */
 __kernel void median(__global const float *in, const int width, const int height, __global float *out,
                      __global float *noise)
 {
@@ -292,7 +292,7 @@ __kernel void median(__global const float *in, const int width, const int height
     for (int j = 0; j < 3; ++j)
         for (int i = 0; i < 3; ++i)
             v[3 * j + i] = in[inside(y + j - 1, height - 1) * width + inside(x + i - 1, width - 1)];
-    /* of independent noise, a second difference has 1.95 times its deviation on average */
+    /* for independent noise the mean |second difference| is 1.95 standard deviations */
     noise[y * width + x] = (fabs(v[0] + v[8] - 2 * v[4]) + fabs(v[1] + v[7] - 2 * v[4])
                             + fabs(v[2] + v[6] - 2 * v[4]) + fabs(v[3] + v[5] - 2 * v[4])) / (4 * 1.95f);
 #define SORT(a, b) { const float low = v[a] < v[b] ? v[a] : v[b]; v[b] = v[a] < v[b] ? v[b] : v[a]; v[a] = low; }

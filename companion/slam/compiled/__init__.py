@@ -1,6 +1,6 @@
-"""Loops over arrays, compiled to machine code: what each frame does to hundreds of points.
+"""Numba kernels for per-frame work on hundreds of points.
 
-They hold no interpreter lock, so that tracking and mapping run beside each other. Compiled when
-they are imported, before any flight, and kept on disk for the next start. What one calls lies in
-the file where it is: a kept one is made anew where its own file has changed, and no other.
+They release the interpreter lock, so that tracking and mapping run in parallel. They are compiled
+on import, before any flight, and cached on disk. A kernel calls only functions of its own file,
+because the cache of a file is invalidated by changes of that file alone.
 """

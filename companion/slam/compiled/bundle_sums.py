@@ -1,4 +1,4 @@
-"""Sums over the observations of a bundle: errors, normal equations, and cameras without points."""
+"""Bundle adjustment kernels: residuals, normal equations, Schur complement, back-substitution."""
 
 from __future__ import annotations
 
@@ -16,16 +16,20 @@ def errors(
     rotation: Array, translation: Array, points: Array, camera: Ints, point: Ints, seen: Array,
     whitening: Array,
 ) -> tuple[Array, Array, float]:  # fmt: skip
-    """Observed points in their cameras (O, 3), whitened errors (O, 2), and Huber's loss of all.
+    """Points in camera frames (O, 3), whitened errors (O, 2), and Huber's loss.
 
-    Of C cameras, P points and O observations, those behind a camera at a high price.
+    For C cameras, P points and O observations; points behind a camera cost a high constant.
     """
     n = len(camera)
     inside, residual, cost = np.empty((n, 3)), np.empty((n, 2)), 0.0
     for o in range(n):
-        turn, p = rotation[camera[o]], points[point[o]]
+        camera_rotation, p = rotation[camera[o]], points[point[o]]
         for i in range(3):
-            along = turn[i, 0] * p[0] + turn[i, 1] * p[1] + turn[i, 2] * p[2]
+            along = (
+                camera_rotation[i, 0] * p[0]
+                + camera_rotation[i, 1] * p[1]
+                + camera_rotation[i, 2] * p[2]
+            )
             inside[o, i] = along + translation[camera[o], i]
         z = inside[o, 2]
         divisor = 1e-9 if abs(z) < 1e-9 else z
@@ -49,8 +53,8 @@ def normal_equations(
 ) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
     """Information and gradient of cameras (V, 6, 6), (V, 6) and points (P, 3, 3), (P, 3).
 
-    The last is what ties the camera of each observation to its point (O, 6, 3). The first
-    `n_variable` cameras move; Huber's weights.
+    The last result is the camera-point block of each observation (O, 6, 3). The first `n_variable`
+    cameras are variable; Huber weights.
     """
     hcc, gc = np.zeros((n_variable, 6, 6)), np.zeros((n_variable, 6))
     hpp, gp = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
@@ -69,14 +73,14 @@ def normal_equations(
         plain[1, 0], plain[1, 1], plain[1, 2] = -1 - y * y, x * y, x
         plain[0, 3], plain[0, 5] = inverse, -x * inverse
         plain[1, 4], plain[1, 5] = inverse, -y * inverse
-        white, turn = whitening[o], rotation[c]
+        white, camera_rotation = whitening[o], rotation[c]
         for i in range(2):
             for k in range(6):
                 jc[i, k] = white[i, 0] * plain[0, k] + white[i, 1] * plain[1, k]
             for k in range(3):
                 jp[i, k] = 0.0
                 for m in range(3):
-                    jp[i, k] += jc[i, 3 + m] * turn[m, k]
+                    jp[i, k] += jc[i, 3 + m] * camera_rotation[m, k]
         for k in range(3):
             a, b = weight * jp[0, k], weight * jp[1, k]
             gp[p, k] += a * u + b * v
@@ -95,16 +99,17 @@ def normal_equations(
 
 
 @compiled(matrices, pairs, matrices, integers, integers, integers, integer)
-def without_points(
+def schur_complement(
     inverse: Array, gradient: Array, hcp: Array, camera: Ints, point: Ints, by_point: Ints,
     n_variable: int,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """What points take from the cameras' information (6 V, 6 V) and add to their right side (6 V).
+    """Schur complement of the points: its part of the camera information and right side.
 
-    `inverse` (P, 3, 3) of the points' information, their `gradient` (P, 3); `by_point` lists the
-    observations of cameras that move, ordered by point.
+    Returns (6 V, 6 V), to subtract, and (6 V,), to add. `inverse` (P, 3, 3) of the point
+    information, `gradient` (P, 3) of the points; `by_point` are the observations of variable
+    cameras, ordered by point.
     """
-    taken, added = np.zeros((6 * n_variable, 6 * n_variable)), np.zeros(6 * n_variable)
+    reduction, rhs_part = np.zeros((6 * n_variable, 6 * n_variable)), np.zeros(6 * n_variable)
     through = np.empty((6, 3))
     start = 0
     for end in range(1, len(by_point) + 1):
@@ -120,7 +125,7 @@ def without_points(
                         + hcp[one, k, 1] * inverse[p, 1, m]
                         + hcp[one, k, 2] * inverse[p, 2, m]
                     )
-                added[row + k] += (
+                rhs_part[row + k] += (
                     through[k, 0] * gradient[p, 0]
                     + through[k, 1] * gradient[p, 1]
                     + through[k, 2] * gradient[p, 2]
@@ -131,7 +136,7 @@ def without_points(
                     continue
                 for k in range(6):
                     for m in range(6):
-                        taken[row + k, column + m] += (
+                        reduction[row + k, column + m] += (
                             through[k, 0] * hcp[other, m, 0]
                             + through[k, 1] * hcp[other, m, 1]
                             + through[k, 2] * hcp[other, m, 2]
@@ -139,21 +144,21 @@ def without_points(
         start = end
     for i in range(6 * n_variable):
         for k in range(i):
-            taken[i, k] = taken[k, i]
-    return taken, added
+            reduction[i, k] = reduction[k, i]
+    return reduction, rhs_part
 
 
 @compiled(matrices, pairs, matrices, integers, integers, integers, pairs)
-def moves_of_points(
+def back_substitute(
     inverse: Array, gradient: Array, hcp: Array, camera: Ints, point: Ints, by_point: Ints,
-    moves: Array,
+    steps: Array,
 ) -> Array:  # fmt: skip
-    """How points move (P, 3) where cameras move by `moves` (V, 6)."""
+    """Steps of points (P, 3) given those of cameras (V, 6)."""
     right = -gradient
     for o in by_point:
         for m in range(3):
             for k in range(6):
-                right[point[o], m] -= hcp[o, k, m] * moves[camera[o], k]
+                right[point[o], m] -= hcp[o, k, m] * steps[camera[o], k]
     out = np.zeros(right.shape)
     for p in range(len(out)):
         for i in range(3):

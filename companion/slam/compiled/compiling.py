@@ -1,4 +1,4 @@
-"""How the loops are compiled and kept."""
+"""Compilation of the kernels by numba, and their cache."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ number, single, integer, flag = types.float64, types.float32, types.int64, types
 
 
 def given(element: Any, dimensions: int) -> Any:
-    """The type of an array in rows, which a loop only reads."""
+    """Type of a C-contiguous read-only array."""
     return types.Array(element, dimensions, "C", readonly=True)
 
 
 numbers, pairs, matrices = given(number, 1), given(number, 2), given(number, 3)
 integers, flags = given(integer, 1), given(flag, 1)
-places, words = given(types.float32, 2), given(types.uint64, 2)
+single_pairs, words = given(types.float32, 2), given(types.uint64, 2)
 images, patches = given(types.uint8, 2), given(types.uint8, 3)
 
 
-not_kept: list[str] = []
-"""Why loops could not be kept on disk or taken from there, in words; each start compiles them."""
+cache_errors: list[str] = []
+"""Why kernels could not be cached or loaded, in words; each start then compiles them."""
 
 
 def compiled(*arguments: Any) -> Callable[[Loop], Loop]:
-    """Compile a loop for these types of arguments, at once; a division by zero gives inf or nan.
+    """Compile a kernel for these argument types on import; division by zero gives inf or nan.
 
-    Arrays that it is given may lie otherwise in memory, which costs a copy.
+    Arrays of other layouts or types are copied.
     """
     kinds = [as_dtype(a.dtype) if isinstance(a, types.Array) else None for a in arguments]
 
     def compile_loop(loop: Loop) -> Loop:
         try:
             done: Any = numba.njit(arguments, nogil=True, cache=True, error_model="numpy")(loop)
-        except Exception as error:  # no room, or a damaged file; what else it is comes up again
-            not_kept.append(f"{loop.__name__}: {error}")
+        except Exception as error:  # disk full or corrupt file; other errors recur below
+            cache_errors.append(f"{loop.__name__}: {error}")
             done = numba.njit(arguments, nogil=True, error_model="numpy")(loop)
 
         @wraps(loop)
@@ -63,6 +63,6 @@ def compiled(*arguments: Any) -> Callable[[Loop], Loop]:
 
 
 def part(loop: Loop) -> Loop:
-    """What only compiled loops of the same file call."""
+    """Compile a function that only kernels of the same file call."""
     done: Any = numba.njit(nogil=True, error_model="numpy")(loop)
     return cast(Loop, done)

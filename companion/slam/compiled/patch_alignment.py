@@ -1,4 +1,4 @@
-"""Stored patches of points laid over an image: how they are warped, and where they fit."""
+"""Inverse compositional alignment of stored patches with an image."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from companion.slam.compiled.compiling import (
 
 N_LEVELS = 3
 STORED = 24
-"""Side of a stored patch: room for the compared part to be turned and scaled."""
+"""Side of a stored patch, px: room to rotate and scale the compared part."""
 HALF = 4
 ITERATIONS = 8
 CONVERGED_PX = 0.02
 MIN_ZNCC = 0.85
 MIN_TEXTURE = 25.0
-"""Least eigenvalue of the mean outer product of gradients, (grey levels per pixel) squared."""
+"""Smallest eigenvalue of the structure tensor per pixel, (grey levels per pixel) squared."""
 MIN_SPREAD = 2.0
-"""Least standard deviation of a patch, grey levels."""
+"""Smallest standard deviation of a patch, grey levels."""
 MIN_SCALE, MAX_SCALE = 0.6, 1.6
 _SIDE = 2 * HALF + 1
 _AREA = float(_SIDE * _SIDE)
@@ -37,7 +37,7 @@ _AREA = float(_SIDE * _SIDE)
 
 @part
 def _template(stored: Bytes, centre: Array, patch_from_image: Array, out: Array) -> bool:
-    """A patch as the image should show it, a pixel wider than is compared; False if too small."""
+    """Warped patch, one pixel wider than compared; False where it exceeds the stored patch."""
     for i in range(_SIDE + 2):
         for j in range(_SIDE + 2):
             dx, dy = float(j - HALF - 1), float(i - HALF - 1)
@@ -64,7 +64,7 @@ def _without_mean(values: Array) -> None:
 
 @part
 def _sample(image: Bytes, x: float, y: float, out: Array) -> bool:
-    """What an image shows around a pixel; False where that is not all inside."""
+    """Bilinear samples around a pixel; False where not all inside."""
     h, w = image.shape
     if not (HALF <= x < w - HALF - 1 and HALF <= y < h - HALF - 1):
         return False
@@ -85,9 +85,14 @@ def _sample(image: Bytes, x: float, y: float, out: Array) -> bool:
 
 @part
 def _fit(
-    stored: Bytes, centre: Array, patch_from_image: Array, image: Bytes, place: Array, work: Array
+    stored: Bytes,
+    centre: Array,
+    patch_from_image: Array,
+    image: Bytes,
+    position: Array,
+    work: Array,
 ) -> bool:
-    """Move a place (2,) to where a patch fits an image; False where that is not sure."""
+    """Move a position (2,) to the best alignment of a patch with an image; False on failure."""
     wide = np.empty((_SIDE + 2, _SIDE + 2))
     if not _template(stored, centre, patch_from_image, wide):
         return False
@@ -114,7 +119,7 @@ def _fit(
     det = a * c - b * b
     zncc, last = 0.0, np.inf
     for _ in range(ITERATIONS):
-        if not _sample(image, place[0], place[1], seen):
+        if not _sample(image, position[0], position[1], seen):
             return False
         _without_mean(seen)
         square = 0.0
@@ -123,24 +128,24 @@ def _fit(
                 square += seen[i, j] * seen[i, j]
         contrast = max(np.sqrt(square / _AREA), 1e-3)
         gain = spread / contrast
-        ex, ey, alike = 0.0, 0.0, 0.0
+        ex, ey, correlation = 0.0, 0.0, 0.0
         for i in range(_SIDE):
             for j in range(_SIDE):
                 error = seen[i, j] * gain - inner[i, j]
                 ex += gx[i, j] * error
                 ey += gy[i, j] * error
-                alike += seen[i, j] * inner[i, j]
+                correlation += seen[i, j] * inner[i, j]
         ex, ey = ex / _AREA, ey / _AREA
-        zncc = alike / _AREA / (contrast * spread)
+        zncc = correlation / _AREA / (contrast * spread)
         step_x = min(max((c * ex - b * ey) / det, -1.0), 1.0)
         step_y = min(max((a * ey - b * ex) / det, -1.0), 1.0)
-        place[0] -= step_x
-        place[1] -= step_y
+        position[0] -= step_x
+        position[1] -= step_y
         last = max(abs(step_x), abs(step_y))
         if last <= CONVERGED_PX:
             break
     h, w = image.shape
-    inside = HALF <= place[0] < w - HALF - 1 and HALF <= place[1] < h - HALF - 1
+    inside = HALF <= position[0] < w - HALF - 1 and HALF <= position[1] < h - HALF - 1
     return inside and zncc > MIN_ZNCC and last < 0.1
 
 
@@ -151,7 +156,7 @@ def align(
 ) -> tuple[Array, Bools]:  # fmt: skip
     """As `companion.slam.features.patches.align`."""
     found, sure = pixels.copy(), np.zeros(len(pixels), np.bool_)
-    back, place, work = np.empty((2, 2)), np.empty(2), np.empty((4, _SIDE, _SIDE))
+    back, position, work = np.empty((2, 2)), np.empty(2), np.empty((4, _SIDE, _SIDE))
     for i in range(len(pixels)):
         warp = image_from_patch[i]
         det = warp[0, 0] * warp[1, 1] - warp[0, 1] * warp[1, 0]
@@ -166,11 +171,11 @@ def align(
         back[0, 0], back[0, 1] = warp[1, 1] / det / shrunk, -warp[0, 1] / det / shrunk
         back[1, 0], back[1, 1] = -warp[1, 0] / det / shrunk, warp[0, 0] / det / shrunk
         size = 2.0**level
-        place[0], place[1] = pixels[i, 0] / size, pixels[i, 1] / size
+        position[0], position[1] = pixels[i, 0] / size, pixels[i, 1] / size
         here = image if level == 0 else half_image if level == 1 else quarter_image
-        if not _fit(grey[i], centre[i], back, here, place, work):
+        if not _fit(grey[i], centre[i], back, here, position, work):
             continue
-        x, y = place[0] * size, place[1] * size
+        x, y = position[0] * size, position[1] * size
         if np.hypot(x - pixels[i, 0], y - pixels[i, 1]) < max_move_px[i]:
             found[i, 0], found[i, 1], sure[i] = x, y, True
     return found, sure

@@ -1,4 +1,4 @@
-"""One camera's pose and the points it sees: Gauss-Newton's sums and steps."""
+"""Pose refinement kernels: Gauss-Newton over the points that a camera observes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from companion.slam.compiled.compiling import (
 )
 
 CHI2_2D = 5.991
-"""95 % of squared errors of a pixel position, in units of its sigma, lie below this."""
+"""95 % quantile of the chi-squared distribution with two degrees of freedom."""
 HUBER = float(np.sqrt(CHI2_2D))
 _BEHIND_COST = HUBER * 100.0
 
@@ -25,7 +25,7 @@ _BEHIND_COST = HUBER * 100.0
 def _whitened(
     rotation: Array, translation: Array, point: Array, seen: Array, whitening: Array
 ) -> tuple[float, float, float]:
-    """The error (2) of one point in units of its sigma, and its depth."""
+    """Whitened reprojection error (2) of one point, and its depth."""
     x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2]
     y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2]
     z = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2]
@@ -43,7 +43,7 @@ def _whitened(
 def cost(
     rotation: Array, translation: Array, points: Array, seen: Array, whitening: Array
 ) -> float:
-    """Huber's loss of N points, those behind the camera at a high price."""
+    """Huber's loss of N points, those behind the camera at a high constant."""
     total = 0.0
     for i in range(len(points)):
         u, v, depth = _whitened(rotation, translation, points[i], seen[i], whitening[i])
@@ -58,8 +58,8 @@ def cost(
 
 
 @part
-def _turn(vector: Array) -> Array:
-    """The rotation of a rotation vector (Rodrigues)."""
+def _rotation(vector: Array) -> Array:
+    """Rotation matrix of a rotation vector (Rodrigues)."""
     x, y, z = vector[0], vector[1], vector[2]
     theta2 = x * x + y * y + z * z
     theta = np.sqrt(theta2)
@@ -79,7 +79,7 @@ def _turn(vector: Array) -> Array:
 
 @part
 def _solve(matrix: Array, right: Array) -> bool:
-    """Solve a square system in place by elimination with pivots; False where it is singular."""
+    """Solve a square system in place by pivoted Gaussian elimination; False where singular."""
     n = len(right)
     for k in range(n):
         pivot = k
@@ -109,7 +109,7 @@ def _sums(
     rotation: Array, translation: Array, points: Array, seen: Array, whitening: Array,
     inlier: Bools, robust: bool, information: Array, gradient: Array,
 ) -> None:  # fmt: skip
-    """The normal equations of the points that are `inlier`, into the last two."""
+    """Normal equations of the inliers, written to the last two arguments."""
     information[:] = 0.0
     gradient[:] = 0.0
     plain, jac = np.zeros((2, 6)), np.empty((2, 6))
@@ -153,7 +153,7 @@ def refine(
     rounds: int, iterations: int,
 ) -> tuple[Array, Array, Bools, Array]:  # fmt: skip
     """As `refine_pose`: rotation, translation, inliers (N,), information (6, 6)."""
-    turned, moved = rotation.copy(), translation.copy()
+    rotated, moved = rotation.copy(), translation.copy()
     inlier = np.ones(len(points), np.bool_)
     information, gradient = np.zeros((6, 6)), np.zeros(6)
     for round_ in range(rounds):
@@ -161,7 +161,7 @@ def refine(
             break
         for _ in range(iterations):
             _sums(
-                turned, moved, points, seen, whitening, inlier, round_ < rounds - 1,
+                rotated, moved, points, seen, whitening, inlier, round_ < rounds - 1,
                 information, gradient,
             )  # fmt: skip
             system, step = information.copy(), -gradient
@@ -169,18 +169,18 @@ def refine(
                 system[k, k] += 1e-9
             if not (_solve(system, step) and np.all(np.isfinite(step))):
                 break
-            turn = _turn(step)
-            before_turned, before_moved = turned.copy(), moved.copy()
+            step_rotation = _rotation(step)
+            before_rotated, before_moved = rotated.copy(), moved.copy()
             for i in range(3):
                 moved[i] = step[3 + i]
                 for k in range(3):
-                    moved[i] += turn[i, k] * before_moved[k]
-                    turned[i, k] = 0.0
+                    moved[i] += step_rotation[i, k] * before_moved[k]
+                    rotated[i, k] = 0.0
                     for m in range(3):
-                        turned[i, k] += turn[i, m] * before_turned[m, k]
+                        rotated[i, k] += step_rotation[i, m] * before_rotated[m, k]
             if np.max(np.abs(step)) < 1e-6:
                 break
         for i in range(len(points)):
-            u, v, depth = _whitened(turned, moved, points[i], seen[i], whitening[i])
+            u, v, depth = _whitened(rotated, moved, points[i], seen[i], whitening[i])
             inlier[i] = u * u + v * v < CHI2_2D and depth > 0.0
-    return turned, moved, inlier, information
+    return rotated, moved, inlier, information

@@ -1,4 +1,4 @@
-"""Which points of the map a camera should see, where, and how their surroundings turn in it."""
+"""Projection kernels: visible map points of a camera, and patch warps."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from companion.slam.compiled.compiling import (
 )
 
 NO_LENS, RADTAN, EQUIDISTANT = 0, 1, 2
-"""The distortion models of companion.geometry.camera."""
+"""Distortion models of companion.geometry.camera."""
 N_COEFFICIENTS = 5
 MIN_VIEW_COSINE = 0.5
-"""A point is looked for only within 60 degrees of where it was seen from before."""
+"""Points are searched within 60 degrees of their mean viewing direction only."""
 NEARER, FARTHER = 0.7, 1.3
-"""A point is looked for only at distances at which its corner has a level, give or take."""
+"""Tolerance on the distances at which the pyramid covers a point."""
 
 
 @part
@@ -60,14 +60,14 @@ def warps(
     first_rotation: Array, first_translation: Array, first_known: Bools, which: Ints,
     jacobian: Array,
 ) -> Array:  # fmt: skip
-    """How full-size pixels of the first view of each point `ids` move in this one (M, 2, 2).
+    """Warps (M, 2, 2) of full-resolution pixels from the reference view of points to this view.
 
-    The first two are of all points; the poses of K first views, of which `which` (M,) is each
-    point's; `jacobian` (M, 2, 2) of pixels here by normalised coordinates. nan where the first
-    view is not known.
+    The first two arguments are of all points; `ids` (M,) selects; of K reference views the poses,
+    of which `which` (M,) is that of each point; `jacobian` (M, 2, 2) of pixels here by normalised
+    coordinates. nan where the reference view is unknown.
     """
     out = np.full((len(ids), 2, 2), np.nan)
-    here, turned, projected = np.empty(3), np.empty((3, 2)), np.empty((2, 2))
+    here, rotated, projected = np.empty(3), np.empty((3, 2)), np.empty((2, 2))
     for m in range(len(ids)):
         k = which[m]
         if not first_known[k]:
@@ -88,10 +88,10 @@ def warps(
                 x += rotation[i, j] * first[0, j]
                 y += rotation[i, j] * first[1, j]
             for j in range(2):
-                turned[i, j] = (x * shift[0, j] + y * shift[1, j]) * depth
+                rotated[i, j] = (x * shift[0, j] + y * shift[1, j]) * depth
         for j in range(2):
-            projected[0, j] = (turned[0, j] - u * turned[2, j]) / z
-            projected[1, j] = (turned[1, j] - v * turned[2, j]) / z
+            projected[0, j] = (rotated[0, j] - u * rotated[2, j]) / z
+            projected[1, j] = (rotated[1, j] - v * rotated[2, j]) / z
         for i in range(2):
             for j in range(2):
                 out[m, i, j] = (
@@ -109,10 +109,10 @@ def visible(
     translation: Array, model: int, coefficients: Array, intrinsics: Array, max_radius: float,
     scale_factor: float, n_levels: int,
 ) -> tuple[Ints, Array, Ints]:  # fmt: skip
-    """Ids (M,), pixels (M, 2) and levels (M,) of those of the points `ids` that are in the image.
+    """Ids (M,), pixels (M, 2) and pyramid levels (M,) of the points `ids` that are visible.
 
-    The first three are of all points; `coefficients` five whatever the model; `intrinsics` fx, fy,
-    cx, cy, width, height; beyond `max_radius` in normalised coordinates nothing is seen.
+    The first three arguments are of all points; `coefficients` five for any model; `intrinsics` fx,
+    fy, cx, cy, width, height; beyond `max_radius` in normalised coordinates nothing is visible.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     width, height = intrinsics[4], intrinsics[5]

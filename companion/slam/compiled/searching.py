@@ -1,4 +1,4 @@
-"""Which feature shows what another shows, or a point: by where it lies, level and descriptor."""
+"""Descriptor search kernels: around projections, and along epipolar lines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.slam.compiled.compiling import (
     numbers,
     pairs,
     part,
-    places,
+    single_pairs,
     words,
 )
 
@@ -26,7 +26,7 @@ Words = NDArray[np.uint64]
 
 CELL_PX = 32.0
 N_NEAREST = 12
-"""So many features around a pixel are looked at."""
+"""Features examined around a pixel."""
 _FAR = np.float32(1000.0)
 _PAIRS, _FOURS = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
 _EIGHTS, _SUM = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
@@ -52,22 +52,22 @@ def _cell(position: float, n_cells: int) -> int:
 
 @part
 def _in_cells(pixels: Floats, n_columns: int, n_rows: int) -> tuple[Ints, Ints]:
-    """Features ordered by the cell they are in, and where each cell begins, and the end."""
+    """Features ordered by grid cell, and the start of each cell, and the end."""
     starts = np.zeros(n_columns * n_rows + 1, np.int64)
     cells = np.empty(len(pixels), np.int64)
     for i in range(len(pixels)):
         cells[i] = _cell(pixels[i, 1], n_rows) * n_columns + _cell(pixels[i, 0], n_columns)
         starts[cells[i] + 1] += 1
     starts = np.cumsum(starts)
-    place, order = starts[:-1].copy(), np.empty(len(pixels), np.int64)
+    next_slot, order = starts[:-1].copy(), np.empty(len(pixels), np.int64)
     for i in range(len(pixels)):
-        order[place[cells[i]]] = i
-        place[cells[i]] += 1
+        order[next_slot[cells[i]]] = i
+        next_slot[cells[i]] += 1
     return order, starts
 
 
 @compiled(
-    pairs, integers, words, integers, numbers, places, words, integers, flags,
+    pairs, integers, words, integers, numbers, single_pairs, words, integers, flags,
     number, number, integer,
 )  # fmt: skip
 def search(
@@ -75,10 +75,10 @@ def search(
     pixels: Floats, feature_words: Words, octaves: Ints, usable: Bools,
     max_distance: float, ratio: float, max_octave_gap: int,
 ) -> tuple[Ints, Ints]:  # fmt: skip
-    """Places in `ids` (M,) and features, each at most once, by feature.
+    """Indices into `ids` (M,) and features, each at most once, ordered by feature.
 
-    `projected` (M, 2), `levels` (M,) and `radius` (M,) are of the points `ids`, `point_words`
-    (P, 4) of all points; the others of the features (N,).
+    `projected` (M, 2), `levels` (M,) and `radius` (M,) are of the points `ids`, `point_words` (P,
+    4) of all points; the others of the features (N,).
     """
     n = len(pixels)
     right, bottom = 0.0, 0.0
@@ -117,33 +117,33 @@ def search(
                 best = k
         if best < 0:
             continue
-        # a rival counts against a match only at the same level: the next shows the same corner
-        feature, rival = near[best], _FAR
+        # ratio test within one level only: adjacent levels show the same corner
+        feature, second_best = near[best], _FAR
         for k in range(n_near):
             if k != best and octaves[near[k]] == octaves[feature]:
-                rival = min(rival, bits[k])
-        if bits[best] < np.float32(ratio) * rival and bits[best] < taken_for[feature]:
+                second_best = min(second_best, bits[k])
+        if bits[best] < np.float32(ratio) * second_best and bits[best] < taken_for[feature]:
             taken_by[feature], taken_for[feature] = m, bits[best]
     found = np.flatnonzero(taken_by >= 0)
     return taken_by[found], found
 
 
 @compiled(
-    places, places, numbers, words, words, integers, integers, integer, integer, number
+    single_pairs, single_pairs, numbers, words, words, integers, integers, integer, integer, number
 )  # fmt: skip
 def search_along(
     lines: Floats, rays: Floats, reach: Array, words_a: Words, words_b: Words, octaves_a: Ints,
     octaves_b: Ints, max_octave_gap: int, max_distance: int, ratio: float,
 ) -> tuple[Ints, Ints]:  # fmt: skip
-    """Features of two images that are each other's best near epipolar lines, by the first.
+    """Mutually best features of two images near epipolar lines, ordered by the first.
 
-    Those of the second, by their `rays` (Nb, 3), may lie within `reach` (Nb,) of the `lines`
-    (Na, 3) of the first's.
+    Those of the second, by their `rays` (Nb, 3), must lie within `reach` (Nb,) of the `lines` (Na,
+    3) of the first.
     """
     n, far = len(rays), 1000
     off = np.empty(n, np.float32)
     best_of_a, bits_of_a = np.full(len(lines), -1, np.int64), np.full(len(lines), far, np.int64)
-    rival_of_a = np.full(len(lines), far, np.int64)
+    second_of_a = np.full(len(lines), far, np.int64)
     best_of_b, bits_of_b = np.full(n, -1, np.int64), np.full(n, far, np.int64)
     for a in range(len(lines)):
         x, y, z = lines[a, 0], lines[a, 1], lines[a, 2]
@@ -154,16 +154,16 @@ def search_along(
                 continue
             bits = _differing_bits(words_a[a], words_b[b])
             if bits < bits_of_a[a]:
-                rival_of_a[a] = bits_of_a[a]
+                second_of_a[a] = bits_of_a[a]
                 best_of_a[a], bits_of_a[a] = b, bits
-            elif bits < rival_of_a[a]:
-                rival_of_a[a] = bits
+            elif bits < second_of_a[a]:
+                second_of_a[a] = bits
             if bits < bits_of_b[b]:
                 best_of_b[b], bits_of_b[b] = a, bits
     good = np.zeros(len(lines), np.bool_)
     for a in range(len(lines)):
         b = best_of_a[a]
         if b >= 0 and best_of_b[b] == a and bits_of_a[a] <= max_distance:
-            good[a] = bits_of_a[a] < ratio * rival_of_a[a]
+            good[a] = bits_of_a[a] < ratio * second_of_a[a]
     found = np.flatnonzero(good)
     return found, best_of_a[found]

@@ -1,4 +1,4 @@
-"""Which of many corners to keep, so that all of an image has some."""
+"""Selection of corners evenly distributed over an image."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from companion.slam.compiled.compiling import (
     given,
     integer,
     number,
-    places,
     single,
+    single_pairs,
 )
 
 
-@compiled(places, given(single, 1), number, integer)
+@compiled(single_pairs, given(single, 1), number, integer)
 def spread(pixels: Floats, response: Floats, cell_px: float, n_wanted: int) -> Ints:
     """Indices, ascending: the strongest of every cell in turn, until there are enough.
 
-    Of equally strong ones the first.
+    Ties resolve to the first.
     """
     n = len(pixels)
     if n <= n_wanted:

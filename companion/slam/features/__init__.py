@@ -1,1 +1,1 @@
-"""ORB features of a frame, their matching and tracking, triangulation. Knows no map."""
+"""ORB features, matching, KLT tracking, patch alignment, triangulation. Knows no map."""

@@ -1,7 +1,7 @@
-"""Which feature is which: by descriptor alone, along epipolar lines, and by projection.
+"""Feature matching: by descriptor alone, along epipolar lines, and by projection.
 
-Descriptors are 256 bits; distances are Hamming. A match passes a threshold, the ratio test against
-the second best, and is the best in both directions.
+Descriptors have 256 bits; distances are Hamming. A match passes a threshold, the ratio test against
+the second best, and is mutual.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from companion.slam.compiled.searching import search, search_along
 from companion.slam.features.orb_features import Bools, Features, Ints
 
 MAX_DISTANCE = 64
-"""Bits that the same corner may differ by between views."""
+"""Largest distance, bits, between views of the same corner."""
 MAX_DISTANCE_STRICT = 50
 MAX_OCTAVE_GAP = 4
 FAR = np.float32(1000.0)
@@ -28,7 +28,7 @@ def hamming_matrix(descriptors_a: Bytes, descriptors_b: Bytes) -> Floats:
 
 
 def mutual_matches(distances: Floats, max_distance: float, ratio: float) -> tuple[Ints, Ints]:
-    """Index pairs that are each other's best; ties go to the first."""
+    """Index pairs that are mutually best; ties resolve to the first."""
     none = np.zeros(0, np.int64)
     if distances.shape[0] == 0 or distances.shape[1] < 2:
         return none, none
@@ -36,16 +36,16 @@ def mutual_matches(distances: Floats, max_distance: float, ratio: float) -> tupl
     best = distances.argmin(1)
     value = distances[rows, best]
     good = distances.argmin(0)[best] == rows
-    rivals = distances.copy()
-    rivals[rows, best] = FAR
-    good &= (value <= max_distance) & (value < ratio * rivals.min(1))
+    second_best = distances.copy()
+    second_best[rows, best] = FAR
+    good &= (value <= max_distance) & (value < ratio * second_best.min(1))
     return rows[good], best[good]
 
 
 def match_descriptors(
     a: Features, b: Features, max_distance: float = MAX_DISTANCE_STRICT, ratio: float = 0.8
 ) -> tuple[Ints, Ints]:
-    """Match two images without knowing anything of their poses."""
+    """Match two images by descriptors only."""
     if len(a) == 0 or len(b) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     return mutual_matches(hamming_matrix(a.descriptors, b.descriptors), max_distance, ratio)
@@ -87,10 +87,10 @@ def match_projected(
     ratio: float = 0.85,
     max_octave_gap: int = 2,
 ) -> tuple[Ints, Ints]:
-    """Match M points, seen to lie at `projected_px` (M, 2), with the features around there.
+    """Match M projected points at `projected_px` (M, 2) with the features around them.
 
-    Theirs are the rows `ids` (M,) of `descriptors` (P, 32); `octaves` (M,) is the pyramid level at
-    which each is expected; `radius_px` (M,) how far to look; `usable` (N,) features that may be
+    Their descriptors are rows `ids` (M,) of `descriptors` (P, 32); `octaves` (M,) the predicted
+    pyramid levels; `radius_px` (M,) the search radii; `usable` (N,) masks features that may be
     taken. Returns indices into ids and features, each at most once.
     """
     none = np.zeros(0, np.int64)

@@ -43,14 +43,14 @@ def features_of(
     camera: Camera, scale_factor: float, pixels: Floats, normalised: Array, octaves: Ints,
     angles_deg: Floats, descriptors: Bytes,
 ) -> Features:  # fmt: skip
-    """Features with what follows from octave and lens; arguments as the fields of `Features`."""
+    """Features, with sigma and whitening derived; arguments as the fields of `Features`."""
     sigma = scale_factor ** octaves.astype(np.float64)
     whitening = camera.pixel_from_normalised_jacobian(normalised) / sigma[:, None, None]
     return Features(pixels, normalised, octaves, angles_deg, descriptors, sigma, whitening)
 
 
 class FeatureExtractor:
-    """Finds the features of images of one camera."""
+    """Extracts the features of images of one camera."""
 
     def __init__(self, config: FeaturesConfig, camera: Camera) -> None:
         self._camera = camera
@@ -62,11 +62,11 @@ class FeatureExtractor:
             fastThreshold=config.fast_threshold,
         )
         self._threshold = config.fast_threshold
-        self.effort = 1.0
-        """Share of the configured number of features that is looked for."""
+        self.feature_ratio = 1.0
+        """Ratio of the configured number of features to extract."""
 
     def extract(self, grey: Bytes) -> Features:
-        """Features of an image (H, W); as few as none where it shows nothing."""
+        """Features of an image (H, W); possibly none."""
         keypoints = self._detect(grey)
         words = None
         if keypoints:
@@ -90,10 +90,10 @@ class FeatureExtractor:
 
     @property
     def _n_wanted(self) -> int:
-        return round(self.effort * self._config.n_features)
+        return round(self.feature_ratio * self._config.n_features)
 
     def _detect(self, grey: Bytes) -> list[cv2.KeyPoint]:
-        """Corners by a threshold that follows the scene, so that dull ground has some too."""
+        """FAST corners with an adaptive threshold, so that low-contrast ground has some too."""
         config = self._config
         while True:
             self._orb.setFastThreshold(self._threshold)

@@ -1,8 +1,8 @@
-"""Where a map point lies in an image to a fraction of a pixel: its first patch, laid over it.
+"""Sub-pixel localisation of map points by alignment of their reference patch.
 
-A corner found in each image by itself is off by half a pixel; aligning the patch of the view that
-defines a point (inverse compositional: Baker & Matthews, IJCV 2004) is several times better. The
-patch is warped as a small plane that faces the first view would be.
+A corner detected independently in each image is off by half a pixel; inverse compositional
+alignment (Baker & Matthews, IJCV 2004) of the patch of the reference view is several times better.
+The patch is warped as a small plane that faces the reference view.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from companion.slam.features.orb_features import Bools, Ints
 
 
 def image_levels(grey: Bytes) -> list[Bytes]:
-    """An image (H, W) at full, half and quarter size; pixel p of one is pixel p / 2 of the next."""
+    """Pyramid of an image (H, W) at full, half and quarter size; pixel p maps to p / 2."""
     levels = [np.ascontiguousarray(grey)]
     for _ in range(N_LEVELS - 1):
         levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.uint8))
@@ -28,7 +28,7 @@ def image_levels(grey: Bytes) -> list[Bytes]:
 
 
 def level_of(octaves: Ints, scale_factor: float) -> Ints:
-    """The level at which corners of these octaves are compared."""
+    """Pyramid level at which corners of these octaves are compared."""
     level = np.rint(octaves * np.log2(scale_factor) - 0.5)
     return np.asarray(np.clip(level, 0, N_LEVELS - 1), np.int64)
 
@@ -43,7 +43,7 @@ class Patches:
 
 
 def cut(levels: list[Bytes], pixels: Array, level: Ints) -> Patches:
-    """The patches around full-size `pixels` (N, 2)."""
+    """Extract the patches around full-resolution `pixels` (N, 2)."""
     scaled = pixels / 2.0 ** level[:, None]
     corner = np.floor(scaled).astype(np.int64) - STORED // 2 + 1
     grey = np.zeros((len(pixels), STORED, STORED), np.uint8)
@@ -66,10 +66,10 @@ def align(
     pixels: Array,
     max_move_px: Array,
 ) -> tuple[Array, Bools]:
-    """Where patches lie near full-size `pixels` (N, 2) of an image, and which were found for sure.
+    """Align patches near full-resolution `pixels` (N, 2); aligned pixels and a mask of success.
 
-    `image_from_patch` (N, 2, 2) is the warp between full-size pixels; a patch may move by
-    `max_move_px` (N,) at most.
+    `image_from_patch` (N, 2, 2) is the warp between full-resolution pixels; a patch may move by at
+    most `max_move_px` (N,).
     """
     full, half, quarter = levels
     return patch_alignment.align(

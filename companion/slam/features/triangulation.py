@@ -1,4 +1,4 @@
-"""Points from two views."""
+"""Two-view triangulation."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def consistent(
     whitening_b: Array,
     max_chi2: float = 5.991,
 ) -> Bools:
-    """Which points (N, 3) lie before both cameras and project to where both saw them."""
+    """Mask of points (N, 3) in front of both cameras with reprojection errors below `max_chi2`."""
     in_b = b_from_a.apply(points_a)
     with np.errstate(invalid="ignore", divide="ignore"):
         ok = (points_a[:, 2] > 0) & (in_b[:, 2] > 0) & np.isfinite(points_a).all(1)

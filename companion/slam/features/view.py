@@ -1,4 +1,4 @@
-"""The frame in hand, between its image and its place in the map."""
+"""The frame being tracked."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.slam.features.orb_features import Features, Ints
 
 @dataclass(slots=True, eq=False)
 class View:
-    """The frame in hand: its features, its pose, and the map point of each feature (-1: none)."""
+    """The frame being tracked: features, pose, and the map point of each feature (-1: none)."""
 
     seq: int
     t_ns: int
@@ -24,7 +24,7 @@ class View:
     point_ids: Ints
     n_matches: int = 0
     map_from_camera_rotation: Array | None = None
-    """by the autopilot, in the axes of the map in use"""
+    """by the autopilot, in the axes of the current map"""
     normalised: Array | None = None
     whitening: Array | None = None
     refined_for: Ints | None = None
@@ -34,17 +34,17 @@ class View:
 
     @property
     def centre(self) -> Array:
-        """Position of the camera in the map."""
+        """Position of the camera in the map (3,)."""
         out: Array = -self.camera_from_map.rotation.T @ self.camera_from_map.translation
         return out
 
     @property
     def n_inliers(self) -> int:
-        """Features that show a map point."""
+        """Features that observe a map point."""
         return int(np.count_nonzero(self.point_ids >= 0))
 
     @property
     def level_from_camera(self) -> Array | None:
-        """To a frame whose z axis is the map's, where the autopilot tells it."""
+        """Rotation to a gravity-aligned frame, where the attitude is measured."""
         by_map = self.map_from_camera_rotation
         return self.ned_from_camera if by_map is None else by_map

@@ -1,1 +1,1 @@
-"""The first two keyframes of a map, or of its continuation after tracking was lost."""
+"""Two-view initialisation of a map, and continuation of one after tracking loss."""

@@ -1,4 +1,4 @@
-"""Waiting for two frames that start a map, and keeping those that came meanwhile."""
+"""Search for a frame pair to initialise a map, with a buffer of the frames in between."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from companion.slam.features.matching import match_descriptors
 from companion.slam.features.orb_features import Features, Ints
 from companion.slam.features.view import View
 from companion.slam.initialisation.initializer import MIN_POINTS, initialise
-from companion.slam.initialisation.third_view import contradicts, half_way
+from companion.slam.initialisation.third_view import middle_view, third_view_rejects
 
 MAX_PENDING = 150
 MIN_PARALLAX_PX = 8.0
-"""Of a coarse picture the same angle is fewer pixels, of which each is as uncertain."""
+"""Lower bound in pixels: in low-resolution images the same angle spans fewer, equally uncertain
+pixels."""
 FORWARD_IS_NORTH = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-"""Attitude of a camera that is taken as level and looking north, where nobody tells."""
+"""Attitude `ned_from_camera` assumed where none is measured: level and looking north."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
-    """Two views with poses in a new map, and the points (N, 3) that both see."""
+class TwoViewReconstruction:
+    """Two views with poses in a new map, and the points (N, 3) that both observe."""
 
     first: View
     second: View
@@ -36,11 +37,11 @@ class Start:
 
 
 class Bootstrap:
-    """Tries each new frame against a reference frame until both start a map.
+    """Tries each new frame against a reference frame until the pair initialises a map.
 
-    With a `reference` given, such as the last frame before the camera was lost, the map begins with
-    that one, for as long as it is in sight. `min_parallax_ratio` times the usual parallax is asked
-    for: the more there is, the surer is the motion.
+    `reference` fixes the first view, such as the last frame before tracking loss, while it
+    overlaps. `min_parallax_ratio` scales the required parallax: more of it makes the motion
+    estimate more certain.
     """
 
     def __init__(
@@ -55,8 +56,10 @@ class Bootstrap:
             np.radians(config.min_init_parallax_deg), MIN_PARALLAX_PX / camera.focal_px
         )
 
-    def step(self, frame: Frame, features: Features, ned_from_camera: Array | None) -> Start | None:
-        """Take a frame; a Start when a map can begin with it."""
+    def step(
+        self, frame: Frame, features: Features, ned_from_camera: Array | None
+    ) -> TwoViewReconstruction | None:
+        """Take a frame; a reconstruction once a map can be initialised with it."""
         seq = frame.seq
         view = View(
             seq, frame.t_ns, features, ned_from_camera, frame.grey, Pose.identity(),
@@ -74,7 +77,7 @@ class Bootstrap:
             return None
         ia, ib = match_descriptors(reference.features, features)
         if len(ia) < MIN_POINTS:
-            # the view has moved on: begin again from a frame in between, else from this one
+            # overlap is lost: restart from a frame in between, else from this one
             between = [
                 v
                 for v in self.pending
@@ -104,15 +107,19 @@ class Bootstrap:
         b_from_a = Pose(result.b_from_a.rotation, result.b_from_a.translation * unit)
         view.camera_from_map = b_from_a @ reference.camera_from_map
         points_map = result.points_a * unit @ map_rotation.T
-        third = half_way(self.pending, reference, view)
-        if third is not None and contradicts(third, reference, view, points_map, result.features_a):
+        third = middle_view(self.pending, reference, view)
+        if third is not None and third_view_rejects(
+            third, reference, view, points_map, result.features_a
+        ):
             return None
-        return Start(reference, view, points_map, result.features_a, result.features_b)
+        return TwoViewReconstruction(
+            reference, view, points_map, result.features_a, result.features_b
+        )
 
     def _with_attitude(self, reference: View) -> View:
-        """The first view with an attitude, where the reference came before telemetry did.
+        """The first view with an attitude, where the reference came before telemetry.
 
-        Without attitudes two motions explain a plane, and nothing tells which way is down.
+        Without attitudes a planar scene has two motion solutions, and gravity is unknown.
         """
         if reference.ned_from_camera is not None:
             return reference

@@ -1,7 +1,7 @@
-"""The first two keyframes: motion and points from two images alone.
+"""Two-view initialisation: relative pose and points from two images.
 
-The motion is one of several that the images allow; which one is told by the points that it gives,
-and by the autopilot's turn.
+The pose is selected among competing hypotheses by its reprojection cost and the autopilot's
+relative rotation.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from companion.geometry.transforms import Array, Pose, angle_between
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.features.triangulation import consistent, triangulate
 from companion.slam.optimisation.bundle_adjustment import Bundle, adjust
-from companion.slam.optimisation.motion_hypotheses import possible_motions
-from companion.slam.optimisation.rotation_factor import Turns
+from companion.slam.optimisation.motion_hypotheses import motion_hypotheses
+from companion.slam.optimisation.rotation_factor import RelativeRotationFactor
 
 MIN_POINTS = 60
 GAMMA = 5.991
-TURNED_PX, MAX_TURNED_SHARE = 2.0, 0.5
-TOLD_TURN_RAD, TOLD_TURN_SHARE = np.radians(0.5), 0.1
-"""What the autopilot's turn between two views may be off by, at least and as a share of it."""
-RIVAL_SHARE = 0.6
-"""Motions that fit fewer of the matches than this share of the best are no rivals to it."""
-MIN_WORSE = 1.15
-"""What another motion leaves unexplained must be so many times as much."""
+PURE_ROTATION_PX, MAX_PURE_ROTATION_RATIO = 2.0, 0.5
+PRIOR_ROTATION_RAD, PRIOR_ROTATION_RATIO = np.radians(0.5), 0.1
+"""Tolerance of the autopilot's relative rotation: at least, and as a ratio of its angle."""
+HYPOTHESIS_INLIER_RATIO = 0.6
+"""Hypotheses with fewer inliers than this ratio of the best do not compete."""
+MIN_COST_RATIO = 1.15
+"""Cost of any competing hypothesis relative to the best, for that to be unambiguous."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TwoView:
-    """Two views put together: `b_from_a` with a unit baseline, points (N, 3) in a."""
+class TwoViewGeometry:
+    """Two-view geometry: `b_from_a` with a unit baseline, points (N, 3) in a."""
 
     b_from_a: Pose
     points_a: Array
@@ -49,19 +49,19 @@ def initialise(
     seed: int,
     attitudes: tuple[Array, Array] | None,
     min_parallax_rad: float,
-) -> TwoView | None:
-    """Motion and points from matches `index_a`, `index_b`; None when it would not be certain.
+) -> TwoViewGeometry | None:
+    """Relative pose and points from matches `index_a`, `index_b`; None when ambiguous.
 
-    `attitudes` are `ned_from_camera` of a and b, where the autopilot told them.
+    `attitudes` are `ned_from_camera` of a and b, where measured.
     """
     if len(index_a) < MIN_POINTS:
         return None
     xa, xb = a.normalised[index_a], b.normalised[index_b]
     rotation_prior = None if attitudes is None else attitudes[1].T @ attitudes[0]
-    turned = _turned(xa, xb, focal_px, rotation_prior)
-    if np.mean(turned) > MAX_TURNED_SHARE:
+    rotation_only = _explained_by_rotation(xa, xb, focal_px, rotation_prior)
+    if np.mean(rotation_only) > MAX_PURE_ROTATION_RATIO:
         return None
-    candidates, planar = possible_motions(xa, xb, focal_px, seed, attitudes)
+    candidates, planar = motion_hypotheses(xa, xb, focal_px, seed, attitudes)
     best = _best(candidates, a, b, index_a, index_b, rotation_prior)
     if best is None:
         return None
@@ -69,16 +69,23 @@ def initialise(
     if found is None:
         return None
     pose, points, agree, shown, parallax_rad = found
-    # wrong matches speak for no turn either, and are known only now; untold turns have met rivals
-    if rotation_prior is not None and np.sum(turned) > MAX_TURNED_SHARE * np.sum(turned | agree):
+    # outliers fit no rotation either, but are known only now; with no prior the hypotheses competed
+    if rotation_prior is not None and np.sum(rotation_only) > MAX_PURE_ROTATION_RATIO * np.sum(
+        rotation_only | agree
+    ):
         return None
-    return TwoView(pose, points[shown], index_a[shown], index_b[shown], parallax_rad, planar)
+    return TwoViewGeometry(
+        pose, points[shown], index_a[shown], index_b[shown], parallax_rad, planar
+    )
 
 
-def _turned(xa: Array, xb: Array, focal_px: float, told: Array | None) -> Bools:
-    """Which matches (N,) are explained by a rotation alone: a baseline would be made up for them.
+def _explained_by_rotation(
+    xa: Array, xb: Array, focal_px: float, rotation_prior: Array | None
+) -> Bools:
+    """Mask (N,) of matches explained by rotation alone, which carry no baseline.
 
-    None where it is not the one that was `told`: a short way over a plane looks like a turn.
+    None if that rotation contradicts `rotation_prior`: a short translation over a plane resembles a
+    rotation.
     """
     rays_a, rays_b = _unit_rays(xa), _unit_rays(xb)
     weight = np.ones(len(rays_a))
@@ -88,12 +95,14 @@ def _turned(xa: Array, xb: Array, focal_px: float, told: Array | None) -> Bools:
         u, _, vt = np.linalg.svd((rays_b * weight[:, None]).T @ rays_a)
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         error_px = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1) * focal_px
-        weight = 1.0 / (1.0 + (error_px / TURNED_PX) ** 2) ** 2
-    if told is not None:
-        off_rad = float(TOLD_TURN_RAD) + TOLD_TURN_SHARE * angle_between(told, np.eye(3))
-        if angle_between(rotation, told) >= off_rad:
+        weight = 1.0 / (1.0 + (error_px / PURE_ROTATION_PX) ** 2) ** 2
+    if rotation_prior is not None:
+        off_rad = float(PRIOR_ROTATION_RAD) + PRIOR_ROTATION_RATIO * angle_between(
+            rotation_prior, np.eye(3)
+        )
+        if angle_between(rotation, rotation_prior) >= off_rad:
             return np.zeros(len(xa), bool)
-    return np.asarray(error_px < TURNED_PX, bool)
+    return np.asarray(error_px < PURE_ROTATION_PX, bool)
 
 
 def _unit_rays(normalised: Array) -> Array:
@@ -104,7 +113,7 @@ def _unit_rays(normalised: Array) -> Array:
 
 def _best(
     candidates: list[Pose], a: Features, b: Features, index_a: Ints, index_b: Ints,
-    told: Array | None,
+    rotation_prior: Array | None,
 ) -> Pose | None:  # fmt: skip
     scored = []
     for pose in candidates:
@@ -120,21 +129,25 @@ def _best(
     top, pose = scored[0]
     if top < MIN_POINTS // 2:
         return None
-    if told is not None:
-        turn = Turns.told(np.array([1]), np.array([0]), told[None])
+    if rotation_prior is not None:
+        factor = RelativeRotationFactor.with_typical_errors(
+            np.array([1]), np.array([0]), rotation_prior[None]
+        )
 
         def cost(pose: Pose) -> float:
-            _, off = turn.errors(np.stack([np.eye(3), pose.rotation]))
+            _, off = factor.errors(np.stack([np.eye(3), pose.rotation]))
             return _unexplained(pose, a, b, index_a, index_b) + float(off[0]) ** 2
 
-        return min((p for n, p in scored if n > RIVAL_SHARE * top), key=cost)
-    return _most_likely([p for n, p in scored if n > RIVAL_SHARE * top], a, b, index_a, index_b)
+        return min((p for n, p in scored if n > HYPOTHESIS_INLIER_RATIO * top), key=cost)
+    return _most_likely(
+        [p for n, p in scored if n > HYPOTHESIS_INLIER_RATIO * top], a, b, index_a, index_b
+    )
 
 
 def _most_likely(
     poses: list[Pose], a: Features, b: Features, index_a: Ints, index_b: Ints
 ) -> Pose | None:
-    """The pose that explains most, each at its best; None where another does nearly as well."""
+    """The pose of least cost, each refined first; None if another is nearly as good."""
     best: list[tuple[float, Pose]] = []
     for start in poses:
         pose: Pose | None = start
@@ -148,18 +161,18 @@ def _most_likely(
         return None
     best.sort(key=lambda c: c[0])
     cost, pose = best[0]
-    for other, rival in best[1:]:
+    for other, competitor in best[1:]:
         different = (
-            angle_between(rival.rotation, pose.rotation) > np.radians(1.5)
-            or float(rival.translation @ pose.translation) < 0.95
+            angle_between(competitor.rotation, pose.rotation) > np.radians(1.5)
+            or float(competitor.translation @ pose.translation) < 0.95
         )
-        if different and other < MIN_WORSE * cost + 30.0:
+        if different and other < MIN_COST_RATIO * cost + 30.0:
             return None
     return pose
 
 
 def _unexplained(pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints) -> float:
-    """Squared errors of all matches in both views, each no more than an outlier's."""
+    """Sum of squared errors of all matches in both views, truncated at the outlier threshold."""
     xa, xb = a.normalised[index_a], b.normalised[index_b]
     points, _ = triangulate(xa, xb, pose)
     in_b = pose.apply(points)
@@ -176,12 +189,9 @@ def _unexplained(pose: Pose, a: Features, b: Features, index_a: Ints, index_b: I
 
 def _adjusted(
     pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints, limit: float,
-    told: Array | None = None,
+    rotation_prior: Array | None = None,
 ) -> Pose | None:  # fmt: skip
-    """A pose, its baseline of length one, adjusted to the matches that agree with it.
-
-    And to the turn that was `told`.
-    """
+    """Pose with a unit baseline, bundle-adjusted on its inliers and on `rotation_prior`."""
     points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
     ok = consistent(
         points, pose, a.normalised[index_a], b.normalised[index_b],
@@ -191,12 +201,18 @@ def _adjusted(
     n = len(ia)
     if n < MIN_POINTS // 2:
         return None
-    turn = None if told is None else Turns.told(np.array([1]), np.array([0]), told[None])
+    factor = (
+        None
+        if rotation_prior is None
+        else RelativeRotationFactor.with_typical_errors(
+            np.array([1]), np.array([0]), rotation_prior[None]
+        )
+    )
     bundle = Bundle(
         [pose, Pose.identity()], 1, pts,
         np.repeat(np.array([0, 1]), n), np.tile(np.arange(n), 2),
         np.r_[b.normalised[ib], a.normalised[ia]], np.r_[b.whitening[ib], a.whitening[ia]],
-        () if turn is None else (turn,),
+        () if factor is None else (factor,),
     )  # fmt: skip
     adjusted = adjust(bundle, 12)
     scale = 1.0 / max(float(np.linalg.norm(adjusted.poses[0].translation)), 1e-12)
@@ -204,12 +220,12 @@ def _adjusted(
 
 
 def _refined(
-    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints, told: Array | None,
-    min_parallax_rad: float,
+    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints,
+    rotation_prior: Array | None, min_parallax_rad: float,
 ) -> tuple[Pose, Array, Bools, Bools, float] | None:  # fmt: skip
-    """Pose, points (N, 3), which of them agree and which show their depth, parallax in rad."""
+    """Pose, points (N, 3), masks of inliers and of those with parallax, and the parallax in rad."""
     for limit in (16.0, 5.991):
-        adjusted = _adjusted(pose, a, b, index_a, index_b, limit, told)
+        adjusted = _adjusted(pose, a, b, index_a, index_b, limit, rotation_prior)
         if adjusted is None:
             return None
         pose = adjusted

@@ -1,7 +1,7 @@
-"""How two views go on with a map that the first of them is part of.
+"""Continuation of a map by a two-view reconstruction from its last tracked frame.
 
-A camera that turns faster than its map grows is lost although each image shows much of the one
-before: their points, put to the scale of those that the map knows, carry the map on.
+A camera that rotates faster than its map grows loses tracking although consecutive images overlap:
+the reconstruction is scaled by the depths of points that the map already has.
 """
 
 from __future__ import annotations
@@ -13,18 +13,19 @@ import numpy as np
 from companion.geometry.transforms import Array, Pose
 from companion.slam.features.orb_features import Bools, Ints
 from companion.slam.features.view import View
-from companion.slam.initialisation.bootstrap import Start
+from companion.slam.initialisation.bootstrap import TwoViewReconstruction
 from companion.slam.map.sparse_map import SlamMap
 
 MIN_SHARED, MAX_SPREAD = 8, 0.25
-"""Points known to both, and how much the ratios of their depths may differ."""
+"""Shared points required, and the largest relative spread of their depth ratios (1.4826 MAD)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bridge:
-    """A Start in a map: `known` (N,) of its points, as `known_points`; the others' places (M, 3).
+class MapContinuation:
+    """A two-view reconstruction placed in a map.
 
-    `features_first` (M,) are those of the first view that show the others.
+    `known` (N,) marks the points that the map has, as `known_points`; `points_map` (M, 3) are the
+    others, observed by `features_first` (M,) of the first view.
     """
 
     second_from_map: Pose
@@ -34,8 +35,10 @@ class Bridge:
     features_first: Ints
 
 
-def bridge(slam_map: SlamMap, tracked: View, start: Start) -> Bridge | None:
-    """Put a Start into a map in which its first view was `tracked`; None where that is unsure."""
+def continuation_of(
+    slam_map: SlamMap, tracked: View, start: TwoViewReconstruction
+) -> MapContinuation | None:
+    """Place a reconstruction in the map that its first view was `tracked` in; None if uncertain."""
     if start.first.seq != tracked.seq:
         return None
     ids = tracked.point_ids[start.features_first]
@@ -51,7 +54,7 @@ def bridge(slam_map: SlamMap, tracked: View, start: Start) -> Bridge | None:
     second_from_first = start.second.camera_from_map @ start.first.camera_from_map.inverse()
     second_from_first = Pose(second_from_first.rotation, scale * second_from_first.translation)
     points_map = tracked.camera_from_map.inverse().apply(scale * in_first[~known])
-    return Bridge(
+    return MapContinuation(
         second_from_first @ tracked.camera_from_map, np.asarray(known, bool), ids[known],
         points_map, start.features_first[~known],
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a third view says of two that would begin a map: two always agree with something."""
+"""Third-view consistency check of a two-view reconstruction."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from companion.slam.features.orb_features import Ints
 from companion.slam.features.view import View
 from companion.slam.optimisation.pose_refinement import refine_pose
 
-MIN_SHOWN = 25
-"""A view that shows fewer of the points has no say."""
-MIN_AGREE_SHARE = 0.5
+MIN_OBSERVED = 25
+"""Points that a third view must observe to be able to reject."""
+MIN_INLIER_RATIO = 0.5
 
 
-def half_way(views: Iterable[View], first: View, second: View) -> View | None:
-    """The view that was taken nearest to half way in time; None where there is none between."""
+def middle_view(views: Iterable[View], first: View, second: View) -> View | None:
+    """The view nearest in time to the middle between two; None if there is none between."""
     half_ns = (first.t_ns + second.t_ns) // 2
     inside = [v for v in views if first.seq < v.seq < second.seq]
     return min(inside, key=lambda v: abs(v.t_ns - half_ns), default=None)
 
 
-def contradicts(
+def third_view_rejects(
     third: View, first: View, second: View, points_map: Array, features_first: Ints
 ) -> bool:
-    """Whether from no pose a view taken between two shows their points (N, 3) where it does.
+    """Whether a view between two fits their points (N, 3) from no pose.
 
-    `first` and `second` have their poses, `features_first` (N,) are those that show the points.
+    `first` and `second` have poses; `features_first` (N,) observe the points.
     """
     ia, ib = match_descriptors(first.features, third.features)
     point_of = np.full(len(first.features), -1)
     point_of[features_first] = np.arange(len(features_first))
     shown = point_of[ia] >= 0
-    if np.count_nonzero(shown) < MIN_SHOWN:
+    if np.count_nonzero(shown) < MIN_OBSERVED:
         return False
     share = (third.t_ns - first.t_ns) / max(second.t_ns - first.t_ns, 1)
     a, b = first.camera_from_map, second.camera_from_map
@@ -46,4 +46,4 @@ def contradicts(
         Pose(rotation, -rotation @ centre), points_map[point_of[ia[shown]]],
         third.features.normalised[seen], third.features.whitening[seen],
     )  # fmt: skip
-    return float(np.mean(agree)) < MIN_AGREE_SHARE
+    return float(np.mean(agree)) < MIN_INLIER_RATIO

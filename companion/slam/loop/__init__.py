@@ -1,1 +1,1 @@
-"""Place recognition, relocalisation, loop closure and the merging of maps."""
+"""Place recognition, relocalisation, loop closure and map merging."""

@@ -1,7 +1,7 @@
-"""A place seen again: how two parts of the map, or two maps, lie to each other there.
+"""Loop detection: the similarity between the surroundings of a keyframe and another part.
 
-A keyframe is put into the other part as a lost camera would be; its neighbours must then find there
-what the answer predicts, which a repeating facade or a field of equal plants does not give them.
+A keyframe is relocalised in an older part of its map, or in another map; its neighbours must then
+confirm the similarity, which rejects repetitive facades and fields.
 """
 
 from __future__ import annotations
@@ -12,117 +12,122 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.geometry.transforms import Array, Pose, Similarity, angle_between
-from companion.slam.loop.place_recognition import PlaceIndex
-from companion.slam.loop.relocalizer import Located, Relocalizer
+from companion.slam.loop.place_recognition import KeyframeDatabase
+from companion.slam.loop.relocalizer import Relocalised, Relocalizer
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 N_CANDIDATES = 4
-N_WITNESSES, MIN_WITNESSES = 3, 2
+N_NEIGHBOURS, MIN_CONFIRMING = 3, 2
 MIN_SHARED = 20
-"""Features that show a point of both parts, from which the scale is taken."""
+"""Features that observe a point of both parts, for the relative scale."""
 MAX_SCALE_SPREAD = 0.08
 MAX_TILT_RAD = np.radians(10.0)
-"""Each of two maps was levelled by an attitude that may be some degrees off, in its own heading."""
+"""Each map was levelled by an attitude that may be degrees off, with a heading of its own."""
 MAX_SCALE_DRIFT = 1.6
 RECENT = 8
-"""So many of the newest keyframes are no place seen again."""
+"""Newest keyframes that are no loop candidates."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reunion:
-    """A keyframe of one map in another, or in an older part of its own.
+class LoopClosure:
+    """A keyframe relocalised in another map, or in an older part of its own.
 
-    `here_from_there` takes that part's coordinates to those of the keyframe's map.
+    `here_from_there` takes coordinates of that part to those of the map of the keyframe.
     """
 
     keyframe: Keyframe
     there: SlamMap
-    located: Located
+    relocalised: Relocalised
     here_from_there: Similarity
 
 
-Plausible = Callable[[Reunion, bool], bool]
-"""Whether what else is known allows a reunion, and one within the same map if so said."""
+LoopCheck = Callable[[LoopClosure, bool], bool]
+"""Whether other information allows a loop closure, and whether it is within one map."""
 
 
-class ReunionFinder:
-    """Looks for reunions of new keyframes with all older ones."""
+class LoopDetector:
+    """Searches loop closures of new keyframes with all older ones."""
 
-    def __init__(self, places: PlaceIndex, relocalizer: Relocalizer) -> None:
-        self._places = places
+    def __init__(self, database: KeyframeDatabase, relocalizer: Relocalizer) -> None:
+        self._database = database
         self._relocalizer = relocalizer
 
     def find(
-        self, keyframe: Keyframe, here: SlamMap, maps: list[SlamMap], plausible: Plausible,
-        between: Callable[[], None] = lambda: None,
-    ) -> Reunion | None:  # fmt: skip
-        """A reunion that is certain, or None. `between` is called before each keyframe tried."""
-        _, ids = here.seen_by(keyframe)
+        self, keyframe: Keyframe, here: SlamMap, maps: list[SlamMap], check: LoopCheck,
+        yield_point: Callable[[], None] = lambda: None,
+    ) -> LoopClosure | None:  # fmt: skip
+        """A confirmed loop closure, or None. `yield_point` is called before each candidate."""
+        _, ids = here.observations_of(keyframe)
         near = {k for _, k in here.covisible(ids, 8)} | set(sorted(here.keyframes)[-RECENT:])
-        for key in self._places.alike(keyframe.features.descriptors, N_CANDIDATES, near):
-            between()
+        for key in self._database.query(keyframe.features.descriptors, N_CANDIDATES, near):
+            yield_point()
             there = next((m for m in maps if key in m.keyframes), None)
             if there is None:
                 continue
             found = self._try(keyframe, here, there.keyframes[key], there)
-            if found is not None and plausible(found, here is there):
+            if found is not None and check(found, here is there):
                 return found
         return None
 
     def _try(
         self, keyframe: Keyframe, here: SlamMap, other: Keyframe, there: SlamMap
-    ) -> Reunion | None:
+    ) -> LoopClosure | None:
         level = keyframe.camera_from_map.rotation.T if here.level and there.level else None
-        located = self._relocalizer.locate(
+        relocalised = self._relocalizer.relocalise(
             keyframe.features, there, other, level, keyframe.keyframe_id
         )
-        if located is None:
+        if relocalised is None:
             return None
-        tie = tie_of(keyframe, here, located, there)
-        if tie is None:
+        here_from_there = estimate_similarity(keyframe, here, relocalised, there)
+        if here_from_there is None:
             return None
-        if level is not None and _tilt(tie.rotation) > MAX_TILT_RAD:
+        if level is not None and _tilt(here_from_there.rotation) > MAX_TILT_RAD:
             return None
-        if here is there and not 1 / MAX_SCALE_DRIFT < tie.scale < MAX_SCALE_DRIFT:
+        if here is there and not 1 / MAX_SCALE_DRIFT < here_from_there.scale < MAX_SCALE_DRIFT:
             return None
-        if self._witnesses(keyframe, here, other, there, tie) < MIN_WITNESSES:
+        if self._n_confirming(keyframe, here, other, there, here_from_there) < MIN_CONFIRMING:
             return None
-        return Reunion(keyframe, there, located, tie)
+        return LoopClosure(keyframe, there, relocalised, here_from_there)
 
-    def _witnesses(
-        self, keyframe: Keyframe, here: SlamMap, other: Keyframe, there: SlamMap, tie: Similarity
+    def _n_confirming(
+        self,
+        keyframe: Keyframe,
+        here: SlamMap,
+        other: Keyframe,
+        there: SlamMap,
+        here_from_there: Similarity,
     ) -> int:
-        """How many neighbours see in the other part what they should."""
-        _, ids = here.seen_by(keyframe)
+        """Number of covisible neighbours verified in the other part."""
+        _, ids = here.observations_of(keyframe)
         ranked = [here.keyframes[k] for _, k in here.covisible(ids)]
-        witnesses = [k for k in ranked if k is not keyframe][:N_WITNESSES]
+        neighbours = [k for k in ranked if k is not keyframe][:N_NEIGHBOURS]
         return sum(
-            self._relocalizer.confirm(
-                k.features, there, other, camera_from_there(k.camera_from_map, tie)
+            self._relocalizer.verify(
+                k.features, there, other, camera_from_there(k.camera_from_map, here_from_there)
             )
             is not None
-            for k in witnesses
+            for k in neighbours
         )
 
 
 def camera_from_there(camera_from_here: Pose, here_from_there: Similarity) -> Pose:
-    """A camera's pose in the other map, in that map's units."""
+    """Pose of a camera in the other map, in its units."""
     s = here_from_there
     return Pose(
         camera_from_here.rotation @ s.rotation, camera_from_here.apply(s.translation) / s.scale
     )
 
 
-def tie_of(
-    keyframe: Keyframe, here: SlamMap, located: Located, there: SlamMap
+def estimate_similarity(
+    keyframe: Keyframe, here: SlamMap, relocalised: Relocalised, there: SlamMap
 ) -> Similarity | None:
-    """`here_from_there` by a camera that is in both; its scale from points that are too."""
-    own = keyframe.point_ids[located.features]
+    """`here_from_there` of a camera in both maps; scale by the depths of shared points."""
+    own = keyframe.point_ids[relocalised.features]
     both = (own >= 0) & here.alive[np.maximum(own, 0)]
     if both.sum() < MIN_SHARED:
         return None
     depth_here = keyframe.camera_from_map.apply(here.positions[own[both]])[:, 2]
-    depth_there = located.camera_from_map.apply(there.positions[located.points[both]])[:, 2]
+    depth_there = relocalised.camera_from_map.apply(there.positions[relocalised.points[both]])[:, 2]
     ratio = depth_here / depth_there
     scale = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio / scale - 1.0)))
@@ -130,13 +135,13 @@ def tie_of(
         return None
     here_from_camera = keyframe.camera_from_map.inverse()
     camera = Similarity(
-        scale, located.camera_from_map.rotation, scale * located.camera_from_map.translation
+        scale, relocalised.camera_from_map.rotation, scale * relocalised.camera_from_map.translation
     )
     return Similarity(1.0, here_from_camera.rotation, here_from_camera.translation) @ camera
 
 
 def _tilt(rotation: Array) -> float:
-    """How far a turn moves the vertical."""
+    """Change of the vertical by a rotation, rad."""
     upright = np.arctan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
     c, s = np.cos(upright), np.sin(upright)
     return angle_between(rotation, np.array([[c, -s, 0.0], [s, c, 0.0], [0, 0, 1.0]]))

@@ -1,7 +1,7 @@
-"""Which keyframes show a place seen again: an index of binary descriptors that needs no vocabulary.
+"""Place recognition: an index of binary descriptors without a trained vocabulary.
 
 Locality-sensitive hashing (Indyk & Motwani 1998): some bits of a descriptor make a word, once for
-each of several tables; keyframes that share rare words are alike, as with a bag of words.
+each of several tables; keyframes that share rare words are similar, as with a bag of words.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ def words_of(descriptors: Bytes) -> Words:
 
 @dataclass(slots=True, eq=False)
 class _Block:
-    """Words of some keyframes, sorted, and the place in `keys` of each one's keyframe."""
+    """Sorted words of some keyframes, and the row in `keys` of the keyframe of each."""
 
     words: Words = field(default_factory=lambda: np.zeros(0, np.uint32))
     owners: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     n_keys: int = 0
 
 
-class PlaceIndex:
-    """Keyframes by what they look like. A key is added once; it is left out of answers if asked."""
+class KeyframeDatabase:
+    """Keyframes by appearance. A key is added once."""
 
     def __init__(self) -> None:
         self._keys: list[int] = []
-        """-1 where one was removed and none has come in its place"""
+        """-1 where one was removed and the row not reused"""
         self._block_of: list[_Block] = []
         self._blocks: list[_Block] = []
         self._free: list[int] = []
@@ -58,38 +58,38 @@ class PlaceIndex:
         return key in self._keys
 
     def add(self, key: int, descriptors: Bytes) -> None:
-        """Take a keyframe's descriptors (N, 32)."""
+        """Add the descriptors (N, 32) of a keyframe."""
         block = next((b for b in self._blocks if b.n_keys < BLOCK), None)
         if block is None:
             block = _Block()
             self._blocks.append(block)
         if self._free:
-            place = self._free.pop()
-            self._keys[place], self._block_of[place] = key, block
+            row = self._free.pop()
+            self._keys[row], self._block_of[row] = key, block
         else:
-            place = len(self._keys)
+            row = len(self._keys)
             self._keys.append(key)
             self._block_of.append(block)
         words = words_of(descriptors)
         at = np.searchsorted(block.words, words)
         block.words = np.insert(block.words, at, words)
-        block.owners = np.insert(block.owners, at, np.full(len(words), place))
+        block.owners = np.insert(block.owners, at, np.full(len(words), row))
         block.n_keys += 1
 
     def remove(self, key: int) -> None:
-        """Forget a keyframe."""
-        place = self._keys.index(key)
-        block = self._block_of[place]
-        others = block.owners != place
+        """Remove a keyframe."""
+        row = self._keys.index(key)
+        block = self._block_of[row]
+        others = block.owners != row
         block.words, block.owners = block.words[others], block.owners[others]
         block.n_keys -= 1
-        self._keys[place] = -1
-        self._free.append(place)
+        self._keys[row] = -1
+        self._free.append(row)
 
-    def alike(self, descriptors: Bytes, n: int, but: set[int] | None = None) -> list[int]:
-        """At most `n` keys that stand out as like these descriptors, the likest first.
+    def query(self, descriptors: Bytes, n: int, exclude: set[int] | None = None) -> list[int]:
+        """At most `n` keys whose similarity to descriptors (N, 32) stands out, best first.
 
-        Keys in `but` are not among them.
+        Keys in `exclude` are left out.
         """
         keys = np.array(self._keys, np.int64)
         scores, keys = self._scores(words_of(descriptors))[keys >= 0], keys[keys >= 0]
@@ -101,14 +101,14 @@ class PlaceIndex:
         stands_out = scores[order] > usual + 2.0 * spread if len(scores) > 20 else scores[order] > 0
         out: list[int] = []
         for key in keys[order[stands_out]].tolist():
-            if but is None or key not in but:
+            if exclude is None or key not in exclude:
                 out.append(key)
             if len(out) == n:
                 break
         return out
 
     def _scores(self, words: Words) -> Array:
-        """How much each key has in common with these words: rare ones count for more."""
+        """Similarity of each row to these words, by inverse document frequency."""
         found, sizes = [], np.zeros(len(words), np.int64)
         for block in self._blocks:
             low = np.searchsorted(block.words, words, "left")
@@ -116,7 +116,7 @@ class PlaceIndex:
             count = high - low
             sizes += count
             hit = np.flatnonzero(count)
-            # places of all equal words, one after the other
+            # rows of all equal words, concatenated
             starts = np.repeat(low[hit] - np.r_[0, np.cumsum(count[hit])[:-1]], count[hit])
             found.append(
                 (np.repeat(hit, count[hit]), block.owners[starts + np.arange(len(starts))])

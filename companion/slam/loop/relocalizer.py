@@ -1,8 +1,7 @@
-"""Where in a map a camera is that only knows what it sees: descriptors, then a pose by RANSAC.
+"""Relocalisation without a predicted pose: descriptor matching, then pose by RANSAC.
 
-With the vertical known two matches give a pose, without it four; what the pose predicts is then
-looked for in the image, so that a place is believed for what it shows all over, not for a few
-matches.
+With known gravity two matches give a pose, without it four. The pose is verified by the points that
+it predicts all over the image.
 """
 
 from __future__ import annotations
@@ -29,17 +28,17 @@ from companion.slam.optimisation.upright_pose import upright_pose
 MIN_MATCHES = 12
 MIN_INLIERS = 10
 TILT_ERROR_PX = 12.0
-"""What an error of the vertical may move a point by."""
-MIN_SEEN, MIN_SEEN_SHARE = 30, 0.35
-"""Map points that must be seen where a pose predicts them, and as a share of those predicted."""
-MANY_INLIERS, MANY_SEEN_SHARE = 25, 0.2
-"""Without the vertical: where so many matches agree, less of what the pose predicts is enough."""
-N_AROUND = 6
+"""Image displacement allowed for errors of the measured vertical."""
+MIN_FOUND, MIN_FOUND_RATIO = 30, 0.35
+"""Predicted map points that must be found, and their ratio."""
+MANY_INLIERS, LOW_FOUND_RATIO = 25, 0.2
+"""Without known gravity: with so many inliers a lower found ratio suffices."""
+N_COVISIBLE = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Located:
-    """A camera put into a map: which points it sees (M,), with which features (M,)."""
+class Relocalised:
+    """A relocalised camera: pose, the points it observes (M,), with which features (M,)."""
 
     camera_from_map: Pose
     points: Ints
@@ -48,22 +47,22 @@ class Located:
 
 
 class Relocalizer:
-    """Puts images into maps."""
+    """Relocalises images in maps."""
 
     def __init__(self, camera: Camera) -> None:
         self._focal_px = camera.focal_px
         self._projector = Projector(camera)
 
-    def locate(
+    def relocalise(
         self, features: Features, slam_map: SlamMap, keyframe: Keyframe,
-        level_from_camera: Array | None, seed: int, share: float = MIN_SEEN_SHARE,
-    ) -> Located | None:  # fmt: skip
-        """Put an image into a map by a keyframe that it may resemble; None if unsure.
+        level_from_camera: Array | None, seed: int, share: float = MIN_FOUND_RATIO,
+    ) -> Relocalised | None:  # fmt: skip
+        """Relocalise an image in a map against a candidate keyframe; None if uncertain.
 
-        `level_from_camera` (3, 3), where the vertical is known, as in `upright_pose`; `share` as in
-        `confirm`.
+        `level_from_camera` (3, 3), where gravity is known, as in `upright_pose`; `share` as in
+        `verify`.
         """
-        points, found = _alike(features, slam_map, keyframe, level_from_camera is None)
+        points, found = _candidate_matches(features, slam_map, keyframe, level_from_camera is None)
         if len(points) < MIN_MATCHES:
             return None
         start = self._solve(slam_map.positions[points], features, found, level_from_camera, seed)
@@ -77,34 +76,34 @@ class Relocalizer:
         if inlier.sum() < MIN_INLIERS:
             return None
         if level_from_camera is None and inlier.sum() >= MANY_INLIERS:
-            share = min(share, MANY_SEEN_SHARE)
-        return self.confirm(features, slam_map, keyframe, pose, share)
+            share = min(share, LOW_FOUND_RATIO)
+        return self.verify(features, slam_map, keyframe, pose, share)
 
-    def confirm(
+    def verify(
         self, features: Features, slam_map: SlamMap, keyframe: Keyframe, pose: Pose,
-        share: float = MIN_SEEN_SHARE,
-    ) -> Located | None:  # fmt: skip
-        """Look for what a pose predicts, around a keyframe; None where less than `share` is seen.
+        share: float = MIN_FOUND_RATIO,
+    ) -> Relocalised | None:  # fmt: skip
+        """Match the points predicted around a keyframe; None where less than `share` is found.
 
-        Of an image with few features no more than half of them need be seen.
+        For images with few features the number required is capped at half of them.
         """
-        ids = around(slam_map, keyframe)
+        ids = covisible_points(slam_map, keyframe)
         points, found = np.zeros(0, np.int64), np.zeros(0, np.int64)
         n_due = 0
         for radius_px in (10.0, 5.0):
             visible = self._projector.visible(slam_map, pose, ids)
             n_due = len(visible.ids)
             points, found = self._projector.search(slam_map, visible, features, radius_px)
-            if len(points) < MIN_SEEN:
+            if len(points) < MIN_FOUND:
                 return None
             pose, inlier, _ = refine_pose(
                 pose, slam_map.positions[points],
                 features.normalised[found], features.whitening[found],
             )  # fmt: skip
             points, found = points[inlier], found[inlier]
-        if len(points) < max(MIN_SEEN, share * min(n_due, len(features) // 2)):
+        if len(points) < max(MIN_FOUND, share * min(n_due, len(features) // 2)):
             return None
-        return Located(pose, points, found, keyframe)
+        return Relocalised(pose, points, found, keyframe)
 
     def _solve(
         self, points: Array, features: Features, found: Ints, level_from_camera: Array | None,
@@ -134,16 +133,16 @@ class Relocalizer:
         return Pose(rotation, np.asarray(translation, np.float64).ravel()), agree
 
 
-def _alike(
-    features: Features, slam_map: SlamMap, keyframe: Keyframe, widely: bool
+def _candidate_matches(
+    features: Features, slam_map: SlamMap, keyframe: Keyframe, with_covisible: bool
 ) -> tuple[Ints, Ints]:
-    """Points and the features that look like them: of one keyframe, or of all around it."""
-    if widely:
-        ids = around(slam_map, keyframe)
+    """Descriptor matches: points and features, of a keyframe or also its covisible ones."""
+    if with_covisible:
+        ids = covisible_points(slam_map, keyframe)
         distances = hamming_matrix(slam_map.descriptors[ids], features.descriptors)
         nearest, found = mutual_matches(distances, MAX_DISTANCE_STRICT, 0.8)
         return ids[nearest], found
-    seen, ids = slam_map.seen_by(keyframe)
+    seen, ids = slam_map.observations_of(keyframe)
     ia, ib = match_descriptors(keyframe.features, features, ratio=0.8)
     at = np.full(len(keyframe.features), -1)
     at[seen] = ids
@@ -151,11 +150,11 @@ def _alike(
     return at[ia][known], ib[known]
 
 
-def around(slam_map: SlamMap, keyframe: Keyframe, n: int = N_AROUND) -> Ints:
-    """Points that a keyframe and those that share most with it see."""
-    _, own = slam_map.seen_by(keyframe)
+def covisible_points(slam_map: SlamMap, keyframe: Keyframe, n: int = N_COVISIBLE) -> Ints:
+    """Points observed by a keyframe and its `n` most covisible ones."""
+    _, own = slam_map.observations_of(keyframe)
     mask = np.zeros(slam_map.n_points, bool)
     mask[own] = True
     for _, key in slam_map.covisible(own)[: n + 1]:
-        mask[slam_map.seen_by(slam_map.keyframes[key])[1]] = True
+        mask[slam_map.observations_of(slam_map.keyframes[key])[1]] = True
     return np.flatnonzero(mask)

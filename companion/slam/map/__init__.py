@@ -1,1 +1,1 @@
-"""The sparse map, its parts, and what of it a camera should see."""
+"""The sparse map, extraction of parts of it, and projection of its points into a camera."""

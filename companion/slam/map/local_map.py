@@ -1,4 +1,4 @@
-"""The part of the map that a camera at a given pose should see, and its search in an image."""
+"""Projection of the local map into a camera, and search for its points in an image."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MODELS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visible:
-    """Points that should be in the image: ids (M,), pixels (M, 2), pyramid levels (M,)."""
+    """Points predicted to be in the image: ids (M,), pixels (M, 2), pyramid levels (M,)."""
 
     ids: Ints
     pixels: Array
@@ -35,7 +35,7 @@ class Visible:
 
 
 class Projector:
-    """Projects map points into one camera, with all the reasons not to see a point."""
+    """Projects map points into one camera, with visibility checks."""
 
     def __init__(self, camera: Camera) -> None:
         self._model = _MODELS[camera.distortion]
@@ -47,13 +47,13 @@ class Projector:
         u, v = np.meshgrid(
             np.linspace(0, camera.width - 1.0, 33), np.linspace(0, camera.height - 1.0, 25)
         )
-        # all over: at the rim of a fisheye's image there may be no rays
+        # over the whole image: at the rim of a fisheye there may be no rays
         rim = camera.normalise(np.stack([u.ravel(), v.ravel()], 1))
-        # a distortion model folds back far outside the image: points there must not come in again
+        # distortion models fold back far outside the image: exclude points there
         self._max_radius = float(np.nanmax(np.linalg.norm(rim, axis=1), initial=0.5)) * 1.05
 
     def visible(self, slam_map: SlamMap, camera_from_map: Pose, ids: Ints) -> Visible:
-        """Which of the points `ids` a camera at this pose should see, and where."""
+        """The points among `ids` that a camera at this pose should see, projected."""
         found, px, octaves = visible(
             slam_map.positions, slam_map.normals, slam_map.base_distance, ids,
             camera_from_map.rotation, camera_from_map.translation, self._model,
@@ -72,9 +72,9 @@ class Projector:
         max_distance: float = 64,
         max_octave_gap: int = 2,
     ) -> tuple[Ints, Ints]:
-        """Look for visible points within a radius (at pyramid level 0; wider above).
+        """Match visible points with features within a radius, in px at pyramid level 0.
 
-        Returns point ids and features.
+        Returns point ids (K,) and feature indices (K,).
         """
         radius = radius_px * slam_map.scale_factor ** seen.octaves.astype(np.float64)
         points, found = match_projected(
@@ -85,13 +85,13 @@ class Projector:
 
 
 def local_points(slam_map: SlamMap, near_ids: Ints, centre: Array, n_keyframes: int = 20) -> Ints:
-    """Points of the keyframes that share points with `near_ids`, and of the nearest ones in space.
+    """Points of keyframes covisible with `near_ids`, and of the keyframes nearest to `centre` (3,).
 
-    Keyframes near in space but not in time are how a place seen long ago is taken up again.
+    The spatially nearest ones let tracking reuse old parts of the map on a revisit.
     """
     chosen = [k for _, k in slam_map.covisible(near_ids, 8)[:n_keyframes]]
     chosen += slam_map.nearest(centre, N_NEAREST, set(chosen))
     mask = np.zeros(slam_map.n_points, bool)
     for keyframe_id in chosen:
-        mask[slam_map.seen_by(slam_map.keyframes[keyframe_id])[1]] = True
+        mask[slam_map.observations_of(slam_map.keyframes[keyframe_id])[1]] = True
     return np.flatnonzero(mask)

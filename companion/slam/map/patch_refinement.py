@@ -1,4 +1,4 @@
-"""Positions of features that show map points, made finer by the points' own patches."""
+"""Sub-pixel refinement of features by alignment of the map points' reference patches."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from companion.slam.features.patches import align
 from companion.slam.map.sparse_map import SlamMap
 
 SIGMA_PX = 0.35
-"""Expected error of an aligned patch at full size; it grows with the level as the pixels do."""
+"""Expected error of an aligned patch at full resolution; it scales with the pyramid level."""
 MAX_MOVE_SIGMAS = 2.0
 
 
@@ -24,10 +24,10 @@ def refine_features(
     points: Ints,
     levels: list[Bytes],
 ) -> tuple[Array, Array, Bools]:
-    """Finer positions of features `index` (M,), which show `points` (M,) of the map.
+    """Refined positions of features `index` (M,), which observe map points `points` (M,).
 
-    Returns their `normalised` (M, 2) and `whitening` (M, 2, 2) as in Features, unchanged where the
-    patch was not found for sure, and where it was (M,).
+    Returns their `normalised` (M, 2) and `whitening` (M, 2, 2) as in Features, unchanged where
+    alignment failed, and a mask of success (M,).
     """
     sigma = features.sigma_px[index]
     normalised, whitening = features.normalised[index], features.whitening[index]
@@ -44,7 +44,7 @@ def refine_features(
 
 
 def _warps(slam_map: SlamMap, camera_from_map: Pose, points: Ints, jacobian: Array) -> Array:
-    """How full-size pixels of each point's first view move in this one (M, 2, 2)."""
+    """Affine warps (M, 2, 2) of full-resolution pixels from each reference view to this view."""
     if len(points) == 0:
         return np.zeros((0, 2, 2))
     first_ids, which = np.unique(slam_map.first_seen[points], return_inverse=True)

@@ -1,4 +1,4 @@
-"""What is told of views that were placed, and of keyframes."""
+"""Messages about tracked frames and new keyframes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 
 def track_of(slam_map: SlamMap, view: View, reference: Keyframe, backfilled: bool = False) -> Track:
-    """Where a view is, in the map and beside a keyframe of it."""
+    """Track message of a view: its pose in the map and relative to a keyframe."""
     map_from_camera = view.camera_from_map.inverse()
     relative = reference.camera_from_map @ map_from_camera
     unit = slam_map.unit_of.get(reference.keyframe_id, 1.0)
@@ -23,7 +23,7 @@ def track_of(slam_map: SlamMap, view: View, reference: Keyframe, backfilled: boo
 
 
 def _sigmas(view: View) -> tuple[float, float]:
-    """Standard deviations by the image alone: of position, map units, and attitude, rad."""
+    """Standard deviations from the pose information: of position, map units, and attitude, rad."""
     if view.information is None:
         return float("inf"), float("inf")
     try:
@@ -35,8 +35,8 @@ def _sigmas(view: View) -> tuple[float, float]:
 
 
 def keyframe_added(slam_map: SlamMap, keyframe: Keyframe) -> KeyframeAdded:
-    """A keyframe with the points that it sees."""
-    _, ids = slam_map.seen_by(keyframe)
+    """KeyframeAdded message of a keyframe, with the points that it observes."""
+    _, ids = slam_map.observations_of(keyframe)
     return KeyframeAdded(
         keyframe.keyframe_id, keyframe.seq, keyframe.t_ns, keyframe.camera_from_map.inverse(),
         keyframe.camera_from_map.apply(slam_map.positions[ids]),

@@ -1,7 +1,7 @@
-"""The sparse map: keyframes, points, and who sees what. One owner, no locks.
+"""The sparse map: keyframes, points and observations. Single owner, no locks.
 
-Points live in growing arrays so that a frame's work is a few vector operations; a point's index is
-its identity for as long as it lives, and is not used again before nobody can still know of it.
+Points live in growing arrays, so that per-frame work is vectorised. The index of a point is its id;
+an id is recycled only once nothing can still refer to the old point.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.features.patches import Patches, cut, level_of
 
-RING = 8
-REST_KEYFRAMES = 40
-"""The index of a point that died is not used again for at least as many."""
-MANY_POINTS = 200_000
-"""Arrays shorter than this cost nothing: they may as well grow."""
-CANDIDATES = 60
+N_OBSERVERS_KEPT = 8
+ID_QUARANTINE_KEYFRAMES = 40
+"""Keyframes for which the id of a removed point is not recycled, at least."""
+MIN_POINTS_RECYCLED = 200_000
+"""Below this number of points the arrays just grow."""
+MAX_COVISIBLE_CANDIDATES = 60
 ARRAYS = (
     "observers", "positions", "alive", "descriptors", "normals", "base_distance", "n_visible",
     "n_found", "n_observers", "born", "first_seen", "first_unproject", "patch_at", "patch_centre",
@@ -33,7 +33,7 @@ ARRAYS = (
 
 @dataclass(slots=True, eq=False)
 class Keyframe:
-    """A frame that stays: `point_ids` (N,) names the map point of each feature, -1 where none."""
+    """A keyframe: `point_ids` (N,) is the map point of each feature, -1 where none."""
 
     keyframe_id: int
     seq: int
@@ -43,23 +43,23 @@ class Keyframe:
     point_ids: Ints
     normalised: Array
     whitening: Array
-    """(N, 2), (N, 2, 2) as those of the features, finer where a point's patch was found"""
+    """(N, 2), (N, 2, 2) as those of the features, refined where patch alignment succeeded"""
     refined_for: Ints
-    """(N,) the point with whose patch each feature was refined, -1 where it was not"""
+    """(N,) the point whose patch refined each feature, -1 where none did"""
     grey: Bytes | None = None
-    """the image, while it may be looked at again"""
+    """the image, while patch alignment may still use it"""
     ned_from_camera: Array | None = None
-    """(3, 3) by the autopilot, where it told"""
+    """(3, 3) attitude by the autopilot, where measured"""
 
     @property
     def centre(self) -> Array:
-        """Position of the camera in the map."""
+        """Position of the camera in the map (3,)."""
         out: Array = -self.camera_from_map.rotation.T @ self.camera_from_map.translation
         return out
 
 
 class PointArrays(NamedTuple):
-    """N points of a map, but for who sees them; each field is as that of `SlamMap`."""
+    """N points of a map without their observations; fields as those of `SlamMap`."""
 
     positions: Array
     descriptors: Bytes
@@ -77,33 +77,33 @@ class PointArrays(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Retired:
-    """Where a keyframe that went is: beside one that stayed, in map units."""
+    """Pose of a culled keyframe relative to its anchor, a keyframe still in the map; map units."""
 
-    beside_id: int
-    beside_from_camera: Pose
+    anchor_id: int
+    anchor_from_camera: Pose
 
     def scaled(self, scale: float) -> Retired:
-        """The same where the map's unit is another."""
-        pose = self.beside_from_camera
-        return Retired(self.beside_id, Pose(pose.rotation, scale * pose.translation))
+        """The same after the map's unit has changed."""
+        pose = self.anchor_from_camera
+        return Retired(self.anchor_id, Pose(pose.rotation, scale * pose.translation))
 
 
 @dataclass(slots=True, eq=False)
 class SlamMap:
-    """All keyframes and points. Arrays are over-allocated; `n_points` of each are in use."""
+    """All keyframes and points. Arrays are over-allocated; the first `n_points` rows are in use."""
 
     scale_factor: float
     n_levels: int
     first_keyframe_id: int = -1
-    """By which it is told from other maps; -1 before it has begun."""
+    """Identifies the map among others; -1 before initialisation."""
     level: bool = False
-    """Whether the z axis is known to point down."""
+    """Whether the z axis is gravity-aligned (down)."""
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
-    """In order of their ids."""
+    """Ordered by id."""
     retired: dict[int, Retired] = field(default_factory=dict)
-    """Keyframes that went, by their ids; frames and parts of the cloud may still hang on them."""
+    """Culled keyframes by id; frames and chunks of the cloud may still refer to them."""
     unit_of: dict[int, float] = field(default_factory=dict)
-    """Map units to one unit of what was said of a keyframe when it was made, where not 1."""
+    """Map units per unit of what was reported about a keyframe at its creation, where not 1."""
     n_points: int = 0
     positions: Array = field(default_factory=lambda: np.zeros((0, 3)))
     alive: Bools = field(default_factory=lambda: np.zeros(0, bool))
@@ -111,31 +111,31 @@ class SlamMap:
     normals: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """mean viewing direction, from point to camera"""
     base_distance: Array = field(default_factory=lambda: np.zeros(0))
-    """distance at which the point would be seen at pyramid level 0"""
+    """distance at which the point would be detected at pyramid level 0"""
     n_visible: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     n_found: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     n_observers: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    observers: Ints = field(default_factory=lambda: np.zeros((0, RING), np.int64))
-    """the keyframes that came to see it last, in no order, -1 where fewer; may be out of date"""
+    observers: Ints = field(default_factory=lambda: np.zeros((0, N_OBSERVERS_KEPT), np.int64))
+    """ids of the latest keyframes to observe the point, unordered, -1 padded; may be outdated"""
     born: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """keyframe id at which the point was made"""
+    """keyframe id at which the point was created"""
     first_seen: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """keyframe id of the view that the patch is from"""
+    """keyframe id of the reference view of the patch"""
     _centres: Array | None = None
     _ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     first_unproject: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
-    """derivative of that view's normalised coordinates by its pixels"""
+    """Jacobian of the reference view's normalised coordinates by its pixels"""
     patch_at: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """place of a point's patch in `patch_grey`, for as long as the point lives"""
+    """row of a point's patch in `patch_grey`, while the point is alive"""
     patch_centre: Array = field(default_factory=lambda: np.zeros((0, 2)))
     patch_level: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     patch_grey: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
     _free: list[int] = field(default_factory=list)
-    """places of patches whose points have died"""
+    """rows of patches of removed points"""
     _free_ids: list[int] = field(default_factory=list)
-    """indices to use again, the lowest last"""
-    _resting_ids: list[int] = field(default_factory=list)
-    _rests: int = 0
+    """point ids to recycle, the lowest last"""
+    _quarantined_ids: list[int] = field(default_factory=list)
+    _quarantine_age: int = 0
 
     def _reserve(self, n: int) -> None:
         size = len(self.alive)
@@ -151,9 +151,9 @@ class SlamMap:
     def add_points(
         self, positions: Array, keyframe: Keyframe, features: Ints, levels: list[Bytes]
     ) -> Ints:
-        """Add points (M, 3), shown by `features` of a keyframe, whose image `levels` are.
+        """Add points (M, 3) seen by `features` of a keyframe, whose image pyramid is `levels`.
 
-        Returns their ids; observations are added apart.
+        Returns their ids; observations are added separately.
         """
         seen = keyframe.features
         again = [self._free_ids.pop() for _ in range(min(len(positions), len(self._free_ids)))]
@@ -182,7 +182,7 @@ class SlamMap:
         return ids
 
     def _store(self, ids: Ints, grey: Bytes) -> None:
-        """Keep the patches of new points, in place of dead ones' where there are any."""
+        """Store the patches of new points, in rows freed by removed points first."""
         missing = len(ids) - len(self._free)
         if missing > 0:
             size = len(self.patch_grey)
@@ -194,30 +194,30 @@ class SlamMap:
         self.patch_at[ids] = [self._free.pop() for _ in range(len(ids))]
         self.patch_grey[self.patch_at[ids]] = grey
 
-    def bury(self) -> None:
-        """Let go of what dead points held."""
+    def free_patches(self) -> None:
+        """Release the patch rows of removed points."""
         dead = np.flatnonzero(~self.alive[: self.n_points] & (self.patch_at[: self.n_points] >= 0))
         self._free += self.patch_at[dead].tolist()
         self.patch_at[dead] = self.patch_level[dead] = -1
 
-    def reclaim(self) -> None:
-        """Let indices of points that died long ago be used again; called for each keyframe."""
-        self._rests += 1
-        if self._rests < REST_KEYFRAMES or self.n_points < MANY_POINTS:
+    def recycle_ids(self) -> None:
+        """Recycle ids of points removed long ago; called once per keyframe."""
+        self._quarantine_age += 1
+        if self._quarantine_age < ID_QUARANTINE_KEYFRAMES or self.n_points < MIN_POINTS_RECYCLED:
             return
-        self._rests = 0
+        self._quarantine_age = 0
         n = self.n_points
         known = self.alive[:n].copy()
-        known[self._free_ids + self._resting_ids] = True
+        known[self._free_ids + self._quarantined_ids] = True
         dead = np.r_[~known, False]
         for keyframe in self.keyframes.values():
             for ids in (keyframe.point_ids, keyframe.refined_for):
                 ids[dead[ids]] = -1
-        self._free_ids = sorted(self._free_ids + self._resting_ids, reverse=True)
-        self._resting_ids = np.flatnonzero(~known).tolist()
+        self._free_ids = sorted(self._free_ids + self._quarantined_ids, reverse=True)
+        self._quarantined_ids = np.flatnonzero(~known).tolist()
 
-    def take_points(self, other: SlamMap, own_from_other: Similarity) -> int:
-        """Take all points of another map; returns what their ids grow by."""
+    def append_points(self, other: SlamMap, own_from_other: Similarity) -> int:
+        """Append all points of another map; returns the offset added to their ids."""
         offset, n = self.n_points, other.n_points
         self._reserve(offset + n)
         for name in ARRAYS:
@@ -231,8 +231,8 @@ class SlamMap:
         self._store(offset + held, other.patch_grey[other.patch_at[held]])
         return offset
 
-    def put_points(self, points: PointArrays) -> None:
-        """Take points that were kept (see `points_of`) into a map that has none yet."""
+    def load_points(self, points: PointArrays) -> None:
+        """Load stored points (see `points_of`) into an empty map."""
         n = len(points.positions)
         self._reserve(n)
         self.n_points = n
@@ -245,7 +245,7 @@ class SlamMap:
         self._store(np.arange(n), points.patch_grey)
 
     def points_of(self, ids: Ints) -> PointArrays:
-        """Copies of what is known of points that live, but for who sees them."""
+        """Copies of the data of living points, without their observations."""
         rows = [getattr(self, name)[ids] for name in PointArrays._fields[:-1]]
         return PointArrays._make([*rows, self.patch_grey[self.patch_at[ids]]])
 
@@ -257,15 +257,15 @@ class SlamMap:
             self.patch_level[points],
         )
 
-    def observe(self, keyframe: Keyframe, features: Ints, points: Ints) -> None:
-        """Let `keyframe` see `points` with `features`; a feature's earlier point is let go."""
+    def add_observations(self, keyframe: Keyframe, features: Ints, points: Ints) -> None:
+        """Let `keyframe` observe `points` with `features`, replacing earlier observations."""
         old = keyframe.point_ids[features]
         np.subtract.at(self.n_observers, old[old >= 0], 1)
         keyframe.point_ids[features] = points
-        self.observers[points, self.n_observers[points] % RING] = keyframe.keyframe_id
+        self.observers[points, self.n_observers[points] % N_OBSERVERS_KEPT] = keyframe.keyframe_id
         np.add.at(self.n_observers, points, 1)
 
-    def forget(self, keyframe: Keyframe, features: Ints) -> None:
+    def remove_observations(self, keyframe: Keyframe, features: Ints) -> None:
         """Remove observations of a keyframe; points left with fewer than two are removed."""
         old = keyframe.point_ids[features]
         old = old[old >= 0]
@@ -273,36 +273,36 @@ class SlamMap:
         np.subtract.at(self.n_observers, old, 1)
         self.alive[old[self.n_observers[old] < 2]] = False
 
-    def sweep(self, keyframes: list[Keyframe]) -> None:
+    def clear_dead_observations(self, keyframes: list[Keyframe]) -> None:
         """Clear observations of removed points from `keyframes`."""
         for keyframe in keyframes:
             ids = keyframe.point_ids
             dead = (ids >= 0) & ~self.alive[np.maximum(ids, 0)]
             ids[dead] = -1
 
-    def seen_by(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
-        """Features and points (same length) of living points that a keyframe sees."""
+    def observations_of(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
+        """Features and living points (same length) that a keyframe observes."""
         ids = keyframe.point_ids
         features = np.flatnonzero((ids >= 0) & self.alive[np.maximum(ids, 0)])
         return features, ids[features]
 
-    def refresh(self, points: Ints, keyframes: list[Keyframe]) -> None:
-        """Recompute direction and base distance of `points` from the keyframes that see them.
+    def update_geometry(self, points: Ints, keyframes: list[Keyframe]) -> None:
+        """Recompute viewing direction and base distance of `points` from `keyframes`.
 
-        Only `keyframes` are looked at; a point's base distance comes from the last of them.
+        The base distance of a point comes from the last keyframe that observes it.
         """
         if len(points) == 0:
             return
-        place = np.full(self.n_points, -1, np.int32)
-        place[points] = np.arange(len(points))
+        row = np.full(self.n_points, -1, np.int32)
+        row[points] = np.arange(len(points))
         total = np.zeros((len(points), 3))
         for keyframe in keyframes:
-            features, ids = self.seen_by(keyframe)
-            chosen = place[ids] >= 0
+            features, ids = self.observations_of(keyframe)
+            chosen = row[ids] >= 0
             features, ids = features[chosen], ids[chosen]
             towards = keyframe.centre - self.positions[ids]
             distance = np.linalg.norm(towards, axis=1)
-            total[place[ids]] += towards / np.maximum(distance, 1e-12)[:, None]
+            total[row[ids]] += towards / np.maximum(distance, 1e-12)[:, None]
             self.base_distance[ids] = (
                 distance * self.scale_factor ** keyframe.features.octaves[features]
             )
@@ -312,51 +312,51 @@ class SlamMap:
         self.normals[points[known]] = total[known] / norm[known][:, None]
 
     def covisible(self, points: Ints, minimum: int = 15) -> list[tuple[int, int]]:
-        """Keyframes that share living `points`: (count, id), most first, older first on a tie.
+        """Keyframes that share living `points`: (count, id), most first, older first where equal.
 
-        Only those are looked at that are among the last to have come to see many of the points.
+        Only candidates that are frequent among the latest observers of the points are counted.
         """
         points = points[self.alive[points]]
         mask = np.zeros(self.n_points + 1, bool)
         mask[points] = True
-        seen_by = self.observers[points].ravel()
-        keys, often = np.unique(seen_by[seen_by >= 0], return_counts=True)
-        order = np.lexsort((keys, -often))[:CANDIDATES]
+        observations_of = self.observers[points].ravel()
+        keys, often = np.unique(observations_of[observations_of >= 0], return_counts=True)
+        order = np.lexsort((keys, -often))[:MAX_COVISIBLE_CANDIDATES]
         near = [self.keyframes[k] for k in keys[order].tolist() if k in self.keyframes]
         counts = [(int(np.count_nonzero(mask[k.point_ids])), k.keyframe_id) for k in near]
         return sorted((c for c in counts if c[0] >= minimum), key=lambda c: (-c[0], c[1]))
 
     def pose_of(self, keyframe_id: int) -> Pose | None:
-        """`camera_from_map` of a keyframe, be it one that went; None where there is no such."""
+        """`camera_from_map` of a keyframe, culled or not; None if unknown."""
         keyframe = self.keyframes.get(keyframe_id)
         if keyframe is not None:
             return keyframe.camera_from_map
         retired = self.retired.get(keyframe_id)
         if retired is None:
             return None
-        beside = self.keyframes[retired.beside_id].camera_from_map
-        return retired.beside_from_camera.inverse() @ beside
+        anchor = self.keyframes[retired.anchor_id].camera_from_map
+        return retired.anchor_from_camera.inverse() @ anchor
 
-    def places(self) -> Iterator[tuple[int, Pose]]:
-        """Every keyframe's id and `map_from_camera`, those that went among them."""
+    def poses(self) -> Iterator[tuple[int, Pose]]:
+        """Id and `map_from_camera` of every keyframe, culled ones included."""
         living = {key: k.camera_from_map.inverse() for key, k in self.keyframes.items()}
         yield from living.items()
         for key, retired in self.retired.items():
-            yield key, living[retired.beside_id] @ retired.beside_from_camera
+            yield key, living[retired.anchor_id] @ retired.anchor_from_camera
 
-    def poses_changed(self) -> None:
-        """Tell the map that keyframes have come or moved."""
+    def invalidate_centres(self) -> None:
+        """Invalidate cached camera centres after keyframes were added or moved."""
         self._centres = None
 
-    def nearest(self, centre: Array, n: int, but: set[int]) -> list[int]:
-        """Ids of the `n` keyframes nearest to a place (3,) that are not in `but`."""
+    def nearest(self, centre: Array, n: int, exclude: set[int]) -> list[int]:
+        """Ids of the `n` keyframes nearest to a position (3,), without those in `exclude`."""
         if self._centres is None:
             self._centres = np.stack([k.centre for k in self.keyframes.values()])
             self._ids = np.array(list(self.keyframes))
         apart = np.linalg.norm(self._centres - centre, axis=1)
-        order = np.argsort(apart, kind="stable")[: n + len(but)]
-        return [k for k in self._ids[order].tolist() if k not in but][:n]
+        order = np.argsort(apart, kind="stable")[: n + len(exclude)]
+        return [k for k in self._ids[order].tolist() if k not in exclude][:n]
 
-    def living_positions(self) -> Array:
+    def point_positions(self) -> Array:
         """Positions (M, 3) of all living points."""
         return self.positions[: self.n_points][self.alive[: self.n_points]].copy()

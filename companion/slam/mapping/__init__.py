@@ -1,1 +1,1 @@
-"""From a new keyframe to a better map: points, bundle adjustment, culling, the atlas of maps."""
+"""Keyframe insertion: triangulation, bundle adjustment, culling; the atlas of all maps."""

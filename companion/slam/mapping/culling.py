@@ -1,8 +1,8 @@
-"""Keyframes that show nothing new go, so that hovering and flying to and fro add nothing.
+"""Culling of redundant keyframes, so that hovering and return passes do not grow the map.
 
-One goes where another stands nearer than keyframes are made apart, and three others show nearly all
-of its points as finely or finer (after Mur-Artal & Tardos, T-RO 2015). What hangs on it, a frame's
-pose or a chunk of the cloud, goes on with the nearest one.
+A keyframe is culled if another is closer than the keyframe spacing and three others observe nearly
+all of its points at the same or a finer scale (after Mur-Artal & Tardos, T-RO 2015). Frames and
+cloud chunks that refer to it follow its anchor, the nearest keyframe.
 """
 
 from __future__ import annotations
@@ -10,88 +10,92 @@ from __future__ import annotations
 import numpy as np
 
 from companion.slam.features.orb_features import Ints
-from companion.slam.map.sparse_map import RING, Keyframe, Retired, SlamMap
+from companion.slam.map.sparse_map import N_OBSERVERS_KEPT, Keyframe, Retired, SlamMap
 
-MIN_SHARE, MIN_OTHERS = 0.9, 3
-COARSER = 1
-"""Pyramid levels by which another view may be the coarser one."""
-N_TRIED, N_OTHERS = 12, 20
-NEWEST_KEPT, OLDEST_KEPT = 4, 5
-"""Tracking works with the newest ones; the oldest hold position, attitude and scale."""
+MIN_REDUNDANT_RATIO, MIN_OBSERVERS = 0.9, 3
+MAX_COARSER_LEVELS = 1
+"""Pyramid levels by which another observation may be coarser."""
+MAX_CANDIDATES, N_OTHERS = 12, 20
+N_NEWEST_KEPT, N_OLDEST_KEPT = 4, 5
+"""Tracking uses the newest keyframes; the oldest fix the gauge."""
 MIN_SHARED = 30
 
 
 def cull_keyframes(slam_map: SlamMap, newest: Keyframe, spacing_deg: float) -> list[int]:
-    """Retire what became redundant around the newest keyframe, younger ones first; their ids.
+    """Cull redundant keyframes around the newest one, newer ones first; returns their ids.
 
-    One may go that is nearer than `spacing_deg` to another, as an angle seen from its points.
+    A keyframe is a candidate within `spacing_deg` of another, as an angle seen from its points.
     """
     spacing = float(np.tan(np.radians(spacing_deg)))
     keys = list(slam_map.keyframes)
-    held = {*keys[:OLDEST_KEPT], *keys[-NEWEST_KEPT:], newest.keyframe_id}
-    _, points = slam_map.seen_by(newest)
-    near = [k for _, k in slam_map.covisible(points, MIN_SHARED)[:N_TRIED] if k not in held]
-    gone = []
+    protected = {*keys[:N_OLDEST_KEPT], *keys[-N_NEWEST_KEPT:], newest.keyframe_id}
+    _, points = slam_map.observations_of(newest)
+    near = [
+        k for _, k in slam_map.covisible(points, MIN_SHARED)[:MAX_CANDIDATES] if k not in protected
+    ]
+    culled = []
     for key in sorted(near, reverse=True):
         keyframe = slam_map.keyframes[key]
-        stays = _nearest(slam_map, keyframe, spacing)
-        if stays is not None and _redundant(slam_map, keyframe):
-            retire(slam_map, keyframe, stays)
-            gone.append(key)
-    return gone
+        anchor = _nearest(slam_map, keyframe, spacing)
+        if anchor is not None and _redundant(slam_map, keyframe):
+            retire(slam_map, keyframe, anchor)
+            culled.append(key)
+    return culled
 
 
 def _nearest(slam_map: SlamMap, keyframe: Keyframe, spacing: float) -> Keyframe | None:
-    """The keyframe next to this one in space, where that is near enough and sees the same."""
+    """The nearest keyframe in space, if close enough and sharing at least half of the points."""
     (key,) = slam_map.nearest(keyframe.centre, 1, {keyframe.keyframe_id})
     other = slam_map.keyframes[key]
-    _, points = slam_map.seen_by(keyframe)
+    _, points = slam_map.observations_of(keyframe)
     if len(points) < MIN_SHARED:
         return None
     depth = float(np.median(keyframe.camera_from_map.apply(slam_map.positions[points])[:, 2]))
     apart = float(np.linalg.norm(other.centre - keyframe.centre))
     if apart > spacing * depth:
         return None
-    shared = np.isin(points, slam_map.seen_by(other)[1])
+    shared = np.isin(points, slam_map.observations_of(other)[1])
     return other if np.count_nonzero(shared) >= 0.5 * len(points) else None
 
 
 def _redundant(slam_map: SlamMap, keyframe: Keyframe) -> bool:
-    features, points = slam_map.seen_by(keyframe)
+    features, points = slam_map.observations_of(keyframe)
     octave = np.full(slam_map.n_points + 1, -1, np.int64)
     octave[points] = keyframe.features.octaves[features]
     others = np.zeros(slam_map.n_points, np.int64)
-    for _, key in slam_map.covisible(points, MIN_OTHERS)[: N_OTHERS + 1]:
+    for _, key in slam_map.covisible(points, MIN_OBSERVERS)[: N_OTHERS + 1]:
         if key == keyframe.keyframe_id:
             continue
         other = slam_map.keyframes[key]
-        theirs, ids = slam_map.seen_by(other)
-        as_fine = other.features.octaves[theirs] <= octave[ids] + COARSER
+        theirs, ids = slam_map.observations_of(other)
+        as_fine = other.features.octaves[theirs] <= octave[ids] + MAX_COARSER_LEVELS
         others[ids[as_fine & (octave[ids] >= 0)]] += 1
-    return int(np.count_nonzero(others[points] >= MIN_OTHERS)) >= MIN_SHARE * len(points)
+    return int(np.count_nonzero(others[points] >= MIN_OBSERVERS)) >= MIN_REDUNDANT_RATIO * len(
+        points
+    )
 
 
-def retire(slam_map: SlamMap, keyframe: Keyframe, stays: Keyframe) -> None:
-    """Take a keyframe out of the map; from now on its place is one beside the keyframe `stays`."""
+def retire(slam_map: SlamMap, keyframe: Keyframe, anchor: Keyframe) -> None:
+    """Remove a keyframe from the map; its pose is from now on relative to its anchor."""
     key = keyframe.keyframe_id
-    beside = stays.camera_from_map @ keyframe.camera_from_map.inverse()
+    anchor_from_keyframe = anchor.camera_from_map @ keyframe.camera_from_map.inverse()
     for old, retired in slam_map.retired.items():
-        if retired.beside_id == key:
-            place = beside @ retired.beside_from_camera
-            slam_map.retired[old] = Retired(stays.keyframe_id, place)
-    slam_map.retired[key] = Retired(stays.keyframe_id, beside)
-    _, points = slam_map.seen_by(keyframe)
-    slam_map.forget(keyframe, np.arange(len(keyframe.point_ids)))
-    _vacate(slam_map, key, points)
+        if retired.anchor_id == key:
+            pose = anchor_from_keyframe @ retired.anchor_from_camera
+            slam_map.retired[old] = Retired(anchor.keyframe_id, pose)
+    slam_map.retired[key] = Retired(anchor.keyframe_id, anchor_from_keyframe)
+    _, points = slam_map.observations_of(keyframe)
+    slam_map.remove_observations(keyframe, np.arange(len(keyframe.point_ids)))
+    _drop_observer(slam_map, key, points)
     keyframe.grey = None
     del slam_map.keyframes[key]
-    slam_map.poses_changed()
+    slam_map.invalidate_centres()
 
 
-def _vacate(slam_map: SlamMap, key: int, points: Ints) -> None:
-    """Let the next keyframe that sees a point be noted where this one was, over no other."""
+def _drop_observer(slam_map: SlamMap, key: int, points: Ints) -> None:
+    """Free a culled keyframe's slot in the ring of observers, without overwriting another."""
     own = slam_map.observers[points] == key
     points, at = points[own.any(1)], own[own.any(1)].argmax(1)
-    following = slam_map.n_observers[points] % RING
+    following = slam_map.n_observers[points] % N_OBSERVERS_KEPT
     slam_map.observers[points, at] = slam_map.observers[points, following]
     slam_map.observers[points, following] = -1

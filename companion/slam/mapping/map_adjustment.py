@@ -1,7 +1,7 @@
-"""What is adjusted together: taken out of the map, adjusted on its own, and put back.
+"""Bundle adjustment problems extracted from the map, and the write-back of their results.
 
-Between the two the map may go on: what changed or came meanwhile is moved along with what was
-adjusted, so that putting back is one step and nothing tears.
+The map may change in between: what was changed or added meanwhile moves with the adjusted
+keyframes, in one step.
 """
 
 from __future__ import annotations
@@ -14,24 +14,25 @@ import numpy as np
 from companion.geometry.transforms import Array, Pose
 from companion.slam.features.orb_features import Bools, Ints
 from companion.slam.map.sparse_map import Keyframe, SlamMap
-from companion.slam.optimisation.bundle_adjustment import Adjusted, Bundle
-from companion.slam.optimisation.displacement_factor import Ways
-from companion.slam.optimisation.factors import Tie
-from companion.slam.optimisation.gravity_factor import Plumb, plumb_of
-from companion.slam.optimisation.rotation_factor import turns_of
+from companion.slam.optimisation.bundle_adjustment import AdjustmentResult, Bundle
+from companion.slam.optimisation.displacement_factor import DisplacementFactor
+from companion.slam.optimisation.factors import Factor
+from companion.slam.optimisation.gravity_factor import GravityFactor, gravity_in_map
+from companion.slam.optimisation.rotation_factor import relative_rotation_factor
 
-MOST_TOGETHER, MOST_HOLDING = 500, 80
-"""Keyframes adjusted at once, for which memory grows with the square, and those that hold them."""
-MAX_TURN_NS = 2_000_000_000
-"""Gyroscopes tell a turn that took longer no better than the vertical and the compass do."""
+MAX_VARIABLE, MAX_FIXED = 500, 80
+"""Keyframes adjusted in one problem, whose memory is quadratic in them, and fixed ones around them.
+"""
+MAX_ROTATION_SPAN_NS = 2_000_000_000
+"""Over longer spans integrated gyroscopes are no better than gravity and compass."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Taken:
-    """Keyframes (the first `bundle.n_variable` of which move) and points as they were.
+class AdjustmentProblem:
+    """Keyframes and points of a bundle, with their state at extraction.
 
-    `features` (O,) are those of the bundle's observations; `born` (P,) tells whether the index of a
-    point has been given to another since.
+    The first `bundle.n_variable` keyframes are variable. `features` (O,) are those of the
+    observations; `born` (P,) detects ids recycled since.
     """
 
     bundle: Bundle
@@ -41,22 +42,22 @@ class Taken:
     born: Ints
 
 
-WaysOf = Callable[[SlamMap, list[Keyframe]], Ways | None]
-"""What is told of how far a map's cameras are apart; None where nothing is."""
+DisplacementSource = Callable[[SlamMap, list[Keyframe]], DisplacementFactor | None]
+"""Displacement factor between cameras of a map; None without measurements."""
 
 
-def no_ways(slam_map: SlamMap, keyframes: list[Keyframe]) -> None:
-    """Nothing is told."""
+def no_displacements(slam_map: SlamMap, keyframes: list[Keyframe]) -> None:
+    """A source without measurements."""
 
 
-def take(
+def build_problem(
     slam_map: SlamMap, variable: list[Keyframe], fixed: list[Keyframe], mask: Bools,
-    ways_of: WaysOf = no_ways,
-) -> Taken | None:  # fmt: skip
-    """Keyframes and, of the points in `mask` (N,), those that two of them see; None if too few."""
+    displacements_of: DisplacementSource = no_displacements,
+) -> AdjustmentProblem | None:  # fmt: skip
+    """The problem over the points in `mask` (N,) with two observations; None if too few."""
     cameras, obs_cam, obs_feat, obs_id = [*variable, *fixed], [], [], []
     for i, k in enumerate(cameras):
-        features, ids = slam_map.seen_by(k)
+        features, ids = slam_map.observations_of(k)
         wanted = mask[ids]
         obs_feat.append(features[wanted])
         obs_id.append(ids[wanted])
@@ -73,112 +74,125 @@ def take(
         cam, index,
         np.concatenate([k.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
         np.concatenate([k.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
-        _ties(slam_map, cameras, ways_of(slam_map, cameras)),
+        _factors(slam_map, cameras, displacements_of(slam_map, cameras)),
     )  # fmt: skip
-    return Taken(bundle, cameras, feat, points, slam_map.born[points])
+    return AdjustmentProblem(bundle, cameras, feat, points, slam_map.born[points])
 
 
-def _ties(slam_map: SlamMap, cameras: list[Keyframe], ways: Ways | None) -> list[Tie]:
-    """What the autopilot tells of cameras: the vertical, or first their turns, and ways between."""
+def _factors(
+    slam_map: SlamMap, cameras: list[Keyframe], displacements: DisplacementFactor | None
+) -> list[Factor]:
+    """Factors from the autopilot: gravity or else relative rotations, and displacements."""
     everywhere, attitudes = list(slam_map.keyframes.values()), _attitudes(cameras)
     rotation = np.stack([k.camera_from_map.rotation for k in everywhere])
-    down = plumb_of(rotation, _attitudes(everywhere)[:, 2])
+    down = gravity_in_map(rotation, _attitudes(everywhere)[:, 2])
     if down is not None:
-        told: Tie | None = Plumb(attitudes[:, 2], *down)
+        measured: Factor | None = GravityFactor(attitudes[:, 2], *down)
     else:
         t_ns = np.array([k.t_ns for k in cameras])
         order = np.argsort(t_ns, kind="stable")
-        soon = np.diff(t_ns[order]) < MAX_TURN_NS
-        told = turns_of(order[:-1][soon], order[1:][soon], attitudes)
-    return [tie for tie in (told, ways) if tie is not None]
+        consecutive = np.diff(t_ns[order]) < MAX_ROTATION_SPAN_NS
+        measured = relative_rotation_factor(
+            order[:-1][consecutive], order[1:][consecutive], attitudes
+        )
+    return [factor for factor in (measured, displacements) if factor is not None]
 
 
 def _attitudes(keyframes: list[Keyframe]) -> Array:
-    untold = np.full((3, 3), np.nan)
-    return np.stack([untold if k.ned_from_camera is None else k.ned_from_camera for k in keyframes])
+    missing = np.full((3, 3), np.nan)
+    return np.stack(
+        [missing if k.ned_from_camera is None else k.ned_from_camera for k in keyframes]
+    )
 
 
-def put_back(slam_map: SlamMap, taken: Taken, result: Adjusted) -> None:
-    """Put back what was adjusted, the map being as it was."""
+def apply_result(slam_map: SlamMap, problem: AdjustmentProblem, result: AdjustmentResult) -> None:
+    """Write back a result to an unchanged map."""
     for keyframe, pose in zip(
-        taken.keyframes[: taken.bundle.n_variable], result.poses, strict=False
+        problem.keyframes[: problem.bundle.n_variable], result.poses, strict=False
     ):
         keyframe.camera_from_map = pose
-    slam_map.poses_changed()
-    slam_map.positions[taken.points] = result.points
-    _forget_wrong(slam_map, taken, result)
+    slam_map.invalidate_centres()
+    slam_map.positions[problem.points] = result.points
+    _remove_outliers(slam_map, problem, result)
 
 
-def put_back_later(slam_map: SlamMap, taken: Taken, result: Adjusted) -> None:
-    """Put back what was adjusted into a map that has gone on since."""
+def apply_result_later(
+    slam_map: SlamMap, problem: AdjustmentProblem, result: AdjustmentResult
+) -> None:
+    """Write back a result to a map that has changed since."""
     before = slam_map.positions[: slam_map.n_points].copy()
-    moves = _moves(slam_map, taken, result)
+    moves = _moves(slam_map, problem, result)
     for key, keyframe in slam_map.keyframes.items():
         keyframe.camera_from_map = keyframe.camera_from_map @ moves[key].inverse()
-    slam_map.poses_changed()
-    same = slam_map.alive[taken.points] & (slam_map.born[taken.points] == taken.born)
-    known = taken.points[same]
-    slam_map.positions[known] = before[known] + (result.points - taken.bundle.points)[same]
+    slam_map.invalidate_centres()
+    same = slam_map.alive[problem.points] & (slam_map.born[problem.points] == problem.born)
+    known = problem.points[same]
+    slam_map.positions[known] = before[known] + (result.points - problem.bundle.points)[same]
     fresh = slam_map.alive[: slam_map.n_points].copy()
     fresh[known] = False
     ids = np.flatnonzero(fresh)
     homes = slam_map.first_seen[ids]
     for home in np.unique(homes).tolist():
         retired = slam_map.retired.get(home)
-        move = moves.get(home if retired is None else retired.beside_id)
+        move = moves.get(home if retired is None else retired.anchor_id)
         if move is not None:
             own = ids[homes == home]
             slam_map.positions[own] = move.apply(before[own])
-    _forget_wrong(slam_map, taken, result)
+    _remove_outliers(slam_map, problem, result)
 
 
-def _moves(slam_map: SlamMap, taken: Taken, result: Adjusted) -> dict[int, Pose]:
-    """How every keyframe of the map is moved in it; a new one as that which shows most of it."""
+def _moves(
+    slam_map: SlamMap, problem: AdjustmentProblem, result: AdjustmentResult
+) -> dict[int, Pose]:
+    """Correction of every keyframe; of a new one that of its most covisible adjusted keyframe."""
     moves = {
         k.keyframe_id: after.inverse() @ before
         for k, before, after in zip(
-            taken.keyframes, taken.bundle.poses, result.poses, strict=True
+            problem.keyframes, problem.bundle.poses, result.poses, strict=True
         )
     }
     last = moves[max(moves)]
     for key, keyframe in slam_map.keyframes.items():
         if key not in moves:
-            _, points = slam_map.seen_by(keyframe)
-            alike = (k for _, k in slam_map.covisible(points) if k in moves and k != key)
-            moves[key] = moves.get(next(alike, -1), last)
+            _, points = slam_map.observations_of(keyframe)
+            covisible = (k for _, k in slam_map.covisible(points) if k in moves and k != key)
+            moves[key] = moves.get(next(covisible, -1), last)
     return moves
 
 
-def _forget_wrong(slam_map: SlamMap, taken: Taken, result: Adjusted) -> None:
+def _remove_outliers(
+    slam_map: SlamMap, problem: AdjustmentProblem, result: AdjustmentResult
+) -> None:
     wrong = ~result.inlier
-    for i, keyframe in enumerate(taken.keyframes):
-        of = wrong & (taken.bundle.camera == i)
-        bad = taken.features[of]
-        still = keyframe.point_ids[bad] == taken.points[taken.bundle.point[of]]
+    for i, keyframe in enumerate(problem.keyframes):
+        of = wrong & (problem.bundle.camera == i)
+        bad = problem.features[of]
+        still = keyframe.point_ids[bad] == problem.points[problem.bundle.point[of]]
         if still.any():
-            slam_map.forget(keyframe, bad[still])
-    slam_map.sweep(taken.keyframes)
+            slam_map.remove_observations(keyframe, bad[still])
+    slam_map.clear_dead_observations(problem.keyframes)
 
 
-def parts_of(slam_map: SlamMap) -> Iterator[tuple[list[Keyframe], list[Keyframe], Bools]]:
-    """What to `take` one after the other to adjust all; the first two keyframes hold the gauge.
+def partition(slam_map: SlamMap) -> Iterator[tuple[list[Keyframe], list[Keyframe], Bools]]:
+    """Variable keyframes, fixed keyframes and point mask of each problem of a global adjustment.
 
-    A long flight is adjusted part by part, each held by the keyframes around it.
+    The first two keyframes fix the gauge. A long flight is adjusted in overlapping windows, each
+    held by covisible keyframes.
     """
     ordered = sorted(slam_map.keyframes.values(), key=lambda k: k.keyframe_id)
     if len(ordered) < 3:
         return
-    if len(ordered) <= MOST_TOGETHER:
+    if len(ordered) <= MAX_VARIABLE:
         yield ordered[2:], ordered[:2], slam_map.alive[: slam_map.n_points].copy()
         return
-    for start in range(2, len(ordered), MOST_TOGETHER // 2):
-        part = ordered[start : start + MOST_TOGETHER]
+    for start in range(2, len(ordered), MAX_VARIABLE // 2):
+        part = ordered[start : start + MAX_VARIABLE]
         mask = np.zeros(slam_map.n_points, bool)
         for k in part:
-            mask[slam_map.seen_by(k)[1]] = True
+            mask[slam_map.observations_of(k)[1]] = True
         inside = {k.keyframe_id for k in part}
         rest = [k for k in ordered if k.keyframe_id not in inside]
-        shared = [int(np.count_nonzero(mask[slam_map.seen_by(k)[1]])) for k in rest]
-        order = np.argsort(-np.array(shared), kind="stable")[:MOST_HOLDING]
+        shared = [int(np.count_nonzero(mask[slam_map.observations_of(k)[1]])) for k in rest]
+        order = np.argsort(-np.array(shared), kind="stable")[:MAX_FIXED]
         holding = [rest[int(i)] for i in np.sort(order) if shared[int(i)] >= 3]
         yield part, holding or ordered[:2], mask

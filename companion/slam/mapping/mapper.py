@@ -1,4 +1,4 @@
-"""From a new keyframe to a better map: new points, longer tracks, bundle adjustment, culling."""
+"""Local mapping of a keyframe: triangulation, fusion, bundle adjustment, culling."""
 
 from __future__ import annotations
 
@@ -19,71 +19,71 @@ from companion.slam.map.patch_refinement import refine_features
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.culling import cull_keyframes
 from companion.slam.mapping.map_adjustment import (
-    WaysOf,
-    no_ways,
-    parts_of,
-    put_back,
-    put_back_later,
-    take,
+    DisplacementSource,
+    apply_result,
+    apply_result_later,
+    build_problem,
+    no_displacements,
+    partition,
 )
-from companion.slam.mapping.mapping_worker import MapTurn
+from companion.slam.mapping.mapping_worker import MapLock
 from companion.slam.optimisation.bundle_adjustment import adjust
 
 MIN_PARALLAX_RAD = np.radians(0.8)
 N_NEIGHBOURS = 8
-IMAGES_KEPT = 100
-"""Images of older keyframes are let go; what they show is then only as fine as its corners are."""
+N_IMAGES_KEPT = 100
+"""Images of older keyframes are dropped; their features are no longer refined by patches."""
 
 
 class Mapper:
-    """Owns the work done once for each keyframe."""
+    """Local mapping, run once per keyframe."""
 
     def __init__(
-        self, config: MappingConfig, camera: Camera, slam_map: SlamMap, turn: MapTurn,
-        ways_of: WaysOf = no_ways,
+        self, config: MappingConfig, camera: Camera, slam_map: SlamMap, map_lock: MapLock,
+        displacements_of: DisplacementSource = no_displacements,
     ) -> None:  # fmt: skip
-        self._ways_of = ways_of
+        self._displacements_of = displacements_of
         self._config = config
-        self._turn = turn
+        self._map_lock = map_lock
         self._map = slam_map
         self._projector = Projector(camera)
 
     def add(self, keyframe: Keyframe) -> list[int]:
-        """Take a keyframe, whose tracked points are set, into the map; which ones went for it."""
+        """Insert a keyframe, whose tracked points are set; ids of the keyframes culled for it."""
         slam_map = self._map
         slam_map.keyframes[keyframe.keyframe_id] = keyframe
-        slam_map.poses_changed()
-        for key in islice(reversed(slam_map.keyframes), IMAGES_KEPT, IMAGES_KEPT + 2):
+        slam_map.invalidate_centres()
+        for key in islice(reversed(slam_map.keyframes), N_IMAGES_KEPT, N_IMAGES_KEPT + 2):
             slam_map.keyframes[key].grey = None
-        _, points = slam_map.seen_by(keyframe)
+        _, points = slam_map.observations_of(keyframe)
         neighbours = [
             slam_map.keyframes[k]
             for _, k in slam_map.covisible(points, 10)
             if k != keyframe.keyframe_id
         ][:N_NEIGHBOURS]
-        slam_map.refresh(points, [*reversed(neighbours), keyframe])
+        slam_map.update_geometry(points, [*reversed(neighbours), keyframe])
         assert keyframe.grey is not None
         created = self._triangulate(keyframe, neighbours, image_levels(keyframe.grey))
         self._extend(keyframe, neighbours, created)
         self._refine([keyframe, *neighbours])
         self.adjust_locally(keyframe)
         self._cull(keyframe)
-        slam_map.reclaim()
-        self._turn.give_way()
+        slam_map.recycle_ids()
+        self._map_lock.yield_to_tracking()
         return cull_keyframes(slam_map, keyframe, self._config.keyframe_spacing_deg)
 
     def _refine(self, keyframes: list[Keyframe]) -> None:
-        """Make positions finer that were not yet, by the points' patches."""
+        """Refine features by patch alignment that were not refined yet."""
         slam_map = self._map
         for k in keyframes:
-            features, points = slam_map.seen_by(k)
+            features, points = slam_map.observations_of(k)
             new = (k.refined_for[features] != points) & (
                 slam_map.first_seen[points] != k.keyframe_id
             )
             features, points = features[new], points[new]
             if k.grey is None or len(points) == 0:
                 continue
-            self._turn.give_way()
+            self._map_lock.yield_to_tracking()
             finer, white, _ = refine_features(
                 slam_map, k.camera_from_map, k.features, features, points, image_levels(k.grey)
             )
@@ -96,14 +96,14 @@ class Mapper:
         created = []
         slam_map = self._map
         for other in neighbours:
-            self._turn.give_way()
+            self._map_lock.yield_to_tracking()
             free_a = np.flatnonzero(keyframe.point_ids < 0)
             free_b = np.flatnonzero(other.point_ids < 0)
             other_from_here = other.camera_from_map @ keyframe.camera_from_map.inverse()
             depth = np.median(
-                keyframe.camera_from_map.apply(slam_map.positions[slam_map.seen_by(keyframe)[1]])[
-                    :, 2
-                ]
+                keyframe.camera_from_map.apply(
+                    slam_map.positions[slam_map.observations_of(keyframe)[1]]
+                )[:, 2]
             )
             if np.linalg.norm(other_from_here.translation) < 0.01 * depth:
                 continue
@@ -135,32 +135,32 @@ class Mapper:
             ids = slam_map.add_points(
                 keyframe.camera_from_map.inverse().apply(points), keyframe, ia, levels
             )
-            slam_map.observe(keyframe, ia, ids)
-            slam_map.observe(other, ib, ids)
-            slam_map.refresh(ids, [other, keyframe])
+            slam_map.add_observations(keyframe, ia, ids)
+            slam_map.add_observations(other, ib, ids)
+            slam_map.update_geometry(ids, [other, keyframe])
             created.append(ids)
         return np.concatenate(created) if created else np.zeros(0, np.int64)
 
     def _extend(self, keyframe: Keyframe, neighbours: list[Keyframe], created: Ints) -> None:
-        """Look for this keyframe's points in its neighbours, and theirs in it; merge doubles."""
+        """Project points of this keyframe into its neighbours and vice versa; fuse duplicates."""
         slam_map = self._map
         for other in neighbours:
-            self._turn.give_way()
-            _, mine = slam_map.seen_by(keyframe)
-            self._search_in(other, mine)
+            self._map_lock.yield_to_tracking()
+            _, mine = slam_map.observations_of(keyframe)
+            self._fuse_into(other, mine)
         theirs = (
-            np.unique(np.concatenate([slam_map.seen_by(o)[1] for o in neighbours]))
+            np.unique(np.concatenate([slam_map.observations_of(o)[1] for o in neighbours]))
             if neighbours
             else created
         )
-        self._search_in(keyframe, theirs)
-        _, mine = slam_map.seen_by(keyframe)
-        slam_map.refresh(mine, [*reversed(neighbours), keyframe])
+        self._fuse_into(keyframe, theirs)
+        _, mine = slam_map.observations_of(keyframe)
+        slam_map.update_geometry(mine, [*reversed(neighbours), keyframe])
 
-    def _search_in(self, keyframe: Keyframe, points: Ints) -> None:
+    def _fuse_into(self, keyframe: Keyframe, points: Ints) -> None:
         slam_map = self._map
         known = np.zeros(slam_map.n_points, bool)
-        known[slam_map.seen_by(keyframe)[1]] = True
+        known[slam_map.observations_of(keyframe)[1]] = True
         points = points[~known[points] & slam_map.alive[points]]
         visible = self._projector.visible(slam_map, keyframe.camera_from_map, points)
         ids, features = self._projector.search(
@@ -171,12 +171,12 @@ class Mapper:
         old = keyframe.point_ids[features]
         old = np.where((old >= 0) & slam_map.alive[np.maximum(old, 0)], old, -1)
         free = old < 0
-        slam_map.observe(keyframe, features[free], ids[free])
-        for point, rival in zip(ids[~free].tolist(), old[~free].tolist(), strict=True):
-            self._merge(point, rival)
+        slam_map.add_observations(keyframe, features[free], ids[free])
+        for point, duplicate in zip(ids[~free].tolist(), old[~free].tolist(), strict=True):
+            self._merge(point, duplicate)
 
     def _merge(self, a: int, b: int) -> None:
-        """One point of two: the one seen more often takes over the other's observations."""
+        """Merge two points: the one with more observations takes over those of the other."""
         slam_map = self._map
         if a == b or not (slam_map.alive[a] and slam_map.alive[b]):
             return
@@ -186,7 +186,7 @@ class Mapper:
             if np.any(keyframe.point_ids == keep):
                 keyframe.point_ids[feature] = -1
             else:
-                slam_map.observe(keyframe, feature, np.full(len(feature), keep))
+                slam_map.add_observations(keyframe, feature, np.full(len(feature), keep))
         slam_map.alive[drop] = False
         slam_map.n_observers[drop] = 0
         slam_map.n_visible[keep] += slam_map.n_visible[drop]
@@ -197,25 +197,27 @@ class Mapper:
         near = [self._map.keyframes.get(k) for k in np.unique(known[known >= 0]).tolist()]
         return [k for k in near if k is not None and np.any(k.point_ids == point)]
 
-    def unite(self, keyframe: Keyframe, other: Keyframe, seen_there: Ints) -> None:
-        """Let the two parts of the map around a place seen again know each other's points."""
+    def fuse(self, keyframe: Keyframe, other: Keyframe, seen_there: Ints) -> None:
+        """Fuse points of the two sides of a closed loop."""
         slam_map = self._map
-        _, ids = slam_map.seen_by(keyframe)
+        _, ids = slam_map.observations_of(keyframe)
         here = [slam_map.keyframes[k] for _, k in slam_map.covisible(ids, 10)][:N_NEIGHBOURS]
-        _, ids = slam_map.seen_by(other)
+        _, ids = slam_map.observations_of(other)
         there = [slam_map.keyframes[k] for _, k in slam_map.covisible(ids, 10)][:N_NEIGHBOURS]
-        seen_here = np.unique(np.concatenate([slam_map.seen_by(k)[1] for k in [keyframe, *here]]))
+        seen_here = np.unique(
+            np.concatenate([slam_map.observations_of(k)[1] for k in [keyframe, *here]])
+        )
         for k in [keyframe, *here]:
-            self._search_in(k, seen_there)
+            self._fuse_into(k, seen_there)
         for k in [other, *there]:
-            self._search_in(k, seen_here)
-        slam_map.sweep([keyframe, other, *here, *there])
+            self._fuse_into(k, seen_here)
+        slam_map.clear_dead_observations([keyframe, other, *here, *there])
         self.adjust_locally(keyframe)
 
     def adjust_locally(self, keyframe: Keyframe) -> None:
-        """Adjust a keyframe and those that share most with it, and all points they see."""
+        """Local bundle adjustment over a keyframe, its most covisible ones and all their points."""
         slam_map, config = self._map, self._config
-        _, points = slam_map.seen_by(keyframe)
+        _, points = slam_map.observations_of(keyframe)
         ranked = [slam_map.keyframes[k] for _, k in slam_map.covisible(points, 15)]
         variable = [k for k in ranked if k is not keyframe][: config.window - 1] + [keyframe]
         first = min(slam_map.keyframes)
@@ -224,7 +226,7 @@ class Mapper:
             return
         mask = np.zeros(slam_map.n_points, bool)
         for k in variable:
-            mask[slam_map.seen_by(k)[1]] = True
+            mask[slam_map.observations_of(k)[1]] = True
         chosen = {k.keyframe_id for k in variable}
         fixed = [
             slam_map.keyframes[k]
@@ -242,36 +244,36 @@ class Mapper:
         self._adjust(variable, fixed, mask)
 
     def adjust_all(self, iterations: int) -> None:
-        """Adjust every keyframe and point, a long flight part by part."""
-        for variable, fixed, mask in parts_of(self._map):
+        """Global bundle adjustment, windowed for long flights."""
+        for variable, fixed, mask in partition(self._map):
             self._adjust(variable, fixed, mask, iterations)
 
-    def adjust_all_later(
-        self, iterations: int, meanwhile: Callable[[], None], still: Callable[[], bool]
+    def adjust_all_in_background(
+        self, iterations: int, yield_point: Callable[[], None], still_valid: Callable[[], bool]
     ) -> None:
-        """Adjust every keyframe and point while the map goes on; comes without the map in hand.
+        """Global bundle adjustment while the map goes on; called without the map lock.
 
-        `meanwhile` is called every few milliseconds, and may change the map; what was adjusted is
-        put back where `still` holds.
+        `yield_point` is called every few milliseconds and may change the map; results are applied
+        while `still_valid` holds.
         """
-        with self._turn.mapping():
-            parts = list(parts_of(self._map))
+        with self._map_lock.mapping():
+            parts = list(partition(self._map))
         for variable, fixed, mask in parts:
-            with self._turn.mapping():
+            with self._map_lock.mapping():
                 stayed = self._map.keyframes.keys()
                 variable = [k for k in variable if k.keyframe_id in stayed]
                 fixed = [k for k in fixed if k.keyframe_id in stayed]
                 mask = np.r_[mask, np.zeros(self._map.n_points - len(mask), bool)]
                 if not (variable and fixed):
                     continue
-                taken = take(self._map, variable, fixed, mask, self._ways_of)
-            if taken is None:
+                problem = build_problem(self._map, variable, fixed, mask, self._displacements_of)
+            if problem is None:
                 continue
-            result = adjust(taken.bundle, iterations, meanwhile)
-            with self._turn.mapping():
-                if not still():
+            result = adjust(problem.bundle, iterations, yield_point)
+            with self._map_lock.mapping():
+                if not still_valid():
                     return
-                put_back_later(self._map, taken, result)
+                apply_result_later(self._map, problem, result)
 
     def _adjust(
         self,
@@ -280,18 +282,20 @@ class Mapper:
         mask: Bools,
         iterations: int | None = None,
     ) -> None:
-        taken = take(self._map, variable, fixed, mask, self._ways_of)
-        if taken is None:
+        problem = build_problem(self._map, variable, fixed, mask, self._displacements_of)
+        if problem is None:
             return
         if iterations is None:
-            result = adjust(taken.bundle, self._config.iterations, self._turn.give_way)
+            result = adjust(
+                problem.bundle, self._config.iterations, self._map_lock.yield_to_tracking
+            )
         else:  # it takes long, and works on copies
-            with self._turn.away():
-                result = adjust(taken.bundle, iterations)
-        put_back(self._map, taken, result)
+            with self._map_lock.released():
+                result = adjust(problem.bundle, iterations)
+        apply_result(self._map, problem, result)
 
     def _cull(self, keyframe: Keyframe) -> None:
-        """Remove recent points that are seldom found where they should be, or seen by too few."""
+        """Remove recent points that are seldom found where visible, or have too few observers."""
         slam_map = self._map
         n = slam_map.n_points
         age = keyframe.keyframe_id - slam_map.born[:n]
@@ -300,7 +304,7 @@ class Mapper:
         few = (age >= 2) & (slam_map.n_observers[:n] <= 2)
         doomed = recent & (seldom | few)
         slam_map.alive[:n][doomed] = False
-        slam_map.sweep(
+        slam_map.clear_dead_observations(
             [slam_map.keyframes[key] for key in islice(reversed(slam_map.keyframes), 30)]
         )
-        slam_map.bury()
+        slam_map.free_patches()

@@ -1,4 +1,4 @@
-"""Where mapping runs: at once, so that results do not depend on speed, or beside the tracking."""
+"""Synchronous mapping, for results independent of timing, and mapping in a background thread."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from companion.messages import KeyframeAdded, LoopClosed
 
 Done = list[KeyframeAdded | LoopClosed]
 Job = Callable[[], Done]
-Spare = Callable[[Callable[[], None]], None]
-"""Work for when there is no other; it calls what it is given every few milliseconds."""
-MAX_WAITING = 2
+IdleWork = Callable[[Callable[[], None]], None]
+"""Work for idle time; it calls its argument every few milliseconds."""
+MAX_QUEUED = 2
 
 
-class MapTurn:
-    """Whose turn it is to touch the map: the tracker's whenever it wants, else the mapper's.
+class MapLock:
+    """Lock of the map with priority for tracking.
 
-    The mapper gives way at places where the map is whole, so that a frame waits for a few
-    milliseconds of mapping at most. Not reentrant.
+    Mapping yields where the map is consistent, so that a frame waits for at most a few
+    milliseconds. Not reentrant.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class MapTurn:
 
     @contextmanager
     def tracking(self) -> Iterator[None]:
-        """Have the map for a frame; comes before any mapping that waits."""
+        """Hold the lock for a frame, ahead of any waiting mapping."""
         with self._changed:
             self._wanted = True
             self._changed.wait_for(lambda: not self._mapping)
@@ -44,8 +44,8 @@ class MapTurn:
 
     @contextmanager
     def mapping(self) -> Iterator[None]:
-        """Have the map while no frame needs it."""
-        self._take()
+        """Hold the lock while no frame needs it."""
+        self._acquire()
         try:
             yield
         finally:
@@ -53,17 +53,17 @@ class MapTurn:
                 self._mapping = False
                 self._changed.notify_all()
 
-    def give_way(self) -> None:
-        """Let a frame that waits go first; for use within `mapping`, nothing outside of it."""
+    def yield_to_tracking(self) -> None:
+        """Let a waiting frame go first; within `mapping`, without effect elsewhere."""
         if self._wanted and self._mapping:
             with self._changed:
                 self._mapping = False
                 self._changed.notify_all()
-            self._take()
+            self._acquire()
 
     @contextmanager
-    def away(self) -> Iterator[None]:
-        """Let the map go for a longer while, within `mapping`; without effect outside of it."""
+    def released(self) -> Iterator[None]:
+        """Release the lock during long work on copies, within `mapping`; no effect elsewhere."""
         if not self._mapping:
             yield
             return
@@ -73,39 +73,39 @@ class MapTurn:
         try:
             yield
         finally:
-            self._take()
+            self._acquire()
 
-    def pause(self) -> None:
-        """Wait while a frame has the map; for who has nothing of it in hand."""
+    def wait_for_tracking(self) -> None:
+        """Wait while a frame holds the lock; for callers that hold nothing of the map."""
         if self._wanted or self._tracking:
             with self._changed:
                 self._changed.wait_for(lambda: not (self._wanted or self._tracking))
 
-    def _take(self) -> None:
+    def _acquire(self) -> None:
         with self._changed:
             self._changed.wait_for(lambda: not (self._wanted or self._tracking))
             self._mapping = True
 
 
 class MappingWorker(Protocol):
-    """Runs one mapping job after the other."""
+    """Runs mapping jobs one after the other."""
 
     @property
     def busy(self) -> bool:
-        """Whether so much waits that another keyframe would come too late to be of use."""
+        """Whether the queue is so long that another keyframe would be mapped too late."""
 
     def submit(self, job: Job) -> None:
-        """Have a job done."""
+        """Queue a job."""
 
     def done(self) -> Done:
-        """What was finished since the last call; raises what a job raised."""
+        """Results since the last call; raises what a job raised."""
 
     def close(self) -> None:
-        """Finish what waits."""
+        """Finish queued jobs."""
 
 
-class AtOnce:
-    """Does each job while it is handed in."""
+class SynchronousMapping:
+    """Runs each job on submission."""
 
     busy = False
 
@@ -113,27 +113,27 @@ class AtOnce:
         self._finished: Done = []
 
     def submit(self, job: Job) -> None:
-        """Do it."""
+        """Run the job."""
         self._finished.extend(job())
 
     def done(self) -> Done:
-        """What was finished since the last call."""
+        """Results since the last call."""
         finished, self._finished = self._finished, []
         return finished
 
     def close(self) -> None:
-        """Nothing waits."""
+        """Nothing is queued."""
 
 
 class _ClosingError(Exception):
-    """Spare work is given up for the end."""
+    """Aborts idle work on closing."""
 
 
-class Beside:
-    """Does the jobs in a thread of its own, in the tracker's pauses, and `spare` between them."""
+class BackgroundMapping:
+    """Runs jobs in a thread of its own while no frame is tracked, and `idle_work` between them."""
 
-    def __init__(self, turn: MapTurn, spare: Spare = lambda meanwhile: None) -> None:
-        self._turn, self._spare = turn, spare
+    def __init__(self, map_lock: MapLock, idle_work: IdleWork = lambda yield_point: None) -> None:
+        self._map_lock, self._idle_work = map_lock, idle_work
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._finished: queue.SimpleQueue[Done] = queue.SimpleQueue()
         self._fault: BaseException | None = None
@@ -143,8 +143,8 @@ class Beside:
 
     @property
     def busy(self) -> bool:
-        """Whether so much waits that another keyframe would come too late to be of use."""
-        return self._waiting >= MAX_WAITING
+        """Whether the queue is so long that another keyframe would be mapped too late."""
+        return self._waiting >= MAX_QUEUED
 
     def submit(self, job: Job) -> None:
         """Queue a job."""
@@ -152,7 +152,7 @@ class Beside:
         self._jobs.put(job)
 
     def done(self) -> Done:
-        """What was finished since the last call; raises what a job raised."""
+        """Results since the last call; raises what a job raised."""
         if self._fault is not None:
             raise self._fault
         out: Done = []
@@ -162,7 +162,7 @@ class Beside:
         return out
 
     def close(self) -> None:
-        """Finish what waits, and end the thread."""
+        """Finish queued jobs and end the thread."""
         self._jobs.put(None)
         self._thread.join()
 
@@ -170,22 +170,22 @@ class Beside:
         try:
             while (job := self._jobs.get()) is not None:
                 self._do(job)
-                self._spare(self._meanwhile)
+                self._idle_work(self._yield_point)
         except _ClosingError:
             return
         except BaseException as fault:  # handed to the tracker's thread, which raises it
             self._fault = fault
 
     def _do(self, job: Job) -> None:
-        with self._turn.mapping():
+        with self._map_lock.mapping():
             self._finished.put(job())
 
-    def _meanwhile(self) -> None:
-        """Let frames and jobs go before spare work, which touches nothing of the map now."""
-        self._turn.pause()
+    def _yield_point(self) -> None:
+        """Let frames and jobs go before idle work, which holds nothing of the map now."""
+        self._map_lock.wait_for_tracking()
         while not self._jobs.empty():
             job = self._jobs.get()
             if job is None:
                 raise _ClosingError
             self._do(job)
-            self._turn.pause()
+            self._map_lock.wait_for_tracking()

@@ -1,1 +1,1 @@
-"""Bundle adjustment and its factors, pose graph, and the minimal and refined pose solvers."""
+"""Bundle adjustment and its factors, pose graph, minimal solvers and pose refinement."""

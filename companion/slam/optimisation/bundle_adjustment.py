@@ -1,7 +1,7 @@
-"""Bundle adjustment: cameras and points together, by the Schur complement (Triggs et al. 1999).
+"""Bundle adjustment of cameras and points by the Schur complement (Triggs et al. 1999).
 
-Levenberg-Marquardt with Huber's loss. What ties cameras to points is kept by observation, so that a
-window of ten cameras and a whole flight of hundreds are the same code and little memory.
+Levenberg-Marquardt with Huber's loss. Camera-point blocks are stored per observation, so that a
+window of ten cameras and a flight of hundreds share the same code with little memory.
 """
 
 from __future__ import annotations
@@ -14,24 +14,22 @@ from scipy.linalg import cho_factor, cho_solve
 
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.slam.compiled.bundle_sums import (
+    back_substitute,
     errors,
-    moves_of_points,
     normal_equations,
-    without_points,
+    schur_complement,
 )
 from companion.slam.compiled.pose_sums import CHI2_2D
 from companion.slam.features.orb_features import Bools, Ints
-from companion.slam.optimisation.factors import Tie
+from companion.slam.optimisation.factors import Factor
 
 
 @dataclass(slots=True, eq=False)
 class Bundle:
-    """Cameras (C), points (P, 3) and observations (O): which camera sees which point where.
+    """Cameras (C), points (P, 3), observations (O) and other factors.
 
-    `ties` is what is told beside the images.
-
-    The first `n_variable` cameras move, the others hold the gauge. `normalised` (O, 2) and
-    `whitening` (O, 2, 2) are as in Features. No camera sees a point twice.
+    The first `n_variable` cameras are variable, the others fix the gauge. `normalised` (O, 2) and
+    `whitening` (O, 2, 2) are as in Features. No camera observes a point twice.
     """
 
     poses: list[Pose]
@@ -41,12 +39,12 @@ class Bundle:
     point: Ints
     normalised: Array
     whitening: Array
-    ties: Sequence[Tie] = ()
+    factors: Sequence[Factor] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
-    """Adjusted poses and points, which observations agree (O,), and the cost before and after."""
+class AdjustmentResult:
+    """Adjusted poses and points, inlier mask of observations (O,), cost before and after."""
 
     poses: list[Pose]
     points: Array
@@ -56,9 +54,9 @@ class Adjusted:
 
 
 def adjust(
-    bundle: Bundle, iterations: int = 6, between: Callable[[], None] = lambda: None
-) -> Adjusted:
-    """Adjust; the input is left as it is. `between` is called every few milliseconds."""
+    bundle: Bundle, iterations: int = 6, yield_point: Callable[[], None] = lambda: None
+) -> AdjustmentResult:
+    """Solve; the input is not changed. `yield_point` is called every few milliseconds."""
     b = bundle
     n_var, n_points = b.n_variable, len(b.points)
     rotation = np.stack([p.rotation for p in b.poses])
@@ -67,52 +65,54 @@ def adjust(
     p, residual, cost = errors(
         rotation, translation, points, b.camera, b.point, b.normalised, b.whitening
     )
-    cost += sum(tie.cost(rotation, translation) for tie in b.ties)
+    cost += sum(factor.cost(rotation, translation) for factor in b.factors)
     first_cost = cost
     damping = 1e-4
     moving = np.flatnonzero(b.camera < n_var)
     by_point = moving[np.argsort(b.point[moving], kind="stable")]
     accepted = True
     for _ in range(iterations):
-        between()
+        yield_point()
         if accepted:
             hcc, gc, hpp, gp, hcp = normal_equations(
                 rotation, p, residual, b.camera, b.point, b.whitening, n_var, n_points
             )
-        between()
+        yield_point()
         damped = hpp + (damping * np.einsum("nii->ni", hpp) + 1e-9)[..., None] * np.eye(3)
         inverse = np.linalg.inv(damped)
-        between()
-        taken, added = without_points(inverse, gp, hcp, b.camera, b.point, by_point, n_var)
-        between()
-        schur = -taken
+        yield_point()
+        reduction, rhs_part = schur_complement(inverse, gp, hcp, b.camera, b.point, by_point, n_var)
+        yield_point()
+        schur = -reduction
         for k in range(n_var):
             block = schur[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
             block += hcc[k] + np.diag(damping * np.diag(hcc[k]) + 1e-9)
-        pull = gc.copy()
-        for tie in b.ties:
-            tie.add_to(schur.reshape(n_var, 6, n_var, 6), pull, rotation, translation)
-        rhs = added - pull.ravel()
+        gradient = gc.copy()
+        for factor in b.factors:
+            factor.add_normal_equations(
+                schur.reshape(n_var, 6, n_var, 6), gradient, rotation, translation
+            )
+        rhs = rhs_part - gradient.ravel()
         try:
             dc = cho_solve(cho_factor(schur, check_finite=False), rhs, check_finite=False)
         except np.linalg.LinAlgError:
             damping *= 10
             accepted = False
             continue
-        moves = dc.reshape(n_var, 6)
-        dp = moves_of_points(inverse, gp, hcp, b.camera, b.point, by_point, moves)
-        between()
-        turns = np.stack([rotation_from_vector(d[:3]) for d in moves])
+        steps = dc.reshape(n_var, 6)
+        dp = back_substitute(inverse, gp, hcp, b.camera, b.point, by_point, steps)
+        yield_point()
+        rotations = np.stack([rotation_from_vector(d[:3]) for d in steps])
         new_rotation, new_translation = rotation.copy(), translation.copy()
-        new_rotation[:n_var] = turns @ rotation[:n_var]
+        new_rotation[:n_var] = rotations @ rotation[:n_var]
         new_translation[:n_var] = (
-            np.matmul(turns, translation[:n_var, :, None])[..., 0] + moves[:, 3:]
+            np.matmul(rotations, translation[:n_var, :, None])[..., 0] + steps[:, 3:]
         )
         new_points = points + dp
         new_p, new_residual, new_cost = errors(
             new_rotation, new_translation, new_points, b.camera, b.point, b.normalised, b.whitening
         )
-        new_cost += sum(tie.cost(new_rotation, new_translation) for tie in b.ties)
+        new_cost += sum(factor.cost(new_rotation, new_translation) for factor in b.factors)
         accepted = new_cost < cost
         if accepted:
             gain = (cost - new_cost) / max(cost, 1e-12)
@@ -125,4 +125,4 @@ def adjust(
             damping *= 10
     inlier = ((residual * residual).sum(1) < CHI2_2D) & (p[:, 2] > 0)
     poses = [Pose(rotation[i], translation[i]) for i in range(len(b.poses))]
-    return Adjusted(poses, points, inlier, first_cost, cost)
+    return AdjustmentResult(poses, points, inlier, first_cost, cost)

@@ -1,7 +1,8 @@
-"""What the autopilot says of the vertical, for bundle adjustment: each camera's down direction.
+"""Gravity factor of bundle adjustment: each camera's down direction by the autopilot.
 
-Its attitude is wrong by some tenths of a degree for seconds on end, where images are usually wrong
-by hundredths; but it does not bend with a map that shows little, such as the first of a climb.
+Attitude errors are tenths of a degree with correlation times of seconds, those of images usually
+hundredths; but attitude does not drift with a map of little texture, such as at the start of a
+climb.
 """
 
 from __future__ import annotations
@@ -12,21 +13,21 @@ import numpy as np
 
 from companion.geometry.transforms import Array, skew
 
-LEAST_SIGMA_RAD, MOST_SIGMA_RAD = np.radians(0.3), np.radians(1.0)
-"""More is not the attitude's error but the map's,"""
-USELESS_RAD = np.radians(4.0)
-"""or the attitude is not the camera's."""
-ALIKE = 2.0
-"""Errors of attitudes that follow each other are alike: each counts for so much less."""
+MIN_SIGMA_RAD, MAX_SIGMA_RAD = np.radians(0.3), np.radians(1.0)
+"""Larger disagreement is due to the map, not the attitude,"""
+MAX_DISAGREEMENT_RAD = np.radians(4.0)
+"""or the attitude is not that of the camera."""
+CORRELATION_INFLATION = 2.0
+"""Inflation of sigma, as consecutive attitude errors are correlated."""
 HUBER = 2.0
-MIN_TOLD = 5
+MIN_MEASURED = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plumb:
-    """Down as the autopilot has it, in cameras (C, 3), and as the map has it (3,).
+class GravityFactor:
+    """Down by the autopilot in camera axes (C, 3), and in map axes (3,).
 
-    `down_camera` is nan where nothing was told. `sigma_rad` is one standard deviation of each.
+    `down_camera` is nan where missing. `sigma_rad` is one standard deviation.
     """
 
     down_camera: Array
@@ -34,42 +35,44 @@ class Plumb:
     sigma_rad: float
 
     def errors(self, rotation: Array) -> tuple[Array, Array]:
-        """Whitened errors (C, 3) of cameras with `camera_from_map` rotations, and their sizes."""
-        off = np.nan_to_num((rotation @ self.down_map - self.down_camera) / self.sigma_rad)
-        return off, np.linalg.norm(off, axis=1)
+        """Whitened errors (C, 3) of `camera_from_map` rotations, and their norms."""
+        residual = np.nan_to_num((rotation @ self.down_map - self.down_camera) / self.sigma_rad)
+        return residual, np.linalg.norm(residual, axis=1)
 
     def cost(self, rotation: Array, translation: Array) -> float:
-        """Huber's loss of all of them."""
+        """Huber's loss."""
         _, size = self.errors(rotation)
         return float(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).sum())
 
-    def add_to(
+    def add_normal_equations(
         self, information: Array, gradient: Array, rotation: Array, translation: Array
     ) -> None:
-        """As of a Tie."""
-        told = np.flatnonzero(np.isfinite(self.down_camera[: len(gradient), 0]))
-        off, size = self.errors(rotation)
-        jacobian = -skew(rotation[told] @ self.down_map) / self.sigma_rad
-        weight = np.minimum(1.0, HUBER / np.maximum(size[told], 1e-9))
+        """As of a Factor."""
+        measured = np.flatnonzero(np.isfinite(self.down_camera[: len(gradient), 0]))
+        residual, size = self.errors(rotation)
+        jacobian = -skew(rotation[measured] @ self.down_map) / self.sigma_rad
+        weight = np.minimum(1.0, HUBER / np.maximum(size[measured], 1e-9))
         weighted = jacobian.transpose(0, 2, 1) * weight[:, None, None]
-        information[told, :3, told, :3] += weighted @ jacobian
-        gradient[told, :3] += (weighted @ off[told, :, None])[..., 0]
+        information[measured, :3, measured, :3] += weighted @ jacobian
+        gradient[measured, :3] += (weighted @ residual[measured, :, None])[..., 0]
 
 
-def plumb_of(rotation: Array, down_camera: Array) -> tuple[Array, float] | None:
-    """Down in a map (3,), and how well cameras (C, 3, 3), `camera_from_map`, agree about it, rad.
+def gravity_in_map(rotation: Array, down_camera: Array) -> tuple[Array, float] | None:
+    """Down in a map (3,), and its standard deviation, rad, over `camera_from_map` (C, 3, 3).
 
-    By those that were told `down_camera` (C, 3), nan elsewhere; None where too few were, or where
-    they do not agree at all.
+    `down_camera` (C, 3) is nan where missing; None with too few measurements or too much
+    disagreement.
     """
-    told = np.isfinite(down_camera[:, 0])
-    if np.count_nonzero(told) < MIN_TOLD:
+    measured = np.isfinite(down_camera[:, 0])
+    if np.count_nonzero(measured) < MIN_MEASURED:
         return None
-    inside = np.matmul(rotation[told].transpose(0, 2, 1), down_camera[told][..., None])[..., 0]
+    inside = np.matmul(rotation[measured].transpose(0, 2, 1), down_camera[measured][..., None])[
+        ..., 0
+    ]
     down = np.median(inside, axis=0)
     down /= max(float(np.linalg.norm(down)), 1e-9)
-    off = np.linalg.norm(inside - down, axis=1)
-    sigma_rad = float(np.median(off)) / 1.18  # of each of two axes
-    if sigma_rad > USELESS_RAD:
+    residual = np.linalg.norm(inside - down, axis=1)
+    sigma_rad = float(np.median(residual)) / 1.18  # of each of two axes
+    if sigma_rad > MAX_DISAGREEMENT_RAD:
         return None
-    return down, float(np.clip(sigma_rad, LEAST_SIGMA_RAD, MOST_SIGMA_RAD)) * ALIKE
+    return down, float(np.clip(sigma_rad, MIN_SIGMA_RAD, MAX_SIGMA_RAD)) * CORRELATION_INFLATION

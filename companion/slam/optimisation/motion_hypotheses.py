@@ -1,8 +1,8 @@
-"""How a camera may have moved from one image to the next, by what both show.
+"""Competing relative-pose hypotheses of two views.
 
-An essential matrix explains a scene with depth, a homography a plane (a survey seen from straight
-above); the one that explains more is taken (after Mur-Artal et al., 2015). Where the autopilot
-tells attitudes, its vertical and its turn each give one more motion.
+An essential matrix explains a scene with depth, a homography a plane (nadir surveys); both are
+scored (after Mur-Artal et al., 2015). Measured attitudes add an upright solution and one with the
+measured rotation.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ GAMMA = 5.991
 UPRIGHT_PX = 2.0
 
 
-def possible_motions(
+def motion_hypotheses(
     xa: Array, xb: Array, focal_px: float, seed: int, attitudes: tuple[Array, Array] | None
 ) -> tuple[list[Pose], bool]:
-    """Motions b from a, their baselines of length one, and whether a plane explains most.
+    """Hypotheses `b_from_a` with unit baselines, and whether a plane explains most matches.
 
-    `xa` and `xb` (N, 2) are normalised; `attitudes` are `ned_from_camera` of both, where told.
+    `xa` and `xb` (N, 2) are normalised; `attitudes` are `ned_from_camera` of both, where measured.
     """
     motions: list[Pose] = []
     essential, homography = _models(xa * focal_px, xb * focal_px, focal_px, seed)
@@ -38,19 +38,21 @@ def possible_motions(
         rotations = (np.asarray(r1, np.float64), np.asarray(r2, np.float64))
         motions += [Pose(r, s * direction) for r in rotations for s in (1.0, -1.0)]
     if homography is not None and (planar or essential is None or attitudes is None):
-        _, turns, shifts, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
-        for r, t in zip(turns, shifts, strict=True):
+        _, rotations_h, translations_h, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
+        for r, t in zip(rotations_h, translations_h, strict=True):
             norm = float(np.linalg.norm(t))
             if norm > 1e-6 and np.linalg.det(r) > 0:
                 unit = np.asarray(t, np.float64).ravel() / norm
                 motions.append(Pose(np.asarray(r, np.float64), unit))
     if attitudes is not None:
-        told = attitudes[1].T @ attitudes[0]
+        rotation_prior = attitudes[1].T @ attitudes[0]
         upright = upright_motion(xa, xb, *attitudes, UPRIGHT_PX / focal_px, seed)
         motions += [] if upright is None else [upright[0]]
-        motions += _with_known_rotation(told, xa, xb)
+        motions += _with_known_rotation(rotation_prior, xa, xb)
         motions = [
-            m for m in motions if angle_between(m.rotation, told) < MAX_PRIOR_DISAGREEMENT_RAD
+            m
+            for m in motions
+            if angle_between(m.rotation, rotation_prior) < MAX_PRIOR_DISAGREEMENT_RAD
         ]
     return motions, planar
 
@@ -104,7 +106,7 @@ def _score_homography(h: Array, xa: Array, xb: Array, focal_px: float) -> float:
 
 
 def _with_known_rotation(rotation: Array, xa: Array, xb: Array) -> list[Pose]:
-    """Both signs of the translation that, with this rotation, fits most rays."""
+    """Both signs of the translation direction that fits most rays with this rotation."""
     rays_a = np.c_[xa, np.ones(len(xa))] @ rotation.T
     normals = np.cross(rays_a, np.c_[xb, np.ones(len(xb))])
     length = np.linalg.norm(normals, axis=1)

@@ -1,4 +1,4 @@
-"""The pose of one camera from map points that it sees: robust Gauss-Newton."""
+"""Pose of one camera from observed map points: robust Gauss-Newton, and SQPnP."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from companion.geometry.transforms import Array, Pose, nearest_rotation
 from companion.slam.compiled.pose_sums import CHI2_2D, HUBER, cost, refine
 from companion.slam.features.orb_features import Bools
 
-__all__ = ["CHI2_2D", "HUBER", "other_pose", "refine_pose", "robust_cost"]
+__all__ = ["CHI2_2D", "HUBER", "refine_pose", "robust_cost", "solve_sqpnp"]
 
 
 def robust_cost(
     camera_from_map: Pose, points_map: Array, normalised: Array, whitening: Array
 ) -> float:
-    """Huber's loss of all N points, those behind the camera at a high price."""
+    """Huber's loss of all N points, those behind the camera at a high constant."""
     pose = camera_from_map.rotation, camera_from_map.translation
     return float(cost(*pose, points_map, normalised, whitening))
 
 
-def other_pose(points_map: Array, normalised: Array) -> Pose | None:
-    """`camera_from_map` that fits N points best, from nowhere (Terzakis & Lourakis, ECCV 2020).
+def solve_sqpnp(points_map: Array, normalised: Array) -> Pose | None:
+    """`camera_from_map` of N points without initial guess (Terzakis & Lourakis, ECCV 2020).
 
-    Before a plane a pose can have two minima; this does not depend on where a search begins. It
-    knows no outliers.
+    SQPnP: in front of a plane a pose can have two minima; this finds the global one. Not robust to
+    outliers.
     """
     if len(points_map) < 6:
         return None
@@ -45,10 +45,10 @@ def refine_pose(
     rounds: int = 4,
     iterations: int = 4,
 ) -> tuple[Pose, Bools, Array]:
-    """Refine a pose on N points; after each round points with too large an error are set aside.
+    """Refine a pose on N points; outliers are reclassified after each round.
 
-    Huber's loss in all rounds but the last. Returns the pose, which points agree with it (N,), and
-    the (6, 6) information matrix (rotation, translation) in the camera frame.
+    Huber's loss in all rounds but the last. Returns the pose, the inlier mask (N,), and the (6, 6)
+    information matrix (rotation, translation) in the camera frame.
     """
     rotation, translation, inlier, information = refine(
         camera_from_map.rotation, camera_from_map.translation,

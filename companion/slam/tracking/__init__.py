@@ -1,1 +1,1 @@
-"""The tracking state machine: from a frame to its pose, and to the choice of keyframes."""
+"""The tracking state machine: pose of each frame, keyframe decision, map initialisation."""

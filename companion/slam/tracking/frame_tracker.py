@@ -1,4 +1,4 @@
-"""Where one view lies in the map: its points found in the image, and its pose from them."""
+"""Pose of one frame in the active map: point matching, pose refinement, KLT fallback."""
 
 from __future__ import annotations
 
@@ -7,54 +7,54 @@ import numpy as np
 from companion.config import TrackingConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
-from companion.slam.features.klt_tracking import follow
+from companion.slam.features.klt_tracking import track_points
 from companion.slam.features.orb_features import Ints
 from companion.slam.features.patches import image_levels
 from companion.slam.features.view import View
-from companion.slam.loop.relocalizer import Located
+from companion.slam.loop.relocalizer import Relocalised
 from companion.slam.map.local_map import Projector, local_points
 from companion.slam.map.patch_refinement import refine_features
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.mapping.atlas import Atlas
-from companion.slam.optimisation.pose_refinement import other_pose, refine_pose, robust_cost
+from companion.slam.optimisation.pose_refinement import refine_pose, robust_cost, solve_sqpnp
 
-MOST_REFINED = 150
-"""Points laid over each image by their patches: no pose needs more of them, and they take time."""
-MOST_FOLLOWED = 200
-MIN_DUE_SHARE, ENOUGH = 0.08, 30
-"""Without attitude what is found is at least this share of what should be seen, or so many."""
+MAX_REFINED = 150
+"""Points aligned by patches per frame: more cost time without improving the pose."""
+MAX_KLT_POINTS = 200
+MIN_VISIBLE_RATIO, ENOUGH_INLIERS = 0.08, 30
+"""Inliers required without attitude: this ratio of the visible points, or so many."""
 
 
-class Placer:
-    """Places views in the map that is in use, and knows which of its points are around them."""
+class FrameTracker:
+    """Tracks frames in the active map, and holds the local map."""
 
     def __init__(self, config: TrackingConfig, camera: Camera, atlas: Atlas) -> None:
         self._config = config
         self._atlas = atlas
         self._camera, self._projector = camera, Projector(camera)
         self.local: Ints = np.zeros(0, np.int64)
-        """The points around the last view that was placed."""
+        """Ids of the local map points around the last tracked view."""
 
     @property
     def _map(self) -> SlamMap:
         return self._atlas.map
 
-    def forget(self) -> None:
-        """Another map is in use."""
+    def reset(self) -> None:
+        """Clear the local map after another map became active."""
         self.local = np.zeros(0, np.int64)
 
-    def sees_too_little(self, view: View) -> bool:
-        """Whether a view has too few features to be placed at all."""
+    def too_few_features(self, view: View) -> bool:
+        """Whether a view has too few features to be tracked."""
         return len(view.features) < self._config.min_inliers
 
     def match(
         self, view: View, guess: Pose, ids: Ints, radius_px: float, count: bool = False,
-        at_least: int = 0,
+        min_inliers: int = 0,
     ) -> bool:  # fmt: skip
-        """Look for the points `ids` as if from `guess`, so far around; whether the view is there.
+        """Match points `ids` projected from `guess` within a radius and refine the pose; success.
 
-        With `count` the points are told whether they were found where they should be. At least
-        `at_least` must agree with the pose.
+        With `count` the visibility statistics of the points are updated. At least `min_inliers` are
+        required.
         """
         visible = self._projector.visible(self._map, guess, ids)
         points, found = self._projector.search(self._map, visible, view.features, radius_px)
@@ -66,10 +66,14 @@ class Placer:
             features.whitening[found], rounds=4 if count else 2,  # at first roughly
         )  # fmt: skip
         n = int(inlier.sum())
-        if n < max(self._config.min_inliers, at_least) or n < 0.3 * len(points):
+        if n < max(self._config.min_inliers, min_inliers) or n < 0.3 * len(points):
             return False
-        told = view.ned_from_camera is not None
-        if count and not told and n < min(MIN_DUE_SHARE * len(visible.ids), ENOUGH):
+        has_attitude = view.ned_from_camera is not None
+        if (
+            count
+            and not has_attitude
+            and n < min(MIN_VISIBLE_RATIO * len(visible.ids), ENOUGH_INLIERS)
+        ):
             return False
         view.camera_from_map, view.information = pose, information
         view.point_ids[:] = -1
@@ -80,25 +84,25 @@ class Placer:
             self._map.n_found[points[inlier]] += 1
         return True
 
-    def place_near(self, view: View, guess: Pose) -> bool:
-        """Look for the points around the last view as if from `guess`; whether it was found."""
-        if self.sees_too_little(view):
+    def track_local_map(self, view: View, guess: Pose) -> bool:
+        """Track a view by the local map from a predicted pose; success."""
+        if self.too_few_features(view):
             return False
         view.point_ids = np.full(len(view.features), -1)
         return self.match(view, guess, self.local, 25.0) or self.match(
             view, guess, self.local, 60.0
         )
 
-    def follow(self, view: View, guess: Pose, last: View) -> bool:
-        """Follow the points around from a view that was placed; whether the view is there.
+    def track_klt(self, view: View, guess: Pose, last: View) -> bool:
+        """Track a view by KLT from the last tracked view; success.
 
-        It has a pose then, but shows points only as far as its features do. The turn between the
-        two must have been told.
+        The pose is then set, but points only where features match. The relative rotation must be
+        measured.
         """
         if last.ned_from_camera is None or view.ned_from_camera is None:
             return False
-        some = self.local[:: max(1, -(-len(self.local) // MOST_FOLLOWED))]
-        pose = follow(
+        some = self.local[:: max(1, -(-len(self.local) // MAX_KLT_POINTS))]
+        pose = track_points(
             self._camera, self._map.positions[some], last.grey, last.camera_from_map,
             view.grey, guess,
         )  # fmt: skip
@@ -109,33 +113,35 @@ class Placer:
             view.point_ids = np.full(len(view.features), -1)
         return True
 
-    def locate_by(self, view: View, keyframe: Keyframe) -> bool:
-        """Place a view as a lost camera would, by what one keyframe shows."""
-        located = self._atlas.locate_by(view.features, keyframe, view.level_from_camera, view.seq)
-        return located is not None and self.accept(view, located)
+    def relocalise_by(self, view: View, keyframe: Keyframe) -> bool:
+        """Relocalise a view against one keyframe."""
+        relocalised = self._atlas.relocalise_by(
+            view.features, keyframe, view.level_from_camera, view.seq
+        )
+        return relocalised is not None and self.verify(view, relocalised)
 
-    def accept(self, view: View, located: Located) -> bool:
-        """See whether a view fits the map where it was recognised."""
-        view.camera_from_map = located.camera_from_map
+    def verify(self, view: View, relocalised: Relocalised) -> bool:
+        """Verify a relocalised pose by the local map around it."""
+        view.camera_from_map = relocalised.camera_from_map
         view.point_ids[:] = -1
-        view.point_ids[located.features] = located.points
-        self.refresh_local(view)
-        return self.match(view, located.camera_from_map, self.local, 12.0)
+        view.point_ids[relocalised.features] = relocalised.points
+        self.update_local_map(view)
+        return self.match(view, relocalised.camera_from_map, self.local, 12.0)
 
-    def refresh_local(self, view: View) -> None:
-        """Take the points around a view that was placed as those to look for next."""
+    def update_local_map(self, view: View) -> None:
+        """Set the local map to the points around a tracked view."""
         seen = view.point_ids[view.point_ids >= 0]
         pose = view.camera_from_map
         self.local = local_points(self._map, seen, -pose.rotation.T @ pose.translation)
 
     def refine(self, view: View) -> None:
-        """Lay the points' patches over the image, and take the pose from where they fit."""
+        """Refine the pose by patch alignment of its points."""
         features = view.features
         normalised, whitening = features.normalised.copy(), features.whitening.copy()
         refined_for = np.full(len(features), -1)
         index = np.flatnonzero(view.point_ids >= 0)
         points = view.point_ids[index]
-        some = np.arange(0, len(index), max(1, -(-len(index) // MOST_REFINED)))
+        some = np.arange(0, len(index), max(1, -(-len(index) // MAX_REFINED)))
         finer, white = normalised[index], whitening[index]
         finer[some], white[some], _ = refine_features(
             self._map, view.camera_from_map, features, index[some], points[some],
@@ -148,15 +154,15 @@ class Placer:
         pose, inlier, information = refine_pose(
             view.camera_from_map, positions, finer, white, rounds=2
         )
-        told = view.ned_from_camera is not None
-        if not told:
-            start = other_pose(positions, finer)
+        has_attitude = view.ned_from_camera is not None
+        if not has_attitude:
+            start = solve_sqpnp(positions, finer)
             if start is not None:
-                other, theirs, info = refine_pose(start, positions, finer, white)
+                other, other_inlier, info = refine_pose(start, positions, finer, white)
                 if robust_cost(other, positions, finer, white) < robust_cost(
                     pose, positions, finer, white
                 ):
-                    pose, inlier, information = other, theirs, info
+                    pose, inlier, information = other, other_inlier, info
         if inlier.sum() >= max(self._config.min_inliers, 0.5 * len(points)):
             view.camera_from_map, view.information = pose, information
             view.point_ids[index[~inlier]] = -1

@@ -1,4 +1,4 @@
-"""Which frames stay, as keyframes."""
+"""Keyframe decision."""
 
 from __future__ import annotations
 
@@ -11,51 +11,52 @@ from companion.slam.features.orb_features import Ints
 from companion.slam.features.view import View
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 
-NEWEST_ALONE = 8
-"""So many of the newest keyframes do not stand in for a new one: slow flight needs more of them."""
-MIN_SHARED, COVERED = 0.5, 0.75
-"""One that does shows so much of what the view shows, within so much of the parallax allowed."""
+N_NEWEST_EXCLUDED = 8
+"""The newest keyframes never replace a new one: slow flight needs more of them."""
+MIN_SHARED, MAX_PARALLAX_RATIO = 0.5, 0.75
+"""Shared points required of a replacement, and its largest ratio of the parallax threshold."""
 
 
-def wants_keyframe(
+def needs_keyframe(
     config: TrackingConfig, slam_map: SlamMap, reference: Keyframe, view: View, since_ns: int
 ) -> bool:
-    """Whether a view shows so much that its `reference`, in use since then, does not."""
-    share = view.n_inliers / max(len(_firm(slam_map, reference)), 1)
+    """Whether a view shows enough that `reference`, in use since `since_ns`, does not."""
+    share = view.n_inliers / max(len(_well_observed(slam_map, reference)), 1)
     parallax_deg = _parallax_deg(slam_map, reference, view)
     late = view.t_ns - since_ns > config.keyframe_max_s * 1e9 and parallax_deg > 0.5
     weak = share < config.keyframe_min_share and (parallax_deg > 0.4 or share < 0.5)
     return weak or parallax_deg > config.keyframe_parallax_deg or late
 
 
-def covering(config: TrackingConfig, slam_map: SlamMap, view: View) -> Keyframe | None:
-    """An older keyframe that shows what a view does, which then need not become one; or None.
+def equivalent_keyframe(config: TrackingConfig, slam_map: SlamMap, view: View) -> Keyframe | None:
+    """An older keyframe that makes a view redundant, or None.
 
-    So that ground flown over again costs no more keyframes.
+    On return passes it becomes the reference instead of a new keyframe.
     """
     seen = view.point_ids[view.point_ids >= 0]
-    newest = set(islice(reversed(slam_map.keyframes), NEWEST_ALONE))
+    newest = set(islice(reversed(slam_map.keyframes), N_NEWEST_EXCLUDED))
     for n_shared, key in slam_map.covisible(seen):
         if n_shared < MIN_SHARED * len(seen):
             break
         keyframe = slam_map.keyframes[key]
         if (
             key not in newest
-            and _parallax_deg(slam_map, keyframe, view) < COVERED * config.keyframe_parallax_deg
-            and not wants_keyframe(config, slam_map, keyframe, view, view.t_ns)
+            and _parallax_deg(slam_map, keyframe, view)
+            < MAX_PARALLAX_RATIO * config.keyframe_parallax_deg
+            and not needs_keyframe(config, slam_map, keyframe, view, view.t_ns)
         ):
             return keyframe
     return None
 
 
-def _firm(slam_map: SlamMap, keyframe: Keyframe) -> Ints:
-    """The points of a keyframe that others see too."""
-    _, ids = slam_map.seen_by(keyframe)
+def _well_observed(slam_map: SlamMap, keyframe: Keyframe) -> Ints:
+    """Points of a keyframe with several observers."""
+    _, ids = slam_map.observations_of(keyframe)
     return ids[slam_map.n_observers[ids] >= min(3, len(slam_map.keyframes))]
 
 
 def _parallax_deg(slam_map: SlamMap, reference: Keyframe, view: View) -> float:
-    """By how much the view of the points has turned, seen from them."""
+    """Median parallax of the points of a view between it and a keyframe."""
     position = slam_map.positions[view.point_ids[view.point_ids >= 0]]
     pose = view.camera_from_map
     here = (-pose.rotation.T @ pose.translation) - position
@@ -67,7 +68,7 @@ def _parallax_deg(slam_map: SlamMap, reference: Keyframe, view: View) -> float:
 
 
 def keyframe_of(view: View, keyframe_id: int) -> Keyframe:
-    """A view as a keyframe that sees no points yet."""
+    """A keyframe from a view, without observations."""
     return Keyframe(
         keyframe_id, view.seq, view.t_ns, view.camera_from_map, view.features,
         np.full(len(view.features), -1),

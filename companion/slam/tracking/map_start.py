@@ -1,4 +1,4 @@
-"""How a map begins with two views, or goes on with them, and what came before them is placed."""
+"""Initialisation and continuation of a map by two views, and backfilling of earlier frames."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import numpy as np
 from companion.geometry.transforms import Pose
 from companion.slam.features.patches import image_levels
 from companion.slam.features.view import View
-from companion.slam.initialisation.bootstrap import Start
-from companion.slam.initialisation.map_continuation import Bridge
+from companion.slam.initialisation.bootstrap import TwoViewReconstruction
+from companion.slam.initialisation.map_continuation import MapContinuation
 from companion.slam.map.sparse_map import Keyframe
 from companion.slam.mapping.atlas import Atlas
-from companion.slam.tracking.frame_tracker import Placer
+from companion.slam.tracking.frame_tracker import FrameTracker
 
 
-def begin_map(atlas: Atlas, start: Start, first: Keyframe, second: Keyframe) -> None:
-    """Fill the map in use, which is empty, with the points of a Start and its two keyframes."""
+def initialise_map(
+    atlas: Atlas, start: TwoViewReconstruction, first: Keyframe, second: Keyframe
+) -> None:
+    """Fill the empty active map with a reconstruction and its two keyframes."""
     slam_map = atlas.map
     assert second.grey is not None
     ids = slam_map.add_points(
@@ -27,71 +29,84 @@ def begin_map(atlas: Atlas, start: Start, first: Keyframe, second: Keyframe) -> 
         keyframe.refined_for[:] = -1  # a view that was tracked in another map names points of that
     slam_map.first_keyframe_id = first.keyframe_id
     slam_map.keyframes[first.keyframe_id] = first
-    slam_map.poses_changed()
-    slam_map.observe(first, start.features_first, ids)
-    slam_map.observe(second, start.features_second, ids)
-    slam_map.refresh(ids, [first, second])
+    slam_map.invalidate_centres()
+    slam_map.add_observations(first, start.features_first, ids)
+    slam_map.add_observations(second, start.features_second, ids)
+    slam_map.update_geometry(ids, [first, second])
     mapper = atlas.mapper
     mapper.add(second)
     mapper.adjust_all(10)
-    atlas.remember(first)
-    atlas.remember(second)
+    atlas.index_keyframe(first)
+    atlas.index_keyframe(second)
     start.second.camera_from_map = second.camera_from_map
     start.second.point_ids = second.point_ids.copy()
 
 
-def carry_on(atlas: Atlas, ashore: View, first: Keyframe, start: Start, across: Bridge) -> None:
-    """Take two views into the map that the first of them, `ashore`, was the last to be tracked in.
+def continue_map(
+    atlas: Atlas,
+    last_tracked: View,
+    first: Keyframe,
+    start: TwoViewReconstruction,
+    continuation: MapContinuation,
+) -> None:
+    """Insert a reconstruction into the map that its first view was last tracked in.
 
-    Its keyframe `first` is in the map then, the second view has a pose and points in it.
+    That view is `last_tracked`. Afterwards its keyframe `first` is in the map, and the second view
+    has a pose and points.
     """
     slam_map, view = atlas.map, start.second
-    tracked = np.flatnonzero(ashore.point_ids >= 0)
-    tracked = tracked[slam_map.alive[ashore.point_ids[tracked]]]
+    tracked = np.flatnonzero(last_tracked.point_ids >= 0)
+    tracked = tracked[slam_map.alive[last_tracked.point_ids[tracked]]]
     slam_map.keyframes[first.keyframe_id] = first
-    slam_map.poses_changed()
-    slam_map.observe(first, tracked, ashore.point_ids[tracked])
+    slam_map.invalidate_centres()
+    slam_map.add_observations(first, tracked, last_tracked.point_ids[tracked])
     ids = slam_map.add_points(
-        across.points_map, first, across.features_first, image_levels(ashore.grey)
+        continuation.points_map, first, continuation.features_first, image_levels(last_tracked.grey)
     )
-    slam_map.observe(first, across.features_first, ids)
-    slam_map.refresh(ids, [first])
-    atlas.remember(first)
-    view.camera_from_map = across.second_from_map
+    slam_map.add_observations(first, continuation.features_first, ids)
+    slam_map.update_geometry(ids, [first])
+    atlas.index_keyframe(first)
+    view.camera_from_map = continuation.second_from_map
     view.point_ids = np.full(len(view.features), -1)
-    view.point_ids[start.features_second[across.known]] = across.known_points
-    view.point_ids[start.features_second[~across.known]] = ids
+    view.point_ids[start.features_second[continuation.known]] = continuation.known_points
+    view.point_ids[start.features_second[~continuation.known]] = ids
 
 
-def place_earlier(
-    placer: Placer, views: Iterable[View], first: View, second: View, reference: Keyframe
+def backfill(
+    frame_tracker: FrameTracker,
+    views: Iterable[View],
+    first: View,
+    second: View,
+    reference: Keyframe,
 ) -> list[View]:
-    """Place the frames that came before the map: from the first view outwards.
+    """Track the buffered frames of before the initialisation, outwards from the first view.
 
-    `reference` is the first view's keyframe.
+    `reference` is the keyframe of the first view.
     """
     views = [v for v in views if v.seq != second.seq]
-    placed: list[View] = []
+    tracked_views: list[View] = []
     before = [v for v in views if v.seq <= first.seq][::-1]
     after = [v for v in views if v.seq > first.seq]
     for run, between in ((before, False), (after, True)):
         last, other, misses = first, second, 0
         for v in run:
-            guess = _on_the_way(last, other, v)
-            found = placer.place_near(v, guess) or placer.locate_by(v, reference)
-            if found or placer.follow(v, guess, last):
+            guess = _interpolated_pose(last, other, v)
+            found = frame_tracker.track_local_map(v, guess) or frame_tracker.relocalise_by(
+                v, reference
+            )
+            if found or frame_tracker.track_klt(v, guess, last):
                 other = second if between or v.seq == first.seq else last
                 last, misses = v, 0
-                placed.append(v)
+                tracked_views.append(v)
             else:
                 misses += 1
                 if misses > 5 or abs(v.t_ns - last.t_ns) > 1e9:
                     break
-    return sorted(placed, key=lambda v: v.seq)
+    return sorted(tracked_views, key=lambda v: v.seq)
 
 
-def _on_the_way(last: View, other: View, view: View) -> Pose:
-    """Where a view is that is between or beyond two with poses, by time; turned as is told."""
+def _interpolated_pose(last: View, other: View, view: View) -> Pose:
+    """Pose of a view by interpolation in time between two, rotated as measured."""
     share = (view.t_ns - last.t_ns) / ((other.t_ns - last.t_ns) or 1)
     centre = last.centre + share * (other.centre - last.centre)
     rotation = last.camera_from_map.rotation

@@ -80,7 +80,7 @@ def write_message_log(flight_path: Path, path: Path, config: Config) -> None:
     times, devices = StageTimes(), choose_devices(config.opencl)
     with MessageLogWriter(path, flight.camera, log.origin) as writer:
         pipeline = Pipeline(
-            LocalisationStage(config, flight.camera, times, beside=False),
+            LocalisationStage(config, flight.camera, times, background=False),
             DepthStage(config.depth, config.cloud, flight.camera, devices, times), [writer],
             lossless=True,
         )  # fmt: skip

@@ -21,7 +21,7 @@ from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.slam.features.orb_features import Bools
 from companion.slam.features.triangulation import triangulate
 from companion.slam.initialisation import bootstrap
-from companion.slam.initialisation.initializer import TwoView, initialise
+from companion.slam.initialisation.initializer import TwoViewGeometry, initialise
 from companion.slam.optimisation.pose_refinement import refine_pose
 
 KINDS = ("axes", "turn", "depth")
@@ -36,14 +36,14 @@ def tilted_starts(kind: str, tilt_deg: float, n: int = 1) -> Iterator[list[int]]
     turn = rotation_from_vector(np.radians(tilt_deg) * AXIS)
     step = bootstrap.Bootstrap.step
 
-    def wrong(a: Any, b: Any, index_a: Any, index_b: Any, *rest: Any) -> TwoView | None:
+    def wrong(a: Any, b: Any, index_a: Any, index_b: Any, *rest: Any) -> TwoViewGeometry | None:
         found = initialise(a, b, index_a, index_b, *rest)
         if found is None or len(seen) >= n or kind == "axes":
             return found
         xa, xb = a.normalised[found.features_a], b.normalised[found.features_b]
         return (_turned if kind == "turn" else _deepened)(found, turn, xa, xb, b)
 
-    def stepped(self: Any, frame: Any, *rest: Any) -> bootstrap.Start | None:
+    def stepped(self: Any, frame: Any, *rest: Any) -> bootstrap.TwoViewReconstruction | None:
         found = step(self, frame, *rest)
         if found is None or len(seen) >= n:
             return found
@@ -62,14 +62,14 @@ def tilted_starts(kind: str, tilt_deg: float, n: int = 1) -> Iterator[list[int]]
         yield seen
 
 
-def _turned(found: TwoView, turn: Array, xa: Array, xb: Array, b: Any) -> TwoView:
+def _turned(found: TwoViewGeometry, turn: Array, xa: Array, xb: Array, b: Any) -> TwoViewGeometry:
     pose = Pose(turn @ found.b_from_a.rotation, found.b_from_a.translation)
     points, _ = triangulate(xa, xb, pose)
     ahead = np.isfinite(points).all(1) & (points[:, 2] > 0) & (pose.apply(points)[:, 2] > 0)
     return _kept(found, pose, points, ahead) if ahead.sum() > 30 else found
 
 
-def _deepened(found: TwoView, turn: Array, xa: Array, xb: Array, b: Any) -> TwoView:
+def _deepened(found: TwoViewGeometry, turn: Array, xa: Array, xb: Array, b: Any) -> TwoViewGeometry:
     """The plane nearest to the points turned about where the first camera's axis meets it."""
     rays = np.c_[xa, np.ones(len(xa))]
     inverse_depth = 1.0 / found.points_a[:, 2]
@@ -85,7 +85,7 @@ def _deepened(found: TwoView, turn: Array, xa: Array, xb: Array, b: Any) -> TwoV
     return _kept(found, pose, points, ahead)
 
 
-def _kept(found: TwoView, pose: Pose, points: Array, some: Bools) -> TwoView:
+def _kept(found: TwoViewGeometry, pose: Pose, points: Array, some: Bools) -> TwoViewGeometry:
     return replace(
         found, b_from_a=pose, points_a=points[some], features_a=found.features_a[some],
         features_b=found.features_b[some],

@@ -1,7 +1,7 @@
 """Devices whose driver fails: real ones, spoilt by failing_driver.c in processes that load it.
 
-    pair = two_devices(monkeypatch, tmp_path)
-    fail(monkeypatch, tmp_path, "abort", pair[0])
+pair = two_devices(monkeypatch, tmp_path)
+fail(monkeypatch, tmp_path, "abort", pair[0])
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from companion.compute.device_probe import listed_devices
 from companion.compute.device_verdict import circumstances, keep_verdict, verdict_path
 from companion.dense.device_choice import MeasuredDevice, measured
 from companion.dense.opencl import POCL, ComputeDevice
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 
 SOURCE = Path(__file__).with_suffix(".c")
 SPEEDS = (100.0, 50.0)
@@ -40,7 +40,10 @@ def two_devices(
     They are of one PoCL, which has a device with threads and one without. Where `known`, the
     verdict on them is kept in the folder; all other devices are refused.
     """
-    good = next((each for each in at_hand.known() if each.number == at_hand.working()[0]), None)
+    good = next(
+        (each for each in opencl_devices.known() if each.number == opencl_devices.working()[0]),
+        None,
+    )
     assert good is not None, "no OpenCL device works"
     if good.platform != POCL:
         pytest.skip("another OpenCL than PoCL has one device only here")

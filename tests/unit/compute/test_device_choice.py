@@ -1,4 +1,4 @@
-"""Which OpenCL device is taken, whatever the others do; and what is kept of that on disk."""
+"""Selection of the OpenCL device, and the cache of test results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from companion.config import OpenclConfig
 from companion.dense.device_choice import MeasuredDevice, in_order, why_taken
 from companion.dense.opencl import ACCELERATOR, GPU, PROCESSOR, ListedDevice
 from companion.errors import DeviceError
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 from tests.support.reference.failing_driver import fail, two_devices
 
 DEVICE = ListedDevice("0:0", "a device", "a platform")
@@ -48,7 +48,7 @@ LONG_S = 120.0
 
 
 def chosen(asked: str = "auto", patience_s: float = LONG_S) -> tuple[str, str, list[str]]:
-    """Name of the device that a new process takes, or ""; why; and what it says meanwhile."""
+    """Name of the device chosen by a new process, or ""; why; and its output."""
     done = subprocess.run(
         [sys.executable, "-c", CHOOSE, asked, str(patience_s)], capture_output=True, check=True
     )
@@ -81,14 +81,14 @@ def at(number: str, speed: float | None, kind: str = PROCESSOR, name: str = "") 
         ([at("0:0", None)], []),
     ],
 )  # fmt: skip
-def test_the_fastest_first_and_a_fixed_order_between_equals(
+def test_fastest_first_and_fixed_order_between_equals(
     devices: list[MeasuredDevice], order: list[str]
 ) -> None:
     assert [each.number for each in in_order(devices)] == order
     assert [each.number for each in in_order(devices[::-1])] == order
 
 
-def test_the_choice_says_why() -> None:
+def test_choice_is_explained() -> None:
     slow, fast, gpu, bad = at("0:0", 50), at("0:1", 100), at("1:0", 90, GPU), at("2:0", None)
     assert why_taken(fast, [fast]) == "the only one"
     assert why_taken(fast, [slow, fast]) == "the fastest of 2: 100 frames/s; 0:0 50"
@@ -110,7 +110,7 @@ def test_the_choice_says_why() -> None:
         ("hang", "hangs for 5 s", 5.0),
     ],
 )
-def test_a_device_that_fails_is_refused_in_a_line_and_the_next_one_taken(
+def test_failing_device_is_rejected_and_the_next_one_chosen(
     fault: str, problem: str, patience_s: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     bad, good = two_devices(monkeypatch, tmp_path, known=(False, True))
@@ -125,7 +125,7 @@ def test_a_device_that_fails_is_refused_in_a_line_and_the_next_one_taken(
     assert (name, said) == (good.named, [])
 
 
-def test_a_device_asked_for_by_name_is_never_replaced(
+def test_configured_device_is_never_replaced(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     bad, _ = two_devices(monkeypatch, tmp_path)
@@ -144,7 +144,7 @@ def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     assert "none" in run.stdout and "sudo apt install pocl-opencl-icd" in run.stderr
 
 
-def test_a_script_can_ask_whether_a_device_works(
+def test_exit_status_tells_whether_a_device_works(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     bad, good = two_devices(monkeypatch, tmp_path)
@@ -160,7 +160,7 @@ def test_a_script_can_ask_whether_a_device_works(
     assert good.name in {each["name"] for each in document["opencl_devices"]}
 
 
-def test_what_a_compiler_says_is_shown_where_it_is_asked_for() -> None:
+def test_compiler_log_is_shown_on_request() -> None:
     bad = dataclasses.replace(at("0:0", None), problem="kernels do not build", detail="a\nb\nc")
     told = [line.strip() for line in opencl_lines([bad, at("1:0", 40)], verbose=False)]
     assert told[1:] == [
@@ -180,7 +180,7 @@ def test_what_a_compiler_says_is_shown_where_it_is_asked_for() -> None:
         ("print('[1]'); print('{\"number\": 1}'); print('{')", "its driver ends the program", 60.0),
     ],
 )
-def test_a_driver_that_ends_its_process_is_named(
+def test_driver_that_ends_its_process_is_reported(
     program: str, problem: str, patience_s: float
 ) -> None:
     found = probed(DEVICE, (sys.executable, "-c", program), patience_s)
@@ -202,7 +202,7 @@ print(json.dumps({"finished": True}))
 """
 
 
-def test_a_driver_that_ends_the_listing_hides_no_other() -> None:
+def test_driver_that_ends_the_listing_hides_no_other() -> None:
     devices, failed = listed_devices((sys.executable, "-c", LISTS))
     assert [each.number for each in devices] == ["0:0", "2:0"]
     (bad,) = failed
@@ -239,10 +239,12 @@ else:
 
 
 class Measuring:
-    """Chooses the device of this computer, which is measured by a program that counts."""
+    """Selects the device of this computer, measured by a program that counts its calls."""
 
     def __init__(self, folder: Path) -> None:
-        best = next(each for each in at_hand.known() if each.number == at_hand.working()[0])
+        best = next(
+            each for each in opencl_devices.known() if each.number == opencl_devices.working()[0]
+        )
         self._log = folder / "measured.txt"
         self._log.write_text("")
         self.said: list[str] = []
@@ -250,7 +252,7 @@ class Measuring:
         self._program = (sys.executable, "-c", ANSWERS, listed, str(self._log))
 
     def n(self) -> int:
-        """How often a device is measured when one is chosen now."""
+        """Measurements during a selection now."""
         before = len(self._log.read_text())
         devices = choose_devices(OpenclConfig(), self.said.append, program=self._program)
         assert devices.current is not None
@@ -259,7 +261,7 @@ class Measuring:
 
 @pytest.fixture
 def measuring(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Measuring:
-    at_hand.known()
+    opencl_devices.known()
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path / "cache"))
     return Measuring(tmp_path)
 
@@ -271,7 +273,7 @@ def change(key: str) -> Callable[[dict[str, Any]], object]:
 @pytest.mark.parametrize(
     "changed", [change(key) for key in ("devices", "processor", "linkers", "kernels", "companion")]
 )
-def test_the_verdict_counts_until_something_has_changed(
+def test_cache_is_valid_until_something_changes(
     changed: Callable[[dict[str, Any]], object], measuring: Measuring
 ) -> None:
     assert [measuring.n() for _ in range(3)] == [1, 0, 0]
@@ -299,9 +301,7 @@ def test_the_verdict_counts_until_something_has_changed(
         lambda text: text.replace('"problem": ""', '"problem": 3'),
     ],
 )
-def test_a_damaged_verdict_is_as_good_as_none(
-    damage: Callable[[str], str], measuring: Measuring
-) -> None:
+def test_corrupt_cache_is_ignored(damage: Callable[[str], str], measuring: Measuring) -> None:
     assert measuring.n() == 1
     path = verdict_path()
     assert path is not None
@@ -311,7 +311,7 @@ def test_a_damaged_verdict_is_as_good_as_none(
     assert [measuring.n() for _ in range(2)] == [1, 0]
 
 
-def test_bytes_that_are_no_text_are_a_damaged_verdict(measuring: Measuring) -> None:
+def test_binary_cache_is_ignored(measuring: Measuring) -> None:
     assert measuring.n() == 1
     path = verdict_path()
     assert path is not None
@@ -319,16 +319,14 @@ def test_bytes_that_are_no_text_are_a_damaged_verdict(measuring: Measuring) -> N
     assert [measuring.n() for _ in range(2)] == [1, 0]
 
 
-def test_where_nothing_can_be_kept_it_is_measured_each_time_and_said(
-    measuring: Measuring, tmp_path: Path
-) -> None:
+def test_unwritable_cache_is_reported(measuring: Measuring, tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("a file where a folder is wanted")  # root writes anywhere else
     assert [measuring.n() for _ in range(2)] == [1, 1]
     assert len(measuring.said) == 2  # once for each start
     assert all("measured at each start" in line for line in measuring.said)
 
 
-def test_where_the_verdict_lies() -> None:
+def test_cache_path() -> None:
     assert verdict_path({"HOME": "/h"}) == Path("/h/.cache/companion/opencl.json")
     assert verdict_path({"HOME": "/h", "XDG_CACHE_HOME": "/c"}) == Path("/c/companion/opencl.json")
     service = {"CACHE_DIRECTORY": "/var/cache/companion", "XDG_CACHE_HOME": "/c"}
@@ -346,7 +344,7 @@ def test_another_driver_of_the_same_device_is_another_device(tmp_path: Path) -> 
     assert kept_verdict(path, circumstances([old, at("0:1", 40)])) == {}
 
 
-def test_the_processor_is_its_model_and_not_its_clock(tmp_path: Path) -> None:
+def test_processor_identity_excludes_its_clock(tmp_path: Path) -> None:
     path = tmp_path / "cpuinfo"
     path.write_text("processor\t: 0\nmodel name\t: A\ncpu MHz\t: 800\nprocessor\t: 1\n")
     one = processor(path)
@@ -356,10 +354,10 @@ def test_the_processor_is_its_model_and_not_its_clock(tmp_path: Path) -> None:
     assert processor(path) != one
 
 
-def test_what_was_measured_before_an_interruption_is_kept(
+def test_results_before_an_interruption_are_cached(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A service is ended that takes too long to start, and would never get further."""
+    """A service that exceeds its start timeout would otherwise never get further."""
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
 
     def stop(remark: str) -> None:
@@ -374,9 +372,9 @@ def test_what_was_measured_before_an_interruption_is_kept(
     assert [each["name"] for each in document["measured"]] == ["first"]
 
 
-def test_in_flight_what_has_failed_is_passed_over_and_none_may_be_left() -> None:
-    (number, *_) = at_hand.working()
-    best = next(each for each in at_hand.known() if each.number == number)
+def test_devices_failed_in_flight_are_excluded() -> None:
+    (number, *_) = opencl_devices.working()
+    best = next(each for each in opencl_devices.known() if each.number == number)
     devices = choose_devices(OpenclConfig(number), failed={best.identity: "it: was lost"})
     assert devices.current is None
     assert devices.described == "none is left; failed: it: was lost"

@@ -1,4 +1,4 @@
-"""Which OpenCL driver is installed where: the script with stand-ins for what changes a computer."""
+"""Installation of an OpenCL driver: the script with stand-ins for system commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SCRIPT = Path(__file__).parents[3] / "packaging/opencl.sh"
 
 
 class Computer:
-    """A folder of commands that note how they were called, in front of the real ones."""
+    """A folder of commands that log their calls, ahead of the real ones."""
 
     def __init__(self, folder: Path) -> None:
         self.venv, self.commands, self.log = folder / "venv", folder / "bin", folder / "calls"

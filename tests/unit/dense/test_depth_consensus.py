@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.config import DepthConfig
-from companion.dense.consensus import AROUND, Consensus, judged
+from companion.dense.consensus import N_NEIGHBOURS, Consensus, check_consistency
 from companion.geometry.transforms import Pose
 from companion.messages import DepthMap, Floats, PixelState
 
@@ -20,7 +20,7 @@ SIDE_PX = 5
 
 
 def wall(keyframe_id: int = 0, sigma: float = 0.005, depth_m: float = WALL_M) -> DepthMap:
-    """A wall straight ahead that has converged."""
+    """A converged wall straight ahead."""
     depth = np.full(SHAPE, depth_m, np.float32)
     return DepthMap(
         keyframe_id, keyframe_id, (50.0, 50.0, 29.5, 19.5), depth, depth * np.float32(sigma),
@@ -30,16 +30,16 @@ def wall(keyframe_id: int = 0, sigma: float = 0.005, depth_m: float = WALL_M) ->
 
 
 def unsure(depth_map: DepthMap, sigma: float = 0.03) -> DepthMap:
-    """The same, not one pixel of which has converged."""
+    """The same without converged pixels."""
     return replace(
         depth_map, state=np.full(SHAPE, UPDATING, np.uint8),
         sigma=depth_map.depth * np.float32(sigma),
     )  # fmt: skip
 
 
-def test_what_maps_are_sure_of_together_converges_where_they_see_it() -> None:
+def test_agreeing_maps_converge_in_their_overlap() -> None:
     others = [(wall(k), HALF_RIGHT.inverse()) for k in (1, 2, 3)]
-    out = judged(unsure(wall()), others, CONFIG)
+    out = check_consistency(unsure(wall()), others, CONFIG)
     assert (out.state[:, SIDE_PX + 1 :] == CONVERGED).all()
     assert (out.state[:, : SIDE_PX - 1] == UPDATING).all()
     np.testing.assert_allclose(out.depth, WALL_M, rtol=1e-6)
@@ -47,55 +47,55 @@ def test_what_maps_are_sure_of_together_converges_where_they_see_it() -> None:
 
 
 @pytest.mark.parametrize("state", [CONVERGED, UPDATING])
-def test_maps_that_agree_and_know_little_are_not_enough(state: int) -> None:
+def test_agreement_of_uncertain_maps_does_not_converge(state: int) -> None:
     others = [
         (replace(unsure(wall(k), 0.2), state=np.full(SHAPE, state, np.uint8)), Pose.identity())
         for k in (1, 2, 3)
     ]
-    out = judged(unsure(wall(), 0.2), others, CONFIG)
+    out = check_consistency(unsure(wall(), 0.2), others, CONFIG)
     assert (out.state == UPDATING).all()
 
 
-def test_what_was_filled_in_from_around_supports_nothing() -> None:
+def test_filled_in_pixels_are_no_support() -> None:
     filled = replace(unsure(wall(), 0.001), inlier_ratio=np.full(SHAPE, 0.1, np.float32))
     others = [(replace(filled, keyframe_id=k), Pose.identity()) for k in (1, 2, 3)]
-    out = judged(unsure(wall(), 0.001), others, CONFIG)
+    out = check_consistency(unsure(wall(), 0.001), others, CONFIG)
     assert (out.state == UPDATING).all()
 
 
-def test_one_that_errs_alone_is_put_right() -> None:
+def test_single_wrong_map_is_corrected() -> None:
     depth = np.full(SHAPE, WALL_M, np.float32)
     depth[10:20, 10:20] = 5.5
-    out = judged(
+    out = check_consistency(
         replace(wall(), depth=depth), [(wall(k), Pose.identity()) for k in (1, 2, 3)], CONFIG
     )
     np.testing.assert_allclose(out.depth, WALL_M, rtol=1e-6)
     assert (out.state == CONVERGED).all()
 
 
-def test_what_two_contradict_without_agreeing_has_not_converged() -> None:
+def test_two_contradictions_without_agreement_revoke_convergence() -> None:
     others = [(wall(k, depth_m=d), Pose.identity()) for k, d in ((1, 6.0), (2, 9.0))]
-    out = judged(wall(), others, CONFIG)
+    out = check_consistency(wall(), others, CONFIG)
     assert (out.state == UPDATING).all()
     assert (out.depth == wall().depth).all()
 
 
-def test_what_no_other_sees_stays() -> None:
+def test_pixels_unseen_by_others_are_unchanged() -> None:
     here = wall()
     nothing = replace(wall(1), depth=np.zeros(SHAPE, np.float32))
     behind = Pose(np.diag([-1.0, 1, -1]), np.zeros(3))
     for others in ([], [(nothing, Pose.identity())], [(wall(1), behind)]):
-        out = judged(here, others, CONFIG)
+        out = check_consistency(here, others, CONFIG)
         assert (out.state == CONVERGED).all() and (out.depth == here.depth).all()
 
 
 @pytest.mark.parametrize("n", [1, 3, 20])
-def test_all_come_back_in_order_and_few_are_held(n: int) -> None:
+def test_maps_are_returned_in_order_and_the_buffer_is_bounded(n: int) -> None:
     it, out = Consensus(CONFIG), []
     for k in range(n):
         out += it.add(wall(k), Pose.identity())
-        assert len(out) == max(0, k + 1 - AROUND)
-        assert len(it._held) <= 2 * AROUND
+        assert len(out) == max(0, k + 1 - N_NEIGHBOURS)
+        assert len(it._recent) <= 2 * N_NEIGHBOURS
     out += it.flush()
     assert [m.keyframe_id for m in out] == list(range(n))
 
@@ -125,7 +125,7 @@ def true_depth(world_from_camera: Pose) -> Floats:
 
 
 def measured(k: int, rng: np.random.Generator, *, wrong: bool = False) -> DepthMap:
-    """Truth with noise; a tenth is unsure, and errs more; if `wrong` all lies a tenth too far."""
+    """Truth with noise; a tenth uncertain, with larger errors; if `wrong` all a tenth too far."""
     truth = true_depth(places()[k])
     weak = rng.random(SIZE) < 0.1
     sigma = np.where(weak, 0.05, NOISE)
@@ -138,7 +138,7 @@ def measured(k: int, rng: np.random.Generator, *, wrong: bool = False) -> DepthM
 
 
 def quality(depth_map: DepthMap, truth: Floats) -> dict[str, float]:
-    """Share converged, and shares within 1, 2 and 5 % of these and of all."""
+    """Ratio converged, and ratios within 1, 2 and 5 % of these and of all."""
     error = np.abs(depth_map.depth - truth) / truth
     converged = depth_map.state == CONVERGED
     out = {"converged": float(converged.mean())}
@@ -150,7 +150,7 @@ def quality(depth_map: DepthMap, truth: Floats) -> dict[str, float]:
 
 @pytest.mark.parametrize("wrong", [None, 0, 3, 5])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_agreement_makes_no_reference_worse(seed: int, wrong: int | None) -> None:
+def test_consistency_check_degrades_no_reference(seed: int, wrong: int | None) -> None:
     rng = np.random.default_rng(seed)
     maps = [measured(k, rng, wrong=k == wrong) for k in range(7)]
     it, out = Consensus(CONFIG), []
@@ -169,12 +169,12 @@ def test_agreement_makes_no_reference_worse(seed: int, wrong: int | None) -> Non
             assert after["all within 0.01"] > 0.6, "the others put it right"
 
 
-def test_a_wall_beside_an_object_that_hides_it_from_most_is_left_as_it_was() -> None:
+def test_wall_occluded_in_most_views_is_unchanged() -> None:
     rng = np.random.default_rng(4)
     maps = [measured(k, rng) for k in range(7)]
     first, relative = places()[0], places()
     others = [(maps[k], relative[k].inverse() @ first) for k in range(1, 7)]
-    out = judged(maps[0], others, CONFIG)
+    out = check_consistency(maps[0], others, CONFIG)
     # of the wall that the first sees, what the object hides from at least four of the others
     truth = true_depth(first)
     v, u = np.indices(SIZE)

@@ -1,4 +1,4 @@
-"""The dense engine: rendered scenes, and inputs that show nothing."""
+"""The dense engine on rendered scenes and uninformative inputs."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from companion.config import DepthConfig
 from companion.dense import verification
 from companion.dense.engine import DepthEngine
 from companion.dense.opencl import ComputeDevice, device_asked_for
-from companion.dense.verification import MOST_NOISE_GREY, image_noise
+from companion.dense.verification import MAX_NOISE_GREY, image_noise
 from companion.dense.view_selection import Intrinsics
 from companion.errors import DeviceError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, rotation_from_vector
 from companion.messages import Bytes, DepthMap, PixelState
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld, texture
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 
 STATES = {state.value for state in PixelState}
 
 
 @pytest.fixture(scope="module")
 def device() -> ComputeDevice:
-    return at_hand.best()
+    return opencl_devices.best()
 
 
 def engine(device: ComputeDevice, width: int, height: int, **keys: float) -> DepthEngine:
@@ -63,7 +63,7 @@ def fly(
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
-def test_a_rendered_scene_is_measured(device: ComputeDevice, stride: int) -> None:
+def test_rendered_scene_is_reconstructed(device: ComputeDevice, stride: int) -> None:
     depth_map, truth = fly(device, stride)
     assert depth_map.depth.shape == truth.shape == depth_map.state.shape == depth_map.rgb.shape[:2]
     assert depth_map.intrinsics[0] == pytest.approx(260.0 / stride)
@@ -79,7 +79,7 @@ def test_a_rendered_scene_is_measured(device: ComputeDevice, stride: int) -> Non
     assert 0.4 < np.quantile(off, 0.68) < 1.6, "sigma is what it says"
 
 
-def test_what_noise_hides_says_nothing_against_a_depth(
+def test_noise_does_not_reject_depth(
     device: ComputeDevice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def weak() -> tuple[DepthMap, np.ndarray]:
@@ -101,7 +101,7 @@ def test_what_noise_hides_says_nothing_against_a_depth(
     np.testing.assert_array_equal(depth_map.depth, strict.depth, "it weighs no more for that")
 
 
-def test_noise_is_measured_where_an_image_is_smoothest() -> None:
+def test_noise_is_measured_in_the_smoothest_blocks() -> None:
     rng = np.random.default_rng(5)
     picture = cv2.resize(texture(rng, 128), (320, 240), interpolation=cv2.INTER_CUBIC)
     for noise in (0.7, 1.5, 4.0):
@@ -110,17 +110,17 @@ def test_noise_is_measured_where_an_image_is_smoothest() -> None:
     assert image_noise(np.full((65, 97), 9, np.uint8)) == 0.0
     assert image_noise(np.full((7, 9), 9, np.uint8)) == 0.0
     anything = rng.integers(0, 256, (240, 320), np.uint8)
-    assert image_noise(anything) == MOST_NOISE_GREY
+    assert image_noise(anything) == MAX_NOISE_GREY
 
 
-def test_an_estimate_is_there_before_the_end_and_gets_better(device: ComputeDevice) -> None:
+def test_eager_estimates_improve(device: ComputeDevice) -> None:
     left: list[int] = []
     depth_map, _ = fly(device, on_update=left.append)
     assert left[0] == depth_map.state.size
     assert left[-1] < 0.5 * depth_map.state.size
 
 
-def test_images_that_say_nothing_new_are_passed_over(device: ComputeDevice) -> None:
+def test_redundant_images_are_skipped(device: ComputeDevice) -> None:
     it = engine(device, 64, 48)
     grey = texture(np.random.default_rng(5), 128)[:48, :64].copy()
     it.begin(grey, 5.0, 30.0)
@@ -133,7 +133,7 @@ def test_images_that_say_nothing_new_are_passed_over(device: ComputeDevice) -> N
     assert it.n_searched == 1
 
 
-def test_two_runs_are_the_same_to_the_last_bit(device: ComputeDevice) -> None:
+def test_runs_are_bit_exact(device: ComputeDevice) -> None:
     one, two = fly(device)[0], fly(device)[0]
     for name in ("depth", "sigma", "state", "inlier_ratio"):
         assert np.array_equal(getattr(one, name), getattr(two, name)), name
@@ -166,7 +166,7 @@ def _nothing() -> dict[str, tuple[Bytes, Bytes, Pose]]:
 
 
 @pytest.mark.parametrize("name", sorted(_nothing()))
-def test_what_shows_nothing_yields_nothing(device: ComputeDevice, name: str) -> None:
+def test_uninformative_images_yield_no_depth(device: ComputeDevice, name: str) -> None:
     first, second, pose = _nothing()[name]
     it = engine(device, 64, 48, stride=1)
     it.begin(first, 5.0, 30.0)
@@ -183,7 +183,7 @@ def test_what_shows_nothing_yields_nothing(device: ComputeDevice, name: str) -> 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (65, 49), (101, 57), (48, 64)])
-def test_any_size_gives_numbers(
+def test_any_size_gives_finite_values(
     device: ComputeDevice, width: int, height: int, stride: int
 ) -> None:
     big = texture(np.random.default_rng(5), 256)
@@ -200,13 +200,13 @@ def test_any_size_gives_numbers(
     assert depth_map.depth.min() >= 4.99 and depth_map.depth.max() <= 30.01
 
 
-def test_what_no_device_can_hold_is_an_error(device: ComputeDevice) -> None:
+def test_image_too_large_for_the_device_is_an_error(device: ComputeDevice) -> None:
     with pytest.raises(DeviceError, match=r"raise depth\.stride"):
         engine(device, 100_000, 90_000, stride=1)
 
 
-def test_a_device_is_found_by_number_and_by_name_and_never_replaced() -> None:
-    listed = [each.listed for each in at_hand.known()]
+def test_device_by_number_and_by_name() -> None:
+    listed = [each.listed for each in opencl_devices.known()]
     for each in listed:
         assert device_asked_for(each.number, listed) is each
         assert device_asked_for(each.name, listed).name == each.name

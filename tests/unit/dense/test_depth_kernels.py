@@ -1,4 +1,4 @@
-"""Each kernel of the dense engine against the same in numpy, at sizes that fit no vector."""
+"""Kernels of the dense engine against numpy, at unaligned sizes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.dense.regularisation import HUBER, Regularisation
 from companion.dense.view_selection import Intrinsics, Views
 from companion.geometry.transforms import Pose, rotation_from_vector
 from tests.support.flights.scene import texture
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 from tests.support.reference import reference_depth as reference
 
 PLANES = 32
@@ -27,9 +27,9 @@ MOST_APART = 9000.0
 """What the sum of squared differences of a window may be where it is alike."""
 
 
-@pytest.fixture(scope="module", params=at_hand.working())
+@pytest.fixture(scope="module", params=opencl_devices.working())
 def device(request: pytest.FixtureRequest) -> ComputeDevice:
-    return at_hand.opened(request.param)
+    return opencl_devices.opened(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +196,7 @@ def test_median(device: ComputeDevice, sweep: cl.Program, rng: np.random.Generat
     np.testing.assert_allclose(out, second / (4 * 1.95), atol=1e-6)
 
 
-def test_blocks_hold_the_planes_of_the_coarse_neighbours(
+def test_blocks_cover_the_planes_of_coarse_neighbours(
     device: ComputeDevice, sweep: cl.Program, rng: np.random.Generator
 ) -> None:
     coarse, fine = (17, 11), (33, 21)

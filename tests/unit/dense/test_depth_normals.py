@@ -27,18 +27,18 @@ def test_normals_of_a_plane(way: tuple[float, float, float]) -> None:
     assert (found[~known] == 0).all()
 
 
-def test_a_surface_is_not_mixed_with_what_lies_behind_it() -> None:
+def test_normals_do_not_mix_surfaces() -> None:
     depth = depth_of_plane(np.array([0, 0, -1.0]), 2.0)
     depth[:, 32:] *= 1.5
     assert np.abs(normals(depth, K) - [0, 0, -1]).max() < 1e-4
 
 
-def test_a_lone_pixel_faces_nowhere() -> None:
+def test_isolated_pixel_has_no_normal() -> None:
     depth = np.zeros((48, 64), np.float32)
     depth[20, 20] = 2.0
     assert not normals(depth, K).any()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 70)])
-def test_any_size_will_do(shape: tuple[int, int]) -> None:
+def test_any_size(shape: tuple[int, int]) -> None:
     assert normals(np.ones(shape, np.float32), K).shape == (*shape, 3)

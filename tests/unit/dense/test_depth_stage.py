@@ -11,8 +11,8 @@ import pytest
 
 from companion.config import CloudConfig, DepthConfig
 from companion.dense import device_takeover
-from companion.dense.depth_stage import MAX_HELD, DepthStage
-from companion.dense.device_takeover import NONE_LEFT, TOOK_OVER, Devices
+from companion.dense.depth_stage import MAX_FRAMES, DepthStage
+from companion.dense.device_takeover import FAILED_OVER, NO_DEVICE_LEFT, Devices
 from companion.dense.self_test import SelfTest
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose
@@ -26,7 +26,7 @@ from companion.messages import (
     Warned,
 )
 from tests.support.flights.mapped_plane import at, told
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 from tests.support.reference.failing_driver import WrongDevice
 
 RADTAN = Camera(242, 181, 200.0, 199.0, 121.0, 88.0, Distortion.RADTAN, (-0.1, 0.02, 0, 0, 0))
@@ -35,7 +35,11 @@ FISHEYE = Camera(242, 181, 170.0, 170.0, 121.0, 90.0, Distortion.EQUIDISTANT, (0
 
 def stage(camera: Camera, devices: Devices | None = None) -> DepthStage:
     return DepthStage(
-        DepthConfig(), CloudConfig(), camera, devices or at_hand.devices(), lambda _: nullcontext()
+        DepthConfig(),
+        CloudConfig(),
+        camera,
+        devices or opencl_devices.devices(),
+        lambda _: nullcontext(),
     )
 
 
@@ -83,18 +87,18 @@ def test_points_lie_on_the_surfaces(camera: Camera) -> None:
         assert np.median(up) < -0.98
 
 
-def test_keyframes_of_other_segments_do_not_meet() -> None:
+def test_segments_are_not_fused() -> None:
     alone = fly(RADTAN, scale_of={k: 1.0 + 0.1 * k for k in range(20)})
     assert not [m for m in alone if isinstance(m, PointChunk)], "no two keyframes share a unit"
 
 
-def test_images_do_not_pile_up_while_hovering() -> None:
+def test_frame_buffer_is_bounded_while_hovering() -> None:
     it = stage(RADTAN)
     grey = np.zeros((RADTAN.height, RADTAN.width), np.uint8)
-    for k in range(3 * MAX_HELD):
+    for k in range(3 * MAX_FRAMES):
         it.step(Frame(k, k, grey, np.repeat(grey[..., None], 3, 2)))
         it.step(Track(k, k, TrackState.TRACKING, Pose.identity(), 0, Pose.identity(), 50))
-    assert len(it._held) <= MAX_HELD + 1
+    assert len(it._frames) <= MAX_FRAMES + 1
 
 
 # -- devices that fail in flight -----------------------------------------------------------------
@@ -106,19 +110,21 @@ def undisturbed() -> list[Message]:
 
 
 def twice() -> Devices:
-    """The best device, and once more to take over from itself."""
-    best = next(each for each in at_hand.known() if each.number == at_hand.working()[0])
+    """The best device, and again for failover to itself."""
+    best = next(
+        each for each in opencl_devices.known() if each.number == opencl_devices.working()[0]
+    )
     return Devices([best, best], lambda _: "")
 
 
 def lose(devices: Devices) -> None:
-    """Whatever is asked of the device in use is refused by its driver from now on."""
+    """All commands to the current device fail from now on."""
     assert devices.current is not None
     devices.current.queue = cl.CommandQueue(cl.Context([devices.current.device]))
 
 
 def spoil(devices: Devices) -> None:
-    """The next test of the device in use finds that it computes wrongly."""
+    """The next test of the current device fails."""
     assert devices.current is not None and devices._taken is not None
     listed, _ = devices._taken
     devices._taken = (listed, SelfTest(WrongDevice(devices.current.device)))
@@ -132,15 +138,15 @@ def points(out: list[Message]) -> list[bytes]:
     ("fault", "in_words"),
     [(lose, "fails while it computes"), (spoil, "self-test failed: only")],
 )
-def test_the_next_device_takes_over_and_nothing_is_missing(
+def test_failover_loses_nothing(
     fault: Callable[[Devices], None], in_words: str, undisturbed: list[Message],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(device_takeover, "TEST_EVERY_NS", 1)
+    monkeypatch.setattr(device_takeover, "TEST_PERIOD_NS", 1)
     devices = twice()
     out = fly(RADTAN, devices=devices, before=lambda k: fault(devices) if k == 18 else None)
     (warned,) = [m for m in out if isinstance(m, Warned)]
-    assert (warned.what, warned.good) == (TOOK_OVER, False) and 18 <= warned.t_ns < 24
+    assert (warned.what, warned.good) == (FAILED_OVER, False) and 18 <= warned.t_ns < 24
     assert devices.current is not None
     assert warned.detail.startswith(f"{devices.current.name}; {devices.current.name}: {in_words}")
     assert ("may be wrong" in warned.detail) == (fault is spoil)
@@ -149,30 +155,32 @@ def test_the_next_device_takes_over_and_nothing_is_missing(
 
 
 @pytest.mark.parametrize("fault", [lose, spoil])
-def test_without_another_device_depth_ends_and_the_stage_goes_on(
+def test_without_another_device_depth_ends_and_the_stage_continues(
     fault: Callable[[Devices], None], undisturbed: list[Message], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_takeover, "TEST_EVERY_NS", 1)
+    monkeypatch.setattr(device_takeover, "TEST_PERIOD_NS", 1)
     devices = twice()
     out = fly(RADTAN, devices=devices, before=lambda k: fault(devices) if k in (12, 26) else None)
-    assert [m.what for m in out if isinstance(m, Warned)] == [TOOK_OVER, NONE_LEFT]
+    assert [m.what for m in out if isinstance(m, Warned)] == [FAILED_OVER, NO_DEVICE_LEFT]
     maps = [m.depth.tobytes() for m in out if isinstance(m, DepthMap)]
     whole = [m.depth.tobytes() for m in undisturbed if isinstance(m, DepthMap)]
     assert 0 < len(maps) < len(whole) and maps == whole[: len(maps)]
     assert devices.described.startswith("none is left; failed: ")
 
 
-def test_a_stage_that_begins_with_a_failed_device_says_so() -> None:
-    """As one does that is started again in flight."""
-    best = next(each for each in at_hand.known() if each.number == at_hand.working()[0])
+def test_stage_started_with_a_failed_device_reports_it() -> None:
+    """As after a restart in flight."""
+    best = next(
+        each for each in opencl_devices.known() if each.number == opencl_devices.working()[0]
+    )
     out = fly(RADTAN, 12, devices=Devices([best], lambda _: "", ["another: was lost"]))
     (warned,) = [m for m in out if isinstance(m, Warned)]
-    assert (warned.what, warned.detail) == (TOOK_OVER, f"{best.named}; another: was lost")
+    assert (warned.what, warned.detail) == (FAILED_OVER, f"{best.named}; another: was lost")
     out = fly(RADTAN, 12, devices=Devices([], lambda _: "", ["another: was lost"]))
     assert len(out) == 1 and isinstance(out[0], Warned)  # and nothing else
     warned = out[0]
-    assert (warned.what, warned.detail) == (NONE_LEFT, "another: was lost")
+    assert (warned.what, warned.detail) == (NO_DEVICE_LEFT, "another: was lost")
 
 
-def test_the_autopilot_can_be_told_in_one_message() -> None:
-    assert all(len(f"Companion: {what}") <= 50 for what in (TOOK_OVER, NONE_LEFT))
+def test_warnings_fit_one_autopilot_message() -> None:
+    assert all(len(f"Companion: {what}") <= 50 for what in (FAILED_OVER, NO_DEVICE_LEFT))

@@ -1,4 +1,4 @@
-"""Obstacles at known places around vehicles that are turned, tilted and not at the origin."""
+"""Obstacles at known positions around rotated, tilted and displaced vehicles."""
 
 from __future__ import annotations
 
@@ -29,9 +29,7 @@ def vehicle(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Po
     return Pose(rotation_from_quaternion(q), PLACE)
 
 
-def at(
-    bearing_deg: float, distance_m: float, down_m: float = 0.0, n: int = 10
-) -> Array:
+def at(bearing_deg: float, distance_m: float, down_m: float = 0.0, n: int = 10) -> Array:
     """A small cluster of points at a true bearing from the vehicle, clockwise from north."""
     b = math.radians(bearing_deg)
     centre = PLACE + [distance_m * math.cos(b), distance_m * math.sin(b), down_m]
@@ -41,14 +39,14 @@ def at(
 
 
 def distances(pose: Pose, points: Array, eyes: Array | None = None) -> dict[int, int]:
-    """Sectors that are not unknown."""
+    """Sectors that are known."""
     seen_from = np.broadcast_to(pose.translation, points.shape) if eyes is None else eyes
     found = obstacles_around(7, pose, points, seen_from)
     assert found.distances_cm.shape == (72,)
     return {i: int(d) for i, d in enumerate(found.distances_cm) if d != UNKNOWN_CM}
 
 
-def test_nothing_seen_is_unknown_everywhere() -> None:
+def test_unseen_is_unknown_everywhere() -> None:
     assert distances(vehicle(30), np.zeros((0, 3))) == {}
 
 
@@ -83,7 +81,7 @@ def test_tilting_changes_neither_sector_nor_height() -> None:
         assert found[8] == pytest.approx(1500, abs=4)
 
 
-def test_the_nearest_counts_but_not_a_single_point() -> None:
+def test_single_point_is_no_obstacle() -> None:
     points = np.concatenate([at(40, 12.0), at(40, 6.0), at(40, 3.0, n=2)])
     assert distances(vehicle(0), points) == {8: pytest.approx(600, abs=4)}
 
@@ -91,7 +89,7 @@ def test_the_nearest_counts_but_not_a_single_point() -> None:
 @pytest.mark.parametrize(
     ("down_m", "seen"), [(-0.9, True), (-1.2, False), (0.6, True), (0.9, False)]
 )
-def test_only_its_own_height_counts(down_m: float, seen: bool) -> None:
+def test_height_band(down_m: float, seen: bool) -> None:
     assert bool(distances(vehicle(0), at(40, 6.0, down_m))) is seen
 
 
@@ -100,8 +98,8 @@ def test_the_vehicle_itself_is_no_obstacle() -> None:
     assert distances(vehicle(0), at(40, 0.4)) == {8: pytest.approx(40, abs=3)}
 
 
-def test_free_is_only_what_was_seen_through() -> None:
-    """A far wall ahead, seen from here; a far one aside, seen from elsewhere."""
+def test_free_requires_a_line_of_sight() -> None:
+    """A far wall ahead, seen from here; a far one to the side, seen from elsewhere."""
     ahead, aside = at(20, 40.0), at(110, 40.0)
     eyes = np.concatenate(
         [np.broadcast_to(PLACE, ahead.shape), np.broadcast_to(PLACE + [30.0, 0, 0], aside.shape)]
@@ -109,8 +107,8 @@ def test_free_is_only_what_was_seen_through() -> None:
     assert distances(vehicle(20), np.concatenate([ahead, aside]), eyes) == {0: FREE}
 
 
-def test_a_line_of_sight_that_began_behind_and_passes_by_counts() -> None:
-    """Flying ahead: the keyframe lies behind, its view led through here."""
+def test_line_of_sight_from_behind_counts() -> None:
+    """In forward flight the keyframe is behind, and its view passed through here."""
     wall = at(0, 40.0)
     behind = np.broadcast_to(PLACE - [15.0, 0.3, 0.1], wall.shape)
     beyond = np.broadcast_to(PLACE + [15.0, 0.0, 0.0], wall.shape)
@@ -118,16 +116,16 @@ def test_a_line_of_sight_that_began_behind_and_passes_by_counts() -> None:
     assert distances(vehicle(0), wall, beyond) == {}
 
 
-def test_looking_down_at_the_ground_frees_nothing() -> None:
+def test_nadir_view_frees_nothing() -> None:
     assert distances(vehicle(0), at(0, 40.0, down_m=12.0)) == {}
 
 
-def test_an_obstacle_before_what_is_free_is_an_obstacle() -> None:
+def test_obstacle_in_front_of_free_space() -> None:
     found = distances(vehicle(0), np.concatenate([at(0, 40.0), at(0, 10.0)]))
     assert found == {0: pytest.approx(1000, abs=4)}
 
 
-def test_points_that_are_no_numbers_are_passed_over() -> None:
+def test_nan_points_are_ignored() -> None:
     points = at(40, 6.0)
     points[3] = np.nan
     points[4, 1] = np.inf
@@ -173,7 +171,7 @@ def map_update(world_from_map: Similarity | None) -> MapUpdate:
     return MapUpdate(1, 0, {5: camera}, np.zeros((0, 3)), georeference, {5: 0.5})
 
 
-def test_recent_cloud_is_placed_by_the_map_of_the_moment() -> None:
+def test_recent_cloud_follows_map_updates() -> None:
     turn = rotation_from_vector(np.array([0.0, 0.0, 0.7]))
     update = map_update(Similarity(4.0, turn, PLACE))
     cloud = RecentCloud(max_age_s=10)

@@ -1,4 +1,4 @@
-"""The file in which a flight's map is kept: the same comes back, or a reason why nothing does."""
+"""Checkpoint files: restored unchanged, or rejected with a reason."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from companion.config import Config, FeedbackConfig
 from companion.daemon.flights import kept_map_place
 from companion.daemon.flights.kept_map_place import kept_map_path
 from companion.estimation.checkpoint import (
-    MOST_BYTES,
+    MAX_BYTES,
     Checkpoint,
     CheckpointError,
     decode,
     encode,
-    opened,
+    read_arrays,
 )
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.resumption import (
+    MAX_ABSENT_NS,
     MIN_FRAMES,
-    MOST_ABSENT_NS,
-    TRIED_NS,
+    TIMEOUT_NS,
     Resumption,
     Verdict,
 )
@@ -39,7 +39,14 @@ from companion.slam.map.sparse_map import SlamMap
 from companion.stages import localisation_work, map_keeper
 from companion.stages.map_keeper import MapKeeper
 from companion.timing.clock import since_boot_ns
-from tests.support.reference.made_map import CAMERA, N_LEVELS, SCALE_FACTOR, Ground, flown, mapped
+from tests.support.reference.synthetic_map import (
+    CAMERA,
+    N_LEVELS,
+    SCALE_FACTOR,
+    Ground,
+    flown,
+    mapped,
+)
 
 SETUP = Setup(Config(), CAMERA)
 SECOND_NS = 1_000_000_000
@@ -57,7 +64,7 @@ def slam_map() -> SlamMap:
 def checkpoint(slam_map: SlamMap) -> Checkpoint:
     to_world = Similarity(2.5, np.eye(3), np.array([1.0, 2.0, 3.0]))
     return Checkpoint(
-        123_456_789_012_345_678, part_around(slam_map, slam_map.keyframes[20], MOST_BYTES), 40,
+        123_456_789_012_345_678, part_around(slam_map, slam_map.keyframes[20], MAX_BYTES), 40,
         np.eye(3), Georeference(to_world, 0.02, 0.1, "rangefinder", 12, 0.0, has_origin=False),
         OdometryState(Pose.identity(), False, np.array([1.0, 2, -3]), np.array([0.5, 0, 0])),
         np.eye(3), 31_000_000,
@@ -65,7 +72,7 @@ def checkpoint(slam_map: SlamMap) -> Checkpoint:
 
 
 def written(keeper: MapKeeper, checkpoint: Checkpoint) -> None:
-    """Have it written, and wait for that."""
+    """Write it, and wait for that."""
     keeper.put(checkpoint)
     done = threading.Event()
     while keeper.busy:
@@ -79,7 +86,7 @@ def keep(path: Path, checkpoint: Checkpoint, setup: Setup = SETUP) -> None:
 
 
 def refusal(path: Path, setup: Setup = SETUP) -> str:
-    """Why what is kept is refused; it is gone then."""
+    """Why a stored checkpoint is rejected; it is deleted then."""
     keeper = MapKeeper(path, setup)
     with pytest.raises(CheckpointError, match=path.name) as refused:
         keeper.take()
@@ -88,20 +95,20 @@ def refusal(path: Path, setup: Setup = SETUP) -> str:
     return str(refused.value)
 
 
-def test_what_a_feature_was_refined_for_in_another_map_is_not_kept() -> None:
+def test_refinement_for_points_of_another_map_is_not_stored() -> None:
     path = [flown(p) for p in np.linspace((-6, 0), (6, 0), 8)]
     made = mapped(Ground(np.random.default_rng(4)), path, Similarity.identity())
     first, second = list(made.keyframes.values())[:2]
     first.refined_for[:] = made.n_points + 2000
     second.refined_for[:] = second.point_ids
-    part = part_around(made, second, MOST_BYTES)
+    part = part_around(made, second, MAX_BYTES)
     kept = {k.keyframe_id: k for k in part.keyframes}
     assert (kept[first.keyframe_id].refined_for == -1).all()
     of_second = kept[second.keyframe_id]
     assert (of_second.refined_for == of_second.point_ids).all() and of_second.refined_for.max() > 0
 
 
-def test_a_fault_in_what_is_kept_for_later_does_not_end_the_pose_of_now(
+def test_checkpoint_failure_does_not_stop_localisation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(stage: LocalisationStage) -> None:
@@ -112,13 +119,13 @@ def test_a_fault_in_what_is_kept_for_later_does_not_end_the_pose_of_now(
     localisation = localisation_work.work(SETUP)
     list(localisation.step(KeepMap(path, take_up=False)))
     grey = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
-    told = [
+    messages = [
         message
         for k in range(1, 4)
         for message in localisation.step(Frame(k, k * SECOND_NS, grey, np.dstack([grey] * 3)))
     ]
-    assert len([m for m in told if isinstance(m, Odometry)]) == 3
-    (warned,) = (m for m in told if isinstance(m, Warned))
+    assert len([m for m in messages if isinstance(m, Odometry)]) == 3
+    (warned,) = (m for m in messages if isinstance(m, Warned))
     assert (warned.what, warned.detail) == (
         localisation_work.NOT_KEPT, "IndexError: index 2080 is out of bounds"
     )  # fmt: skip
@@ -126,7 +133,7 @@ def test_a_fault_in_what_is_kept_for_later_does_not_end_the_pose_of_now(
     assert not path.exists()
 
 
-def test_what_was_kept_comes_back_once(tmp_path: Path, checkpoint: Checkpoint) -> None:
+def test_checkpoint_is_restored_once(tmp_path: Path, checkpoint: Checkpoint) -> None:
     path = tmp_path / "run" / "map.checkpoint"
     keep(path, checkpoint)
     keeper = MapKeeper(path, SETUP)
@@ -134,14 +141,14 @@ def test_what_was_kept_comes_back_once(tmp_path: Path, checkpoint: Checkpoint) -
     assert kept is not None
     assert keeper.take() is None
     found, made = kept.checkpoint, checkpoint
-    for name in ("t_ns", "next_keyframe_id", "late_ns"):
+    for name in ("t_ns", "next_keyframe_id", "delay_ns"):
         assert getattr(found, name) == getattr(made, name)
     assert found.georeference is not None and made.georeference is not None
     assert found.georeference.world_from_map.scale == 2.5
     assert (found.georeference.world_from_map.translation == [1.0, 2.0, 3.0]).all()
     assert replace(found.georeference, world_from_map=Similarity.identity()).method == "rangefinder"
     assert not found.georeference.has_origin
-    assert found.odometry is not None and (found.odometry.place_m == [1.0, 2, -3]).all()
+    assert found.odometry is not None and (found.odometry.position_m == [1.0, 2, -3]).all()
     ours = map_of(made.part, SCALE_FACTOR, N_LEVELS)
     theirs = map_of(found.part, SCALE_FACTOR, N_LEVELS, shift_ns=5)
     assert (theirs.level, theirs.first_keyframe_id) == (True, 7)
@@ -167,7 +174,7 @@ def test_what_was_kept_comes_back_once(tmp_path: Path, checkpoint: Checkpoint) -
     keeper.close(forget=True)
 
 
-def test_a_part_is_the_surroundings_and_no_larger_than_wanted(slam_map: SlamMap) -> None:
+def test_part_is_local_and_bounded_in_size(slam_map: SlamMap) -> None:
     whole = part_around(slam_map, slam_map.keyframes[20], 1 << 40)
     assert len(whole.keyframes) == len(slam_map.keyframes)
     assert len(whole.points.positions) == slam_map.alive.sum()
@@ -180,7 +187,7 @@ def test_a_part_is_the_surroundings_and_no_larger_than_wanted(slam_map: SlamMap)
     assert 0.2e6 < len(data) < 0.32e6
 
 
-def test_a_part_does_not_change_with_its_map(slam_map: SlamMap) -> None:
+def test_part_is_a_copy(slam_map: SlamMap) -> None:
     part = part_around(slam_map, slam_map.keyframes[20], 1_000_000)
     before = part.points.positions.copy(), [k.point_ids.copy() for k in part.keyframes]
     positions, ids = slam_map.positions.copy(), slam_map.keyframes[20].point_ids.copy()
@@ -192,7 +199,7 @@ def test_a_part_does_not_change_with_its_map(slam_map: SlamMap) -> None:
     slam_map.positions, slam_map.keyframes[20].point_ids = positions, ids
 
 
-def test_damage_is_found_wherever_it_is(tmp_path: Path, checkpoint: Checkpoint) -> None:
+def test_corruption_is_detected_anywhere(tmp_path: Path, checkpoint: Checkpoint) -> None:
     path = tmp_path / "map.checkpoint"
     keep(path, checkpoint)
     whole = path.read_bytes()
@@ -202,16 +209,16 @@ def test_damage_is_found_wherever_it_is(tmp_path: Path, checkpoint: Checkpoint) 
         damaged = bytearray(whole)
         damaged[place] ^= 1 << int(rng.integers(8))
         with pytest.raises(CheckpointError):
-            opened(bytes(damaged))
+            read_arrays(bytes(damaged))
     for length in [0, 5, 12, 40, *rng.integers(0, len(whole), 20)]:
         with pytest.raises(CheckpointError):
-            opened(whole[:length])
+            read_arrays(whole[:length])
     path.write_bytes(whole[: len(whole) // 2])
     assert "damaged" in refusal(path)
 
 
-def test_arrays_that_do_not_fit_together_are_refused(checkpoint: Checkpoint) -> None:
-    """As another program could write them, with a sum that is right."""
+def test_inconsistent_arrays_are_rejected(checkpoint: Checkpoint) -> None:
+    """As another program could write them, with a valid checksum."""
     wrong: list[Callable[[dict[str, object]], object]] = [
         lambda arrays: arrays.pop("pixels"),
         lambda arrays: arrays.update(pixels=np.zeros((3, 2))),
@@ -220,16 +227,14 @@ def test_arrays_that_do_not_fit_together_are_refused(checkpoint: Checkpoint) -> 
         lambda arrays: arrays.update(world_from_map=np.zeros(2)),
     ]
     for spoil in wrong:
-        _, arrays = opened(b"".join(encode(checkpoint, {})))
+        _, arrays = read_arrays(b"".join(encode(checkpoint, {})))
         decode(arrays, CAMERA, SCALE_FACTOR)
         spoil(arrays)
         with pytest.raises(CheckpointError):
             decode(arrays, CAMERA, SCALE_FACTOR)
 
 
-def test_what_is_of_another_camera_or_scale_is_refused(
-    tmp_path: Path, checkpoint: Checkpoint
-) -> None:
+def test_other_camera_or_scale_source_is_rejected(tmp_path: Path, checkpoint: Checkpoint) -> None:
     path = tmp_path / "map.checkpoint"
     others = [
         Setup(Config(), replace(CAMERA, fx=501.0)),
@@ -242,13 +247,13 @@ def test_what_is_of_another_camera_or_scale_is_refused(
         assert "are others now" in refusal(path, other)
 
 
-def test_what_is_old_or_of_another_start_is_refused(
+def test_outdated_checkpoint_or_other_boot_is_rejected(
     tmp_path: Path, checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "map.checkpoint"
     now_ns = since_boot_ns()
     for age_ns, refused in (
-        (MOST_ABSENT_NS - SECOND_NS, False), (MOST_ABSENT_NS + SECOND_NS, True),
+        (MAX_ABSENT_NS - SECOND_NS, False), (MAX_ABSENT_NS + SECOND_NS, True),
         (-SECOND_NS, True),
     ):  # fmt: skip
         monkeypatch.setattr(map_keeper, "since_boot_ns", lambda: now_ns)
@@ -266,7 +271,7 @@ def test_what_is_old_or_of_another_start_is_refused(
     assert "started anew" in refusal(path)
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, checkpoint: Checkpoint) -> None:
+def test_unwritable_path_is_reported(tmp_path: Path, checkpoint: Checkpoint) -> None:
     (tmp_path / "file").write_text("")
     keeper = MapKeeper(tmp_path / "file" / "map.checkpoint", SETUP)
     written(keeper, checkpoint)
@@ -274,9 +279,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, checkpoint: Che
     keeper.close(forget=True)
 
 
-def test_a_folder_that_others_can_write_to_is_not_trusted(
-    tmp_path: Path, checkpoint: Checkpoint
-) -> None:
+def test_world_writable_folder_is_not_trusted(tmp_path: Path, checkpoint: Checkpoint) -> None:
     folder = tmp_path / "open"
     keep(folder / "map.checkpoint", checkpoint)
     folder.chmod(0o777)
@@ -288,8 +291,8 @@ def test_a_folder_that_others_can_write_to_is_not_trusted(
     keeper.close(forget=False)
 
 
-def test_it_is_kept_in_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Where no runtime folder is given the socket lies on what may be an SD card."""
+def test_checkpoint_is_stored_in_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without a runtime folder the socket may be on an SD card."""
     monkeypatch.setattr(kept_map_place, "SHARED_MEMORY", tmp_path)
     in_memory = tmp_path / f"companion-{os.getuid()}" / "map.checkpoint"
     assert kept_map_path("auto", {}) == in_memory
@@ -300,7 +303,7 @@ def test_it_is_kept_in_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     assert kept_map_path("auto", {}).parent.name == f"companion-{os.getuid()}"
 
 
-def test_a_flight_that_is_over_leaves_nothing(tmp_path: Path, checkpoint: Checkpoint) -> None:
+def test_finished_flight_leaves_no_checkpoint(tmp_path: Path, checkpoint: Checkpoint) -> None:
     keeper = MapKeeper(tmp_path / "map.checkpoint", SETUP)
     written(keeper, checkpoint)
     assert (tmp_path / "map.checkpoint").exists()
@@ -308,24 +311,24 @@ def test_a_flight_that_is_over_leaves_nothing(tmp_path: Path, checkpoint: Checkp
     assert list(tmp_path.iterdir()) == []
 
 
-def test_beyond_reach_is_not_believed(checkpoint: Checkpoint) -> None:
-    """At half a metre a second it cannot be 40 m away after two seconds, but after twenty."""
+def test_unreachable_position_is_rejected(checkpoint: Checkpoint) -> None:
+    """At 0.5 m/s 40 m are out of reach after 2 s, but not after 20 s."""
     far = Pose(np.eye(3), np.array([16.0, 0.0, 0.0]))  # times 2.5 metres
     for absent_s, verdict in ((2.0, Verdict.TRYING), (20.0, Verdict.PROVEN)):
         resumption = Resumption(checkpoint, 0, round(absent_s * 1e9))
         for k in range(MIN_FRAMES):
             t_ns = k * 100_000_000
             track = Track(k, t_ns, TrackState.TRACKING, far, 1, far, 100, 100)
-            found = resumption.judge(t_ns, track, np.eye(3), Pose.identity())
+            found = resumption.check(t_ns, track, np.eye(3), Pose.identity())
         assert found is verdict
     assert "beyond its reach" not in resumption.why_not
 
 
 @pytest.mark.parametrize(
     ("why_not", "n_inliers", "gap", "refused_ns"),
-    [("too little", 20, False, TRIED_NS), ("", 100, True, MOST_ABSENT_NS - SECOND_NS)],
+    [("too little", 20, False, TIMEOUT_NS), ("", 100, True, MAX_ABSENT_NS - SECOND_NS)],
 )
-def test_a_map_is_proven_by_frames_in_a_row(
+def test_map_is_proven_by_successive_frames(
     checkpoint: Checkpoint, why_not: str, n_inliers: int, gap: bool, refused_ns: int
 ) -> None:
     resumption = Resumption(checkpoint, 0, SECOND_NS)
@@ -334,7 +337,7 @@ def test_a_map_is_proven_by_frames_in_a_row(
         pose = Pose.identity()
         track = Track(k, t_ns, TrackState.TRACKING, pose, 1, pose, n_inliers, n_inliers)
         seen = None if gap and k % MIN_FRAMES == MIN_FRAMES - 1 else track
-        found = resumption.judge(t_ns, seen, np.eye(3), Pose.identity())
+        found = resumption.check(t_ns, seen, np.eye(3), Pose.identity())
         assert found is not Verdict.PROVEN
         if found is Verdict.REFUSED:
             break
@@ -342,7 +345,7 @@ def test_a_map_is_proven_by_frames_in_a_row(
     assert why_not in resumption.why_not
 
 
-def test_what_cannot_be_checked_yet_is_waited_for(checkpoint: Checkpoint) -> None:
+def test_missing_attitude_is_waited_for(checkpoint: Checkpoint) -> None:
     """The link opens later than the camera; its first attitudes decide."""
     turned = flown(np.zeros(2), yaw_rad=0.5).rotation
     for attitude, verdict in ((np.eye(3), Verdict.PROVEN), (turned, Verdict.REFUSED)):
@@ -350,7 +353,7 @@ def test_what_cannot_be_checked_yet_is_waited_for(checkpoint: Checkpoint) -> Non
         for k in range(100 + MIN_FRAMES):
             pose, t_ns = Pose.identity(), k * 100_000_000
             track = Track(k, t_ns, TrackState.TRACKING, pose, 1, pose, 100, 100)
-            told = attitude if k >= 100 else None
-            found.append(resumption.judge(t_ns, track, told, Pose.identity()))
+            measured = attitude if k >= 100 else None
+            found.append(resumption.check(t_ns, track, measured, Pose.identity()))
         assert set(found[:100]) == {Verdict.TRYING}
         assert found[-1] is verdict

@@ -1,4 +1,4 @@
-"""Scale, heading and origin of made-up paths with known errors."""
+"""Georeference of synthetic paths with known errors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.config import GeoreferenceConfig
-from companion.estimation.georeference import Georeferencer, Place
+from companion.estimation.georeference import AlignmentSample, Georeferencer
 from companion.geometry.transforms import Pose, Similarity, rotation_from_vector, yaw_rotation
 from companion.messages import HeightSample, PositionSample, PositionSource, RangeSample
 
@@ -16,7 +16,9 @@ TRUTH = Similarity(
 T0 = 1_700_000_000_000_000_000
 
 
-def places(n: int = 80, attitude_error_rad: float = 0.0) -> tuple[list[Place], np.ndarray]:
+def places(
+    n: int = 80, attitude_error_rad: float = 0.0
+) -> tuple[list[AlignmentSample], np.ndarray]:
     """Keyframes along a lawn-mower path, every half second, and their true positions in NED."""
     k = np.arange(n)
     ned = np.stack([20 * np.sin(k / 9), 0.8 * k, -30 - 2 * np.sin(k / 15)], 1)
@@ -28,7 +30,7 @@ def places(n: int = 80, attitude_error_rad: float = 0.0) -> tuple[list[Place], n
         in_map = TRUTH.inverse()
         pose = Pose(TRUTH.rotation.T @ rotation, in_map.apply(ned[i]))
         ned_from_camera = yaw_rotation(attitude_error_rad) @ rotation
-        out.append(Place(T0 + i * 500_000_000, pose, ned_from_camera, 30.0 / TRUTH.scale))
+        out.append(AlignmentSample(T0 + i * 500_000_000, pose, ned_from_camera, 30.0 / TRUTH.scale))
     return out, ned
 
 
@@ -66,7 +68,7 @@ def test_exact_positions_give_the_exact_similarity() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_slow_drift_of_a_metre_is_within_the_stated_sigma(seed: int) -> None:
+def test_slow_drift_of_a_metre_is_within_sigma(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kept, ned = places(attitude_error_rad=0.05)
     drift = np.zeros_like(ned)
@@ -81,7 +83,7 @@ def test_slow_drift_of_a_metre_is_within_the_stated_sigma(seed: int) -> None:
     assert error < 0.03
 
 
-def test_a_wrong_position_for_a_few_seconds_does_not_bend_the_map() -> None:
+def test_position_outliers_for_seconds_are_rejected() -> None:
     kept, ned = places()
     jump = np.zeros_like(ned)
     jump[30:36] = [80.0, -40.0, 10.0]
@@ -90,7 +92,7 @@ def test_a_wrong_position_for_a_few_seconds_does_not_bend_the_map() -> None:
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=0.02)
 
 
-def test_keyframes_of_a_joined_map_may_come_before_those_that_are_older() -> None:
+def test_keyframes_of_a_merged_map_may_be_unordered() -> None:
     kept, ned = places()
     velocity_noise = np.zeros((1, 3))
     georeferencer = reference(ned, np.zeros_like(ned), velocity_noise)
@@ -107,7 +109,7 @@ def test_hovering_gives_no_scale() -> None:
     assert reference(still, np.zeros_like(still), None).solve(kept) is None
 
 
-def test_rangefinder_gives_scale_where_there_is_no_position() -> None:
+def test_rangefinder_gives_scale_without_position() -> None:
     kept, _ = places()
     georeferencer = Georeferencer(GeoreferenceConfig(), None)
     for i in range(400):
@@ -131,29 +133,27 @@ def test_barometer_gives_scale_of_a_climb() -> None:
     assert found.world_from_map.scale == pytest.approx(TRUTH.scale, rel=0.05)
 
 
-@pytest.mark.parametrize(("stretch", "known"), [(1.0, True), (1.4, False)])
-def test_a_rangefinder_that_the_barometer_contradicts_is_not_believed(
-    stretch: float, known: bool
-) -> None:
+@pytest.mark.parametrize(("scale", "known"), [(1.0, True), (1.4, False)])
+def test_rangefinder_contradicted_by_barometer_is_uncertain(scale: float, known: bool) -> None:
     kept, ned = places()
     georeferencer = Georeferencer(GeoreferenceConfig(), None)
     for i in range(400):
         down = np.interp(i * 0.1, np.arange(len(ned)) * 0.5, ned[:, 2])
-        georeferencer.take(RangeSample(T0 + i * 100_000_000, 30.0 * stretch))
+        georeferencer.take(RangeSample(T0 + i * 100_000_000, 30.0 * scale))
         georeferencer.take(HeightSample(T0 + i * 100_000_000, 400.0 - down))
     assert (georeferencer.solve(kept) is not None) is known
 
 
-def test_nothing_known_gives_nothing() -> None:
+def test_no_measurements_give_none() -> None:
     kept, _ = places()
     assert Georeferencer(GeoreferenceConfig(), None).solve(kept) is None
 
 
-def test_a_map_that_has_just_begun_lies_roughly_by_the_velocity_since() -> None:
+def test_new_map_is_placed_by_velocity() -> None:
     kept, ned = places(4)
     velocity_noise = np.array([[0.1, -0.1, 0.05], [-0.1, 0.1, -0.05]])
     georeferencer = reference(ned, np.zeros_like(ned), velocity_noise)
-    found = georeferencer.begin(kept[:3], ned[0])
+    found = georeferencer.place_new_map(kept[:3], ned[0])
     assert found is not None
     np.testing.assert_allclose(found.world_from_map.scale, TRUTH.scale, rtol=0.15)
     np.testing.assert_allclose(
@@ -164,6 +164,6 @@ def test_a_map_that_has_just_begun_lies_roughly_by_the_velocity_since() -> None:
     assert found.sigma_scale > 0.02, "two keyframes are no measure"
 
 
-def test_without_velocity_a_map_that_has_just_begun_has_no_place() -> None:
+def test_new_map_is_not_placed_without_velocity() -> None:
     kept, ned = places(4)
-    assert reference(ned, np.zeros_like(ned), None).begin(kept[:3], ned[0]) is None
+    assert reference(ned, np.zeros_like(ned), None).place_new_map(kept[:3], ned[0]) is None

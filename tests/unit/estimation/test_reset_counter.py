@@ -1,4 +1,4 @@
-"""Which reset counter an autopilot is sent, and which of its boots are seen as the same."""
+"""Reset counter sent to an autopilot, and identification of its boots."""
 
 from __future__ import annotations
 
@@ -8,12 +8,17 @@ from typing import Any
 
 import pytest
 
-from companion.estimation.reset_counter import BootIdentity, ResetCounter, same_boot, unlike_any
+from companion.estimation.reset_counter import (
+    BootIdentity,
+    ResetCounter,
+    initial_counter,
+    same_boot,
+)
 
 NOTED = BootIdentity(1, 60.0, 1000.0, 1_795_000_000.0, "this")
 
 
-def test_nothing_counts_before_the_first_pose() -> None:
+def test_discontinuities_before_the_first_pose_are_not_counted() -> None:
     counter = ResetCounter()
     counter.discontinuity()
     assert counter.value == 0
@@ -23,7 +28,7 @@ def test_nothing_counts_before_the_first_pose() -> None:
     assert counter.value == 2
 
 
-def test_a_boot_goes_on_from_what_it_was_sent_or_begins_at_0() -> None:
+def test_counter_continues_from_what_was_sent_or_starts_at_0() -> None:
     counter = ResetCounter()
     counter.booted(7)
     assert (counter.value, counter.sent) == (8, True)
@@ -61,7 +66,7 @@ def test_same_boot(changes: dict[str, Any], same: bool) -> None:
     assert same_boot(NOTED, replace(NOTED, **changes)) is same
 
 
-def test_what_stands_for_the_unknown_is_never_0_and_differs_from_second_to_second() -> None:
-    found = [unlike_any(1_795_000_000.0 + second) for second in range(600)]
+def test_initial_counter_is_never_0_and_varies() -> None:
+    found = [initial_counter(1_795_000_000.0 + second) for second in range(600)]
     assert min(found) == 1 and max(found) == 255
     assert all(a != b for a, b in pairwise(found))

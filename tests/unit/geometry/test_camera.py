@@ -24,7 +24,7 @@ def grid(camera: Camera) -> np.ndarray:
 
 
 @ALL
-def test_every_pixel_comes_back(camera: Camera) -> None:
+def test_pixel_round_trip(camera: Camera) -> None:
     pixels = grid(camera)
     rays = np.c_[camera.normalise(pixels), np.ones(len(pixels))]
     assert np.isfinite(rays).all()
@@ -45,18 +45,18 @@ def test_projection_agrees_with_opencv(rng: np.random.Generator) -> None:
         np.testing.assert_allclose(camera.project(points), theirs[:, 0], atol=1e-6)
 
 
-def test_what_is_behind_has_no_pixel() -> None:
+def test_points_behind_the_camera_are_nan() -> None:
     pixels = PINHOLE.project(np.array([[0.1, 0.2, -1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     assert np.isnan(pixels[:2]).all()
     np.testing.assert_allclose(pixels[2], [PINHOLE.cx, PINHOLE.cy])
 
 
-def test_beyond_the_view_of_a_fisheye_there_is_no_ray() -> None:
+def test_pixels_outside_the_fisheye_are_nan() -> None:
     assert np.isnan(FISHEYE.normalise(np.array([[5000.0, 242.0]]))).all()
 
 
 @ALL
-def test_jacobian_is_the_slope_of_the_projection(camera: Camera) -> None:
+def test_jacobian_matches_finite_differences(camera: Camera) -> None:
     n = camera.normalise(grid(camera))[10:20]
     step = 1e-5
     jacobian = camera.pixel_from_normalised_jacobian(n)

@@ -8,7 +8,7 @@ from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned, ned_from_ge
 HOME = GeoOrigin(-35.363262, 149.165237, 584.09)
 
 
-def test_a_degree_of_latitude_and_of_longitude() -> None:
+def test_degree_of_latitude_and_longitude() -> None:
     """Meridian 110.574 km a degree and parallel 111.320 km a degree at the equator (WGS84)."""
     equator = GeoOrigin(0.0, 10.0, 0.0)
     assert ned_from_geodetic(0.01, 10.0, 0.0, equator)[0] == pytest.approx(1105.74, abs=0.01)
@@ -23,7 +23,7 @@ def test_up_is_negative() -> None:
     )
 
 
-def test_origin_of_a_place_known_twice() -> None:
+def test_origin_of() -> None:
     latitude, longitude, altitude = -35.36, 149.17, 612.0
     position = ned_from_geodetic(latitude, longitude, altitude, HOME)
     found = origin_of(latitude, longitude, altitude, position)
@@ -31,8 +31,8 @@ def test_origin_of_a_place_known_twice() -> None:
     assert np.abs(away).max() < 0.1
 
 
-def test_there_and_back() -> None:
-    """An asymmetric place, kilometres away, returns to micrometres."""
+def test_round_trip() -> None:
+    """A position kilometres away returns to micrometres."""
     places = np.array([[-35.3, 149.1, 700.0], [-35.4, 149.3, -20.0]])
     ned = np.stack([ned_from_geodetic(lat, lon, alt, HOME) for lat, lon, alt in places])
     back = geodetic_from_ned(ned, HOME)

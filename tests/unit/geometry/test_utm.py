@@ -1,4 +1,4 @@
-"""Map coordinates against PROJ's, another's arithmetic."""
+"""UTM against PROJ, an independent implementation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_same_as_proj_within_a_micrometre(zone: UtmZone, rng: np.random.Generato
     assert CRS.from_epsg(zone.epsg).name == zone.name
 
 
-def test_there_and_back(rng: np.random.Generator) -> None:
+def test_round_trip(rng: np.random.Generator) -> None:
     zone = UtmZone(31, False)
     places = np.stack([rng.uniform(-80, 0, 100), rng.uniform(-1, 7, 100)], 1)
     back = geodetic_from_utm(utm_from_geodetic(places[:, 0], places[:, 1], zone), zone)

@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.geometry.voxel import thin_by_voxel
+from companion.geometry.voxel import voxel_downsample
 
 
-def test_the_most_confident_of_each_cube_is_kept() -> None:
+def test_most_confident_point_per_voxel() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-10, 10, (5000, 3))
     confidence = rng.uniform(0, 1, 5000)
-    kept = thin_by_voxel(points, confidence, 1.5)
+    kept = voxel_downsample(points, confidence, 1.5)
     cell = [tuple(c) for c in np.floor((points - points.min(0)) / 1.5).astype(int)]
     best: dict[tuple[int, ...], int] = {}
     for n, c in enumerate(cell):
@@ -18,22 +18,22 @@ def test_the_most_confident_of_each_cube_is_kept() -> None:
     assert kept.tolist() == sorted(best.values())
 
 
-def test_equal_confidence_goes_to_the_earlier() -> None:
+def test_ties_resolve_to_the_earlier_point() -> None:
     points = np.tile([[0.1, 0.2, 0.3], [5.0, 5.0, 5.0]], (10, 1))
-    assert thin_by_voxel(points, np.ones(20), 1.0).tolist() == [0, 1]
+    assert voxel_downsample(points, np.ones(20), 1.0).tolist() == [0, 1]
 
 
-def test_thinning_again_with_the_same_points_changes_nothing() -> None:
+def test_downsampling_is_idempotent() -> None:
     points = np.random.default_rng(1).uniform(0, 3, (1000, 3))
     points[0] = 0  # the grid begins at the lowest corner, which must stay
     confidence = np.r_[2.0, np.random.default_rng(2).uniform(0, 1, 999)]
-    once = thin_by_voxel(points, confidence, 0.4)
-    again = thin_by_voxel(points[once], confidence[once], 0.4)
+    once = voxel_downsample(points, confidence, 0.4)
+    again = voxel_downsample(points[once], confidence[once], 0.4)
     assert again.tolist() == list(range(len(once)))
 
 
-def test_small_voxels_keep_all_and_a_huge_one_keeps_one() -> None:
+def test_voxel_size_limits() -> None:
     points = np.random.default_rng(3).uniform(0, 3, (200, 3))
-    assert len(thin_by_voxel(points, np.ones(200), 1e-4)) == 200
-    assert len(thin_by_voxel(points, np.ones(200), 100.0)) == 1
-    assert len(thin_by_voxel(points[:0], np.ones(0), 1.0)) == 0
+    assert len(voxel_downsample(points, np.ones(200), 1e-4)) == 200
+    assert len(voxel_downsample(points, np.ones(200), 100.0)) == 1
+    assert len(voxel_downsample(points[:0], np.ones(0), 1.0)) == 0

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from companion.geometry.voxel import thin_by_voxel
+from companion.geometry.voxel import voxel_downsample
 from companion.products import gathered_cloud, voxel_cloud
 from companion.products.cloud import Cloud, joined, no_cloud
 from companion.products.gathered_cloud import gathered
@@ -45,7 +45,7 @@ def test_thinned_in_parts_is_as_thinned_at_once(
     assert shares == sorted(shares) and shares[-1] == 1.0
     whole = joined(clouds)
     low = clouds[0].points.astype(np.float64).min(0)
-    kept = thin_by_voxel(whole.points, whole.confidence, 0.7, low)
+    kept = voxel_downsample(whole.points, whole.confidence, 0.7, low)
     order = np.argsort(found.sigma)
     assert len(found) < 0.9 * len(whole)
     assert np.array_equal(found.sigma[order], whole.sigma[kept])

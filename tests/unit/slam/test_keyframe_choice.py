@@ -1,4 +1,4 @@
-"""Ground flown over again makes no keyframes, ground that no older one shows does."""
+"""Keyframe decision: none on return passes, new ones over new ground."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ from companion.geometry.transforms import Pose, Similarity
 from companion.slam.features.orb_features import Ints
 from companion.slam.features.view import View
 from companion.slam.map.sparse_map import SlamMap
-from companion.slam.tracking.keyframe_choice import NEWEST_ALONE, covering, wants_keyframe
-from tests.support.reference.made_map import GREY, Ground, flown, mapped
+from companion.slam.tracking.keyframe_choice import (
+    N_NEWEST_EXCLUDED,
+    equivalent_keyframe,
+    needs_keyframe,
+)
+from tests.support.reference.synthetic_map import GREY, Ground, flown, mapped
 
 THERE = [flown(np.array([x, 0.0])) for x in np.linspace(-12, 12, 49)]
 
 
 def view_from(ground: Ground, slam_map: SlamMap, place: Pose, share: float = 1.0) -> View:
-    """A view that is tracked by `share` of the points that keyframes of the map show of it."""
+    """A view tracked by `share` of the points that keyframes of the map observe of it."""
     features, index = ground.seen_from(place)
     known: dict[int, int] = {}
     for keyframe in slam_map.keyframes.values():
-        _, points = slam_map.seen_by(keyframe)
+        _, points = slam_map.observations_of(keyframe)
         for point in points.tolist():
             at = slam_map.positions[point]
             known[hash(tuple(np.round(at, 6)))] = point
@@ -31,25 +35,25 @@ def view_from(ground: Ground, slam_map: SlamMap, place: Pose, share: float = 1.0
     return seen
 
 
-def test_ground_flown_over_again_is_covered_by_an_older_keyframe() -> None:
+def test_return_pass_reuses_an_older_keyframe() -> None:
     config, ground = TrackingConfig(), Ground(np.random.default_rng(11))
     slam_map = mapped(ground, THERE, Similarity.identity())
     newest = slam_map.keyframes[max(slam_map.keyframes)]
     again = view_from(ground, slam_map, flown(np.array([-5.1, 0.1])))
-    assert wants_keyframe(config, slam_map, newest, again, again.t_ns)
-    cover = covering(config, slam_map, again)
+    assert needs_keyframe(config, slam_map, newest, again, again.t_ns)
+    cover = equivalent_keyframe(config, slam_map, again)
     assert cover is not None
     assert np.linalg.norm(cover.centre - flown(np.array([-5.1, 0.1])).translation) < 0.5
-    assert not wants_keyframe(config, slam_map, cover, again, again.t_ns)
+    assert not needs_keyframe(config, slam_map, cover, again, again.t_ns)
 
 
-def test_what_only_the_newest_show_and_what_is_hardly_found_is_not_covered() -> None:
+def test_newest_and_weakly_tracked_keyframes_are_not_reused() -> None:
     config, ground = TrackingConfig(), Ground(np.random.default_rng(12))
     slam_map = mapped(ground, THERE, Similarity.identity())
-    newest = list(slam_map.keyframes.values())[-NEWEST_ALONE:]
+    newest = list(slam_map.keyframes.values())[-N_NEWEST_EXCLUDED:]
     ahead = view_from(ground, slam_map, newest[-1].camera_from_map.inverse())
-    assert covering(config, slam_map, ahead) is None
+    assert equivalent_keyframe(config, slam_map, ahead) is None
     weak = view_from(ground, slam_map, flown(np.array([-5.1, 0.1])), share=0.4)
-    assert covering(config, slam_map, weak) is None
+    assert equivalent_keyframe(config, slam_map, weak) is None
     aside = view_from(ground, slam_map, flown(np.array([-5.1, 1.5])))
-    assert covering(config, slam_map, aside) is None
+    assert equivalent_keyframe(config, slam_map, aside) is None

@@ -1,4 +1,4 @@
-"""The test pattern is a scene that the tracker finds its way in."""
+"""Tracking of the camera test pattern."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEP_NS = 100_000_000
 N_FRAMES = 40
 
 
-def test_the_tracker_follows_the_pattern_to_centimetres() -> None:
+def test_test_pattern_is_tracked_to_centimetres() -> None:
     optics, scene = pattern_optics(CameraConfig(width=320, height=240)), PatternScene()
     tracker = Tracker(Config(), optics, lambda _: nullcontext())
     places: dict[int, np.ndarray] = {}

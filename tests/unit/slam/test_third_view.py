@@ -1,4 +1,4 @@
-"""Two views that would begin a map, right or wrong, and what a view between them says."""
+"""Third-view consistency check of true and false reconstructions."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 from companion.geometry.transforms import Array, Pose
 from companion.slam.features.orb_features import Ints
 from companion.slam.features.view import View
-from companion.slam.initialisation.third_view import contradicts, half_way
-from tests.support.reference.made_map import GREY, Ground, flown
+from companion.slam.initialisation.third_view import middle_view, third_view_rejects
+from tests.support.reference.synthetic_map import GREY, Ground, flown
 
 STEP_NS = 100_000_000
 
 
 def three(middle: Pose) -> tuple[list[View], Array, Ints]:
-    """Views from 0, m and 2 m to the north, the points that the first shows, and its features."""
+    """Views from 0, m and 2 m to the north, the points of the first, and its features."""
     ground = Ground(np.random.default_rng(4))
     views: list[View] = []
     index_first = np.zeros(0, np.int64)
@@ -27,27 +27,27 @@ def three(middle: Pose) -> tuple[list[View], Array, Ints]:
     return views, ground.points[index_first], np.arange(len(index_first))
 
 
-def test_a_true_start_is_borne_out_though_the_camera_turned_meanwhile() -> None:
+def test_true_reconstruction_passes_though_the_camera_rotated() -> None:
     (first, third, second), points, features = three(flown(np.array([1.2, 0.4]), 0.1))
-    assert not contradicts(third, first, second, points, features)
+    assert not third_view_rejects(third, first, second, points, features)
 
 
-def test_a_start_with_hills_for_hollows_is_contradicted() -> None:
+def test_depth_inverted_reconstruction_is_rejected() -> None:
     (first, third, second), points, features = three(flown(np.array([1.2, 0.4]), 0.1))
     in_first = first.camera_from_map.apply(points)
     depth = in_first[:, 2:]
     wrong = in_first * (9.0 - 3.0 * (depth - 9.0)) / depth  # on the same rays
     wrong_map = first.camera_from_map.inverse().apply(wrong)
-    assert contradicts(third, first, second, wrong_map, features)
+    assert third_view_rejects(third, first, second, wrong_map, features)
 
 
-def test_a_view_of_elsewhere_has_no_say() -> None:
+def test_view_without_overlap_does_not_reject() -> None:
     (first, third, second), points, features = three(flown(np.array([25.0, 25.0])))
-    assert not contradicts(third, first, second, points[::-1], features)
+    assert not third_view_rejects(third, first, second, points[::-1], features)
 
 
-def test_the_view_half_way_is_asked() -> None:
+def test_middle_view_is_chosen() -> None:
     views, _, _ = three(flown(np.array([1.0, 0.0])))
     first, third, second = views
-    assert half_way(views, first, second) is third
-    assert half_way([first, second], first, second) is None
+    assert middle_view(views, first, second) is third
+    assert middle_view([first, second], first, second) is None

@@ -1,4 +1,4 @@
-"""How a camera moved by what it sees, its vertical known, more or less."""
+"""Relative pose with approximately known gravity."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     yaw_rotation,
 )
-from companion.slam.optimisation.upright_motion import motions_of_three, upright_motion
+from companion.slam.optimisation.upright_motion import three_point_motions, upright_motion
 
 BODY_FROM_CAMERA = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 MAX_ERROR = 0.003
@@ -34,7 +34,7 @@ def views(
     seed: int, way: tuple[float, float, float], *, yaw: float = 0.3, pitch: float = -0.5,
     flat: bool = False, noise: float = 0.0, tilt_deg: float = 0.0, wrong: float = 0.0,
 ) -> TwoViews:  # fmt: skip
-    """Points 4 to 30 away, or on ground 10 below; levels of any heading, tilted by mistake."""
+    """Points 4 to 30 away, or on ground 10 below; level frames of any heading, with tilt errors."""
     rng = np.random.default_rng(seed)
     a = rotation_from_quaternion(quaternion_from_euler(0.21, pitch, 0.7)) @ BODY_FROM_CAMERA
     b = rotation_from_quaternion(quaternion_from_euler(-0.13, pitch + 0.1, 0.7 + yaw))
@@ -91,7 +91,7 @@ def test_the_motion_is_found_exactly(name: str, seed: int) -> None:
 
 @pytest.mark.parametrize("tilt_deg", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_tilt_that_is_told_wrongly_is_not_believed(seed: int, tilt_deg: float) -> None:
+def test_wrong_tilt_does_not_constrain_the_motion(seed: int, tilt_deg: float) -> None:
     v = views(seed, (1.0, 0.3, 0.0), noise=0.0007, tilt_deg=tilt_deg)
     pose, agree = found_in(v, seed)
     turn, way = off_deg(pose, v.b_from_a)
@@ -100,7 +100,7 @@ def test_a_tilt_that_is_told_wrongly_is_not_believed(seed: int, tilt_deg: float)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_wrong_matches_are_left_out(seed: int) -> None:
+def test_outliers_are_rejected(seed: int) -> None:
     v = views(seed, (0.3, 1.0, 0.0), noise=0.0007, tilt_deg=0.5, wrong=0.3)
     pose, agree = found_in(v, seed)
     turn, way = off_deg(pose, v.b_from_a)
@@ -110,7 +110,7 @@ def test_wrong_matches_are_left_out(seed: int) -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.0007])
-def test_a_camera_that_only_turned_has_no_way(noise: float) -> None:
+def test_pure_rotation_gives_no_translation(noise: float) -> None:
     assert upright_motion(*views(1, (0.0, 0.0, 0.0), noise=noise)[:4], MAX_ERROR, 1) is None
 
 
@@ -119,14 +119,14 @@ def test_two_matches_are_too_few() -> None:
     assert upright_motion(v[0][:2], v[1][:2], v[2], v[3], MAX_ERROR, 1) is None
 
 
-def test_all_motions_of_three_are_found() -> None:
-    """As many as the determinant of the planes' normals changes its sign."""
+def test_all_three_point_solutions_are_found() -> None:
+    """As many as sign changes of the determinant of the plane normals."""
     several = 0
     for seed in range(30):
         v = views(seed, (0.5, -1.0, 0.3))
         a = np.c_[v.seen_a[:3], np.ones(3)] @ v.level_from_a.T
         b = np.c_[v.seen_b[:3], np.ones(3)] @ v.level_from_b.T
-        turns, ways = motions_of_three(a[None], b[None])
+        turns, ways = three_point_motions(a[None], b[None])
         fit = [
             np.abs(np.cross(a @ turn.T, b) @ way).max() < 1e-8  # others are all but real
             for turn, way in zip(turns, ways, strict=True)

@@ -32,7 +32,7 @@ from companion.topics.message_codec import (
     pose_of_envelope,
 )
 from tests.support.flights import flown, topic_flight
-from tests.support.reference import at_hand
+from tests.support.reference import opencl_devices
 
 N = 400
 NASTY: list[Any] = [
@@ -115,7 +115,7 @@ def test_noise_is_refused() -> None:
 def test_what_is_well_formed_but_wrong_does_not_bring_the_depth_stage_down() -> None:
     config, luck = Config(), random.Random(8)
     stage = DepthStage(
-        config.depth, config.cloud, topic_flight.CAMERA, at_hand.devices(), StageTimes()
+        config.depth, config.cloud, topic_flight.CAMERA, opencl_devices.devices(), StageTimes()
     )
     mirror = MapMirror()
     packed = [bundle.pack() for bundle in topic_flight.bundles(48)]

@@ -1,0 +1,124 @@
+"""Smooth odometry: no jump when the map is corrected, dead reckoning while lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from companion.estimation.smooth_odometry import SmoothOdometry
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose, Similarity, yaw_rotation
+from companion.messages import Georeference, Odometry, Track, TrackState
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+PLACED = Georeference(Similarity(2.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "GPS", 50, 0.3)
+SPEED = 1.0
+"""Map units a second, northward; the world's are twice as many metres."""
+
+
+def track(k: int, off: float = 0.0, state: TrackState = TrackState.TRACKING) -> Track:
+    pose = Pose(np.eye(3), np.array([SPEED * k / 10 + off, 0.0, -5.0]))
+    found = state is TrackState.TRACKING
+    return Track(
+        k, k * 100_000_000, state, pose, 0, pose, 200 if found else 0, 220 if found else 0,
+        np.zeros((200, 2), np.float32) if found else None, sigma_position=0.01,
+        sigma_rotation_rad=0.001,
+    )  # fmt: skip
+
+
+def give(odometry: SmoothOdometry, track: Track) -> Odometry:
+    return odometry.step(track, 0, PLACED, (np.array([SPEED, 0.0, 0.0]), 0.1))
+
+
+def north(odometry: Odometry) -> float:
+    assert odometry.world_from_body is not None
+    return float(odometry.world_from_body.translation[0])
+
+
+def test_map_correction_is_slew_limited() -> None:
+    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    for k in range(10):
+        before = give(odometry, track(k))
+    last = track(9, off=1.5).map_from_camera
+    assert last is not None
+    odometry.correct_map(last)
+    after = [give(odometry, track(k, off=1.5)) for k in range(10, 400)]
+    steps = np.diff([north(before), *[north(o) for o in after]])
+    assert np.abs(steps - 0.2).max() < 0.03
+    assert after[-1].reset_counter == 0
+    assert north(after[-1]) == pytest.approx(2 * (39.9 + 1.5), abs=0.01)
+
+
+def test_slew_correction_adds_to_the_drift_sigma() -> None:
+    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    before = [give(odometry, track(k)) for k in range(200)][-1].sigma_position_m
+    last = track(199, off=1.5).map_from_camera
+    assert last is not None
+    odometry.correct_map(last)
+    after = [give(odometry, track(k, off=1.5)).sigma_position_m for k in range(200, 600)]
+    # three metres at 0.15 m/s: for twenty seconds each ten have 1.5 m of it
+    assert max(after) == pytest.approx(np.hypot(before, 1.5 / np.sqrt(3)), rel=0.02)
+    assert after[150] > 0.85 * max(after)
+    assert after[-1] == pytest.approx(before, rel=0.02)
+
+
+def test_heading_sigma_includes_the_pending_correction() -> None:
+    """Heading corrections are slewed; until then the pose is off by the rest."""
+    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    for k in range(10):
+        before = give(odometry, track(k))
+    noise_rad = 3 * 0.001
+    floor_rad = np.radians(0.3)
+    assert before.sigma_yaw_rad == pytest.approx(np.linalg.norm([0.01, noise_rad, floor_rad]))
+    assert before.sigma_attitude_rad == pytest.approx(np.hypot(noise_rad, floor_rad))
+    north_rad = np.radians(4.0)
+    turned = Georeference(
+        Similarity(2.0, yaw_rotation(north_rad), np.zeros(3)), 0.01, 0.002, "GPS", 90, 0.3
+    )
+    velocity = (np.array([SPEED, 0.0, 0.0]), 0.1)
+    after = odometry.step(track(10), 0, turned, velocity)
+    assert after.world_from_body is not None
+    assert abs(np.arctan2(*after.world_from_body.rotation[[1, 0], [0, 0]])) < np.radians(0.1)
+    assert after.sigma_yaw_rad == pytest.approx(north_rad, rel=0.05)
+    later = [odometry.step(track(k), 0, turned, velocity) for k in range(11, 200)][-1]
+    assert later.sigma_yaw_rad == pytest.approx(
+        np.linalg.norm([0.002, noise_rad, floor_rad]), rel=0.01
+    )
+
+
+def test_unexplained_jump_is_a_reset() -> None:
+    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    for k in range(10):
+        give(odometry, track(k))
+    after = [give(odometry, track(k, off=5.0)) for k in range(10, 20)]
+    assert after[0].world_from_body is None
+    assert after[-1].reset_counter == 1
+
+
+def test_dead_reckoning_grows_uncertain_and_reacquires_without_a_jump() -> None:
+    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    for k in range(10):
+        give(odometry, track(k))
+    dead_reckoned = []
+    for k in range(10, 30):
+        lost = replace(
+            track(k, state=TrackState.DEAD_RECKONING), sigma_position=0.01 + 0.02 * (k - 9)
+        )
+        dead_reckoned.append(give(odometry, lost))
+    assert [o.state for o in dead_reckoned] == [TrackState.DEAD_RECKONING] * 20
+    assert {o.quality for o in dead_reckoned} == {1}
+    assert (np.diff([o.sigma_position_m for o in dead_reckoned]) > 0).all()
+    seen = [give(odometry, track(k, off=0.3)) for k in range(30, 40)]
+    steps = np.diff([north(o) for o in [*dead_reckoned, *seen]])
+    assert np.abs(steps - 0.2).max() < 0.03
+    assert seen[-1].reset_counter == 0
+
+
+def test_lost_camera_has_no_pose() -> None:
+    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    give(odometry, track(0))
+    lost = give(odometry, Track(1, 100_000_000, TrackState.LOST))
+    assert lost.world_from_body is None
+    assert lost.quality == -1

@@ -1,0 +1,75 @@
+"""Kernels are cached on disk, and compiled where they cannot be."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.slam.compiled import compiling
+
+TEXT = """
+from companion.slam.compiled.compiling import compiled, number, numbers
+
+@compiled(numbers, number)
+def scaled(values, by):
+    return values * by / 0.0
+"""
+
+
+@pytest.fixture(autouse=True)
+def cache_errors(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    found: list[str] = []
+    monkeypatch.setattr(compiling, "cache_errors", found)
+    yield found
+
+
+def module_in(folder: Path) -> Any:
+    path = folder / "loops_of_a_test.py"
+    path.write_text(TEXT, "utf-8")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_kernel_is_compiled_once(tmp_path: Path, cache_errors: list[str]) -> None:
+    module_in(tmp_path)
+    (kept,) = tmp_path.rglob("*.nbc")  # there before it is called
+    stamp = kept.stat().st_mtime_ns
+    scaled = module_in(tmp_path).scaled
+    assert scaled(np.array([1.0, -2.0, 0.0]), 3.0)[:2].tolist() == [np.inf, -np.inf]
+    assert [path.stat().st_mtime_ns for path in tmp_path.rglob("*.nbc")] == [stamp]
+    assert cache_errors == []
+
+
+def test_corrupt_cache_is_recompiled(tmp_path: Path, cache_errors: list[str]) -> None:
+    module_in(tmp_path)
+    (kept,) = tmp_path.rglob("*.nbc")
+    kept.write_bytes(kept.read_bytes()[:100])
+    assert np.isnan(module_in(tmp_path).scaled(np.zeros(3), 1.0)).all()
+    assert len(cache_errors) == 1 and cache_errors[0].startswith("scaled: ")
+
+
+def test_without_a_cache_folder_kernels_are_compiled(
+    tmp_path: Path, cache_errors: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "__pycache__").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "__pycache__"))
+    assert np.isnan(module_in(tmp_path).scaled(np.zeros(2), 1.0)).all()
+    assert len(cache_errors) == 1 and "cannot cache" in cache_errors[0]
+
+
+def test_arrays_of_any_type_and_order_are_accepted(tmp_path: Path) -> None:
+    scaled = module_in(tmp_path).scaled
+    values = np.arange(1, 9, dtype=np.int32)[::-2]
+    assert scaled(values, -1.0).tolist() == [-np.inf] * 4
+    values.flags.writeable = False
+    assert scaled(values, -1.0).tolist() == [-np.inf] * 4
+    with pytest.raises(ValueError, match="longer"):
+        scaled(values)

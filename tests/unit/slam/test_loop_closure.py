@@ -1,0 +1,175 @@
+"""Place recognition, upright pose solver, map merging, loop closure and false loops."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from companion.geometry.transforms import (
+    Array,
+    Pose,
+    Similarity,
+    angle_between,
+    rotation_from_vector,
+    yaw_rotation,
+)
+from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
+from companion.slam.loop.map_merge import close_loop, merge_maps
+from companion.slam.loop.place_recognition import KeyframeDatabase
+from companion.slam.loop.relocalizer import Relocalizer
+from companion.slam.map.sparse_map import SlamMap
+from companion.slam.optimisation.pose_graph import Edge, relax
+from companion.slam.optimisation.upright_pose import upright_pose
+from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
+
+NOWHERE = Similarity.identity()
+ELSEWHERE = Similarity(0.4, yaw_rotation(1.1), np.array([3.0, -7.0, 2.0]))
+
+
+def line(start: tuple[float, float], end: tuple[float, float], n: int, yaw: float) -> list[Pose]:
+    return [flown(p, yaw) for p in np.linspace(start, end, n)]
+
+
+def index_of(*maps: SlamMap) -> KeyframeDatabase:
+    index = KeyframeDatabase()
+    for slam_map in maps:
+        for key, keyframe in slam_map.keyframes.items():
+            index.add(key, keyframe.features.descriptors)
+    return index
+
+
+def find(newest: int, here: SlamMap, maps: list[SlamMap]) -> LoopClosure | None:
+    finder = LoopDetector(index_of(*maps), Relocalizer(CAMERA))
+    return finder.find(here.keyframes[newest], here, maps, lambda found, same: True)
+
+
+def test_query_returns_the_place_and_nothing_else() -> None:
+    ground = Ground(np.random.default_rng(1))
+    path = line((-20, -20), (20, -20), 40, 0.0)
+    index = KeyframeDatabase()
+    for key, pose in enumerate(path):
+        index.add(key, ground.seen_from(pose)[0].descriptors)
+    again, _ = ground.seen_from(flown(np.array([0.3, -19.8]), yaw_rad=2.0))
+    assert set(index.query(again.descriptors, 3)) <= {18, 19, 20, 21, 22}
+    assert 21 not in index.query(again.descriptors, 3, {21})
+
+
+@pytest.mark.parametrize("wrong_share", [0.0, 0.7])
+def test_two_points_and_gravity_give_a_pose(wrong_share: float) -> None:
+    rng = np.random.default_rng(3)
+    tilted = yaw_rotation(1.2) @ rotation_from_vector(np.array([0.3, -0.2, 0.0]))
+    camera = Pose(tilted @ flown(np.zeros(2)).rotation, np.array([3.0, 4.0, -20.0])).inverse()
+    points: Array = np.c_[rng.uniform(-8, 12, (200, 2)), rng.uniform(-3, 0, 200)]
+    p = camera.apply(points)
+    seen = p[:, :2] / p[:, 2:]
+    wrong = rng.random(200) < wrong_share
+    seen[wrong] += rng.normal(size=(int(wrong.sum()), 2))
+    other_heading = yaw_rotation(0.7) @ camera.rotation.T
+    found = upright_pose(points, seen, other_heading, 0.005, seed=1)
+    assert found is not None
+    pose, agree = found
+    assert angle_between(pose.rotation, camera.rotation) < 1e-6
+    assert np.abs(pose.translation - camera.translation).max() < 1e-6
+    assert (agree | wrong).all()
+
+
+def test_one_point_is_not_enough() -> None:
+    assert upright_pose(np.ones((1, 3)), np.zeros((1, 2)), np.eye(3), 0.01, seed=1) is None
+
+
+def test_pose_graph_removes_the_drift_of_a_closed_square() -> None:
+    corners = [(0, 0), (10, 0), (10, 10), (0, 10), (0, 0)]
+    truth = [
+        Similarity(1.0, yaw_rotation(k * np.pi / 2), np.array([*p, -5.0]))
+        for k in range(4)
+        for p in np.linspace(corners[k], corners[k + 1], 10, endpoint=False)
+    ]
+    steps = [a.inverse() @ b for a, b in itertools.pairwise(truth)]
+    drift = Similarity(1.004, yaw_rotation(0.004), np.array([0.02, -0.01, 0.015]))
+    drifted = [truth[0]]
+    for step in steps:
+        drifted.append(drifted[-1] @ step @ drift)
+    edges = [
+        Edge(k, k + 1, a.inverse() @ b) for k, (a, b) in enumerate(itertools.pairwise(drifted))
+    ]
+    before = max(
+        float(np.linalg.norm(a.translation - b.translation))
+        for a, b in zip(drifted, truth, strict=True)
+    )
+    edges.append(Edge(len(truth) - 1, 0, truth[-1].inverse() @ truth[0], 100.0))
+    relaxed = relax(drifted, edges, fixed=0, level=True)
+    errors = [
+        float(np.linalg.norm(a.translation - b.translation))
+        for a, b in zip(relaxed, truth, strict=True)
+    ]
+    assert before > 1.5
+    assert max(errors) < 0.25 * before
+    assert errors[-1] < 0.05
+    tilts = [abs(n.rotation[2, 2] - 1.0) for n in relaxed]
+    assert max(tilts) < 1e-9
+
+
+def test_overlapping_maps_are_merged() -> None:
+    ground = Ground(np.random.default_rng(5))
+    old = mapped(ground, line((-6, 0), (6, 0), 9, 0.0), ELSEWHERE)
+    new = mapped(ground, line((6, 12), (2, 0.5), 9, 0.6), NOWHERE, first_id=20)
+    found = find(28, new, [old, new])
+    assert found is not None
+    assert found.there is old
+    assert found.here_from_there.scale == pytest.approx(1 / ELSEWHERE.scale, rel=0.01)
+    n_points = new.n_points
+    merge_maps(new, old, found.here_from_there)
+    assert list(new.keyframes) == [*range(9), *range(20, 29)]
+    assert new.unit_of == pytest.approx(dict.fromkeys(range(9), 1 / ELSEWHERE.scale), rel=0.01)
+    for key, x in ((0, -6.0), (8, 6.0)):
+        assert new.keyframes[key].centre == pytest.approx([x, 0, -10], abs=0.15)
+    features, points = new.observations_of(new.keyframes[4])
+    assert (points >= n_points).all()
+    p = new.keyframes[4].camera_from_map.apply(new.positions[points])
+    error = CAMERA.project(p) - new.keyframes[4].features.pixels[features]
+    assert np.median(np.linalg.norm(error, axis=1)) < 1.5
+
+
+def test_loop_closure_moves_its_points() -> None:
+    ground = Ground(np.random.default_rng(6))
+    corners = [(0.0, 0.0), (16.0, 0.0), (16.0, 16.0), (0.0, 16.0), (0.0, 1.0)]
+    sides = itertools.pairwise(corners)
+    path = [pose for a, b in sides for pose in line(a, b, 9, 0.0)]
+    slam_map = mapped(ground, path, NOWHERE, memory=12)
+    _bend(slam_map, 0.05)
+    newest = max(slam_map.keyframes)
+    off = np.linalg.norm(slam_map.keyframes[newest].centre - path[-1].translation)
+    assert off > 1.0
+    found = find(newest, slam_map, [slam_map])
+    assert found is not None
+    assert found.relocalised.keyframe.keyframe_id < 4
+    moved = close_loop(slam_map, found)
+    assert moved == pytest.approx(off, rel=0.2)
+    assert slam_map.keyframes[newest].centre == pytest.approx(path[-1].translation, abs=0.3)
+    keyframe = slam_map.keyframes[newest]
+    features, points = slam_map.observations_of(keyframe)
+    own = slam_map.first_seen[points] == newest
+    p = keyframe.camera_from_map.apply(slam_map.positions[points[own]])
+    error = CAMERA.project(p) - keyframe.features.pixels[features[own]]
+    assert np.median(np.linalg.norm(error, axis=1)) < 1.5
+
+
+def _bend(slam_map: SlamMap, per_keyframe: float) -> None:
+    """Let the map drift sideways."""
+    for key, keyframe in slam_map.keyframes.items():
+        shift = np.array([0.0, per_keyframe * key, 0.0])
+        pose = keyframe.camera_from_map.inverse()
+        keyframe.camera_from_map = Pose(pose.rotation, pose.translation + shift).inverse()
+    n = slam_map.n_points
+    slam_map.positions[:n, 1] += per_keyframe * slam_map.first_seen[:n]
+
+
+@pytest.mark.parametrize("level", [True, False], ids=["level", "vision alone"])
+def test_repetitive_facade_is_no_loop(level: bool) -> None:
+    ground = Ground(np.random.default_rng(7))
+    ground.repeat(period=4.0)
+    slam_map = mapped(ground, line((-24, 0), (24, 0), 30, 0.0), NOWHERE)
+    slam_map.level = level
+    assert find(29, slam_map, [slam_map]) is None

@@ -1,0 +1,98 @@
+"""Bookkeeping of the map: covisibility, nearest keyframes, recycling of removed points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.config import MappingConfig
+from companion.geometry.transforms import Array, Pose, Similarity, angle_between
+from companion.slam.features.patches import image_levels
+from companion.slam.map.sparse_map import SlamMap
+from companion.slam.mapping.mapper import Mapper
+from companion.slam.mapping.mapping_worker import MapLock
+from companion.slam.optimisation.pose_refinement import robust_cost, solve_sqpnp
+from tests.support.reference.synthetic_map import CAMERA, GREY, Ground, flown, mapped
+
+
+@pytest.fixture
+def slam_map() -> SlamMap:
+    ground = Ground(np.random.default_rng(9))
+    path = [flown(p) for p in np.linspace((-15, 0), (15, 0), 25)]
+    return mapped(ground, path, Similarity.identity())
+
+
+def test_covisible_keyframes_are_found_with_counts(slam_map: SlamMap) -> None:
+    _, points = slam_map.observations_of(slam_map.keyframes[12])
+    exact = {
+        key: len(np.intersect1d(points, slam_map.observations_of(k)[1]))
+        for key, k in slam_map.keyframes.items()
+    }
+    found = slam_map.covisible(points, 15)
+    assert found[0] == (len(points), 12)
+    assert all(count == exact[key] for count, key in found)
+    best = sorted(exact, key=lambda key: -exact[key])[:7]
+    assert set(best) <= {key for _, key in found}
+
+
+def test_nearest_keyframes_follow_moved_ones(slam_map: SlamMap) -> None:
+    place = slam_map.keyframes[3].centre
+    assert set(slam_map.nearest(place, 3, {3})) == {1, 2, 4} or set(
+        slam_map.nearest(place, 3, {3})
+    ) == {2, 4, 5}
+    far = slam_map.keyframes[20]
+    far.camera_from_map = slam_map.keyframes[3].camera_from_map
+    slam_map.invalidate_centres()
+    assert 20 in slam_map.nearest(place, 3, {3})
+
+
+def test_patch_rows_of_removed_points_are_reused(slam_map: SlamMap) -> None:
+    keyframe = slam_map.keyframes[0]
+    size = len(slam_map.patch_grey)
+    levels = image_levels(GREY)
+    features = np.arange(len(keyframe.features))
+    positions: Array = np.zeros((len(features), 3))
+    for _ in range(60):
+        ids = slam_map.add_points(positions, keyframe, features, levels)
+        assert (slam_map.patches_of(ids).grey == 128).all()
+        slam_map.alive[ids] = False
+        slam_map.free_patches()
+        assert (slam_map.patch_at[ids] == -1).all()
+    assert len(slam_map.patch_grey) == size
+
+
+def test_planar_pose_is_found_without_initial_guess() -> None:
+    rng = np.random.default_rng(10)
+    camera = flown(np.array([1.0, -2.0]), yaw_rad=0.4).inverse()
+    points: Array = np.c_[rng.uniform(-4, 4, (100, 2)), np.zeros(100)]
+    p = camera.apply(points)
+    seen = p[:, :2] / p[:, 2:] + rng.normal(scale=5e-4, size=(100, 2))
+    found = solve_sqpnp(points, seen)
+    assert found is not None
+    assert angle_between(found.rotation, camera.rotation) < 0.005
+    assert found.translation == pytest.approx(camera.translation, abs=0.05)
+    whitening = np.repeat(np.eye(2)[None] / 5e-4, 100, 0)
+    assert robust_cost(found, points, seen, whitening) < 130
+    assert solve_sqpnp(points[:5], seen[:5]) is None
+
+
+def test_long_flight_is_adjusted_in_windows(
+    slam_map: SlamMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.slam.mapping.map_adjustment.MAX_VARIABLE", 10)
+    rng = np.random.default_rng(11)
+    for k in list(slam_map.keyframes.values())[2:]:
+        pose = k.camera_from_map
+        k.camera_from_map = Pose(pose.rotation, pose.translation + rng.normal(scale=0.05, size=3))
+
+    def error_px() -> float:
+        errors = []
+        for k in slam_map.keyframes.values():
+            features, points = slam_map.observations_of(k)
+            seen = CAMERA.project(k.camera_from_map.apply(slam_map.positions[points]))
+            errors.append(np.linalg.norm(seen - k.features.pixels[features], axis=1))
+        return float(np.median(np.concatenate(errors)))
+
+    assert error_px() > 2.0
+    Mapper(MappingConfig(), CAMERA, slam_map, MapLock()).adjust_all(4)
+    assert error_px() < 0.6

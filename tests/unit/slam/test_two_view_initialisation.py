@@ -1,0 +1,57 @@
+"""Two-view initialisation with outliers among the matches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.geometry.transforms import Array, Pose, angle_between, rotation_from_vector
+from companion.slam.features.orb_features import Features
+from companion.slam.initialisation.initializer import TwoViewGeometry, initialise
+
+FOCAL_PX, N = 500.0, 300
+TURN = rotation_from_vector(np.radians([2.0, -3.0, 4.0]))
+FAR_SHARE = 0.65
+
+
+def features(normalised: Array) -> Features:
+    n = len(normalised)
+    return Features(
+        np.asarray(normalised * FOCAL_PX, np.float32), normalised, np.zeros(n, np.int64),
+        np.zeros(n, np.float32), np.zeros((n, 32), np.uint8), np.ones(n),
+        np.tile(FOCAL_PX * np.eye(2), (n, 1, 1)),
+    )  # fmt: skip
+
+
+def begun(way: float, wrong_share: float, seed: int) -> TwoViewGeometry | None:
+    """Sideways motion over distant hills and closer objects: the geometry, if found."""
+    rng = np.random.default_rng(seed)
+    seen_a = rng.uniform(-0.5, 0.5, (N, 2))
+    depth = np.where(rng.random(N) < FAR_SHARE, rng.uniform(150, 400, N), rng.uniform(8, 14, N))
+    b_from_a = Pose(TURN, np.array([-way, 0.0, 0.0]))
+    points_b = b_from_a.apply(np.c_[seen_a, np.ones(N)] * depth[:, None])
+    seen_b = points_b[:, :2] / points_b[:, 2:]
+    wrong = rng.permutation(N)[: int(wrong_share * N)]
+    seen_b[wrong] = seen_b[np.roll(wrong, 1)]
+    seen_a, seen_b = (s + rng.normal(scale=0.5 / FOCAL_PX, size=s.shape) for s in (seen_a, seen_b))
+    index = np.arange(N)
+    return initialise(
+        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, (TURN, np.eye(3)),
+        np.radians(1.0),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong_share", [0.0, 0.3])
+@pytest.mark.parametrize("seed", range(5))
+def test_most_matches_must_show_parallax(seed: int, wrong_share: float) -> None:
+    """Wrong matches, which no turn explains, do not count for it."""
+    assert begun(0.4, wrong_share, seed) is None
+
+
+@pytest.mark.parametrize("wrong_share", [0.0, 0.3])
+@pytest.mark.parametrize("seed", range(5))
+def test_baseline_is_found_among_outliers(seed: int, wrong_share: float) -> None:
+    found = begun(6.0, wrong_share, seed)
+    assert found is not None
+    assert np.degrees(angle_between(found.b_from_a.rotation, TURN)) < 0.3
+    assert found.b_from_a.translation[0] < -0.99
