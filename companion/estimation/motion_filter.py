@@ -113,7 +113,6 @@ class MotionFilter:
         self._map_from_ned = np.eye(3)
         self._aligned = False
         """Whether `map_from_ned` is known."""
-        self.unit = 1.0
 
     def reset(self) -> None:
         """Reset all but the attitude alignment itself."""
@@ -194,8 +193,8 @@ class MotionFilter:
             f.F[:3, 3:6] = dt * np.eye(3)
             q = np.zeros((9, 9))
             has_attitude = ned_from_camera is not None
-            accel = (ACCELERATION if has_attitude else ACCELERATION_NO_ATTITUDE) * self.unit
-            sigma = (SIGMA_POSITION if has_attitude else SIGMA_POSITION_NO_ATTITUDE) * self.unit
+            accel = ACCELERATION if has_attitude else ACCELERATION_NO_ATTITUDE
+            sigma = SIGMA_POSITION if has_attitude else SIGMA_POSITION_NO_ATTITUDE
             q[:3, :3] = np.eye(3) * accel**2 * dt**4 / 4
             q[:3, 3:6] = q[3:6, :3] = np.eye(3) * accel**2 * dt**3 / 2
             q[3:6, 3:6] = np.eye(3) * accel**2 * dt**2
@@ -226,6 +225,6 @@ class MotionFilter:
     def _initial_filter(self, position: Array) -> KalmanFilter:
         f = KalmanFilter(dim_x=9, dim_z=6)
         f.x = np.r_[position, np.zeros(6)].reshape(-1, 1)
-        lengths = np.r_[np.full(3, 1e-4), np.ones(3)] * self.unit**2
+        lengths = np.r_[np.full(3, 1e-4), np.ones(3)]
         f.P = np.diag(np.r_[lengths, np.full(3, VARIANCE_ALIGNMENT_RAD2)])
         return f

@@ -28,14 +28,6 @@ FORWARD = (
     34729 * N**5 / 80640 - 3418889 * N**6 / 1995840,
     212378941 * N**6 / 319334400,
 )
-INVERSE = (
-    N / 2 - 2 * N**2 / 3 + 37 * N**3 / 96 - N**4 / 360 - 81 * N**5 / 512 + 96199 * N**6 / 604800,
-    N**2 / 48 + N**3 / 15 - 437 * N**4 / 1440 + 46 * N**5 / 105 - 1118711 * N**6 / 3870720,
-    17 * N**3 / 480 - 37 * N**4 / 840 - 209 * N**5 / 4480 + 5569 * N**6 / 90720,
-    4397 * N**4 / 161280 - 11 * N**5 / 504 - 830251 * N**6 / 7257600,
-    4583 * N**5 / 161280 - 108847 * N**6 / 3991680,
-    20648693 * N**6 / 638668800,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,31 +86,3 @@ def utm_from_geodetic(latitude_deg: Array, longitude_deg: Array, zone: UtmZone) 
         eta += a * np.cos(2 * j * xi0) * np.sinh(2 * j * eta0)
     northing = SCALE * RADIUS_M * xi + (0.0 if zone.north else FALSE_NORTHING_M)
     return np.stack([SCALE * RADIUS_M * eta + FALSE_EASTING_M, northing], -1)
-
-
-def geodetic_from_utm(easting_northing_m: Array, zone: UtmZone) -> Array:
-    """Latitude and longitude (N, 2) in degrees of positions (N, 2)."""
-    e, n = np.asarray(easting_northing_m, np.float64).T
-    xi1 = (n - (0.0 if zone.north else FALSE_NORTHING_M)) / (SCALE * RADIUS_M)
-    eta1 = (e - FALSE_EASTING_M) / (SCALE * RADIUS_M)
-    xi, eta = xi1.copy(), eta1.copy()
-    for j, b in enumerate(INVERSE, 1):
-        xi -= b * np.sin(2 * j * xi1) * np.cosh(2 * j * eta1)
-        eta -= b * np.cos(2 * j * xi1) * np.sinh(2 * j * eta1)
-    conformal = np.sin(xi) / np.sqrt(np.sinh(eta) ** 2 + np.cos(xi) ** 2)
-    longitude = np.arctan2(np.sinh(eta), np.cos(xi))
-    tangent = conformal.copy()
-    eccentricity = np.sqrt(ECCENTRICITY_2)
-    for _ in range(4):  # Newton, as Karney does
-        length = np.sqrt(1 + tangent**2)
-        sigma = np.sinh(eccentricity * np.arctanh(eccentricity * tangent / length))
-        found = tangent * np.sqrt(1 + sigma**2) - sigma * length
-        tangent += (
-            (conformal - found)
-            / np.sqrt(1 + found**2)
-            * (1 + (1 - ECCENTRICITY_2) * tangent**2)
-            / ((1 - ECCENTRICITY_2) * length)
-        )
-    out: Array = np.degrees(np.stack([np.arctan(tangent), longitude], -1))
-    out[:, 1] += zone.central_meridian_deg
-    return out

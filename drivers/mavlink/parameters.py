@@ -28,11 +28,8 @@ ANSWER_S, LEAST_ANSWER_S = 0.5, 0.1
 SLACK = 4
 """A missing parameter is not answered: the timeout is the slowest answer, times this."""
 TRIES = 3
-QUIET_S = 1.0
-"""Pause that ends a list, whether complete or not."""
-MOST_ANSWERS_S, MOST_LIST_S = 3.0, 180.0
+MOST_ANSWERS_S = 3.0
 MOST_KNOWN = 10_000
-NO_INDEX = 65535
 LETTERS = {
     mavlink.MAV_PARAM_TYPE_UINT8: "B", mavlink.MAV_PARAM_TYPE_INT8: "b",
     mavlink.MAV_PARAM_TYPE_UINT16: "H", mavlink.MAV_PARAM_TYPE_INT16: "h",
@@ -74,8 +71,6 @@ class Parameters:
         self.known: dict[str, Parameter] = {}
         self._answered: set[str] = set()
         self._unknown: set[str] = set()
-        self._listed: dict[int, str] = {}
-        self._n_listed: int | None = None
         self._came = asyncio.Event()
         self._slowest_s: float | None = None
         self._ends = (
@@ -98,35 +93,11 @@ class Parameters:
             for at in range(0, len(missing), WINDOW):
                 part = missing[at : at + WINDOW]
                 for name in part:
-                    self._request(name=name)
+                    self._request(name)
                 await self._until(partial(self._all_settled, part))
         if wanted and not self._answered and not self._unknown:
             raise SourceError("the autopilot does not answer for its parameters")
         return {name: self.known[name] for name in wanted if name in self._answered}
-
-    async def read_all(self) -> dict[str, Parameter]:
-        """All listed parameters. SourceError if some of them do not come."""
-        self._listed.clear()
-        self._n_listed = None
-        for _ in range(TRIES):
-            if self._n_listed is None:
-                self._send(mavlink.MAVLink_param_request_list_message(self._system, AUTOPILOT))
-                await self._until(self._complete, QUIET_S, MOST_LIST_S)
-        for _ in range(TRIES):
-            missing = self._missing()
-            for at in range(0, len(missing), WINDOW):
-                part = missing[at : at + WINDOW]
-                for index in part:
-                    self._request(index=index)
-                await self._until(partial(self._all_listed, part))
-        if self._n_listed is None:
-            raise SourceError("the autopilot does not answer for its parameters")
-        if not self._complete():
-            raise SourceError(
-                f"{len(self._missing())} of the autopilot's {self._n_listed} parameters do not "
-                "come; the link is bad"
-            )
-        return {name: self.known[name] for name in sorted(self._listed.values())}
 
     async def write(self, name: str, value: float) -> Parameter:
         """Set one that has been read, and read it back. SourceError if the value differs."""
@@ -160,30 +131,20 @@ class Parameters:
             return
         self.known[name] = Parameter(name, value, message.param_type)
         self._answered.add(name)
-        if message.param_index != NO_INDEX and message.param_index < message.param_count:
-            self._listed[message.param_index] = name
-            self._n_listed = message.param_count
         self._came.set()
 
-    def _request(self, name: str = "", index: int = -1) -> None:
+    def _request(self, name: str) -> None:
         self._send(
-            mavlink.MAVLink_param_request_read_message(
-                self._system, AUTOPILOT, name.encode(), index
-            )
+            mavlink.MAVLink_param_request_read_message(self._system, AUTOPILOT, name.encode(), -1)
         )
 
-    async def _until(
-        self,
-        true: Callable[[], bool],
-        patience_s: float | None = None,
-        most_s: float = MOST_ANSWERS_S,
-    ) -> None:
+    async def _until(self, true: Callable[[], bool]) -> None:
         """Wait for a condition, while each message comes in time; others' come too."""
         loop = asyncio.get_running_loop()
-        end_s = loop.time() + most_s
+        end_s = loop.time() + MOST_ANSWERS_S
         while not true() and (begin_s := loop.time()) < end_s:
             self._came.clear()
-            wait_s = min(patience_s or self._patience_s, end_s - begin_s)
+            wait_s = min(self._patience_s, end_s - begin_s)
             try:
                 await within(self._came.wait(), wait_s)
             except asyncio.TimeoutError:
@@ -201,15 +162,6 @@ class Parameters:
 
     def _all_settled(self, names: Sequence[str]) -> bool:
         return all(self._settled(name) for name in names)
-
-    def _all_listed(self, indices: Sequence[int]) -> bool:
-        return all(index in self._listed for index in indices)
-
-    def _missing(self) -> Sequence[int]:
-        return [n for n in range(self._n_listed or 0) if n not in self._listed]
-
-    def _complete(self) -> bool:
-        return self._n_listed is not None and len(self._listed) >= self._n_listed
 
     def _value(self, message: Any) -> float | None:
         """Value of the message; None for an unknown type."""

@@ -138,7 +138,7 @@ def _library() -> Any:
         import zenoh
     except ImportError as error:
         raise InputError(
-            "[distributed] needs Zenoh: pip install 'companion[distributed]' (eclipse-zenoh)"
+            "[distributed] needs Zenoh: pip install eclipse-zenoh"
         ) from error
     return zenoh
 

@@ -113,7 +113,7 @@ def _by_proj(origin: GeoOrigin, epsg: int, above_sea: bool) -> MapFrame:
         from pyproj.exceptions import CRSError
     except ImportError as error:
         raise InputError(
-            f"EPSG:{epsg} is not UTM on WGS84 and wants PROJ: pip install 'companion[survey]'"
+            f"EPSG:{epsg} is not UTM on WGS84 and wants PROJ: pip install pyproj"
         ) from error
     try:
         crs = CRS.from_epsg(epsg)

@@ -25,21 +25,6 @@ def asking(autopilot: FakeAutopilot, ask: Callable[[Parameters], Awaitable[None]
         asyncio.run(run())
 
 
-@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-@pytest.mark.parametrize("loss", [0.0, 0.1])
-def test_all_are_read(firmware: str, loss: float) -> None:
-    autopilot = FakeAutopilot(firmware, "udpin:127.0.0.1:0", loss=loss, seed=5)
-
-    async def ask(parameters: Parameters) -> None:
-        read = await parameters.read_all()
-        assert sorted(read) == autopilot.parameters.listed()
-        assert all(
-            each.value == pytest.approx(autopilot.parameters[name]) for name, each in read.items()
-        )
-
-    asking(autopilot, ask)
-
-
 def test_integers_of_px4() -> None:
     autopilot = FakeAutopilot("px4", "udpin:127.0.0.1:0")
     numbers = [-1, -(2**31), 2**31 - 1, 1310988, 256, 0]
