@@ -179,14 +179,15 @@ def test_no_camera(webcam: FakeV4l2) -> None:
 
 
 def test_damaged_and_lost_pictures_are_counted(webcam: FakeV4l2, camera: V4l2Camera) -> None:
+    webcam.rate_hz = 4.0  # so that a reader that is held up has none to leave out
     camera.open()
     first(camera)
     n_before = camera.n_dropped
     webcam.n_lost = 3
     first(camera)
     assert camera.n_dropped == n_before + 3
-    webcam.damaged = True
-    assert camera.read(0.05) is None
+    webcam.damaged, webcam.rate_hz = True, 100.0
+    assert camera.read(0.5) is None
     assert camera.n_dropped > n_before + 4
 
 
