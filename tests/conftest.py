@@ -29,13 +29,28 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20260101)
 
 
+def goes_on(node: pytest.Item | pytest.Collector) -> bool:
+    """Whether what a test begins is ended by its module."""
+    return node.get_closest_marker("continues") is not None
+
+
+@pytest.fixture(autouse=True, scope="module")
+def nothing_is_left_behind_by_a_module(request: pytest.FixtureRequest) -> Iterator[None]:
+    before = running()
+    yield
+    left = left_since(before) if goes_on(request.node) else []
+    assert not left, f"left behind: {left}"
+
+
 @pytest.fixture(autouse=True)
-def nothing_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def nothing_is_left_behind(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[None]:
     """A test ends what it began: later ones are slower, or fail, by what is left."""
     before = running()
     tasks = watch_tasks(monkeypatch)
     yield
-    left = left_since(before) + tasks
+    left = tasks + ([] if goes_on(request.node) else left_since(before))
     assert not left, f"left behind: {left}"
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from tests.support.processes.flying import Flying
 
+pytestmark = pytest.mark.continues
+
 
 @pytest.fixture(scope="module")
 def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:

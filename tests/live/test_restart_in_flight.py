@@ -19,6 +19,8 @@ from tests.support.autopilot.received_poses import Poses
 from tests.support.cameras.http_camera import world_from_body
 from tests.support.processes.flying import MOST_AWAY_M, MOST_TURNED_DEG, PROOF_S, Flying
 
+pytestmark = pytest.mark.continues
+
 SWAY_M, SWAY_S = 0.1, 5.0
 """As a hovering vehicle sways: too little for GPS or barometer to tell a scale by."""
 STARTED_S = 15.0
