@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +21,9 @@ from companion.geometry.transforms import (
 )
 from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
 from companion.runtime.pipeline import in_order_of_time
+from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_work import Work
+from companion.stages.localisation_work import work
 from drivers.flight import Flight
 from drivers.open_flight import open_flight
 from tests.support.flights.tilted_start import KINDS, tilted_starts
@@ -58,13 +62,22 @@ def sample() -> tuple[Flight, list[Frame], list[Telemetry]]:
     return flight, frames, [s for s in flight.telemetry().samples if s.t_ns < stop_ns]
 
 
-def fly(flight: Flight, frames: list[Frame], samples: list[Telemetry]) -> Flown:
-    stage = LocalisationStage(Config(), flight.camera, lambda _: nullcontext())
+def fly(flight: Flight, frames: list[Frame], samples: list[Telemetry], live: bool = False) -> Flown:
+    """In lockstep; live: in the daemon's stage, mapping beside it, at the pace of flight."""
+    stage: LocalisationStage | Work
+    if live:
+        stage = work(Setup(Config(), flight.camera))
+    else:
+        stage = LocalisationStage(Config(), flight.camera, lambda _: nullcontext())
     history, flown = AttitudeHistory(), Flown()
     messages: list[Message] = list(in_order_of_time(samples, iter(frames)))
+    begun_ns = time.monotonic_ns()
     for message in messages:
         if isinstance(message, AttitudeSample):
             history.add(message)
+        elif live and isinstance(message, Frame):
+            due_ns = begun_ns + message.t_ns - flight.start_ns
+            time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
         for out in stage.step(message):
             t_s = (getattr(out, "t_ns", flight.start_ns) - flight.start_ns) * 1e-9
             if isinstance(out, Warned):
@@ -74,7 +87,10 @@ def fly(flight: Flight, frames: list[Frame], samples: list[Telemetry]) -> Flown:
                 assert attitude is not None
                 cosine = attitude[2] @ out.world_from_body.rotation[2]
                 flown.tilts_deg[t_s] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    stage.finish(adjust=False)
+    if isinstance(stage, Work):
+        list(stage.finish(Finish(hurry=True)))
+    else:
+        stage.finish(adjust=False)
     return flown
 
 
@@ -85,6 +101,19 @@ def test_poses_are_level_two_seconds_after_a_tilted_start(
 ) -> None:
     with tilted_starts(kind, tilt_deg) as begun:
         flown = fly(*sample)
+    assert begun
+    late_s = (sample[1][begun[0]].t_ns - sample[1][0].t_ns) * 1e-9
+    assert flown.worst_deg(max(LEVEL_AFTER_S, late_s + 2.0)) < MAX_TILT_DEG
+
+
+@pytest.mark.parametrize("tilt_deg", [10.0, 20.0, 40.0])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.alone
+def test_poses_of_the_live_stage_are_level_two_seconds_after_a_tilted_start(
+    sample: tuple[Flight, list[Frame], list[Telemetry]], kind: str, tilt_deg: float
+) -> None:
+    with tilted_starts(kind, tilt_deg) as begun:
+        flown = fly(*sample, live=True)
     assert begun
     late_s = (sample[1][begun[0]].t_ns - sample[1][0].t_ns) * 1e-9
     assert flown.worst_deg(max(LEVEL_AFTER_S, late_s + 2.0)) < MAX_TILT_DEG
