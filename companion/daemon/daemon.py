@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
 from companion.config import Config
 from companion.daemon.component_state import POWEROFF, component_state
-from companion.daemon.control.armed_settings import FILE, NOT_KEPT, read_settings
-from companion.daemon.control.arming import Arming
+from companion.daemon.control.armed_settings import NOT_KEPT
 from companion.daemon.control.ground_control import GroundControl
-from companion.daemon.control.kept_settings import kept_over
-from companion.daemon.control.tightening import tightened, value_of_key, with_values
+from companion.daemon.control.settings_in_force import SettingsInForce
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.flights import Flights
@@ -32,7 +30,6 @@ from companion.daemon.missing_devices import MissingDevices
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.daemon.recorder_notes import RecorderNotes
-from companion.daemon.reload import reloaded
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.errors import CompanionError
 from companion.geometry.camera import Camera
@@ -49,15 +46,11 @@ from companion.messages import (
     Warned,
 )
 from companion.pilot_messages import (
-    LIMITS_WAIT,
-    POSITION_ENABLED,
-    POSITION_STAYS_OFF,
     PilotText,
     of_warning,
 )
-from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import Snapshot
-from companion.timing.clock import FlightClock, monotonic_s
+from companion.timing.clock import FlightClock
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_registry import camera_source
 from drivers.camera.live_calibration import live_camera
@@ -66,7 +59,7 @@ from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.origin_keeper import OriginKeeper
 from drivers.mavlink.wire.link_port import link_port
 from drivers.system.clock_is_set import clock_is_set
-from drivers.system.journal import ERROR, INFO, WARNING, Journal
+from drivers.system.journal import ERROR, WARNING, Journal
 from drivers.system.metrics import Metrics
 from drivers.system.service_manager import ServiceManager
 from drivers.system.status_socket import StatusSocket, own_socket_path
@@ -90,24 +83,14 @@ class Daemon:
     """All parts of the daemon; `run` gives the exit status. Create it within the event loop."""
 
     def __init__(self, load: Callable[[], Config]) -> None:
-        self._load = load
-        read, kept = kept_over(load)
         self._clock = clock = FlightClock()
         self._journal = Journal()
         self._loop = asyncio.get_running_loop()
-        flights = Path(read.daemon.flights)
-        before, unreadable = read_settings(flights, read) if read.link.url else (None, "")
-        self._armed_file = NewestFile(
-            flights / FILE, lambda why: self._on_warned(Warned(clock.now_ns(), NOT_KEPT, why))
-        )
-        self._arming = Arming(self._armed_file, before, self._autopilot_boot_s, self._is_heard)
-        resumed = self._arming.resume(read)
-        self._config = config = resumed.config
-        kept |= resumed.by_ground
-        self._stays_off = resumed.by_ground.get("feedback.mode") == "off"
-        """Whether the pilot is still to be told so, once the link is up."""
-        if before is not None:
-            self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
+        self._settings = SettingsInForce(
+            load, self._autopilot_boot_s, self._is_heard, self._journal, self._tell_pilot,
+            lambda why: self._on_warned(Warned(clock.now_ns(), NOT_KEPT, why)), self._reconfigured,
+        )  # fmt: skip
+        config = self.config
         self._stop = asyncio.Event()
         self._status = 0
         self._camera: Camera | None = None
@@ -138,7 +121,7 @@ class Daemon:
         )
         self._flights = Flights(
             clock, self._journal, self._listener,
-            lambda flight: facts_of(flight, self._config, self._link), self._dates,
+            lambda flight: facts_of(flight, self.config, self._link), self._dates,
         )  # fmt: skip
         self._watch = HealthWatch(
             config, clock, self._journal, self._feed, self._link, self._sender, self._flights,
@@ -155,17 +138,18 @@ class Daemon:
         )
         self._missing = MissingDevices(config.daemon.missing_device_s)
         self._standby_later: asyncio.TimerHandle | None = None
-        self._by_ground = self._watch.set_by_ground = kept
+        self._watch.set_by_ground = self._settings.by_ground
         self._ground: GroundControl | None = None
         if self._link is not None and self._reports is not None and config.control.enabled:
             self._ground = GroundControl(
                 self, self._link, clock, self._journal, self._flights,
-                self._reports.questions(lambda: self._config.feedback), kept, self._on_warned,
+                self._reports.questions(lambda: self.config.feedback), self._settings.by_ground,
+                self._on_warned,
             )  # fmt: skip
 
     async def run(self) -> int:
         """Run until stopped or unable to continue; the exit status."""
-        loop, config = self._loop, self._config
+        loop, config = self._loop, self.config
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, self._stop.set)
         loop.add_signal_handler(signal.SIGHUP, self._reload)
@@ -191,7 +175,7 @@ class Daemon:
             if config.feedback.set_origin:
                 keeper = OriginKeeper(
                     config.feedback, self._link, self._journal.say,
-                    lambda: self._config.feedback.mode != "off",
+                    lambda: self.config.feedback.mode != "off",
                 )  # fmt: skip
                 work.append(keeper.run())
         if self._reports is not None:
@@ -219,7 +203,7 @@ class Daemon:
             await metrics.stop()
             await socket.stop()
             await asyncio.wait([feed_closed], timeout=0.2)
-            await loop.run_in_executor(None, self._armed_file.close, WRITE_S)
+            await loop.run_in_executor(None, self._settings.close, WRITE_S)
             if self._ground is not None:
                 await loop.run_in_executor(None, self._ground.close, WRITE_S)
             self._service.close()
@@ -293,7 +277,7 @@ class Daemon:
         if self._camera is not None or size is None:
             return
         try:
-            self._camera, remarks = live_camera(self._config.camera, self._config.mount, *size)
+            self._camera, remarks = live_camera(self.config.camera, self.config.mount, *size)
         except CompanionError as error:
             self._give_up(str(error), BAD_INPUT)
             return
@@ -303,7 +287,7 @@ class Daemon:
 
     @property
     def _always(self) -> bool:
-        return self._config.daemon.flight == "always" or self._link is None
+        return self.config.daemon.flight == "always" or self._link is None
 
     def _begin_if_due(self, take_up: bool = True) -> None:
         if self._camera is None or self._flights.current is not None or self._stop.is_set():
@@ -314,18 +298,12 @@ class Daemon:
             if self._reports is not None:
                 self._reports.restart(self._camera)
             self._watch.restart()
-            self._flights.begin(self._config, self._camera, take_up)
+            self._flights.begin(self.config, self._camera, take_up)
         else:
-            self._flights.prepare(self._config, self._camera)
+            self._flights.prepare(self.config, self._camera)
 
     def _set_armed(self, armed: bool) -> None:
-        if self._arming.take(armed, monotonic_s()):
-            self._let_go()
-        if armed:
-            self._hold()
-            if self._stays_off:
-                self._tell_pilot(POSITION_STAYS_OFF())
-        self._stays_off = False
+        self._settings.set_armed(armed)
         if armed == self._armed:
             return
         self._armed = armed
@@ -384,39 +362,16 @@ class Daemon:
                 self._give_up(str(self._feed.fault), BAD_INPUT)
             if self._dates.step():
                 self._loop.run_in_executor(None, self._dates.write)
-            if self._arming.step(monotonic_s()):
-                self._let_go()
+            self._settings.step()
             gone = self._missing.step(health, now_s, self._armed)
             if gone:
                 self._give_up(gone)
 
     def _reload(self) -> None:
-        """SIGHUP: apply what can change while running, and report what cannot."""
+        """Read the configuration again: SIGHUP."""
         if self._is_ready:
             self._service.reloading()
-        try:
-            read, kept = kept_over(self._load)
-        except CompanionError as error:
-            self._journal.say(f"configuration not taken over: {error}", ERROR)
-        else:
-            config, cannot = reloaded(self._config, read)
-            waiting: dict[str, Any] = {}
-            if self.armed or self._arming.holds:
-                config, waiting = tightened(self._config, config)
-            stays = {*cannot, *waiting}
-            kept |= {name: value for name, value in self._by_ground.items() if name in stays}
-            self._by_ground = self._watch.set_by_ground = kept
-            if self._ground is not None:
-                self._ground.changed = kept
-            self.take_over(config)
-            if "feedback.mode" in self._arming.waiting and read.feedback.mode != "off":
-                waiting["feedback.mode"] = read.feedback.mode
-            self._arming.waiting = waiting
-            text = f"; these need a restart: {', '.join(cannot)}" if cannot else ""
-            if set(waiting) - {"feedback.mode"}:
-                text += f"; these are looser and wait for disarming: {', '.join(waiting)}"
-                self._tell_pilot(LIMITS_WAIT())
-            self._journal.say(f"configuration read again{text}", WARNING if stays else INFO)
+        self._settings.reload()
         if self._is_ready:
             self._service.ready()
 
@@ -425,23 +380,18 @@ class Daemon:
     @property
     def config(self) -> Config:
         """Configuration in force."""
-        return self._config
+        return self._settings.config
 
     @property
     def armed(self) -> bool:
         """Whether the motors are armed; the last known state where nothing is heard."""
-        return self._arming.armed
+        return self._settings.armed
 
     def take_over(self, config: Config) -> None:
         """Continue with another configuration: at once where possible, else with the next map."""
-        old, self._config = self._config, config
-        if self._arming.holds:
-            for name in list(self._arming.waiting):
-                if value_of_key(config, name) != value_of_key(old, name):
-                    del self._arming.waiting[name]  # whoever has set it since has the last word
-            if config.feedback.mode == "off" != old.feedback.mode and not config.control.keep:
-                self._arming.waiting["feedback.mode"] = old.feedback.mode
-            self._hold()
+        self._settings.take_over(config)
+
+    def _reconfigured(self, old: Config, config: Config) -> None:
         if config.daemon != old.daemon:
             self._missing = MissingDevices(config.daemon.missing_device_s)
         self._watch.reconfigure(config)
@@ -461,41 +411,6 @@ class Daemon:
             self._standby_later.cancel()
         self._standby_later = self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
 
-    # -- what holds until the motors are disarmed, see Arming ------------------------------------
-
-    def _hold(self) -> None:
-        """Keep the settings in force for a restart in the air."""
-        self._arming.hold(self._config, self._by_ground, monotonic_s())
-
-    def _let_go(self) -> None:
-        """Disarmed: apply the changes that were held."""
-        waiting = {
-            name: value
-            for name, value in self._arming.let_go().items()
-            if value != value_of_key(self._config, name)
-        }
-        if not waiting:
-            return
-        for name in waiting:
-            self._by_ground.pop(name, None)
-        shown = ", ".join(f"{name} = {value}" for name, value in waiting.items())
-        self._journal.say(f"disarmed: held changes take effect: {shown}", WARNING)
-        if waiting.get("feedback.mode", "off") != "off":
-            self._tell_pilot(POSITION_ENABLED())
-        self.take_over(with_values(self._config, waiting))
-
-    def _say_resumed(
-        self, by_ground: Mapping[str, Any], waiting: Mapping[str, Any], unreadable: str
-    ) -> None:
-        text = "the daemon before ended while armed; until disarmed what counted then counts"
-        if unreadable:
-            text += f", which cannot be read, so that no pose is sent ({unreadable})"
-        else:
-            text += "".join(f"; {k} = {v} (by the ground)" for k, v in by_ground.items())
-        if waiting:
-            text += f"; these wait for disarming: {', '.join(waiting)}"
-        self._journal.say(text, WARNING)
-
     def _autopilot_boot_s(self) -> float | None:
         """Boot time of the autopilot, CLOCK_MONOTONIC; None while its clock is unknown."""
         report = self._link.clock_filter.report() if self._link is not None else None
@@ -507,7 +422,7 @@ class Daemon:
     def prepare(self) -> None:
         """Start the processes of a standby flight."""
         if self._camera is not None:
-            self._flights.prepare(self._config, self._camera)
+            self._flights.prepare(self.config, self._camera)
 
     def begin_flight(self) -> None:
         """Begin a flight with a map of its own, where one is due."""

@@ -102,9 +102,7 @@ class Viewing:
         self._thread.join(4 * self._patience_s + 1.0)
 
     def _open(self) -> LiveViewer:
-        return LiveViewer(
-            self._config.viewer, self._camera, name=self._name, stream=self._stream
-        )
+        return LiveViewer(self._config.viewer, self._camera, name=self._name, stream=self._stream)
 
     def _run(self) -> None:
         wait_s = 0.0

@@ -23,10 +23,10 @@ from companion.daemon.component_state import (
 from companion.daemon.control.flight_parameters import PARAMETERS, number_of, value_of
 from companion.daemon.control.ground_control import CHANGES_AT_ONCE, TEXTS_AT_ONCE, GroundControl
 from companion.daemon.control.kept_settings import kept_over
+from companion.daemon.control.reload import FIXED_KEYS, FIXED_SECTIONS
 from companion.daemon.control.tightening import may_change, value_of_key
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flights import Flights
-from companion.daemon.reload import FIXED_KEYS, FIXED_SECTIONS
 from companion.errors import ConfigError
 from companion.health import Health, SourceHealth, StageHealth
 from companion.pilot_messages import position_lost
