@@ -65,6 +65,14 @@ def changed_by(config: Config, path: Path) -> Config:
     return _changed(config, changed)
 
 
+def config_of_text(text: str, where: str) -> Config:
+    """A configuration in the words of a TOML file, as recordings have it; `where` it comes from."""
+    changed: dict[str, dict[str, Any]] = {section: {} for section in _sections()}
+    for name, value in _parsed(text, where).items():
+        _take(changed, name, value, where)
+    return _changed(Config(), changed)
+
+
 def with_value(config: Config, section: str, key: str, value: Any, where: str) -> Config:
     """A configuration with one value changed, checked as one of a file; `where` it comes from."""
     return _changed(config, {section: {key: _checked(section, key, value, where)}})
@@ -142,10 +150,14 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise ConfigError(f"{path}: cannot read the configuration: {reason}") from error
+    return _parsed(text, str(path))
+
+
+def _parsed(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+        raise ConfigError(f"{where}: not valid TOML: {error}") from error
 
 
 def _take(changed: dict[str, dict[str, Any]], section: str, values: Any, where: str) -> None:

@@ -21,9 +21,7 @@ MAX_EVENTS = 2048
 MIN_BETWEEN_LINES_S = 1.0
 """Least interval of lines about changes."""
 
-SourceState = Literal[
-    "missing", "opening", "running", "silent", "frozen", "ended", "driver fault"
-]
+SourceState = Literal["missing", "opening", "running", "silent", "frozen", "ended", "driver fault"]
 """`driver fault` is a bug of ours, not of the device; its traceback is in the journal."""
 
 

@@ -159,6 +159,21 @@ class Odometry:
     sigma_yaw_rad: float = float("inf")
 
 
+@dataclass(frozen=True, slots=True)
+class FrameTracked:
+    """What the pose of a frame hung on beside its image: told after it.
+
+    `n_samples` of telemetry had been taken since the beginning. `mapping_point` is where mapping
+    stood, see `companion.slam.mapping.mapping_worker.MapLock`; `feature_ratio` the load level.
+    """
+
+    t_ns: int
+    seq: int
+    n_samples: int
+    mapping_point: int
+    feature_ratio: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeAdded:
     """A new keyframe: its frame, and the map points that it sees.
@@ -206,6 +221,14 @@ class Georeference:
     residual_m: float
     has_origin: bool = True
     """False where only the scale is known: the world then begins at the first camera."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Georeferenced:
+    """Georeference of the newest map alone, for whoever needs no more of it."""
+
+    t_ns: int
+    georeference: Georeference | None
 
 
 SPANS_REACH = 6
@@ -354,9 +377,45 @@ class ClockReport:
     n_reboots: int
 
 
+@dataclass(frozen=True, slots=True)
+class LinkBytes:
+    """Bytes of the autopilot's wire; `outgoing` are those sent, ours or clients'."""
+
+    t_ns: int
+    monotonic_ns: int
+    outgoing: bool
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class GateStep:
+    """One call of the pose gate, by which its poses can be made again; see `gate_journal`.
+
+    `t_ns` is the time of the call, `n_attitudes` of the autopilot's had come since the flight
+    began; `counter` is that of resets afterwards, and whether this boot was sent a pose. `sent`
+    tells whether the autopilot was heard, so that a pose was sent.
+    """
+
+    t_ns: int
+    what: str
+    n_attitudes: int
+    counter: int
+    counter_sent: bool
+    sent: bool
+    values: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class HealthNote:
+    """Health of the daemon: status document, state of the clock filter, origin if known."""
+
+    t_ns: int
+    document: Mapping[str, Any]
+
+
 Message = (
     Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
-    | PointChunk | Warned
+    | PointChunk | Warned | FrameTracked | Georeferenced | LinkBytes | HealthNote | GateStep
 )  # fmt: skip
 
 Details = Mapping[str, Any]

@@ -48,9 +48,7 @@ class PilotMessage:
 # -- vision position -----------------------------------------------------------------
 
 POSITION_ON = PilotMessage(INFO, "vision position on")
-POSITION_LOST = PilotMessage(
-    WARNING, "vision position lost: {reason}", {"reason": LONGEST_REASON}
-)
+POSITION_LOST = PilotMessage(WARNING, "vision position lost: {reason}", {"reason": LONGEST_REASON})
 POSITION_OFF = PilotMessage(NOTICE, "vision position off: ground command")
 POSITION_STAYS_OFF = PilotMessage(WARNING, "vision position still off: by ground")
 POSITION_ENABLED = PilotMessage(NOTICE, "vision position enabled: disarmed")

@@ -87,7 +87,7 @@ def replay_one(name: str, flight: Path, out: Path, config: Config, mark: str) ->
     folder = out / name
     try:
         replay(
-            flight, folder, config, start_s=None, stop_s=None, viewer="none", paced=False,
+            flight, folder, config, start_s=None, stop_s=None, viewer="none",
             progress=NoProgress(),
         )  # fmt: skip
         write_atomically(folder / THUMBNAIL, thumbnail(flight, config.camera))

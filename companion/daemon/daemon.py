@@ -49,6 +49,7 @@ from companion.pilot_messages import (
     PilotText,
     of_warning,
 )
+from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import Snapshot
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_feed import CameraFeed
@@ -113,7 +114,7 @@ class Daemon:
         if self._link is not None:
             self._sender = PoseSender(
                 config.feedback, self._link, clock, counter_path(config.daemon.flights),
-                self._on_warned,
+                self._on_warned, lambda step: self._flights.take(step),
             )  # fmt: skip
         date = AutopilotDate(self._link) if self._link is not None else None
         self._dates = FlightDates(
@@ -121,7 +122,7 @@ class Daemon:
         )
         self._flights = Flights(
             clock, self._journal, self._listener,
-            lambda flight: facts_of(flight, self.config, self._link), self._dates,
+            self._facts, self._dates,
         )  # fmt: skip
         self._watch = HealthWatch(
             config, clock, self._journal, self._feed, self._link, self._sender, self._flights,
@@ -247,14 +248,24 @@ class Daemon:
 
             return lambda message: self._soon(later, message)
 
+        needs_map = self._reports is not None and self.config.feedback.obstacle_distance
         return Listener(
-            current(self._on_odometry),
-            current(self._on_mapped),
-            self._on_warned,
-            lambda: self._soon(self._localisation_died, flight),
-            lambda why: self._soon(self._unusable, why),
-            current(self._on_snapshot),
+            odometry=current(self._on_odometry),
+            georeferenced=current(self._watch.take_georeference),
+            warned=self._on_warned,
+            localisation_died=lambda: self._soon(self._localisation_died, flight),
+            unusable=lambda why: self._soon(self._unusable, why),
+            snapshot=current(self._on_snapshot),
+            points_made=current(self._watch.points_made),
+            mapped=current(self._on_mapped) if needs_map else None,
         )
+
+    def _facts(self, flight: LiveFlight) -> RunFacts:
+        link = self._link
+        if link is None:
+            return facts_of(flight, self.config, None, None, {})
+        clock = link.clock_filter.report()
+        return facts_of(flight, self.config, clock, link.origin, link.rates_hz)
 
     def _on_odometry(self, odometry: Odometry) -> None:
         self._watch.take_odometry(odometry)
@@ -262,7 +273,6 @@ class Daemon:
             self._sender.take(odometry)
 
     def _on_mapped(self, message: Track | MapUpdate | PointChunk) -> None:
-        self._watch.take_mapped(message)
         if self._reports is not None:
             self._reports.take(message)
 
@@ -299,6 +309,8 @@ class Daemon:
                 self._reports.restart(self._camera)
             self._watch.restart()
             self._flights.begin(self.config, self._camera, take_up)
+            if self._sender is not None:
+                self._sender.begin_flight()
         else:
             self._flights.prepare(self.config, self._camera)
 

@@ -24,7 +24,7 @@ from companion.health import (
     StageMeter,
     StatusLines,
 )
-from companion.messages import MapUpdate, Odometry, PointChunk, Track, TrackState, Warned
+from companion.messages import Georeferenced, Odometry, TrackState, Warned
 from companion.runtime.governor import Governor, LoadSample
 from companion.timing.clock import FlightClock, monotonic_s
 from drivers.camera.camera_feed import CameraFeed
@@ -126,13 +126,14 @@ class HealthWatch:
         self._pose.done(now_ns, odometry.t_ns)
         self._recent.add(now_ns, (now_ns - odometry.t_ns) * 1e-6)
 
-    def take_mapped(self, message: Track | MapUpdate | PointChunk) -> None:
-        """Take the depth latency from points, and the source of the scale from the map."""
-        if isinstance(message, PointChunk):
-            self._depth.done(self._clock.now_ns(), message.t_ns)
-        elif isinstance(message, MapUpdate):
-            found = message.georeference
-            self._scale = found.method if found is not None else ""
+    def take_georeference(self, told: Georeferenced) -> None:
+        """Take the source of the scale."""
+        found = told.georeference
+        self._scale = found.method if found is not None else ""
+
+    def points_made(self, t_ns: int) -> None:
+        """Take the latency of depth from the time of a keyframe whose points have come."""
+        self._depth.done(self._clock.now_ns(), t_ns)
 
     @property
     def up(self) -> bool:

@@ -9,9 +9,9 @@ from typing import Any
 
 from companion.daemon.flights.flights import Flights
 from companion.daemon.health_watch import HealthWatch
+from companion.messages import HealthNote, LinkBytes
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.recording.recorded_content import HealthNote, LinkBytes
 
 EVERY_S = 1.0
 LEAD_NS = 10_000_000_000
@@ -35,7 +35,7 @@ class RecorderNotes:
         """Record health once a second, until cancelled."""
         while True:
             await asyncio.sleep(EVERY_S)
-            self._flights.record(HealthNote(self._clock.now_ns(), self._document()))
+            self._flights.take(HealthNote(self._clock.now_ns(), self._document()))
 
     def _on_bytes(self, outgoing: bool, data: bytes, monotonic_ns: int) -> None:
         taken = LinkBytes(
@@ -46,7 +46,7 @@ class RecorderNotes:
             self._lead.popleft()
         if self._flights.current is not None:
             while self._lead:
-                self._flights.record(self._lead.popleft())
+                self._flights.take(self._lead.popleft())
 
     def _document(self) -> dict[str, Any]:
         document: dict[str, Any] = {"health": self._watch.document()}

@@ -23,6 +23,7 @@ from companion.geometry.transforms import Array, Pose
 from companion.messages import (
     AttitudeSample,
     Frame,
+    FrameTracked,
     HeightSample,
     KeyframeAdded,
     MapUpdate,
@@ -54,17 +55,19 @@ MAP_NOT_RECOGNISED = "old map not recognised: new map"
 class LocalisationStage:
     """Localises the camera.
 
-    With `background` keyframes are mapped in another thread, so that no frame waits. Position
+    With `background` keyframes are mapped in another thread, so that no frame waits; `order` is
+    then that of mapping and frames, as FrameTracked told it in an earlier flight. Position
     estimates of an autopilot that flies on ours are ignored.
     """
 
     def __init__(
-        self, config: Config, camera: Camera, times: Timer, *, background: bool = False
-    ) -> None:
+        self, config: Config, camera: Camera, times: Timer, *, background: bool = False,
+        order: Iterable[int] | None = None,
+    ) -> None:  # fmt: skip
         self._config = config
         self._camera = camera
         self._times = times
-        self._tracker = Tracker(config, camera, times, background)
+        self._tracker = Tracker(config, camera, times, background, order)
         self._attitude = CameraAttitude(camera.body_from_camera)
         self._motion = MotionFilter()
         self._georeferencer = Georeferencer(
@@ -77,6 +80,9 @@ class LocalisationStage:
         self._last: Track | None = None
         """The last frame with a pose, in the frame of the active segment."""
         self._t_ns = 0
+        self._samples: list[Message] = []
+        """Telemetry since the last frame: taken with the next, while nothing is mapped."""
+        self._n_samples = 0
         self._pruned_ns: int | None = None
         self._resumption: Resumption | None = None
         """While a stored map is being verified."""
@@ -111,11 +117,17 @@ class LocalisationStage:
         """
         if isinstance(message, Frame):
             return self._frame(message)
-        if isinstance(message, AttitudeSample):
-            self._attitude.add(message)
-        elif isinstance(message, (PositionSample, RangeSample, HeightSample)):
-            self._georeferencer.take(message)
+        self._samples.append(message)
         return []
+
+    def _take_samples(self) -> None:
+        for sample in self._samples:
+            if isinstance(sample, AttitudeSample):
+                self._attitude.add(sample)
+            elif isinstance(sample, (PositionSample, RangeSample, HeightSample)):
+                self._georeferencer.take(sample)
+        self._n_samples += len(self._samples)
+        self._samples.clear()
 
     def set_effort(self, share: float) -> None:
         """Extract this ratio of the features from now on, under load."""
@@ -136,7 +148,7 @@ class LocalisationStage:
         mounted = self._camera.body_from_camera is not None
         if georeference is not None and mounted and attitude is None:
             return None
-        with self._times("checkpoint"), self._tracker.map_lock.tracking():
+        with self._times("checkpoint"), self._tracker.map_lock.reading():
             place = last.map_from_camera.translation
             (nearest,) = segment.nearest(place, 1, set())
             part = part_around(segment, segment.keyframes[nearest], MAX_BYTES)
@@ -164,6 +176,7 @@ class LocalisationStage:
     def finish(self, adjust: bool = True) -> list[Message]:
         """The map at the end of a flight, with or without a final global adjustment."""
         out: list[Message] = [*self._tracker.close()]
+        self._take_samples()
         with self._times("final adjustment"):
             for segment in self._segments() if adjust else ():
                 self._tracker.atlas.mapper_of(segment).adjust_all(
@@ -177,17 +190,24 @@ class LocalisationStage:
         return [s for s in self._tracker.segments if s.keyframes]
 
     def _frame(self, frame: Frame) -> Iterator[Message]:
+        # one section for all of a frame: interleaved with mapping each would slow the other
+        with self._tracker.map_lock.tracking():
+            yield from self._tracked(frame)
+            yield FrameTracked(
+                frame.t_ns, frame.seq, self._n_samples, self._tracker.map_lock.point,
+                self._tracker.feature_ratio,
+            )  # fmt: skip
+
+    def _tracked(self, frame: Frame) -> Iterator[Message]:
         self._t_ns = frame.t_ns
+        self._take_samples()
         attitude = self._attitude.at(frame.t_ns)
-        with (
-            self._tracker.map_lock.tracking()
-        ):  # for the whole frame: interleaved with mapping each would slow the other
-            self._apply_map_correction()
-            predicted = self._predicted(frame.t_ns, attitude)
-            before = self._tracker.map
-            aligned = predicted is not None and attitude is not None and self._motion.aligned
-            rotation_in_map = predicted.rotation if predicted is not None and aligned else None
-            tracked = self._tracker.step(frame, Prior(predicted, attitude, rotation_in_map))
+        self._apply_map_correction()
+        predicted = self._predicted(frame.t_ns, attitude)
+        before = self._tracker.map
+        aligned = predicted is not None and attitude is not None and self._motion.aligned
+        rotation_in_map = predicted.rotation if predicted is not None and aligned else None
+        tracked = self._tracker.step(frame, Prior(predicted, attitude, rotation_in_map))
         other_map = self._tracker.map is not before
         if other_map or self.state is TrackState.INITIALISING:
             self._reset_motion()
@@ -230,8 +250,7 @@ class LocalisationStage:
         if self._pruned_ns is not None and t_ns < self._pruned_ns + PRUNE_PERIOD_NS:
             return
         self._pruned_ns = t_ns
-        with self._tracker.map_lock.tracking():
-            living = {k.keyframe_id: k.t_ns for s in self._segments() for k in s.keyframes.values()}
+        living = {k.keyframe_id: k.t_ns for s in self._segments() for k in s.keyframes.values()}
         self._attitude.prune(living.keys())
         when_ns: Array = np.array(sorted(living.values()))
         self._georeferencer.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
@@ -249,8 +268,7 @@ class LocalisationStage:
             return
         self._resumption = None
         if verdict is Verdict.REFUSED:
-            with self._tracker.map_lock.tracking():
-                self._tracker.drop_map(kept.part.first_keyframe_id)
+            self._tracker.drop_map(kept.part.first_keyframe_id)
             if in_use:
                 self._reset_motion()
             yield Warned(t_ns, MAP_NOT_RECOGNISED, resumption.why_not)
@@ -270,7 +288,7 @@ class LocalisationStage:
         self._last = None
 
     def _map_update(self) -> MapUpdate:
-        with self._times("georeference"), self._tracker.map_lock.tracking():
+        with self._times("georeference"):
             return self._georeferences.update(self._segments(), self._t_ns, final=False)
 
     def _apply_map_correction(self) -> None:
@@ -346,10 +364,9 @@ class LocalisationStage:
             pose = segment.pose_of(keyframe_id)
             return None if pose is None else pose.rotation.T
 
-        with self._tracker.map_lock.tracking():
-            checked = self._attitude.check(
-                t_ns, rotation_of, None if placed is None else placed.world_from_map.rotation
-            )
+        checked = self._attitude.check(
+            t_ns, rotation_of, None if placed is None else placed.world_from_map.rotation
+        )
         if checked.now_from_before is not None:
             self._correct_attitudes(checked.now_from_before)
         if checked.before_from_now_ned is not None:
@@ -357,8 +374,7 @@ class LocalisationStage:
         if checked.invalid_since_ns is not None:
             self._invalidate_attitudes(checked.invalid_since_ns)
         if checked.reinitialise:
-            with self._tracker.map_lock.tracking():
-                self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)
+            self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)
             self._motion.reset()
             self._attitude.reset()
             self._last = None
@@ -367,19 +383,17 @@ class LocalisationStage:
     def _invalidate_attitudes(self, since_ns: int) -> None:
         """Clear attitudes of keyframes since a time, which were not those of the camera."""
         self._motion.discard_alignment()
-        with self._tracker.map_lock.tracking():
-            for segment in self._tracker.segments:
-                for keyframe in segment.keyframes.values():
-                    if keyframe.t_ns >= since_ns:
-                        keyframe.ned_from_camera = None
+        for segment in self._tracker.segments:
+            for keyframe in segment.keyframes.values():
+                if keyframe.t_ns >= since_ns:
+                    keyframe.ned_from_camera = None
 
     def _correct_attitudes(self, rotation: Array) -> None:
         """Rotate attitudes of keyframes by a correction of the mount."""
-        with self._tracker.map_lock.tracking():
-            for segment in self._tracker.segments:
-                for keyframe in segment.keyframes.values():
-                    if keyframe.ned_from_camera is not None:
-                        keyframe.ned_from_camera = keyframe.ned_from_camera @ rotation.T
+        for segment in self._tracker.segments:
+            for keyframe in segment.keyframes.values():
+                if keyframe.ned_from_camera is not None:
+                    keyframe.ned_from_camera = keyframe.ned_from_camera @ rotation.T
 
     def _loop_allowed(self, keyframe: Keyframe, other: Keyframe, found: LoopClosure) -> bool:
         return self._georeferences.loop_allowed(self._tracker.map, keyframe, other, found)

@@ -171,8 +171,6 @@ class Governor:
         return (
             (latency_ms is None or latency_ms < HEADROOM_LATENCY_SHARE * self._max_latency_ms)
             and sample.pose_dropped_hz <= 0.2 * MAX_DROPPED_HZ
-            and (
-                sample.temperature_c is None or sample.temperature_c < self._hot_c - COOLER_C
-            )
+            and (sample.temperature_c is None or sample.temperature_c < self._hot_c - COOLER_C)
             and (sample.memory_share is None or sample.memory_share < HEADROOM_MEMORY_SHARE)
         )

@@ -59,9 +59,12 @@ class Mailbox(Generic[T]):
             return sum(map(len, self._waiting.values()))
 
     def put(self, message: T) -> None:
-        """Add a message; never waits."""
+        """Add a message; never waits. Counted as dropped once it is closed."""
         policy, size = self._policy_of(message), self._bytes_of(message)
         with self._changed:
+            if self._closed:
+                self.n_overflowed += 1
+                return
             if policy is DropPolicy.LATEST_WINS and self._waiting[policy]:
                 self._drop(policy)
                 self.n_dropped += 1

@@ -1,11 +1,11 @@
-"""The process of a stage: python -m companion.runtime.stage_child KIND NICE SOCKET_FD RING_FD."""
+"""The process of a stage: python -m companion.runtime.stage_child NAME SOCKET_FD."""
 
 from __future__ import annotations
 
 import os
-import pickle
 import resource
 import signal
+import socket
 import sys
 
 # The daemon says when to end: not Ctrl-C, which is for its own group of processes, nor systemd. No
@@ -23,19 +23,27 @@ for variable in (
 
 import threading  # noqa: E402
 from collections.abc import Callable  # noqa: E402
-from multiprocessing.connection import Connection  # noqa: E402
 from typing import Any  # noqa: E402
 
 from companion.errors import CompanionError, InputError  # noqa: E402
 from companion.messages import Frame  # noqa: E402
-from companion.runtime.frame_ring import FrameHandle, FrameRing  # noqa: E402
-from companion.runtime.mail_policy import FRAMES_SHARE, IN_BYTES, drop_policy_of  # noqa: E402
-from companion.runtime.mailbox import Mailbox  # noqa: E402
-from companion.runtime.message_size import size_bytes  # noqa: E402
-from companion.runtime.stage_protocol import Failed, Finish, Finished, Progress, Setup  # noqa: E402
+from companion.runtime.mailbox import DropPolicy, Mailbox  # noqa: E402
+from companion.runtime.parcel import Parcel  # noqa: E402
+from companion.runtime.stage_protocol import (  # noqa: E402
+    Failed,
+    Finish,
+    Finished,
+    Progress,
+    Remark,
+    Setup,
+    Taken,
+)
 from companion.runtime.stage_work import Work, WorkModule, module_of  # noqa: E402
+from companion.runtime.stages import DROPPED, Frames, Stage, stage_named  # noqa: E402
 from companion.timing.clock import monotonic_s, wait_s  # noqa: E402
 
+IN_BYTES = 64 << 20
+"""Queue in a stage's process: fifty frames of 640x480."""
 REPORT_EVERY_S = 1.0
 LOWEST_NICE = 19
 """Lowest priority: runs only where nothing else wants the processor."""
@@ -45,22 +53,22 @@ SWITCH_S = 5e-4
 
 def main() -> int:
     """Run one stage until told to finish, or until the daemon is gone."""
-    kind, nice, pipe_fd, ring_fd = sys.argv[1], *map(int, sys.argv[2:5])
-    os.nice(min(nice, LOWEST_NICE))
-    if kind == "localisation":
+    stage = stage_named(sys.argv[1])
+    os.nice(min(stage.nice, LOWEST_NICE))
+    if stage.nice == 0:
         _take_real_time()
-    if nice > LOWEST_NICE:
+    if stage.nice > LOWEST_NICE:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     sys.setswitchinterval(SWITCH_S)
-    pipe: Connection[Any, Any] = Connection(pipe_fd)
-    module = module_of(kind)  # which takes a second, and may be long before there is a flight
+    daemon = socket.socket(fileno=int(sys.argv[2]))
+    module = module_of(stage.name)  # which takes a second, and may be long before there is a flight
     try:
-        setup: Setup = pipe.recv()
+        setup: Setup = Parcel.receive(daemon).open()
     except EOFError:
         return 0
-    send = _sender(pipe)
+    send = _sender(daemon)
     try:
-        _serve(pipe, send, module, setup, ring_fd)
+        _serve(daemon, send, stage, module, setup)
     except (CompanionError, OSError) as error:  # no device, no room on the disk: no bug of ours
         send(Failed(str(error), isinstance(error, InputError)))
         return 1
@@ -68,18 +76,14 @@ def main() -> int:
 
 
 def _serve(
-    pipe: Connection[Any, Any],
-    send: Callable[[Any], None],
-    module: WorkModule,
+    daemon: socket.socket, send: Callable[[Any], None], stage: Stage, module: WorkModule,
     setup: Setup,
-    ring_fd: int,
-) -> None:
-    ring = FrameRing(setup.camera.width, setup.camera.height, ring_fd)
+) -> None:  # fmt: skip
     work = module.work(setup)
     work.begin(send)
-    send(Progress(device=work.device))
-    loop = _Loop(ring, work)
-    threading.Thread(target=loop.read, args=(pipe,), name="from the daemon", daemon=True).start()
+    loop = _Loop(stage, work)
+    send(loop.progress())
+    threading.Thread(target=loop.read, args=(daemon, send), daemon=True).start()
     threading.Thread(target=loop.report, args=(send,), name="reports", daemon=True).start()
     loop.run(send)
     send(Finished(work.times.summary(), work.device))
@@ -88,65 +92,62 @@ def _serve(
 class _Loop:
     """Processes one message after the other, and reports progress, also of a step that hangs."""
 
-    def __init__(self, ring: FrameRing, work: Work) -> None:
-        self._ring, self._work = ring, work
-        self._inbox: Mailbox[Any] = Mailbox(
-            lambda message: drop_policy_of(message, work.latest_only), size_bytes, IN_BYTES
+    def __init__(self, stage: Stage, work: Work) -> None:
+        self._stage, self._work = stage, work
+        self._inbox: Mailbox[Parcel] = Mailbox(
+            self._policy_of, lambda parcel: parcel.n_bytes, IN_BYTES
         )
         self._n_done = 0
-        self._n_overwritten = 0
-        """Frames overwritten in the ring or dropped on overflow."""
         self._busy_since_s: float | None = None
 
-    def read(self, pipe: Connection[Any, Any]) -> None:
-        """Put incoming messages into the inbox, frames copied, until the daemon is gone."""
-        ring, work = self._ring, self._work
+    def _policy_of(self, parcel: Parcel) -> DropPolicy:
+        if parcel.kind == "Frame" and self._stage.frames is Frames.NEWEST:
+            return DropPolicy.LATEST_WINS
+        return DROPPED.get(parcel.kind, DropPolicy.LOSSLESS)
+
+    def read(self, daemon: socket.socket, send: Callable[[Any], None]) -> None:
+        """Put what comes into the inbox, until the daemon is gone."""
+        n_taken = 0
         try:
             while True:
-                message = pipe.recv()
-                if isinstance(message, FrameHandle) and not work.latest_only:
-                    capacity = self._inbox.n_bytes + ring.frame_bytes <= FRAMES_SHARE * IN_BYTES
-                    frame = ring.get(message) if capacity or not len(self._inbox) else None
-                    if frame is None:
-                        self._n_overwritten += 1
-                        continue
-                    message = frame
-                self._inbox.put(message)
+                parcel = Parcel.receive(daemon)
+                if parcel.is_shared:
+                    n_taken += parcel.n_bytes
+                    send(Taken(n_taken))
+                self._inbox.put(parcel)
         except (OSError, EOFError):
-            if not work.outlives_daemon:
+            if not self._work.outlives_daemon:
                 os._exit(0)  # the daemon is gone, and nobody waits for results
-            self._inbox.put(Finish(hurry=True))
+            self._inbox.put(Parcel.of(Finish(hurry=True)))
+
+    def progress(self) -> Progress:
+        """Progress now."""
+        inbox, work = self._inbox, self._work
+        return Progress(
+            self._n_done, inbox.n_dropped + inbox.n_overflowed + work.n_rejected,
+            self._busy_since_s, inbox.n_bytes, work.times.summary(), work.device, work.details(),
+        )  # fmt: skip
 
     def report(self, send: Callable[[Any], None]) -> None:
         """Report progress periodically, as long as the process lives."""
         while True:
             wait_s(threading.Event(), REPORT_EVERY_S)
-            inbox, work = self._inbox, self._work
-            n_dropped = inbox.n_dropped + inbox.n_overflowed + self._n_overwritten
-            send(
-                Progress(
-                    self._n_done, n_dropped + work.n_rejected, self._busy_since_s,
-                    inbox.n_bytes, work.times.summary(), work.device,
-                )
-            )  # fmt: skip
+            send(self.progress())
 
     def run(self, send: Callable[[Any], None]) -> None:
         """Work until told to finish."""
         work = self._work
         while True:
             self._busy_since_s = None
-            message = self._inbox.get()
+            parcel = self._inbox.get()
+            assert parcel is not None  # it is never closed
             self._busy_since_s = monotonic_s()
+            message = parcel.open()
+            del parcel
             if isinstance(message, Finish):
                 for out in work.finish(message):
                     send(out)
                 return
-            if isinstance(message, FrameHandle):
-                frame = self._ring.get(message, colour=False)
-                if frame is None:
-                    self._n_overwritten += 1
-                    continue
-                message = frame
             for out in work.step(message):
                 send(out)
             self._n_done += isinstance(message, Frame)
@@ -165,14 +166,17 @@ def _take_real_time() -> None:
         print(f"companion: no real-time policy for the pose: {error.strerror}", file=sys.stderr)
 
 
-def _sender(pipe: Connection[Any, Any]) -> Callable[[Any], None]:
+def _sender(daemon: socket.socket) -> Callable[[Any], None]:
     lock = threading.Lock()
 
     def send(message: Any) -> None:
-        data = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+        if isinstance(message, Remark):
+            print(f"companion: {message.text}", file=sys.stderr, flush=True)
+            return
+        parcel = Parcel.of(message)
         try:
             with lock:
-                pipe.send_bytes(data)
+                parcel.send(daemon)
         except OSError:
             pass  # the daemon is gone, which the reader sees
 

@@ -1,29 +1,35 @@
 """Handle of a stage's process in the daemon.
 
-Messages go through a pair of sockets as pickles (both ends are ours, and nobody else has them),
-frames through shared memory. Nothing here makes the caller wait but `wait`.
+Parcels go through a pair of sockets; both ends are ours, and nobody else has them. Nothing here
+makes the caller wait but `wait`.
 """
 
 from __future__ import annotations
 
-import pickle
 import signal
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from typing import Any
 
-from companion.runtime.frame_ring import FrameRing
-from companion.runtime.mail_policy import OUT_BYTES, drop_policy_of
-from companion.runtime.mailbox import Mailbox
-from companion.runtime.message_size import size_bytes
-from companion.runtime.stage_protocol import DriverAtWork, Failed, Finish, Finished, Progress, Setup
+from companion.runtime.mailbox import DropPolicy, Mailbox
+from companion.runtime.parcel import Parcel
+from companion.runtime.stage_protocol import (
+    DriverAtWork,
+    Failed,
+    Finish,
+    Finished,
+    Progress,
+    Setup,
+    Taken,
+)
+from companion.runtime.stages import DROPPED, QUEUE_BYTES, UNREAD_BYTES, Frames, Stage
 from companion.timing.clock import monotonic_s
 
 CHILD = "companion.runtime.stage_child"
+FRAME = "Frame"
 BY_DRIVER = (
     signal.SIGABRT, signal.SIGALRM, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV,
 )  # fmt: skip
@@ -33,21 +39,14 @@ BY_DRIVER = (
 class StageProcess:
     """Starts the process of a stage, which does nothing before `begin`.
 
-    `deliver` gets its messages, and `ended` one call when it is gone: "" where it was asked to end,
-    else the reason in words. Both are called from a thread of this object. With `every_frame` no
-    frame is dropped for a newer one.
+    `deliver` gets its messages, closed, and `ended` one call when it is gone: "" where it was asked
+    to end, else the reason in words. Both are called from a thread of this object.
     """
 
     def __init__(
-        self,
-        kind: str,
-        nice: int,
-        ring: FrameRing,
-        deliver: Callable[[Any], None],
-        ended: Callable[[str], None],
-        every_frame: bool = False,
+        self, stage: Stage, deliver: Callable[[Parcel], None], ended: Callable[[str], None]
     ) -> None:
-        self.name = kind
+        self.stage = stage
         self.progress: Progress | None = None
         """None until the stage is ready."""
         self.finished: Finished | None = None
@@ -62,19 +61,19 @@ class StageProcess:
         self.asked_to_end = False
         """Whether it was asked to finish or killed."""
         self._driver = DriverAtWork()
-        self._outbox: Mailbox[Any] = Mailbox(
-            lambda message: drop_policy_of(message, not every_frame), size_bytes, OUT_BYTES
-        )
-        ours, theirs = socket.socketpair()
+        self._n_sent = self._n_taken = 0
+        """Bytes of shared memory, so far."""
+        self._was_taken = threading.Condition()
+        self._gone = False
+        self._outbox: Mailbox[Parcel] = Mailbox(self._policy_of, _bytes_of, QUEUE_BYTES)
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._child = subprocess.Popen(
-            [sys.executable, "-m", CHILD, kind, str(nice), str(theirs.fileno()), str(ring.fd)],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-            pass_fds=(theirs.fileno(), ring.fd),
+            [sys.executable, "-m", CHILD, stage.name, str(theirs.fileno())],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=(theirs.fileno(),),
         )  # fmt: skip
         theirs.close()
-        self._pipe = Connection(ours.detach())
-        self._writer = threading.Thread(target=self._write, name=f"to {self.name}", daemon=True)
-        self._reader = threading.Thread(target=self._read, name=f"from {self.name}", daemon=True)
+        self._writer = threading.Thread(target=self._write, name=f"to {stage.name}", daemon=True)
+        self._reader = threading.Thread(target=self._read, name=f"from {stage.name}", daemon=True)
         self._writer.start()
         self._reader.start()
 
@@ -90,7 +89,7 @@ class StageProcess:
 
     @property
     def n_dropped(self) -> int:
-        """Frames dropped before or in the process."""
+        """Messages dropped before or in the process, frames most of all."""
         inside = self.progress.n_dropped if self.progress is not None else 0
         return self._outbox.n_dropped + self._outbox.n_overflowed + inside
 
@@ -113,24 +112,28 @@ class StageProcess:
 
     def begin(self, setup: Setup) -> None:
         """Send the setup; earlier messages are ignored."""
-        self._outbox.put(setup)
+        self._outbox.put(Parcel.of(setup))
         self._begun_s = monotonic_s()
 
-    def offer(self, message: Any) -> None:
-        """Send a message or a FrameHandle; a waiting frame is dropped for a newer one.
+    def offer(self, parcel: Parcel) -> None:
+        """Send a message; a waiting frame is dropped for a newer one.
 
-        Where more than OUT_BYTES wait, depth maps are dropped first; see companion.runtime.mailbox.
+        Where more than QUEUE_BYTES wait, depth maps are dropped first; see runtime.mailbox.
         """
         if self._begun_s is None:
             return
-        self._outbox.put(message)
+        self._outbox.put(parcel)
         if self._offered_s is None:
             self._offered_s = monotonic_s()
+
+    def order(self, control: Any) -> None:
+        """Send a control message, which is never dropped."""
+        self.offer(Parcel.of(control))
 
     def ask_to_finish(self, finish: Finish) -> None:
         """Ask it for its last results and its end."""
         self.asked_to_end = True
-        self._outbox.put(finish)
+        self._outbox.put(Parcel.of(finish))
         self._outbox.close()
 
     def wait(self, seconds: float) -> bool:
@@ -167,38 +170,72 @@ class StageProcess:
         for thread in (self._reader, self._writer):
             if thread is not threading.current_thread():
                 thread.join()
-        self._pipe.close()
+        self._socket.close()
+
+    def _policy_of(self, parcel: Parcel) -> DropPolicy:
+        if parcel.kind == FRAME and self.stage.frames is not Frames.EVERY:
+            return DropPolicy.LATEST_WINS
+        return DROPPED.get(parcel.kind, DropPolicy.LOSSLESS)
 
     def _write(self) -> None:
         try:
-            while (message := self._outbox.get()) is not None:
-                self._pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
+            while (parcel := self._outbox.get()) is not None:
+                if parcel.is_shared and not self._has_room(parcel.n_bytes):
+                    return
+                parcel.send(self._socket)
         except OSError:
             pass  # it is gone, which the reader tells
+
+    def _has_room(self, n_bytes: int) -> bool:
+        """Wait until little is on its way; False where it is gone."""
+        with self._was_taken:
+            self._was_taken.wait_for(
+                lambda: self._gone or self._n_sent - self._n_taken <= UNREAD_BYTES
+            )
+            self._n_sent += n_bytes
+            return not self._gone
 
     def _read(self) -> None:
         try:
             while True:
-                message = self._pipe.recv()
-                if isinstance(message, Progress):
-                    self._busy_since_s = message.busy_since_s
-                    self._offered_s = None
-                    self.progress = message
-                elif isinstance(message, DriverAtWork):
-                    self._driver = message
-                elif isinstance(message, Failed):
-                    self.failed = message
-                elif isinstance(message, Finished):
-                    self.finished = message
-                else:
-                    self._deliver(message)
+                self._take(Parcel.receive(self._socket))
         except (OSError, EOFError):
             pass
         self._outbox.close()
+        with self._was_taken:
+            self._gone = True
+            self._was_taken.notify()
         status = self._child.wait()
         why = self.failed.why if self.failed is not None else self._interrupted
         why = why or _in_words(status)
         self._ended("" if self.asked_to_end else why)
+
+    def _take(self, parcel: Parcel) -> None:
+        if parcel.kind not in REPORTS:
+            self._deliver(parcel)
+            return
+        report = parcel.open()
+        if isinstance(report, Taken):
+            with self._was_taken:
+                self._n_taken = report.n_bytes
+                self._was_taken.notify()
+        elif isinstance(report, Progress):
+            self._busy_since_s = report.busy_since_s
+            self._offered_s = None
+            self.progress = report
+        elif isinstance(report, DriverAtWork):
+            self._driver = report
+        elif isinstance(report, Failed):
+            self.failed = report
+        elif isinstance(report, Finished):
+            self.finished = report
+
+
+REPORTS = {kind.__name__ for kind in (Taken, Progress, DriverAtWork, Failed, Finished)}
+
+
+def _bytes_of(parcel: Parcel) -> int:
+    return parcel.n_bytes
 
 
 def _in_words(status: int) -> str:

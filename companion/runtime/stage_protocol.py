@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from companion.config import Config
 from companion.geometry.camera import Camera
@@ -14,11 +15,17 @@ from companion.products.flight_result import RunFacts
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """First message to a stage's process; recorder and results get the flight's folder."""
+    """First message to a stage; those that begin with the flight get its folder.
+
+    `origin` is that of local NED where it is known before the flight, as in a recorded one, and
+    `is_live` whether the flight is flown just now: then no frame waits for mapping.
+    """
 
     config: Config
     camera: Camera
     folder: Path | None = None
+    origin: GeoOrigin | None = None
+    is_live: bool = True
     failed_devices: Mapping[str, str] = field(default_factory=dict)
     """OpenCL devices that have failed in this flight, by identity, and how, in words."""
 
@@ -28,12 +35,14 @@ class Finish:
     """Last message to a stage: give the last results.
 
     With `hurry` slow results are left out. `results` gets the facts of its report. With `keep_map`
-    the vehicle flies on, and another process may continue the map.
+    the vehicle flies on, and another process may continue the map. `viewers` waits for `n_viewers`
+    at least to have received everything.
     """
 
     hurry: bool
     facts: RunFacts | None = None
     keep_map: bool = False
+    n_viewers: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +58,13 @@ class SetLoadLevel:
     """Share of its work that a stage is to do, 0 to 1; see companion.runtime.governor."""
 
     level: float
+
+
+@dataclass(frozen=True, slots=True)
+class SetBudget:
+    """Limit the rate of all viewers together; 0 for no limit. For `viewers`."""
+
+    kbit_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +100,28 @@ class Progress:
     waiting_bytes: int = 0
     times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     device: str = ""
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """Bytes of shared memory that the process has taken from its socket so far."""
+
+    n_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """A line for whoever runs the stage, on a device that was refused, say."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Listening:
+    """Port where `viewers` serves viewers of this machine."""
+
+    port: int
 
 
 @dataclass(frozen=True, slots=True)

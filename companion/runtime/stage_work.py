@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 from companion.messages import Message
@@ -15,8 +15,6 @@ from companion.timing.clock import StageTimes
 class Work(ABC):
     """Base class of stages; `step` and `finish` are theirs."""
 
-    latest_only = False
-    """Whether it wants the newest frame only, without colours."""
     outlives_daemon = False
     """Whether it finishes by itself when the daemon is gone; else it ends at once."""
     device = ""
@@ -28,6 +26,10 @@ class Work(ABC):
     def n_rejected(self) -> int:
         """Messages taken and then dropped."""
         return 0
+
+    def details(self) -> Mapping[str, Any]:
+        """Facts for its progress report, beside those that all stages have."""
+        return {}
 
     def begin(self, tell: Callable[[Any], None]) -> None:  # noqa: B027 - most have nothing to do
         """Called before the first message; `tell` sends a message to the daemon at once."""

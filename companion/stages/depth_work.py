@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from companion.compute.compute_devices import choose_devices, say_on_stderr
+from companion.compute.compute_devices import choose_devices
 from companion.dense.depth_stage import DepthStage
-from companion.dense.device_takeover import Devices
+from companion.dense.device_takeover import Devices, unsupervised
 from companion.dense.opencl import ListedDevice
 from companion.messages import DepthMap, Message
-from companion.runtime.stage_protocol import DriverAtWork, Finish, SetLoadLevel, Setup
+from companion.runtime.stage_protocol import DriverAtWork, Finish, Remark, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 
 FIRST_PATIENCE_S = 120.0
@@ -39,12 +39,16 @@ class _Depth(Work):
         self._tell = tell
         setup = self._setup
         self._devices = choose_devices(
-            setup.config.opencl, say_on_stderr, setup.failed_devices, self._watched
-        )
+            setup.config.opencl, lambda text: tell(Remark(text)), setup.failed_devices,
+            self._watched if setup.is_live else unsupervised,
+        )  # fmt: skip
         self._stage = DepthStage(
             setup.config.depth, setup.config.cloud, setup.camera, self._devices, self.times
         )
         self.device = self._devices.described
+
+    def details(self) -> Mapping[str, Any]:
+        return {"failures": list(self._devices.failures) if self._devices is not None else []}
 
     def step(self, message: Any) -> Iterable[Message]:
         assert self._stage is not None and self._devices is not None

@@ -5,11 +5,14 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
-from companion.messages import Frame, Message, Warned
+from companion.messages import Frame, Georeferenced, MapUpdate, Message, Warned
 from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import cache_errors
@@ -17,12 +20,11 @@ from companion.stages.map_keeper import Kept, MapKeeper
 from companion.timing.clock import since_boot_ns
 
 KEEP_EVERY_NS = 1_000_000_000
+NO_COLOUR = np.zeros((0, 0, 3), np.uint8)
 NOT_KEPT = "the map cannot be kept for a restart in flight"
 
 
 class _Localisation(Work):
-    latest_only = True
-
     def __init__(self, setup: Setup) -> None:
         super().__init__()
         if cache_errors:
@@ -33,7 +35,9 @@ class _Localisation(Work):
                 file=sys.stderr,
             )
         self._setup = setup
-        self._stage = LocalisationStage(setup.config, setup.camera, self.times, background=True)
+        self._stage = LocalisationStage(
+            setup.config, setup.camera, self.times, background=setup.is_live
+        )
         self._keeper: MapKeeper | None = None
         self._to_take_up: Kept | None = None
         self._reported_fault = ""
@@ -46,7 +50,10 @@ class _Localisation(Work):
         if isinstance(message, KeepMap):
             self._begin_keeping(message)
             return []
-        return self._frame(message) if isinstance(message, Frame) else self._stage.step(message)
+        if not isinstance(message, Frame):
+            return self._stage.step(message)
+        # the map keeps grey images for long, but nothing of the memory that a frame came in
+        return self._frame(replace(message, grey=message.grey.copy(), rgb=NO_COLOUR))
 
     def finish(self, finish: Finish) -> Iterable[Message]:
         if self._keeper is not None:
@@ -67,7 +74,10 @@ class _Localisation(Work):
             kept, tracked_ns = self._to_take_up
             self._to_take_up = None
             self._stage.resume(kept, frame.t_ns, since_boot_ns() - tracked_ns)
-        yield from self._stage.step(frame)
+        for out in self._stage.step(frame):
+            yield out
+            if isinstance(out, MapUpdate):
+                yield Georeferenced(out.t_ns, out.georeference)
         keeper = self._keeper
         if keeper is None or keeper.busy or frame.t_ns - self._kept_ns < KEEP_EVERY_NS:
             return

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any
 
 from companion.errors import StageError
-from companion.messages import Message
+from companion.messages import Message, PointChunk
 from companion.products.flight_result import FlightResult
 from companion.products.report.write_results import write_results
 from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
@@ -28,7 +29,11 @@ class _Results(Work):
         self._snapshots = CloudSnapshots(self._folder, self._result, self._voxel_m)
         self._viewer_file = self._open.enter_context(
             FileViewer(
-                setup.config.viewer, setup.camera, self._folder / "flight.rrd", indexed=False
+                setup.config.viewer,
+                setup.camera,
+                self._folder / "flight.rrd",
+                setup.origin,
+                indexed=not setup.is_live,
             )
         )
 
@@ -36,6 +41,8 @@ class _Results(Work):
         if isinstance(message, TakeSnapshot):
             self._snapshots.begin(message)
             return self._snapshots.step()
+        if isinstance(message, PointChunk):
+            message = kept(message)
         self._result.take(message)
         self._viewer_file.take(message)
         return self._snapshots.step()
@@ -50,6 +57,15 @@ class _Results(Work):
                 )
         self._result.close()
         return []
+
+
+def kept(chunk: PointChunk) -> PointChunk:
+    """The same with arrays of its own, to be kept for long."""
+    return replace(
+        chunk, points_camera=chunk.points_camera.copy(), rgb=chunk.rgb.copy(),
+        confidence=chunk.confidence.copy(), normals_camera=chunk.normals_camera.copy(),
+        sigma=chunk.sigma.copy(),
+    )  # fmt: skip
 
 
 def work(setup: Setup) -> Work:

@@ -1,4 +1,4 @@
-"""Server of a store's items to viewers. In a process of its own; see export_process."""
+"""Server of a store's items to viewers. In a process of its own; see stage `viewers`."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Exporter:
         self._wake_up()
 
     def listen(self, listener: socket.socket) -> None:
-        """Accept viewers at a socket; to be called before `run`."""
+        """Accept viewers at a socket; from any thread."""
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
         with contextlib.suppress(OSError):  # somebody has that port: poses go with all else

@@ -107,9 +107,7 @@ class FileCamera:
             self._prefetch.close()
             mean_ns = self._after_ns[-1] // max(1, len(self._after_ns) - 1)
             # a machine that cannot keep up does not begin in the past
-            self._begun_ns = max(
-                self._begun_ns + self._after_ns[-1] + mean_ns, time.monotonic_ns()
-            )
+            self._begun_ns = max(self._begun_ns + self._after_ns[-1] + mean_ns, time.monotonic_ns())
             self._begin()
 
 

@@ -157,9 +157,7 @@ class _Receiver:
                 self._changed.notify()
             self.opened.set()
 
-    def _decode(
-        self, container: av.container.InputContainer, stream: av.VideoStream
-    ) -> None:
+    def _decode(self, container: av.container.InputContainer, stream: av.VideoStream) -> None:
         stream.thread_type = "SLICE"  # threads by frame would hold back a picture each
         stream.codec_context.flags |= av.codec.context.Flags.low_delay
         clock, last_ns = ArrivalClock(), 0

@@ -30,9 +30,7 @@ HEIGHT_M = 8.0
 TEXTURE_PX = 2048
 METRES_PER_TEXEL = 0.017
 DEFAULT_HFOV_DEG = 75.0
-BODY_FROM_CAMERA = Pose(
-    np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)
-)
+BODY_FROM_CAMERA = Pose(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 """Looks straight down; forward is up in the image."""
 
 

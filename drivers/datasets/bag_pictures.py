@@ -108,9 +108,7 @@ class BagPictures:
         beyond_ns = self._recorded_ns[last] + 1
         try:
             with open_bag_file(self.path) as bag:
-                for message in bag.messages(
-                    [self._topic], self._recorded_ns[number], beyond_ns
-                ):
+                for message in bag.messages([self._topic], self._recorded_ns[number], beyond_ns):
                     if number > last:
                         return
                     if number >= first:
@@ -124,4 +122,3 @@ class BagPictures:
     def _decoded(self, message: Any | None) -> Bytes | None:
         rgb = rgb_of(message) if message is not None else None
         return rgb if rgb is not None and rgb.shape[:2] == (self.height, self.width) else None
-

@@ -97,9 +97,7 @@ def open_bag_file(path: Path) -> Iterator[Bag]:
     several = sorted(path.glob("*.bag")) if path.is_dir() else []
     reader = None
     try:
-        reader = AnyReader(
-            several or [path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)
-        )
+        reader = AnyReader(several or [path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except DAMAGE as error:
         hint = "; `rosbag reindex` may repair it" if path.suffix == ".bag" else ""

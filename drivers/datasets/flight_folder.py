@@ -51,9 +51,7 @@ def open_flight_folder(
             return read_unaligned(logs, pictures, telemetry_config, camera, flight.frames)
         return read_telemetry(logs, pictures, telemetry_config)
 
-    flight = Flight(
-        path, camera, source, numbers, times_ns, [*warnings, *assumed], read_log
-    )
+    flight = Flight(path, camera, source, numbers, times_ns, [*warnings, *assumed], read_log)
     return flight
 
 

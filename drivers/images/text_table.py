@@ -34,9 +34,7 @@ def read_rows(path: Path, n_words: int) -> list[list[str]]:
         if not words or words[0].startswith("#"):
             continue
         if len(words) < n_words:
-            raise FlightError(
-                f"{path}, line {number}: wanted {n_words} words, found {line[:60]!r}"
-            )
+            raise FlightError(f"{path}, line {number}: wanted {n_words} words, found {line[:60]!r}")
         out.append(words)
     if not out:
         raise FlightError(f"{path}: there is nothing in it")

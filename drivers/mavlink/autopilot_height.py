@@ -82,9 +82,7 @@ class AutopilotHeight:
             self._local = taken
 
     def _take_global(self, message: Any, _receive_ns: int) -> None:
-        taken = self._height(
-            message.time_boot_ms, -1e-3 * message.relative_alt, 1e-2 * message.vz
-        )
+        taken = self._height(message.time_boot_ms, -1e-3 * message.relative_alt, 1e-2 * message.vz)
         if taken is None:
             return
         self._below_home = taken

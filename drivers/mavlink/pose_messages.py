@@ -25,6 +25,11 @@ ROW_STARTS = (0, 6, 11, 15, 18, 20)
 UNKNOWN = [math.nan] * N_COVARIANCE
 
 
+def pose_messages(pose: PoseToSend, mode: str) -> tuple[Any, ...]:
+    """Messages of a pose, as `feedback.mode` wants them."""
+    return (odometry_message(pose),) if mode == "odometry" else vision_messages(pose)
+
+
 def odometry_message(pose: PoseToSend) -> Any:
     """ODOMETRY: position and attitude in LOCAL_FRD, velocity in BODY_FRD, microseconds."""
     rotation = pose.world_from_body.rotation

@@ -139,9 +139,7 @@ def _place(path: Path, not_before_s: float | None) -> FlightPlace:
                 n_bytes += os.stat(os.path.join(folder, name)).st_blocks * 512
             except OSError:
                 continue  # gone meanwhile
-    return FlightPlace(
-        path, n_bytes, (path / KEEP).exists(), is_recorded_now(path), not_before_s
-    )
+    return FlightPlace(path, n_bytes, (path / KEEP).exists(), is_recorded_now(path), not_before_s)
 
 
 def _is_growing(path: Path) -> bool:

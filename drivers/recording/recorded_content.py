@@ -9,7 +9,6 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,11 @@ from companion.geometry.transforms import Similarity, quaternion_from_rotation
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
+    FrameTracked,
+    GateStep,
     HeightSample,
     ImuSample,
+    LinkBytes,
     Odometry,
     PointChunk,
     PositionSample,
@@ -54,24 +56,6 @@ _MAY_LACK = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class LinkBytes:
-    """Bytes of the autopilot's wire; `outgoing` are those sent, ours or clients'."""
-
-    t_ns: int
-    monotonic_ns: int
-    outgoing: bool
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class HealthNote:
-    """Health of the daemon: status document, state of the clock filter, origin if known."""
-
-    t_ns: int
-    document: Mapping[str, Any]
-
-
 def json_bytes(values: Mapping[str, Any]) -> bytes:
     """JSON object, in which nan and infinities are null."""
     return json.dumps(_plain(values), allow_nan=False, separators=(",", ":")).encode()
@@ -82,10 +66,10 @@ def sample_topic(sample: Telemetry) -> str:
     return _TOPIC_OF[type(sample)]
 
 
-def sample_bytes(sample: Telemetry) -> bytes:
-    """A sample without its time."""
+def fields_bytes(message: Telemetry | FrameTracked | GateStep) -> bytes:
+    """A message of plain fields, without its time."""
     return json_bytes(
-        {f.name: getattr(sample, f.name) for f in dataclasses.fields(sample) if f.name != "t_ns"}
+        {f.name: getattr(message, f.name) for f in dataclasses.fields(message) if f.name != "t_ns"}
     )
 
 
@@ -128,6 +112,7 @@ def odometry_bytes(odometry: Odometry) -> bytes:
             "quality": odometry.quality,
             "position_m": None if pose is None else pose.translation,
             "world_from_body": None if pose is None else quaternion_from_rotation(pose.rotation),
+            "rotation": None if pose is None else pose.rotation.ravel(),
             "velocity_world_m_s": odometry.velocity_world_m_s,
             "sigma_position_m": odometry.sigma_position_m,
             "sigma_velocity_m_s": odometry.sigma_velocity_m_s,

@@ -17,8 +17,12 @@ from companion.messages import (
     ArmedSample,
     AttitudeSample,
     Frame,
+    FrameTracked,
+    GateStep,
+    HealthNote,
     HeightSample,
     ImuSample,
+    LinkBytes,
     MapUpdate,
     Message,
     Odometry,
@@ -35,21 +39,20 @@ from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.picture_codec import EncodedPicture, picture_encoder
 from drivers.recording.recorded_content import (
-    HealthNote,
-    LinkBytes,
     cloud_bytes,
     event_bytes,
+    fields_bytes,
     json_bytes,
     link_bytes,
     odometry_bytes,
     pose_bytes,
-    sample_bytes,
     sample_topic,
 )
 from drivers.recording.recording_topics import (
     CALIBRATION,
     CLOUD,
     EVENTS,
+    GATE,
     HEALTH,
     ODOMETRY,
     POSE,
@@ -57,6 +60,7 @@ from drivers.recording.recording_topics import (
     RECEIVED,
     SENT,
     TIMESYNC,
+    TRACKING,
     open_channels,
 )
 
@@ -119,7 +123,7 @@ class Recorder:
         """Longest time to write and sync a chunk."""
         return self._disk.slowest_s
 
-    def take(self, message: Message | LinkBytes | HealthNote) -> None:
+    def take(self, message: Message | LinkBytes | HealthNote | GateStep) -> None:
         """Record a message; of the map only the points, and those if configured."""
         self._newest_ns = max(self._newest_ns, message.t_ns)
         if isinstance(message, LinkBytes):
@@ -127,12 +131,15 @@ class Recorder:
         elif isinstance(message, Frame):
             self._frame(message)
         elif isinstance(message, TELEMETRY):
-            self._put(sample_topic(message), message.t_ns, sample_bytes(message))
+            self._put(sample_topic(message), message.t_ns, fields_bytes(message))
         elif isinstance(message, Odometry):
             self._put(ODOMETRY, message.t_ns, odometry_bytes(message), message.seq)
             pose = pose_bytes(message)
             if pose is not None:
                 self._put(POSE, message.t_ns, pose, message.seq)
+        elif isinstance(message, FrameTracked | GateStep):
+            topic = TRACKING if isinstance(message, FrameTracked) else GATE
+            self._put(topic, message.t_ns, fields_bytes(message))
         elif isinstance(message, Warned):
             self._put(EVENTS, message.t_ns, event_bytes(message))
         elif isinstance(message, HealthNote):

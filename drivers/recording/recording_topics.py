@@ -31,6 +31,7 @@ RECEIVED, SENT = "/mavlink/received", "/mavlink/sent"
 TIMESYNC = "/mavlink/timesync"
 POSE, ODOMETRY, CLOUD = "/pose", "/odometry", "/cloud"
 EVENTS, HEALTH = "/events", "/health"
+TRACKING, GATE = "/decisions/tracking", "/decisions/pose_gate"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
 """Topics of images, of which a flight has one."""
 ARMED = "/telemetry/armed"
@@ -129,9 +130,26 @@ TOPICS: dict[str, Any] = {
         "What the autopilot may be told: body (FRD) in local NED, metres; null while not known",
         {
             "seq": INTEGER, "state": TEXT, "reset_counter": INTEGER, "quality": INTEGER,
-            "position_m": NUMBERS, "world_from_body": NUMBERS, "velocity_world_m_s": NUMBERS,
+            "position_m": NUMBERS, "world_from_body": NUMBERS, "rotation": NUMBERS,
+            "velocity_world_m_s": NUMBERS,
             "sigma_position_m": NUMBER, "sigma_velocity_m_s": NUMBER, "sigma_attitude_rad": NUMBER,
             "sigma_yaw_rad": NUMBER,
+        },
+    ),
+    TRACKING: _Json(
+        "companion.FrameTracked",
+        "What a frame's pose hung on beside its image, for a replay as flown",
+        {
+            "seq": INTEGER, "n_samples": INTEGER, "mapping_point": INTEGER,
+            "feature_ratio": NUMBER,
+        },
+    ),
+    GATE: _Json(
+        "companion.GateStep",
+        "What the gate of poses to the autopilot was asked, for a replay as flown",
+        {
+            "what": TEXT, "n_attitudes": INTEGER, "counter": INTEGER, "counter_sent": FLAG,
+            "sent": FLAG, "values": OBJECT,
         },
     ),
     CLOUD: PointCloud,

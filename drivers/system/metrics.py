@@ -175,9 +175,7 @@ def _of_flight(health: Health) -> Iterator[Metric]:
             ("0.95",): _times(feedback.latency_p95_ms, 1e-3),
         },
     )  # fmt: skip
-    yield _gauge(
-        "degradation_level", "0 where nothing is left out.", (), _one(health.degradation)
-    )
+    yield _gauge("degradation_level", "0 where nothing is left out.", (), _one(health.degradation))
     yield _gauge(
         "event_loop_delay_seconds", "How late the event loop comes.", ("quantile",),
         {("0.99",): _times(health.loop_delay_p99_ms, 1e-3)},

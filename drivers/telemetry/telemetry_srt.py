@@ -165,8 +165,10 @@ def _numbers(text: str) -> dict[str, float]:
     elif "height" in said and not said.keys() & {"latitude", "barometer"}:
         del said["height"]
     # zeros are what is written before there is a fix
-    if abs(said.get("latitude", 0.0)) > 90 or abs(said.get("longitude", 0.0)) > 180 or not (
-        said.get("latitude") or said.get("longitude")
+    if (
+        abs(said.get("latitude", 0.0)) > 90
+        or abs(said.get("longitude", 0.0)) > 180
+        or not (said.get("latitude") or said.get("longitude"))
     ):
         for name in SIMPLE_NAMES:
             said.pop(name, None)

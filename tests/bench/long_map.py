@@ -30,7 +30,7 @@ from companion.streaming.viewer.web_proxy import free_ports
 from tests.support.flights import flown
 
 POINTS = 2800
-EACH_S, MOST_WAITING = 0.012, 40
+EACH_S, MOST_WAITING_BYTES = 0.012, 4 << 20
 """An hour in a minute, or slower where the exporter cannot: this is about memory, not speed."""
 MAP_EVERY = 30
 """Keyframes from one map to the next: live there is one for each."""
@@ -82,7 +82,7 @@ def main() -> None:
             if (k + 1) % MAP_EVERY == 0:
                 live.take(MapUpdate(k, t_ns, dict(places), np.zeros((0, 3)), None))
             time.sleep(EACH_S)
-            while len(live._inbox) > MOST_WAITING:
+            while live._stage.waiting_bytes > MOST_WAITING_BYTES:
                 time.sleep(EACH_S)
             if (k + 1) % (n_keyframes // 6) == 0:
                 row = (k + 1, (k + 1) * POINTS, mib(exporter), mib(first))

@@ -111,7 +111,6 @@ class Flown:
             self._answered.set()
 
     def _mapped(self, message: Track | MapUpdate | PointChunk) -> None:
-        self.watch.take_mapped(message)
         if isinstance(message, MapUpdate):
             self._seen.update = message
 
@@ -122,7 +121,10 @@ class Flown:
         def died() -> None:
             raise AssertionError("localisation has died")
 
-        return Listener(self._odometry, self._mapped, self._warned, died, lambda why: None)
+        return Listener(
+            self._odometry, self.watch.take_georeference, self._warned, died, lambda why: None,
+            points_made=self.watch.points_made, mapped=self._mapped,
+        )
 
     def _facts(self, flight: LiveFlight) -> RunFacts:
         raise AssertionError("its results are not written")

@@ -22,9 +22,8 @@ import numpy as np
 from companion.config import CameraConfig, Config, RecorderConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import quaternion_from_euler
-from companion.messages import AttitudeSample, Bytes, Frame
+from companion.messages import AttitudeSample, Bytes, Frame, LinkBytes
 from drivers.open_flight import open_flight
-from drivers.recording.recorded_content import LinkBytes
 from drivers.recording.recorder import Recorder
 from tests.support.flights.recorded import link_bytes
 

@@ -31,7 +31,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
 )
 from companion.messages import AttitudeSample, Frame
-from companion.runtime.pipeline import in_order_of_time
+from companion.runtime.in_order import in_order_of_time
 from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.initialisation.bootstrap import Bootstrap
 from drivers.open_flight import open_flight

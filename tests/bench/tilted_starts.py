@@ -20,7 +20,7 @@ from companion.estimation.localisation import LocalisationStage
 from companion.estimation.motion_filter import AttitudeHistory
 from companion.estimation.pose_gate import MAX_TILT_ERROR_RAD
 from companion.messages import AttitudeSample, Frame, Odometry, TrackState, Warned
-from companion.runtime.pipeline import in_order_of_time
+from companion.runtime.in_order import in_order_of_time
 from drivers.open_flight import open_flight
 from tests.support.flights.tilted_start import KINDS, tilted_starts
 

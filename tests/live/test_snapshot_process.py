@@ -12,9 +12,10 @@ from companion.config import Config
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from companion.messages import MapUpdate, PointChunk
-from companion.runtime.frame_ring import FrameRing
+from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from companion.runtime.stages import stage_named
 from tests.support.reference.scoring import read_ply
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -24,25 +25,27 @@ PATIENCE_S = 60.0
 
 def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> None:
     told: queue.Queue[Any] = queue.Queue()
-    ring = FrameRing(CAMERA.width, CAMERA.height)
-    stage = StageProcess("results", 0, ring, told.put, lambda why: told.put(why))
-    stage.offer(TakeSnapshot(0))  # before it knows what to do: passed over
+    stage = StageProcess(
+        stage_named("results"), lambda parcel: told.put(parcel.open()), lambda why: told.put(why)
+    )
+    stage.order(TakeSnapshot(0))  # before it knows what to do: passed over
     stage.begin(Setup(Config(), CAMERA, tmp_path))
     try:
         poses = {n: Pose(np.eye(3), np.array([3.0 * n, 0, 0])) for n in range(N_CHUNKS)}
         update = MapUpdate(1, 1, poses, np.zeros((0, 3)), None)
-        stage.offer(update)
+        stage.offer(Parcel.of(update))
         for n in range(N_CHUNKS):
             points = rng.uniform((-5, -5, 5), (5, 5, 9), (N_POINTS, 3)).astype(np.float32)
             ones = np.ones(N_POINTS, np.float32)
             colours = np.zeros((N_POINTS, 3), np.uint8)
-            stage.offer(PointChunk(n, n, points, colours, ones, 0 * points, ones))
+            chunk = PointChunk(n, n, points, colours, ones, 0 * points, ones)
+            stage.offer(Parcel.of(chunk))
         for number in (1, 2):
-            stage.offer(TakeSnapshot(number))
+            stage.order(TakeSnapshot(number))
             last = Snapshot(number)
             percents = []
             while not last.path:
-                stage.offer(update)  # the flight goes on: it is between its messages
+                stage.offer(Parcel.of(update))  # the flight goes on: it is between its messages
                 try:
                     last = told.get(timeout=0.02)
                 except queue.Empty:
@@ -56,4 +59,3 @@ def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> Non
         assert stage.finished is not None
     finally:
         stage.kill()
-        ring.close()

@@ -16,10 +16,10 @@ import pytest
 
 from companion.config import Config
 from companion.messages import DepthMap, Frame
-from companion.runtime.frame_ring import FrameRing
-from companion.runtime.mail_policy import OUT_BYTES
+from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Setup
+from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, stage_named
 from companion.timing.clock import monotonic_s
 from drivers.recording.recording import Recording
 from tests.support.flights.topic_flight import CAMERA
@@ -28,11 +28,14 @@ from tests.support.processes.daemon_process import Daemon
 ANSWER_S, UP_S = 4.0, 120.0
 IMPATIENT = f"""
 import sys
+from dataclasses import replace
 from companion.runtime.governor import Governor
 from companion.daemon.flights import live_flight
 Governor.step = lambda self, t_ns, pressure: False
-for kind in ("results", "recorder"):
-    live_flight.ANSWER_S[kind] = {ANSWER_S}
+live_flight.STAGES = [
+    replace(stage, answer_s={ANSWER_S}) if stage.in_folder else stage
+    for stage in live_flight.STAGES
+]
 from companion.__main__ import main
 sys.exit(main())
 """
@@ -50,16 +53,14 @@ def depth_map(number: int) -> DepthMap:
 
 @pytest.fixture
 def results(tmp_path: Path) -> Iterator[StageProcess]:
-    ring = FrameRing(CAMERA.width, CAMERA.height)
     ended: list[str] = []
-    stage = StageProcess("results", 0, ring, lambda message: None, ended.append)
+    stage = StageProcess(stage_named("results"), lambda parcel: None, ended.append)
     stage.begin(Setup(Config(), CAMERA, tmp_path))
     try:
         until(lambda: stage.progress is not None)
         yield stage
     finally:
         stage.kill()
-        ring.close()
 
 
 def until(such: object, timeout_s: float = 60.0) -> None:
@@ -73,10 +74,10 @@ def test_depth_maps_for_a_stage_that_is_stopped(results: StageProcess) -> None:
     psutil.Process(results.pid).suspend()
     before = psutil.Process().memory_info().rss
     for number in range(100):
-        results.offer(depth_map(number))
-    assert results.waiting_bytes <= OUT_BYTES
-    assert psutil.Process().memory_info().rss - before < 2 * OUT_BYTES
-    assert results.n_dropped >= 100 - OUT_BYTES // 5_000_000 - 2
+        results.offer(Parcel.of(depth_map(number)))
+    assert results.waiting_bytes <= QUEUE_BYTES
+    assert psutil.Process().memory_info().rss - before < 2 * QUEUE_BYTES
+    assert results.n_dropped >= 100 - (QUEUE_BYTES + UNREAD_BYTES) // 5_000_000 - 3
     until(lambda: results.stalled_s(monotonic_s()) > 1.5)
 
 
@@ -86,7 +87,8 @@ def test_a_stage_that_has_nothing_to_do_does_not_hang(results: StageProcess) -> 
     first = results.progress
     until(lambda: results.progress is not first)
     assert results.stalled_s(monotonic_s()) == 0.0
-    results.offer(Frame(1, 1, np.zeros((96, 128), np.uint8), np.zeros((96, 128, 3), np.uint8)))
+    frame = Frame(1, 1, np.zeros((96, 128), np.uint8), np.zeros((96, 128, 3), np.uint8))
+    results.offer(Parcel.of(frame))
     until(lambda: results.progress is not None and results.progress.n_done == 1)
     until(lambda: results.stalled_s(monotonic_s()) == 0.0)
 

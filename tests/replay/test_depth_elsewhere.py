@@ -14,7 +14,7 @@ from companion.dense.depth_stage import DepthStage
 from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, KeyframeAdded, MapUpdate, Message, Track
 from companion.products.flight_result import FlightResult
-from companion.runtime.pipeline import in_order_of_time
+from companion.runtime.in_order import in_order_of_time
 from companion.timing.clock import StageTimes
 from companion.topics.envelope import unpack
 from companion.topics.gatherer import Gatherer

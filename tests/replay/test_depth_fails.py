@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.runtime.pipeline import DEPTH_FAILED
+from companion.runtime.in_order import DEPTH_FAILED
 from tests.support.processes.program import Run
 from tests.support.reference.scoring import read_ply, read_tum
 

@@ -20,7 +20,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
 )
 from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
-from companion.runtime.pipeline import in_order_of_time
+from companion.runtime.in_order import in_order_of_time
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
 from companion.stages.localisation_work import work

@@ -24,7 +24,7 @@ from companion.messages import Frame, Odometry, Track, TrackState
 from companion.products.flight_result import FlightResult
 from companion.products.surroundings import peak_memory_mb
 from companion.products.trajectory_error import Path, PathErrors, path_errors
-from companion.runtime.pipeline import in_order_of_time
+from companion.runtime.in_order import in_order_of_time
 from companion.timing.clock import StageTimes
 from drivers.open_flight import open_flight
 

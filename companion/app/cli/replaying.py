@@ -40,8 +40,19 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         from companion.products.export.exports import check_formats
 
         check_formats(config.export)
-    from companion.app.replay_command import replay
+    if arguments.as_flown:
+        if arguments.paced or (arguments.start, arguments.stop) != (None, None):
+            raise InputError("--as-flown replays a whole flight, in the order in which it came")
+        from companion.app.as_flown import replay_as_flown
 
+        progress = signals.between_frames(progress_on(sys.stderr))
+        replay_as_flown(arguments.flight, arguments.out, config, progress, print)
+        signals.take()
+        return 0
+    if arguments.paced:
+        from companion.app.paced_replay import replay_paced as replay
+    else:
+        from companion.app.replay_command import replay
     replay(
         arguments.flight,
         arguments.out,
@@ -49,7 +60,6 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         start_s=arguments.start,
         stop_s=arguments.stop,
         viewer=arguments.viewer,
-        paced=arguments.paced,
         progress=signals.between_frames(progress_on(sys.stderr)),
         notify=print,
     )
@@ -128,6 +138,11 @@ def add_parsers(commands: Any) -> None:
     replay.add_argument(
         "--paced", action="store_true",
         help="in the flight's own time, dropping what a live run would drop",
+    )  # fmt: skip
+
+    replay.add_argument(
+        "--as-flown", action="store_true",
+        help="of a recording: do again what was decided in flight, and compare the poses sent",
     )  # fmt: skip
 
     imported = commands.add_parser(

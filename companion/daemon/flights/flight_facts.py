@@ -8,12 +8,16 @@ from collections.abc import Mapping
 from companion.config import Config
 from companion.config_file import command_shown, shown
 from companion.daemon.flights.live_flight import LiveFlight
+from companion.geometry.geodesy import GeoOrigin
+from companion.messages import ClockReport
 from companion.products.flight_result import RunFacts
 from companion.products.surroundings import peak_memory_mb, versions
-from drivers.mavlink.autopilot_link import AutopilotLink
 
 
-def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> RunFacts:
+def facts_of(
+    flight: LiveFlight, config: Config, clock: ClockReport | None, origin: GeoOrigin | None,
+    rates_hz: Mapping[str, float],
+) -> RunFacts:  # fmt: skip
     """Facts of a flight whose stages have given their last results."""
     times: dict[str, Mapping[str, float]] = {}
     device = "none"
@@ -25,8 +29,8 @@ def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> 
     return RunFacts(
         stage_times=times,
         wall_s=flight.duration_s,
-        clock=link.clock_filter.report() if link is not None else None,
-        origin=link.origin if link is not None and flight.has_origin else None,
+        clock=clock,
+        origin=origin if flight.has_origin else None,
         device=device,
         config=shown(config),
         versions=versions(),
@@ -36,5 +40,5 @@ def facts_of(flight: LiveFlight, config: Config, link: AutopilotLink | None) -> 
         n_frames_total=flight.n_frames,
         completed=True,
         dropped=flight.dropped(),
-        rates_hz=dict(link.rates_hz) if link is not None else {},
+        rates_hz=dict(rates_hz),
     )

@@ -12,13 +12,12 @@ from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.kept_map_place import kept_map_path
 from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.geometry.camera import Camera
-from companion.messages import Frame, Telemetry, Warned
+from companion.messages import Frame, GateStep, HealthNote, LinkBytes, Telemetry, Warned
 from companion.products.flight_result import RunFacts
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import KeepMap
 from companion.timing.clock import FlightClock
 from drivers.recording.flights_folder import COUNTER, flight_name, next_number
-from drivers.recording.recorded_content import HealthNote, LinkBytes
 from drivers.system.journal import WARNING, Journal
 
 
@@ -97,15 +96,10 @@ class Flights:
         if flight is not None:
             flight.frame(frame)
 
-    def take(self, message: Telemetry | Warned) -> None:
-        """Take telemetry or a warning."""
+    def take(self, message: Telemetry | Warned | LinkBytes | HealthNote | GateStep) -> None:
+        """Take telemetry, a warning, or a note for the recorder."""
         if self.current is not None:
             self.current.take(message)
-
-    def record(self, message: LinkBytes | HealthNote) -> None:
-        """Record link bytes or health."""
-        if self.current is not None:
-            self.current.record(message)
 
     async def close(self, patience_s: float, keep_map: bool) -> None:
         """End all flights quickly; with `keep_map` the next daemon may continue the map."""

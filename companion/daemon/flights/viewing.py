@@ -14,6 +14,7 @@ from companion.errors import InputError
 from companion.geometry.camera import Camera
 from companion.health import StageHealth
 from companion.messages import Frame
+from companion.runtime.parcel import Parcel
 from companion.streaming.viewer import LiveViewer, Watched
 from companion.timing.clock import monotonic_s
 
@@ -90,6 +91,11 @@ class Viewing:
         if self.pictures or not isinstance(message, Frame):
             self._viewer.take(message)
 
+    def offer(self, parcel: Parcel) -> None:
+        """The same with a closed message."""
+        if self.pictures or parcel.kind != Frame.__name__:
+            self._viewer.offer(parcel)
+
     def set_budget(self, kbit_s: float) -> None:
         """Limit the rate of all viewers together; 0 for no limit."""
         self._stream = replace(self._stream, budget_kbit_s=kbit_s)
@@ -111,7 +117,8 @@ class Viewing:
             if not self._viewer.alive:
                 self._tell(GONE, "its exporter has ended")
                 self._n_restarted += 1
-                self._close_viewer(HURRIED_S)
+                self._viewer.close(HURRIED_S)
+                self._n_dropped += self._viewer.n_dropped
                 self._viewer = self._open()
                 wait_s = AGAIN_S
             elif self._viewer.stalled_s(monotonic_s()) > STALLED_S:
@@ -120,7 +127,7 @@ class Viewing:
             elif self._where != NOWHERE and not self._viewer.is_shown:
                 wait_s = self._show()
             self._look()
-        self._close_viewer(self._patience_s)
+        self._viewer.close(self._patience_s)
 
     def _show(self) -> float:
         """Open the viewer, for the first time or again; seconds until the next attempt."""
@@ -146,11 +153,6 @@ class Viewing:
         self._n_seen = n_dropped
         if self._viewer.closed:
             self._tell(CLOSED, self._viewer.closed)
-
-    def _close_viewer(self, patience_s: float) -> None:
-        self._viewer.close(patience_s)
-        self._n_dropped += self._viewer.n_dropped
-        self._viewer.n_dropped = 0
 
     def _tell(self, what: str, detail: str) -> None:
         """Warn, unless the same was the last warning."""

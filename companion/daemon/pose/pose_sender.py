@@ -12,15 +12,16 @@ from pathlib import Path
 
 from companion.config import FeedbackConfig
 from companion.daemon.pose.sent_counter import SentCounter
-from companion.estimation.pose_gate import PoseGate, PoseToSend
+from companion.estimation.gate_journal import JournaledGate
+from companion.estimation.pose_gate import PoseToSend
 from companion.estimation.reset_counter import ResetCounter
 from companion.health import FeedbackHealth, LatencyMeter, RateMeter
-from companion.messages import AttitudeSample, Odometry, Warned
+from companion.messages import AttitudeSample, GateStep, Odometry, Warned
 from companion.pilot_messages import POSITION_ON, position_lost
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_height import AutopilotHeight
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.pose_messages import odometry_message, vision_messages
+from drivers.mavlink.pose_messages import pose_messages
 
 TICK_S = 0.005
 IDLE_TICK_S = 0.05
@@ -31,7 +32,8 @@ SWITCHED_OFF = "switched off"
 class PoseSender:
     """Odometry of the current flight in; ODOMETRY or VISION_POSITION_ESTIMATE out, or nothing.
 
-    The file at `counter_path` keeps the reset counter sent, for the next process.
+    The file at `counter_path` keeps the reset counter sent, for the next process. `journal` takes
+    what the gate was asked.
     """
 
     def __init__(
@@ -41,11 +43,20 @@ class PoseSender:
         clock: FlightClock,
         counter_path: Path,
         warn: Callable[[Warned], None],
+        journal: Callable[[GateStep], None],
     ) -> None:
         self._config, self._link, self._clock = config, link, clock
         counter, height = ResetCounter(), AutopilotHeight(link)
         self._counter = SentCounter(counter_path, counter, height, link, clock, warn)
-        self._gate = PoseGate(config, counter, height.down_m, self._counter.may_start)
+        self._gate = JournaledGate(
+            config,
+            counter,
+            height.down_m,
+            self._counter.may_start,
+            clock.now_ns,
+            lambda: link.alive,
+            journal,
+        )
         self._rate, self._latency = RateMeter(), LatencyMeter()
         self._n_sent = 0
         self._last_text: str | None = None
@@ -53,6 +64,10 @@ class PoseSender:
     def restart(self) -> None:
         """Begin anew with another localisation."""
         self._gate.restart()
+
+    def begin_flight(self) -> None:
+        """A flight has begun, and its recording."""
+        self._gate.begin()
 
     def reconfigure(self, config: FeedbackConfig) -> None:
         """Apply other limits, from the next pose on, or another message."""
@@ -107,11 +122,8 @@ class PoseSender:
     def _send(self, pose: PoseToSend | None) -> None:
         if pose is None or not self._link.alive:
             return
-        if self._config.mode == "odometry":
-            self._link.send(odometry_message(pose))
-        else:
-            for message in vision_messages(pose):
-                self._link.send(message)
+        for message in pose_messages(pose, self._config.mode):
+            self._link.send(message)
         now_ns = self._clock.now_ns()
         self._n_sent += 1
         self._rate.add(now_ns)

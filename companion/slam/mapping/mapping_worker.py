@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+from companion.errors import CompanionError
 from companion.messages import KeyframeAdded, LoopClosed
 
 Done = list[KeyframeAdded | LoopClosed]
@@ -15,6 +17,15 @@ Job = Callable[[], Done]
 IdleWork = Callable[[Callable[[], None]], None]
 """Work for idle time; it calls its argument every few milliseconds."""
 MAX_QUEUED = 2
+LONGEST_TURN_S = 60.0
+"""Of mapping, before a frame's turn comes, where their order is given."""
+
+
+class OrderError(CompanionError):
+    """Mapping does not come to the point at which a frame was tracked."""
+
+    def __init__(self, point: int, wanted: int) -> None:
+        super().__init__(f"mapping stands at point {point}, and a frame was tracked at {wanted}")
 
 
 class MapLock:
@@ -22,18 +33,35 @@ class MapLock:
 
     Mapping yields where the map is consistent, so that a frame waits for at most a few
     milliseconds. Not reentrant.
+
+    What mapping and tracking make of the map hangs on their order alone. It is counted in the
+    points where mapping could have yielded: a frame is tracked at the number that `point` has then.
+    With the numbers of a flight's frames as `order` they take turns as they did in that flight.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, order: Iterable[int] | None = None) -> None:
         self._changed = threading.Condition()
         self._wanted = self._tracking = self._mapping = False
+        self._order = deque(order) if order is not None else None
+        self.point = 0
+        """Points that mapping has passed."""
 
     @contextmanager
     def tracking(self) -> Iterator[None]:
         """Hold the lock for a frame, ahead of any waiting mapping."""
+        with self.reading():
+            yield
+            if self._order:
+                self._order.popleft()
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Hold the lock likewise, to look and change nothing: no part of the order."""
         with self._changed:
             self._wanted = True
-            self._changed.wait_for(lambda: not self._mapping)
+            came = self._changed.wait_for(self._may_track, LONGEST_TURN_S if self._order else None)
+            if not came:
+                raise OrderError(self.point, self._order[0] if self._order else 0)
             self._wanted, self._tracking = False, True
         try:
             yield
@@ -55,11 +83,15 @@ class MapLock:
 
     def yield_to_tracking(self) -> None:
         """Let a waiting frame go first; within `mapping`, without effect elsewhere."""
-        if self._wanted and self._mapping:
-            with self._changed:
-                self._mapping = False
-                self._changed.notify_all()
-            self._acquire()
+        if not self._mapping:
+            return
+        if not (self._wanted if self._order is None else self._is_turn_of_tracking()):
+            self.point += 1
+            return
+        with self._changed:
+            self._mapping = False
+            self._changed.notify_all()
+        self._acquire()
 
     @contextmanager
     def released(self) -> Iterator[None]:
@@ -75,16 +107,31 @@ class MapLock:
         finally:
             self._acquire()
 
-    def wait_for_tracking(self) -> None:
-        """Wait while a frame holds the lock; for callers that hold nothing of the map."""
-        if self._wanted or self._tracking:
-            with self._changed:
-                self._changed.wait_for(lambda: not (self._wanted or self._tracking))
+    def pass_point(self, look: Callable[[], bool]) -> bool:
+        """Wait while a frame holds the lock, for callers that hold nothing of the map; then look.
+
+        What frames change is seen by `look` as it was when they were over.
+        """
+        with self._changed:
+            self._changed.wait_for(self._may_map)
+            self.point += 1
+            return look()
 
     def _acquire(self) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: not (self._wanted or self._tracking))
+            self._changed.wait_for(self._may_map)
             self._mapping = True
+            self.point += 1
+
+    def _is_turn_of_tracking(self) -> bool:
+        return self._order is not None and bool(self._order) and self._order[0] <= self.point
+
+    def _may_track(self) -> bool:
+        return not self._mapping and (not self._order or self._is_turn_of_tracking())
+
+    def _may_map(self) -> bool:
+        waits = self._wanted if self._order is None else self._is_turn_of_tracking()
+        return not (waits or self._tracking)
 
 
 class MappingWorker(Protocol):
@@ -182,10 +229,8 @@ class BackgroundMapping:
 
     def _yield_point(self) -> None:
         """Let frames and jobs go before idle work, which holds nothing of the map now."""
-        self._map_lock.wait_for_tracking()
-        while not self._jobs.empty():
+        while self._map_lock.pass_point(lambda: not self._jobs.empty()):
             job = self._jobs.get()
             if job is None:
                 raise _ClosingError
             self._do(job)
-            self._map_lock.wait_for_tracking()

@@ -6,6 +6,7 @@ Knows no clock: times come with the frames, durations are measured by whoever pr
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,18 +63,19 @@ class Tracker:
     """Frames and priors in; Track, KeyframeAdded and LoopClosed out.
 
     With `background` mapping runs in another thread, and keyframes are reported when mapped;
-    without it within their frame.
+    without it within their frame. `order` is that of a MapLock.
     """
 
     def __init__(
-        self, config: Config, camera: Camera, times: Timer, background: bool = False
-    ) -> None:
+        self, config: Config, camera: Camera, times: Timer, background: bool = False,
+        order: Iterable[int] | None = None,
+    ) -> None:  # fmt: skip
         self._config = config.tracking
         self._camera = camera
         self._times = times
         self._extractor = FeatureExtractor(config.features, camera)
         self._next_keyframe_id = 0
-        self.map_lock = MapLock()
+        self.map_lock = MapLock(order)
         """Held by whoever else reads the map."""
         self.atlas = Atlas(config.features, config.mapping, camera, self.map_lock, background)
         self._worker: MappingWorker = (
@@ -135,6 +137,11 @@ class Tracker:
     def next_keyframe_id(self) -> int:
         """The lowest id not used yet."""
         return self._next_keyframe_id
+
+    @property
+    def feature_ratio(self) -> float:
+        """Ratio of the configured features that is extracted."""
+        return self._extractor.feature_ratio
 
     def set_feature_ratio(self, share: float) -> None:
         """Extract this ratio of the configured features from now on."""

@@ -20,7 +20,7 @@ NICE = 10
 
 def main() -> int:
     """Show one flight, until its exporter ends; the exit status."""
-    os.setpgid(0, 0)  # it is ended with what it starts; see companion.streaming.export_process
+    os.setpgid(0, 0)  # it is ended with what it starts
     os.nice(NICE)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     where, port, colours, bind = sys.argv[1], int(sys.argv[2]), Colours(sys.argv[3]), sys.argv[4]

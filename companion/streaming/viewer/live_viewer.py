@@ -1,43 +1,44 @@
-"""Live viewers of a flight: an exporter in a process of its own, and a viewer on board.
+"""Live viewers of a flight: stage `viewers` in its process, and a viewer on board.
 
 Links and viewers are served there. No failure of theirs makes the caller wait.
 """
 
 from __future__ import annotations
 
-import json
+import contextlib
 import os
-import pickle
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from companion.config import StreamConfig, ViewerConfig
+from companion.config import Config, StreamConfig, ViewerConfig
 from companion.errors import InputError
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import Frame
-from companion.streaming.export_process import ExportSetup, SetBudget
-from companion.streaming.items import FlightItem
+from companion.runtime.parcel import Parcel
+from companion.runtime.stage_process import StageProcess
+from companion.runtime.stage_protocol import Finish, Listening, SetBudget, Setup
+from companion.runtime.stages import stage_named
 from companion.streaming.scene_encoder import Watched
-from companion.streaming.viewer.inbox import Inbox
-from companion.streaming.viewer.reduced import SHOWN, reduced
-from companion.timing.clock import monotonic_s
 
-CAPACITY_BYTES = 32 << 20
 PATIENCE_S = 3.0
 START_S = 30.0
 READY = b"ready"
 """Prefix of the line in which the viewer process reports its address for browsers."""
-EXPORTER, GROUND = "companion.streaming.export_process", "companion.streaming.viewer.ground_process"
+GROUND = "companion.streaming.viewer.ground_process"
 NOWHERE = "none"
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 FRAME_EVERY_NS = 60_000_000
 """Least interval of frames for viewers."""
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+STAGE = stage_named("viewers")
+SHOWN = {kind.__name__ for kind in STAGE.listens}
 
 
 class LiveViewer:
@@ -50,35 +51,17 @@ class LiveViewer:
         self, config: ViewerConfig, camera: Camera, where: str = NOWHERE, name: str = "",
         stream: StreamConfig | None = None, origin: GeoOrigin | None = None,
     ) -> None:  # fmt: skip
-        self.n_dropped = 0
-        self.report: Mapping[str, Any] = {}
-        """Last report of the exporter."""
-        self.closed = ""
-        """Reason why nobody can connect, or ""."""
         self.page = ""
         """Address for a browser; "" for a window."""
-        self._config, self._width = config, min(config.image_width, camera.width)
-        self._inbox = Inbox(CAPACITY_BYTES)
-        self._budget: SetBudget | None = None
-        """Change to be sent to the exporter."""
-        self._frame_ns = -(2**63)
+        self._colours = config.colours
+        self._stream = stream or StreamConfig(listen="")
         self._port = 0
+        self._frame_ns = -(2**63)
         self._has_port = threading.Event()
-        self._sending_since_s: float | None = None
-        listen = stream.listen if stream is not None else ""
-        self._bind = stream.web_bind if stream is not None else StreamConfig().web_bind
-        flight = FlightItem(name or os.urandom(8).hex(), name, camera.pinhole(), origin)
-        setup = ExportSetup(
-            flight, stream or StreamConfig(), listen, int(where not in (NOWHERE, ""))
-        )
-        self._exporter = _child(EXPORTER, stdin=True)
         self._ground: subprocess.Popen[bytes] | None = None
-        self._thread = threading.Thread(
-            target=self._work, args=(setup,), name="viewer", daemon=True
-        )
-        self._listener = threading.Thread(target=self._listen, name="exporter", daemon=True)
-        self._thread.start()
-        self._listener.start()
+        self._stage = StageProcess(STAGE, self._take_port, lambda why: self._has_port.set())
+        settings = replace(Config(), viewer=config, stream=self._stream)
+        self._stage.begin(Setup(settings, camera, Path(name) if name else None, origin))
         if where != NOWHERE:
             try:
                 self.look(where)
@@ -87,19 +70,38 @@ class LiveViewer:
                 raise
 
     def take(self, message: Watched) -> None:
-        """Queue one message, or drop it."""
-        if not isinstance(message, SHOWN):
-            return
-        if isinstance(message, Frame):
-            if message.t_ns - self._frame_ns < FRAME_EVERY_NS:
+        """Show one message, or drop it; of those that cannot be shown nothing comes."""
+        if type(message).__name__ in SHOWN:
+            self.offer(Parcel.of(message))
+
+    def offer(self, parcel: Parcel) -> None:
+        """The same with a closed message."""
+        if parcel.kind == Frame.__name__:
+            if parcel.t_ns - self._frame_ns < FRAME_EVERY_NS:
                 return
-            self._frame_ns = message.t_ns
-        if not self._inbox.offer(message):
-            self.n_dropped += 1
+            self._frame_ns = parcel.t_ns
+        if parcel.kind in SHOWN:
+            self._stage.offer(parcel)
+
+    @property
+    def n_dropped(self) -> int:
+        """Messages dropped for lack of capacity."""
+        return self._stage.n_dropped
+
+    @property
+    def report(self) -> Mapping[str, Any]:
+        """Last report of the exporter."""
+        progress = self._stage.progress
+        return progress.details if progress is not None else {}
+
+    @property
+    def closed(self) -> str:
+        """Reason why nobody can connect, or ""."""
+        return str(self.report.get("closed", ""))
 
     def set_budget(self, kbit_s: float) -> None:
-        """Limit the rate of all viewers together from the next message on; 0 for no limit."""
-        self._budget = SetBudget(kbit_s)
+        """Limit the rate of all viewers together; 0 for no limit."""
+        self._stage.order(SetBudget(kbit_s))
 
     def look(self, where: str) -> None:
         """Open a viewer: `web`, `native`, or the rerun+http address of one that runs.
@@ -108,7 +110,7 @@ class LiveViewer:
         """
         if not self._has_port.wait(START_S) or not self._port:
             raise InputError(f"--viewer {where}: the exporter ended as it began")
-        child = _child(GROUND, where, str(self._port), self._config.colours, self._bind)
+        child = _child(where, str(self._port), self._colours, self._stream.web_bind)
         assert child.stdout is not None
         answer = child.stdout.readline()
         ready, _, page = answer.partition(b" ")
@@ -123,21 +125,20 @@ class LiveViewer:
     @property
     def pid(self) -> int:
         """Process id of the exporter."""
-        return self._exporter.pid
+        return self._stage.pid
 
     @property
     def alive(self) -> bool:
         """Whether the exporter runs."""
-        return self._exporter.poll() is None
+        return self._stage.alive
 
     def stalled_s(self, now_s: float) -> float:
-        """Seconds for which the exporter has not read a message; 0 where none waits."""
-        since_s = self._sending_since_s
-        return now_s - since_s if since_s is not None else 0.0
+        """Seconds for which the exporter has not done anything; 0 where nothing waits."""
+        return self._stage.stalled_s(now_s)
 
     def interrupt(self) -> None:
         """End an exporter that hangs, as if it had died by itself."""
-        _end(self._exporter)
+        self._stage.interrupt()
 
     @property
     def is_shown(self) -> bool:
@@ -157,62 +158,26 @@ class LiveViewer:
 
     def close(self, patience_s: float) -> None:
         """Send what is queued, and end; each in the time given."""
-        self._inbox.close()
-        self._thread.join(patience_s)
-        children = [child for child in (self._exporter, self._ground) if child is not None]
-        try:
-            if not self._thread.is_alive():
-                for child in children:
-                    child.wait(patience_s)
-        except subprocess.TimeoutExpired:
-            pass  # it hangs, and is ended below
-        finally:
-            for child in children:
-                _end(child)
-        for thread in (self._thread, self._listener):
-            thread.join(PATIENCE_S)
-        self.n_dropped += len(self._inbox)
+        self._stage.ask_to_finish(Finish(patience_s < PATIENCE_S, n_viewers=int(self.is_shown)))
+        self._stage.wait(2 * patience_s)
+        self._stage.kill()
+        if self._ground is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._ground.wait(patience_s)  # it ends by itself once it has shown all
+            _end(self._ground)
 
-    def _work(self, setup: ExportSetup) -> None:
-        try:
-            self._send(setup)
-            while (message := self._inbox.get()) is not None:
-                self._sending_since_s = monotonic_s()
-                budget, self._budget = self._budget, None
-                if budget is not None:
-                    self._send(budget)
-                self._send(reduced(message, self._width))
-                self._sending_since_s = None
-        except OSError:  # the exporter is gone; the flight goes on, and what follows is counted
-            self.n_dropped += 1
-            self._inbox.close()
-        finally:
-            _close(self._exporter.stdin)
-
-    def _listen(self) -> None:
-        assert self._exporter.stdout is not None
-        for line in self._exporter.stdout:
-            said = json.loads(line)
-            self.report = said.get("report", self.report)
-            self.closed = str(said.get("closed", ""))
-            if "own" in said:
-                self._port = int(said["own"])
-                self._has_port.set()
-        self._has_port.set()
-        _close(self._exporter.stdout)
-
-    def _send(self, thing: object) -> None:
-        assert self._exporter.stdin is not None
-        pickle.dump(thing, self._exporter.stdin, protocol=pickle.HIGHEST_PROTOCOL)
-        self._exporter.stdin.flush()
+    def _take_port(self, parcel: Parcel) -> None:
+        told = parcel.open()
+        if isinstance(told, Listening):
+            self._port = told.port
+            self._has_port.set()
 
 
-def _child(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen[bytes]:
+def _child(*arguments: str) -> subprocess.Popen[bytes]:
     environment = {**dict.fromkeys(ONE_THREAD, "1"), **os.environ}
     return subprocess.Popen(
-        [sys.executable, "-m", module, *arguments], env=environment,
-        stdin=subprocess.PIPE if stdin else subprocess.DEVNULL, stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        [sys.executable, "-m", GROUND, *arguments], env=environment,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
     )  # fmt: skip
 
 
@@ -224,12 +189,5 @@ def _end(child: subprocess.Popen[bytes]) -> None:
         except ProcessLookupError:  # it has not got so far as to have a group of its own
             child.kill()
         child.wait()
-    if child.stdin is None:  # else its own thread reads it
-        _close(child.stdout)
-
-
-def _close(pipe: object) -> None:
-    try:
-        pipe.close()  # type: ignore[attr-defined]
-    except OSError:
-        pass  # what was buffered for a child that is gone
+    assert child.stdout is not None
+    child.stdout.close()

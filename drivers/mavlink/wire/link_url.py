@@ -72,9 +72,7 @@ def _network(key: str, url: str, kind: str, rest: str) -> Endpoint:
     elif ":" in host:
         raise ConfigError(f'{key}: "{url}": an IPv6 address stands in brackets, [::1] for example')
     if not (port.isascii() and port.isdigit() and len(port) < 6 and 0 < int(port) < 65536):
-        raise ConfigError(
-            f'{key}: "{url}" must be {kind}:HOST:PORT with a port from 1 to 65535'
-        )
+        raise ConfigError(f'{key}: "{url}" must be {kind}:HOST:PORT with a port from 1 to 65535')
     if not host and kind not in ("udpin", "tcpin"):
         raise ConfigError(f'{key}: "{url}" says no host: {kind}:HOST:{port}')
     return Endpoint(kind=kind, host=host or LOOPBACK, port=int(port))

@@ -23,9 +23,7 @@ SEND_BUFFER = 65536
 class TcpConnection(Wire):
     """Accepted connection; `run` it through `serve` with a connected socket."""
 
-    def __init__(
-        self, name: str, queue: PacketQueue, read_limit: RateLimit | None = None
-    ) -> None:
+    def __init__(self, name: str, queue: PacketQueue, read_limit: RateLimit | None = None) -> None:
         super().__init__(name, NETWORK_BYTES_PER_S, queue, read_limit)
         self._socket: socket.socket | None = None
 

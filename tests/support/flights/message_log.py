@@ -15,10 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from companion.compute.compute_devices import choose_devices
 from companion.config import Config
-from companion.dense.depth_stage import DepthStage
-from companion.estimation.localisation import LocalisationStage
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import (
@@ -32,9 +29,10 @@ from companion.messages import (
     Track,
     Warned,
 )
-from companion.runtime.pipeline import Pipeline, in_order_of_time
-from companion.streaming.viewer.reduced import reduced
-from companion.timing.clock import StageTimes
+from companion.runtime.in_order import InOrder, in_order_of_time
+from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stages import stage_named
+from companion.streaming.reduced import reduced
 from drivers.open_flight import open_flight
 
 KEPT = (Track, MapUpdate, PointChunk, DepthMap, KeyframeAdded, PositionSample, Warned)
@@ -77,18 +75,14 @@ def write_message_log(flight_path: Path, path: Path, config: Config) -> None:
     """Replay a flight once, and keep all that a viewer is shown."""
     flight = open_flight(flight_path, config.camera, config.telemetry)
     log = flight.telemetry()
-    times, devices = StageTimes(), choose_devices(config.opencl)
+    setup = Setup(config, flight.camera, origin=log.origin, is_live=False)
     with MessageLogWriter(path, flight.camera, log.origin) as writer:
-        pipeline = Pipeline(
-            LocalisationStage(config, flight.camera, times, background=False),
-            DepthStage(config.depth, config.cloud, flight.camera, devices, times), [writer],
-            lossless=True,
-        )  # fmt: skip
+        stages = InOrder(map(stage_named, ("localisation", "depth")), setup, writer.take, print)
         start_ns, stop_ns = flight.start_ns, flight.stop_ns
         samples = [s for s in log.samples if start_ns - 10**10 <= s.t_ns <= stop_ns]
         for message in in_order_of_time(samples, flight.frames(start_ns, stop_ns)):
-            pipeline.feed(message)
-        pipeline.finish()
+            stages.feed(message)
+        stages.finish(lambda stage: Finish(hurry=False))
 
 
 class MessageLog:

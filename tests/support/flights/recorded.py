@@ -17,8 +17,10 @@ from companion.messages import (
     ArmedSample,
     AttitudeSample,
     Frame,
+    HealthNote,
     HeightSample,
     ImuSample,
+    LinkBytes,
     Message,
     Odometry,
     PositionSample,
@@ -29,7 +31,6 @@ from companion.messages import (
     Warned,
 )
 from drivers.camera.pattern_camera import PatternScene, pattern_optics, world_from_camera
-from drivers.recording.recorded_content import HealthNote, LinkBytes
 from drivers.recording.recorder import Recorder
 
 START_NS = 1_780_000_000_123_456_789

@@ -28,7 +28,7 @@ from companion.messages import (
 )
 from companion.products.flight_result import FlightResult
 from companion.products.trajectory_error import Path, PathErrors, path_errors
-from companion.runtime.pipeline import in_order_of_time
+from companion.runtime.in_order import in_order_of_time
 from tests.support.flights.scene import texture
 
 CAMERA_DOWN = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))

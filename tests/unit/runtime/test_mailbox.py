@@ -6,10 +6,11 @@ import pytest
 from companion.config import Config
 from companion.geometry.transforms import Pose
 from companion.messages import AttitudeSample, DepthMap, Frame, MapUpdate
-from companion.runtime.mail_policy import drop_policy_of
 from companion.runtime.mailbox import DropPolicy, Mailbox
 from companion.runtime.message_size import ENTRY_BYTES, SMALL_BYTES, size_bytes
+from companion.runtime.parcel import Parcel
 from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stages import DROPPED
 from tests.support.flights.topic_flight import CAMERA
 
 Sent = tuple[DropPolicy, int, str]
@@ -72,14 +73,17 @@ def test_a_message_larger_than_the_capacity_is_let_in_alone() -> None:
 
 
 def test_a_stage_that_takes_nothing_for_an_hour_stays_within_its_capacity() -> None:
-    box: Mailbox[object] = Mailbox(lambda m: drop_policy_of(m, True), size_bytes, 1 << 20)
-    box.put(Setup(Config(), CAMERA))
+    box: Mailbox[Parcel] = Mailbox(
+        lambda p: DROPPED.get(p.kind, DropPolicy.LOSSLESS), lambda p: p.n_bytes, 1 << 20
+    )
+    box.put(Parcel.of(Setup(Config(), CAMERA)))
     for t_ns in range(20_000):
-        box.put(AttitudeSample(t_ns, np.array([1.0, 0, 0, 0])))
+        box.put(Parcel.of(AttitudeSample(t_ns, np.array([1.0, 0, 0, 0]))))
     assert box.n_bytes <= 1 << 20
     assert box.n_overflowed > 10_000
-    box.put(Finish(hurry=True))
-    assert isinstance(box.get(), Setup), "what it is to do comes before all else"
+    box.put(Parcel.of(Finish(hurry=True)))
+    first = box.get()
+    assert first is not None and isinstance(first.open(), Setup), "its setup comes first"
 
 
 @pytest.mark.parametrize(

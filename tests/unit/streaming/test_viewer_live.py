@@ -65,8 +65,8 @@ def test_a_viewer_that_hangs_neither_stalls_nor_outlives_the_flight() -> None:
 def test_an_exporter_that_dies_does_not_end_the_flight() -> None:
     with LiveViewer(ViewerConfig(), CAMERA) as viewer:
         assert viewer.alive
-        viewer._exporter.kill()
-        viewer._exporter.wait()
+        viewer.interrupt()
+        assert viewer._stage.wait(10.0)
         assert not viewer.alive
         for seq in range(400):
             viewer.take(flown.frame(seq))

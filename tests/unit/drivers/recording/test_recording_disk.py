@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from companion.config import CameraConfig, Config, RecorderConfig, TelemetryConfig
-from companion.messages import Frame, Warned
+from companion.messages import Frame, LinkBytes, Warned
 from drivers.recording.disk_writer import FULL, PRUNED, SLOW
 from drivers.recording.flights_folder import flights_in, may_go
-from drivers.recording.recorded_content import LinkBytes
 from drivers.recording.recorded_flight import RecordedFlight, open_recording
 from drivers.recording.recorder import Recorder
 from tests.support.flights.recorded import SIZE, START_NS, STEP_NS, camera, record

@@ -1,4 +1,4 @@
-"""Messages reduced to the data that viewers need, before they go to the exporter."""
+"""Messages reduced to the data that viewers need."""
 
 from __future__ import annotations
 
@@ -7,25 +7,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from companion.geometry.geodesy import GeoOrigin
-from companion.health import Health
 from companion.messages import (
     DepthMap,
     Frame,
     KeyframeAdded,
     MapUpdate,
-    Odometry,
-    PointChunk,
-    PositionSample,
-    Track,
-    Warned,
 )
 from companion.streaming.scene_encoder import Watched
 
-SHOWN = (
-    Frame, Track, Odometry, MapUpdate, PointChunk, DepthMap, KeyframeAdded, PositionSample, Warned,
-    Health, GeoOrigin,
-)  # fmt: skip
 NO_FLOATS = np.zeros((0, 0), np.float32)
 NO_BYTES = np.zeros((0, 0), np.uint8)
 

@@ -1,0 +1,202 @@
+"""Stages of one flight in one process: each message goes through all of them before the next.
+
+Nothing is lost, and results do not depend on anybody's speed. Localisation works in the caller's
+thread. Depth, to which no stage above it listens, has a thread of its own, fed in order through a
+bounded queue that makes the caller wait. A depth stage that fails is left out from there on:
+trajectory, map and what there is of the cloud stay.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+from companion.errors import CompanionError
+from companion.messages import Frame, Message, Warned
+from companion.runtime.message_size import size_bytes
+from companion.runtime.stage_protocol import Finish, Remark, Setup
+from companion.runtime.stage_work import Work, module_of
+from companion.runtime.stages import Stage
+
+DEPTH_QUEUE, DEPTH_QUEUE_BYTES = 64, 128 << 20
+"""Capacity of the queue to depth, in messages and bytes."""
+DEPTH_FAILED = "the dense map ends here: the depth stage has failed"
+APART = "depth"
+
+
+class InOrder:
+    """The given stages; feed it messages in order of time.
+
+    `watch` sees every message, `say` takes remarks of the stages. CompanionError where a stage
+    cannot begin.
+    """
+
+    def __init__(
+        self, stages: Iterable[Stage], setup: Setup, watch: Callable[[Message], None],
+        say: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        self._watch = watch
+        self._stages = list(stages)
+        self.works: dict[str, Work] = {}
+        for stage in self._stages:
+            self.works[stage.name] = work = module_of(stage.name).work(setup)
+            work.begin(lambda told: say(told.text) if isinstance(told, Remark) else None)
+        self._depth = _Apart(self.works[APART]) if APART in self.works else None
+        self._fault_reported = False
+        self._t_ns = 0
+
+    @property
+    def depth_fault(self) -> BaseException | None:
+        """Exception of the depth stage; None without one."""
+        return self._depth.fault if self._depth is not None else None
+
+    @property
+    def times(self) -> dict[str, Mapping[str, float]]:
+        """Times of all stages, by name of the work."""
+        times = {k: v for work in self.works.values() for k, v in work.times.summary().items()}
+        return dict(sorted(times.items()))
+
+    def feed(self, message: Message) -> None:
+        """Pass one message, and all that comes of it, through the stages that listen."""
+        if not isinstance(message, Warned):
+            self._t_ns = message.t_ns
+        self._pass(message)
+        if self._depth is not None:
+            self._publish(self._depth.collect())
+            self._warn_fault()
+
+    def finish(self, finish: Callable[[Stage], Finish]) -> None:
+        """Complete the map and the depth maps, then the results."""
+        last: list[Any] = []
+        try:
+            for stage in self._stages:
+                if stage.is_source and stage.name != APART:
+                    last += self.works[stage.name].finish(finish(stage))
+        finally:  # what there is is written, whatever has failed
+            # before the final map comes: what it is measured by is that of its own time
+            if self._depth is not None:
+                self._publish(self._depth.close())
+                self._warn_fault()
+            self._publish(last)
+            for stage in self._stages:
+                if not stage.is_source:
+                    self.works[stage.name].finish(finish(stage))
+
+    def _pass(self, message: Message) -> None:
+        """The last stages first: an image is there before its pose."""
+        self._watch(message)
+        for stage in reversed(self._stages):
+            if not isinstance(message, stage.listens):
+                continue
+            if stage.name == APART:
+                assert self._depth is not None
+                self._depth.put(message)
+            else:
+                self._publish(self.works[stage.name].step(message))
+
+    def _publish(self, messages: Iterable[Any]) -> None:
+        for message in messages:
+            self._pass(message)
+
+    def _warn_fault(self) -> None:
+        """Warn once that the dense map has ended early."""
+        fault = self.depth_fault
+        if fault is not None and not self._fault_reported:
+            self._fault_reported = True
+            self._pass(Warned(self._t_ns, DEPTH_FAILED, in_words(fault)))
+
+
+class _Apart:
+    """A stage in its own thread; its results wait until they are collected.
+
+    A stage that raises ends: later messages are ignored, earlier results can still be collected,
+    and `fault` is the exception.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self._work = work
+        self._inbox: queue.Queue[Message | None] = queue.Queue(DEPTH_QUEUE)
+        self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._n_bytes = 0
+        self._taken = threading.Condition()
+        self._is_open = True
+        self.fault: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="depth", daemon=True)
+        self._thread.start()
+
+    def put(self, message: Message) -> None:
+        """Pass a message; waits for room. Ignored once it is closed."""
+        if not self._is_open:
+            return
+        size = size_bytes(message)
+        with self._taken:
+            self._taken.wait_for(
+                lambda: not self._n_bytes or self._n_bytes + size <= DEPTH_QUEUE_BYTES
+            )
+            self._n_bytes += size
+        self._inbox.put(message)
+
+    def collect(self) -> Iterator[Any]:
+        """Results so far."""
+        while True:
+            try:
+                yield self._outbox.get_nowait()
+            except queue.Empty:
+                return
+
+    def close(self) -> Iterator[Any]:
+        """Finish, and yield the last results."""
+        self._is_open = False
+        self._inbox.put(None)
+        self._thread.join()
+        yield from self.collect()
+
+    def _run(self) -> None:
+        is_open = True
+        try:
+            while (message := self._take()) is not None:
+                for out in self._work.step(message):
+                    self._outbox.put(out)
+            is_open = False
+            for out in self._work.finish(Finish(hurry=False)):
+                self._outbox.put(out)
+        except BaseException as fault:  # handed to the caller's thread, which tells of it
+            self.fault = fault
+        while is_open and self._take() is not None:
+            pass  # whoever puts must not wait for ever
+
+    def _take(self) -> Message | None:
+        message = self._inbox.get()
+        if message is not None:
+            with self._taken:
+                self._n_bytes -= size_bytes(message)
+                self._taken.notify()
+        return message
+
+
+def in_words(fault: BaseException) -> str:
+    """A fault in one line: its text if raised on purpose, else its type as well."""
+    text = " ".join(str(fault).split())
+    if isinstance(fault, CompanionError):
+        return text
+    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
+
+
+def in_order_of_time(telemetry: Iterable[Message], frames: Iterable[Message]) -> Iterator[Message]:
+    """Merge telemetry (sorted) and frames; a frame comes after all telemetry up to its time.
+
+    Both are sorted; Warned among the frames passes through at once.
+    """
+    samples = iter(telemetry)
+    waiting = next(samples, None)
+    for frame in frames:
+        if isinstance(frame, Frame):
+            while waiting is not None and waiting.t_ns <= frame.t_ns:
+                yield waiting
+                waiting = next(samples, None)
+        yield frame
+    while waiting is not None:
+        yield waiting
+        waiting = next(samples, None)

@@ -1,0 +1,132 @@
+"""Parcels: messages between processes, whose large arrays are written once and read where they lie.
+
+A message is pickled with its arrays apart (PEP 574). A small one travels whole. A large one is
+written into a file in memory without a name (memfd_create(2)), and only its descriptor travels:
+whoever passes it on copies nothing and opens nothing. The memory is freed with the last process
+that holds it, however that one ends; nothing is overwritten, so that no reader comes too late.
+Readers map it privately: what one writes into its arrays no other sees.
+
+A mapping keeps its whole message, and a descriptor: who keeps an array for long copies it.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import pickle
+import socket
+import struct
+from typing import Any
+
+INLINE_BYTES = 32 << 10
+"""Larger messages are shared; below, mapping costs more than a copy. A packet with one and its
+header fits into a socket's buffer, of 208 KiB in Linux, several times."""
+APART_BYTES = 4 << 10
+"""Smaller arrays are pickled with the rest: the mappings of a map hold thousands."""
+ALIGNMENT = 64
+"""Of arrays, for vector instructions."""
+MOST_BYTES = 2 * INLINE_BYTES
+"""Largest packet."""
+_HEADER = struct.Struct("<qQB")
+_LENGTH = struct.Struct("<Q")
+
+
+class _Memory:
+    """Descriptor of a file in memory; closed with its last reference."""
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+
+    def __del__(self) -> None:
+        os.close(self.descriptor)
+
+
+class Parcel:
+    """A closed message: the name of its class, its time, its size in memory."""
+
+    __slots__ = ("_inline", "_memory", "kind", "n_bytes", "t_ns")
+
+    def __init__(
+        self, kind: str, t_ns: int, n_bytes: int, inline: bytearray, memory: _Memory | None
+    ) -> None:
+        self.kind, self.t_ns, self.n_bytes = kind, t_ns, n_bytes
+        self._inline, self._memory = inline, memory
+
+    @classmethod
+    def of(cls, message: Any) -> Parcel:
+        """Close a message; one without a time has 0."""
+        buffers: list[memoryview] = []
+
+        def keep(buffer: pickle.PickleBuffer) -> bool:
+            raw = buffer.raw()
+            if raw.nbytes < APART_BYTES:
+                return True  # pickled with the rest
+            buffers.append(raw)
+            return False
+
+        pickled = pickle.dumps(message, pickle.HIGHEST_PROTOCOL, buffer_callback=keep)
+        lengths = [len(pickled), *(each.nbytes for each in buffers)]
+        head = b"".join(map(_LENGTH.pack, [len(lengths), *lengths]))
+        parts, n_bytes = [memoryview(head)], len(head)
+        for part in (memoryview(pickled), *buffers):
+            padding = -n_bytes % ALIGNMENT
+            parts += [memoryview(bytes(padding)), part]
+            n_bytes += padding + part.nbytes
+        kind, t_ns = type(message).__name__, getattr(message, "t_ns", 0)
+        if n_bytes <= INLINE_BYTES:
+            return cls(kind, t_ns, n_bytes, bytearray().join(parts), None)
+        memory = _Memory(os.memfd_create(kind, os.MFD_CLOEXEC))
+        _write(memory.descriptor, parts)
+        return cls(kind, t_ns, n_bytes, bytearray(), memory)
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether it lies in memory of its own, of which only a descriptor travels."""
+        return self._memory is not None
+
+    def open(self) -> Any:
+        """The message. Its arrays may be written to, by this reader alone."""
+        if self._memory is None:
+            whole = memoryview(self._inline)
+        else:
+            whole = memoryview(
+                mmap.mmap(
+                    self._memory.descriptor, self.n_bytes, mmap.MAP_PRIVATE,
+                    mmap.PROT_READ | mmap.PROT_WRITE,
+                )
+            )  # fmt: skip
+        (n,) = _LENGTH.unpack_from(whole)
+        lengths = struct.unpack_from(f"<{n}Q", whole, _LENGTH.size)
+        at, parts = _LENGTH.size * (n + 1), []
+        for length in lengths:
+            at += -at % ALIGNMENT
+            parts.append(whole[at : at + length])
+            at += length
+        return pickle.loads(parts[0], buffers=parts[1:])
+
+    def send(self, to: socket.socket) -> None:
+        """Send through a socket of packets; waits for room in it. OSError where nobody reads."""
+        kind = self.kind.encode()
+        header = _HEADER.pack(self.t_ns, self.n_bytes, len(kind))
+        packet: list[bytes | bytearray] = [header, kind, self._inline]
+        descriptors = [self._memory.descriptor] if self._memory is not None else []
+        socket.send_fds(to, packet, descriptors)
+
+    @classmethod
+    def receive(cls, source: socket.socket) -> Parcel:
+        """Wait for the next one; EOFError where nobody sends any more."""
+        packet, descriptors, _flags, _address = socket.recv_fds(source, MOST_BYTES, 1)
+        if not packet:
+            raise EOFError
+        memory = _Memory(descriptors[0]) if descriptors else None
+        t_ns, n_bytes, n_kind = _HEADER.unpack_from(packet)
+        at = _HEADER.size + n_kind
+        kind = packet[_HEADER.size : at].decode()
+        return cls(kind, t_ns, n_bytes, bytearray(packet[at:]), memory)
+
+
+def _write(descriptor: int, parts: list[memoryview]) -> None:
+    for part in parts:
+        left = part
+        while left:  # one call writes 2 GiB at most
+            left = left[os.write(descriptor, left) :]

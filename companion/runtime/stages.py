@@ -1,0 +1,138 @@
+"""The stages of a flight: one table, run by `in_order` (replay) and by `processes` (in flight).
+
+A message goes to every stage that listens to it, in the order of this table, in which a stage
+listens to stages above it only. The work of a stage is in `companion.stages.<name>_work`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from typing import get_args
+
+from companion.geometry.geodesy import GeoOrigin
+from companion.health import Health
+from companion.messages import (
+    DepthMap,
+    Frame,
+    FrameTracked,
+    GateStep,
+    HealthNote,
+    KeyframeAdded,
+    LinkBytes,
+    LoopClosed,
+    MapUpdate,
+    Odometry,
+    PointChunk,
+    PositionSample,
+    Telemetry,
+    Track,
+    Warned,
+)
+from companion.runtime.mailbox import DropPolicy
+
+TELEMETRY: tuple[type, ...] = get_args(Telemetry)
+
+
+class Frames(Enum):
+    """Frames that a stage wants, of those that wait for it."""
+
+    NEWEST = "newest"
+    """Only the newest: a pose of an older one would come too late."""
+    RECENT = "recent"
+    """As many as there is room for; a waiting one is replaced before it leaves the daemon."""
+    EVERY = "every"
+    """All that there is room for."""
+
+
+class Death(Enum):
+    """What follows when a stage ends by itself, or is ended for not answering."""
+
+    ENDS_FLIGHT = "the flight ends, and another begins"
+    RESTARTED = "it is started again within the flight"
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A row of the table. Times in seconds."""
+
+    name: str
+    listens: tuple[type, ...]
+    nice: int
+    """Above 19: runs only where nothing else wants the processor (SCHED_IDLE)."""
+    frames: Frames = Frames.RECENT
+    answer_s: float = math.inf
+    """Longest step before it counts as hanging: room for a slow disk or network, and for depth a
+    driver that compiles. Localisation is judged by its poses, and sooner."""
+    finish_s: float = 60.0
+    """Time for its last results,"""
+    hurried_s: float = 0.2
+    """and where the daemon is to end: three seconds for all."""
+    death: Death = Death.RESTARTED
+    with_flight: bool = False
+    """Whether it begins with the flight, whose name or folder it needs; else it stands by."""
+    in_folder: bool = False
+    """Whether it writes into the flight's folder; each restart into one of its own."""
+    is_source: bool = False
+    """Whether other stages wait for its last results."""
+
+
+STAGES = (
+    Stage(
+        "localisation", (Frame, *TELEMETRY), nice=0, frames=Frames.NEWEST,
+        finish_s=120.0, hurried_s=0.7, death=Death.ENDS_FLIGHT, is_source=True,
+    ),
+    Stage(
+        "depth", (Frame, Track, KeyframeAdded, MapUpdate), nice=20, answer_s=120.0, is_source=True,
+    ),
+    Stage(
+        "recorder",
+        (
+            Frame, *TELEMETRY, LinkBytes, HealthNote, Warned, FrameTracked, GateStep, Odometry,
+            MapUpdate, PointChunk,
+        ),
+        nice=5, frames=Frames.EVERY, answer_s=60.0, hurried_s=0.3, with_flight=True, in_folder=True,
+    ),
+    Stage(
+        "topics", (Frame, Odometry, Track, KeyframeAdded, MapUpdate, DepthMap, PointChunk),
+        nice=10, answer_s=30.0, finish_s=15.0, with_flight=True,
+    ),
+    Stage(
+        "viewers",
+        (
+            Frame, PositionSample, Warned, Health, GeoOrigin, Odometry, Track, KeyframeAdded,
+            MapUpdate, DepthMap, PointChunk,
+        ),
+        nice=10, frames=Frames.EVERY, answer_s=30.0, finish_s=3.0, with_flight=True,
+    ),
+    Stage(
+        "results",
+        (
+            Frame, *TELEMETRY, Warned, Health, GeoOrigin, Track, KeyframeAdded, LoopClosed,
+            MapUpdate, DepthMap, PointChunk,
+        ),
+        nice=10, answer_s=60.0, finish_s=180.0, hurried_s=1.6, with_flight=True, in_folder=True,
+    ),
+)  # fmt: skip
+START_S = 300.0
+"""Longest start of a stage. On an overloaded computer the imports alone take a minute and more, and
+the first start of all compiles loops or kernels."""
+
+QUEUE_BYTES = 32 << 20
+"""Queue before a stage: six depth maps, or twenty-five frames, of 640x480."""
+UNREAD_BYTES = 8 << 20
+"""Shared memory on its way to a stage that it has not taken yet: one that is stopped would else
+leave hundreds of descriptors in its socket."""
+DROPPED = {
+    Frame.__name__: DropPolicy.PICTURE, DepthMap.__name__: DropPolicy.PICTURE,
+    PointChunk.__name__: DropPolicy.MAP, MapUpdate.__name__: DropPolicy.MAP,
+    "Setup": DropPolicy.ALWAYS, "Finish": DropPolicy.ALWAYS, "SetLoadLevel": DropPolicy.ALWAYS,
+    "TakeSnapshot": DropPolicy.ALWAYS, "SetBudget": DropPolicy.ALWAYS, "KeepMap": DropPolicy.ALWAYS,
+}  # fmt: skip
+"""What happens to messages where a queue is full, by kind; all others are LOSSLESS."""
+
+
+def stage_named(name: str) -> Stage:
+    """Row of a stage."""
+    return next(stage for stage in STAGES if stage.name == name)

@@ -1,0 +1,158 @@
+"""Cost of the live daemon with everything on: processor, memory, copies, latency of the pose.
+
+    python -m tests.bench.live_cost [--seconds 60] [--rounds 1] [--against CLONE]
+
+The test pattern at 640x480 and 30 frames/s, dense map, recorder, exporter for viewers, an autopilot
+to which poses are sent. CLONE is another working tree, of an earlier version say: both are measured
+in turn. What is left out where there is too much to do is not left out here. Memory is the sum of
+proportional set sizes (PSS). "Pickled" is what the daemon's own process turns into bytes and back.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from tests.support.autopilot.fake_autopilot import FakeAutopilot
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.processes.daemon_process import Daemon
+
+COUNTING = """
+import sys, threading, time, pickle, _pickle
+from multiprocessing import connection
+n = [0]
+def counted(function, length):
+    def call(*given, **options):
+        out = function(*given, **options)
+        n[0] += length(given, out)
+        return out
+    return call
+pickle.dumps = counted(pickle.dumps, lambda given, out: len(out))
+pickle.loads = counted(pickle.loads, lambda given, out: len(given[0]))
+loads = connection._ForkingPickler.loads
+connection._ForkingPickler.loads = staticmethod(
+    counted(loads, lambda given, out: len(given[0]))
+)
+dump = pickle.dump
+def dump_counted(message, file, **options):
+    data = pickle.dumps(message, **options)
+    file.write(data)
+pickle.dump = dump_counted
+def tell():
+    while True:
+        time.sleep(0.5)
+        with open({path!r}, "w") as file:
+            file.write(str(n[0]))
+threading.Thread(target=tell, daemon=True).start()
+from companion.runtime.governor import Governor
+Governor.step = lambda self, t_ns, pressure: False
+from companion.__main__ import main
+sys.exit(main())
+"""
+SETTLE_S, UP_S = 15.0, 180.0
+NAMES = {"companion.streaming.export_process": "viewers"}
+
+
+def name_of(process: psutil.Process) -> str:
+    """Stage of a child of the daemon."""
+    line = process.cmdline()
+    if "-m" not in line:
+        return "daemon"
+    at = line.index("-m")
+    return str(NAMES.get(line[at + 1], line[at + 2] if len(line) > at + 2 else line[at + 1]))
+
+
+def cpu_and_memory(daemon: psutil.Process) -> dict[str, tuple[float, float]]:
+    """By process: processor seconds so far, and PSS in MB."""
+    found = {}
+    for each in [daemon, *daemon.children(recursive=True)]:
+        with contextlib.suppress(psutil.Error):
+            times = each.cpu_times()
+            name = "daemon" if each.pid == daemon.pid else name_of(each)
+            found[name] = times.user + times.system, each.memory_full_info().pss / 1e6
+    return found
+
+
+def measured(tree: Path, seconds: float) -> dict[str, float]:
+    """Figures of one run of the program in a working tree."""
+    port = free_port()
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = str(tree)
+    figures: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        pickled = folder / "pickled"
+        settings = (
+            "camera.source=pattern", "camera.rate_hz=30", "camera.width=640", "camera.height=480",
+            "daemon.flight=always", f"stream.listen=127.0.0.1:{free_port()}",
+            f"link.url=udpin:127.0.0.1:{port}", "feedback.mode=odometry",
+        )  # fmt: skip
+        autopilot = FakeAutopilot("ardupilot", f"udpout:127.0.0.1:{port}")
+        program = "-c", COUNTING.format(path=str(pickled))
+        with (
+            contextlib.redirect_stdout(sys.stderr),
+            Daemon(folder, *settings, program=program) as daemon, autopilot,
+        ):  # fmt: skip
+            daemon.until(lambda health: health["tracker"] == "tracking", UP_S)
+            time.sleep(SETTLE_S)
+            process = psutil.Process(daemon._running.pid)
+            first, first_n = cpu_and_memory(process), int(pickled.read_text())
+            began_s = time.monotonic()
+            rows: list[dict[str, Any]] = []
+            while time.monotonic() < began_s + seconds:
+                time.sleep(5.0)
+                rows.append(daemon.status())
+            last, last_n = cpu_and_memory(process), int(pickled.read_text())
+            took_s = time.monotonic() - began_s
+            for each, (cpu_s, mb) in last.items():
+                figures[f"{each}: cores"] = (cpu_s - first.get(each, (0, 0))[0]) / took_s
+                figures[f"{each}: MB"] = mb
+            figures["all: cores"] = sum(v for k, v in figures.items() if k.endswith("cores"))
+            figures["all: MB"] = sum(v for k, v in figures.items() if k.endswith("MB"))
+            figures["daemon pickles, MB/s"] = (last_n - first_n) / took_s / 1e6
+            stages = [stage for row in rows for stage in row["stages"]]
+            pose = [stage for stage in stages if stage["name"] == "localisation"]
+            for key in ("rate_hz", "latency_p50_ms", "latency_p95_ms"):
+                figures[f"pose {key}"] = float(np.median([each[key] for each in pose]))
+            figures["loop p99 ms"] = float(np.median([row["loop_delay_p99_ms"] for row in rows]))
+            figures["dropped"] = sum(stage["n_dropped"] for stage in rows[-1]["stages"])
+    if before is None:
+        del os.environ["PYTHONPATH"]
+    else:
+        os.environ["PYTHONPATH"] = before
+    return figures
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--against", type=Path)
+    arguments = parser.parse_args()
+    trees = [Path(__file__).parents[2]] + ([arguments.against] if arguments.against else [])
+    found: dict[Path, list[dict[str, float]]] = {tree: [] for tree in trees}
+    for _ in range(arguments.rounds):
+        for tree in trees:
+            found[tree].append(measured(tree.absolute(), arguments.seconds))
+    keys = sorted({key for runs in found.values() for run in runs for key in run})
+    print("| |" + " | ".join(tree.absolute().name for tree in trees) + " |")
+    for key in keys:
+        cells = []
+        for tree in trees:
+            values = [run[key] for run in found[tree] if key in run]
+            cells.append(f"{np.median(values):.3g}" if values else "")
+        print(f"| {key} | " + " | ".join(cells) + " |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""Messages between processes: what is closed comes out the same, and is freed."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.geometry.transforms import Pose
+from companion.messages import Bytes, Frame, MapUpdate, Track, TrackState
+from companion.runtime.parcel import INLINE_BYTES, Parcel
+
+Ends = tuple[socket.socket, socket.socket]
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        yield ours, theirs
+
+
+def frame(rng: np.random.Generator, width: int = 640, height: int = 480) -> Frame:
+    def pixels(*shape: int) -> Bytes:
+        return rng.integers(0, 256, shape, dtype=np.uint8)
+
+    return Frame(7, 123_456, pixels(height, width), pixels(height, width, 3))
+
+
+def n_descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+@pytest.mark.parametrize("width", [16, 640])
+def test_a_frame_crosses_whole(ends: Ends, rng: np.random.Generator, width: int) -> None:
+    sent = frame(rng, width)
+    Parcel.of(sent).send(ends[0])
+    parcel = Parcel.receive(ends[1])
+    assert (parcel.kind, parcel.t_ns) == ("Frame", 123_456)
+    got = parcel.open()
+    assert (got.seq, got.t_ns) == (7, 123_456)
+    assert np.array_equal(got.grey, sent.grey) and np.array_equal(got.rgb, sent.rgb)
+
+
+def test_small_and_large_messages_come_in_their_order(ends: Ends, rng: np.random.Generator) -> None:
+    given = [Track(1, 1, TrackState.LOST), frame(rng), Track(2, 2, TrackState.LOST), frame(rng)]
+    for message in given:
+        Parcel.of(message).send(ends[0])
+    got = [Parcel.receive(ends[1]) for _ in given]
+    assert [p.kind for p in got] == ["Track", "Frame", "Track", "Frame"]
+    assert [p.open().seq for p in got] == [1, 7, 2, 7]
+
+
+def test_a_map_of_many_small_arrays_crosses_whole(ends: Ends) -> None:
+    poses = {n: Pose(np.eye(3), np.array([n, 0.5, -1.0])) for n in range(2000)}
+    parcel = Parcel.of(MapUpdate(3, 4, poses, np.ones((5000, 3)), None))
+    assert parcel.n_bytes > INLINE_BYTES
+    parcel.send(ends[0])
+    got = Parcel.receive(ends[1]).open()
+    assert got.map_from_camera[1999].translation.tolist() == [1999, 0.5, -1.0]
+    assert got.points_map.shape == (5000, 3)
+
+
+def test_arrays_in_another_order_of_memory_cross_whole(rng: np.random.Generator) -> None:
+    whole = rng.random((300, 400))
+    for array in (whole.T, whole[::2, ::3], np.asfortranarray(whole), whole[:0]):
+        assert np.array_equal(Parcel.of(array).open(), array)
+
+
+def test_what_one_reader_writes_no_other_sees(rng: np.random.Generator) -> None:
+    parcel = Parcel.of(frame(rng))
+    first = parcel.open()
+    before = first.grey.copy()
+    first.grey[:] = 0
+    assert np.array_equal(parcel.open().grey, before)
+
+
+def test_memory_is_freed_with_its_last_reader(ends: Ends, rng: np.random.Generator) -> None:
+    before = n_descriptors()
+    for _ in range(50):
+        Parcel.of(frame(rng)).send(ends[0])
+        got = Parcel.receive(ends[1]).open()
+    assert n_descriptors() <= before + 2
+    del got
+    assert n_descriptors() == before
+
+
+def test_an_array_outlives_its_parcel(rng: np.random.Generator) -> None:
+    sent = frame(rng)
+    grey = Parcel.of(sent).open().grey
+    assert np.array_equal(grey, sent.grey)
+
+
+def test_the_end_of_the_sender_is_told(ends: Ends) -> None:
+    Parcel.of(Track(1, 1, TrackState.LOST)).send(ends[0])
+    ends[0].close()
+    assert Parcel.receive(ends[1]).kind == "Track"
+    with pytest.raises(EOFError):
+        Parcel.receive(ends[1])
+
+
+def test_a_reader_that_is_gone_is_an_error(ends: Ends, rng: np.random.Generator) -> None:
+    ends[1].close()
+    before = n_descriptors()
+    with pytest.raises(OSError):
+        Parcel.of(frame(rng)).send(ends[0])
+    assert n_descriptors() == before
