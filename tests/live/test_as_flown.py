@@ -1,0 +1,79 @@
+"""A recorded flight is flown again at the desk: the poses that were sent, to the byte."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.processes.flying import Flying
+from tests.support.processes.program import Run, replay
+
+FLY_S, LOADED_S = 8.0, 4.0
+BUSY = "while True: pass"
+
+
+@contextmanager
+def load() -> Iterator[None]:
+    """Twice as much to do as the machine has processors for, hence frames that are dropped."""
+    busy = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(4)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+def flown(folder: Path, codec: str) -> Path:
+    """A flight with load, and with a stage killed; its folder."""
+    with Flying(folder, f"recorder.codec={codec}", "recorder.jpeg_quality=90") as flying:
+        flying.take_off()
+        time.sleep(FLY_S)
+        flying.daemon.signal_stage("results", signal.SIGKILL)
+        with load():
+            time.sleep(LOADED_S)
+        flying.camera.on = False
+        time.sleep(1.0)
+        flying.camera.on = True
+        time.sleep(FLY_S)
+        n = len(flying.poses.stamp_us)
+        assert n > 100, f"{n} poses"
+        flying.autopilot.disarm()
+        flying.daemon.line("flight over", 60.0)
+        (path,) = flying.daemon.flown()
+        flying.daemon.stop()
+    return path
+
+
+def again(path: Path, out: Path) -> tuple[Run, dict[str, Any]]:
+    done = replay(path, out, "--as-flown")
+    assert done.status == 0, done.stdout + done.stderr
+    found: dict[str, Any] = json.loads((out / "as_flown.json").read_text())
+    return done, found
+
+
+@pytest.mark.alone
+def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> None:
+    path = flown(tmp_path, "png")
+    done, found = again(path, tmp_path / "again")
+    assert found["tracked_again"]
+    assert found["frames_same"] == found["frames"] > 100
+    assert found["same"] == found["sent"] == found["made_again"] > 100
+    assert "the same to the byte" in done.stdout
+
+
+@pytest.mark.alone
+def test_compressed_images_give_the_decisions_of_the_gate_again(tmp_path: Path) -> None:
+    path = flown(tmp_path, "mjpeg")
+    _, found = again(path, tmp_path / "again")
+    assert not found["tracked_again"]
+    assert found["same"] == found["sent"] == found["made_again"] > 100
