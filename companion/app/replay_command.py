@@ -26,7 +26,7 @@ from companion.runtime.gaps import with_gap_warnings
 from companion.runtime.in_order import InOrder, in_order_of_time, in_words
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stages import Stage, stage_named
-from companion.streaming.viewer import LiveViewer
+from companion.streaming.live_viewer import LiveViewer
 from companion.timing.clock import monotonic_s
 from drivers.flight import ENDS_EARLY, Flight
 from drivers.open_flight import open_flight

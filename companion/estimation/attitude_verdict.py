@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.estimation.attitude_following import RotationAgreement, RotationComparison
+from companion.estimation.attitude_history import AttitudeHistory
 from companion.estimation.map_tilt import MapTilt, RotationOf
-from companion.estimation.motion_filter import AttitudeHistory
 from companion.geometry.transforms import Array, angle_between
 from companion.messages import AttitudeSample, Warned
 

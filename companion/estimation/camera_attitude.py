@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.estimation.attitude_history import AttitudeHistory
 from companion.estimation.attitude_verdict import AttitudeVerdict
 from companion.estimation.map_tilt import RotationOf
-from companion.estimation.motion_filter import AttitudeHistory
 from companion.estimation.mount_estimation import RATE_STEP_NS, MountEstimate, MountEstimator
 from companion.geometry.transforms import Array, Pose, angle_between, rotation_from_vector
 from companion.messages import AttitudeSample, Track, Warned

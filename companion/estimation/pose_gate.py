@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.config import FeedbackConfig
-from companion.estimation.motion_filter import MAX_EXTRAPOLATION_NS, AttitudeHistory
+from companion.estimation.attitude_history import MAX_EXTRAPOLATION_NS, AttitudeHistory
 from companion.estimation.reset_counter import ResetCounter
 from companion.geometry.transforms import Array, Pose
 from companion.messages import AttitudeSample, Odometry, TrackState

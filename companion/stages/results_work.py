@@ -10,7 +10,6 @@ from typing import Any
 from companion.errors import StageError
 from companion.messages import Message, PointChunk
 from companion.products.flight_result import FlightResult
-from companion.products.report.write_results import write_results
 from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
 from companion.runtime.stage_work import Work
 from companion.stages.cloud_snapshots import CloudSnapshots
@@ -48,6 +47,9 @@ class _Results(Work):
         return self._snapshots.step()
 
     def finish(self, finish: Finish) -> Iterable[Message]:
+        # plots are made at the end only: until then their library need not be in memory
+        from companion.products.report.write_results import write_results
+
         try:
             self._open.close()
         finally:  # a viewer file that cannot be written is no reason to lose the results

@@ -58,7 +58,7 @@ def decisions_of(recording: Recording) -> Decisions:
     stream = MavlinkStream()
     take: dict[str, Callable[[int, bytes], None]] = {
         TRACKING: lambda t_ns, data: found.frames.append(_of(FrameTracked, t_ns, data)),
-        GATE: lambda t_ns, data: found.gate.append(_of(GateStep, t_ns, data)),
+        GATE: lambda t_ns, data: found.gate.append(step_of(t_ns, data)),
         SENT: lambda t_ns, data: found.sent.extend(_poses(stream, data, found.config)),
     }
     for number in range(len(recording.found.chunks)):
@@ -84,6 +84,12 @@ def payloads_of(pose: PoseToSend, mode: str) -> list[tuple[int, bytes]]:
     codec = mavlink.MAVLink(None)
     packed = b"".join(bytes(each.pack(codec)) for each in pose_messages(pose, mode))
     return [(packet.message_id, packet.payload) for packet in MavlinkStream().feed(packed, 0)]
+
+
+def step_of(t_ns: int, data: bytes) -> GateStep:
+    """A recorded step of the gate."""
+    step: GateStep = _of(GateStep, t_ns, data)
+    return step
 
 
 def _of(kind: type[Any], t_ns: int, data: bytes) -> Any:

@@ -14,7 +14,7 @@ import psutil
 
 from companion.config import StreamConfig, ViewerConfig
 from companion.messages import PointChunk
-from companion.streaming.viewer import LiveViewer
+from companion.streaming.live_viewer import LiveViewer
 from tests.support.flights.message_log import MessageLog
 
 

@@ -25,7 +25,7 @@ from companion.config import StreamConfig, ViewerConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from companion.messages import SPANS_REACH, KeyframeAdded, MapUpdate, Track, TrackState
-from companion.streaming.viewer import LiveViewer
+from companion.streaming.live_viewer import LiveViewer
 from companion.streaming.viewer.web_proxy import free_ports
 from tests.support.flights import flown
 

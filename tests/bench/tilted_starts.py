@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import Config
+from companion.estimation.attitude_history import AttitudeHistory
 from companion.estimation.localisation import LocalisationStage
-from companion.estimation.motion_filter import AttitudeHistory
 from companion.estimation.pose_gate import MAX_TILT_ERROR_RAD
 from companion.messages import AttitudeSample, Frame, Odometry, TrackState, Warned
 from companion.runtime.in_order import in_order_of_time

@@ -14,7 +14,7 @@ import pytest
 
 from companion.config import StreamConfig, ViewerConfig
 from companion.messages import Bytes
-from companion.streaming.viewer import LiveViewer
+from companion.streaming.live_viewer import LiveViewer
 from companion.streaming.viewer.drawing import COLOUR_AUTOPILOT, COLOUR_PATH
 from companion.streaming.viewer.layout import BACKGROUND
 from companion.streaming.viewer.screen import GRPC_PORT, listens

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from companion.config import Config
+from companion.estimation.attitude_history import AttitudeHistory
 from companion.estimation.attitude_verdict import REINITIALISED
 from companion.estimation.localisation import LocalisationStage
-from companion.estimation.motion_filter import AttitudeHistory
 from companion.geometry.transforms import (
     quaternion_from_rotation,
     rotation_from_quaternion,

@@ -15,7 +15,8 @@ from companion.geometry.camera import Camera
 from companion.health import StageHealth
 from companion.messages import Frame
 from companion.runtime.parcel import Parcel
-from companion.streaming.viewer import LiveViewer, Watched
+from companion.streaming.live_viewer import LiveViewer
+from companion.streaming.scene_encoder import Watched
 from companion.timing.clock import monotonic_s
 
 LOOK_S = 0.5

@@ -9,7 +9,6 @@ from companion.streaming.scene_encoder import Watched
 from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.file_viewer import FileViewer
 from companion.streaming.viewer.ground_viewer import show
-from companion.streaming.viewer.live_viewer import LiveViewer
 from companion.streaming.viewer.screen import Screen
 
-__all__ = ["Colours", "FileViewer", "LiveViewer", "Screen", "Watched", "show"]
+__all__ = ["Colours", "FileViewer", "Screen", "Watched", "show"]

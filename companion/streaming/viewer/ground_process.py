@@ -9,9 +9,9 @@ import threading
 
 from companion.errors import InputError
 from companion.streaming.ground_link import GroundLink
+from companion.streaming.live_viewer import READY
 from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.ground_viewer import show
-from companion.streaming.viewer.live_viewer import READY
 from companion.streaming.viewer.screen import Screen
 from companion.streaming.viewer.web_proxy import LOOPBACK
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from companion.estimation.attitude_history import AttitudeHistory
 from companion.estimation.attitude_verdict import (
     BODY_FIXED_AGAIN,
     MAX_REINITIALISATIONS,
@@ -18,7 +19,6 @@ from companion.estimation.attitude_verdict import (
     AttitudeVerdict,
 )
 from companion.estimation.map_tilt import MAX_MOUNT_RAD
-from companion.estimation.motion_filter import AttitudeHistory
 from companion.geometry.transforms import (
     Array,
     quaternion_from_euler,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.motion_filter import AttitudeHistory, MotionFilter
+from companion.estimation.attitude_history import AttitudeHistory
+from companion.estimation.motion_filter import MotionFilter
 from companion.geometry.transforms import (
     Pose,
     angle_between,

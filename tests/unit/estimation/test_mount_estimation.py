@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.motion_filter import AttitudeHistory
+from companion.estimation.attitude_history import AttitudeHistory
 from companion.estimation.mount_estimation import MountEstimate, MountEstimator
 from companion.geometry.transforms import (
     Array,

@@ -22,7 +22,7 @@ from companion.messages import Frame
 from companion.runtime.message_size import size_bytes
 from companion.streaming.ground_link import GroundLink
 from companion.streaming.items import Item, PictureItem, PointsItem, PoseItem, StatusItem
-from companion.streaming.viewer import LiveViewer
+from companion.streaming.live_viewer import LiveViewer
 from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.screen import GRPC_PORT, WEB_PORT, listens
 from tests.support.flights import flown
