@@ -15,7 +15,11 @@ from companion.app.progress import Progress
 from companion.config import Config
 from companion.errors import FlightError, StageError
 from companion.estimation.gate_journal import poses_as_sent
-from companion.estimation.localisation import LocalisationStage
+from companion.estimation.localisation import (
+    MAP_NOT_RECOGNISED,
+    MAP_RESUMED,
+    LocalisationStage,
+)
 from companion.geometry.camera import Camera
 from companion.messages import AttitudeSample, Frame, Odometry
 from companion.products.atomic_file import write_atomically
@@ -40,6 +44,11 @@ def replay_as_flown(
     try:
         told = decisions_of(flight.recording)
         of_frame = told.odometry
+        if any(event.startswith((MAP_RESUMED, MAP_NOT_RECOGNISED)) for event in told.events):
+            raise FlightError(
+                f"{path}: this flight began with the map of a process before it, which is not in "
+                "the recording"
+            )
         if told.lossless:
             n = flight.n_frames_between(flight.start_ns, flight.stop_ns)
             progress.start(n)

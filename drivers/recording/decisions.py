@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import Config
@@ -22,7 +23,7 @@ from drivers.mavlink.wire.packet_stream import MavlinkStream
 from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recorder import CONFIG_TOML, NOTES
 from drivers.recording.recording import Recording
-from drivers.recording.recording_topics import GATE, ODOMETRY, SENT, TRACKING, MavlinkBytes
+from drivers.recording.recording_topics import EVENTS, GATE, ODOMETRY, SENT, TRACKING, MavlinkBytes
 
 POSES = {
     mavlink.MAVLINK_MSG_ID_ODOMETRY, mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE,
@@ -43,6 +44,8 @@ class Decisions:
     gate: list[GateStep] = field(default_factory=list)
     odometry: dict[int, Odometry] = field(default_factory=dict)
     """By the number of the frame."""
+    events: list[str] = field(default_factory=list)
+    """Warnings and good news, in words."""
     sent: list[tuple[int, bytes]] = field(default_factory=list)
     """Id and payload of the messages with poses that were sent."""
 
@@ -59,6 +62,7 @@ def decisions_of(recording: Recording) -> Decisions:
     take: dict[str, Callable[[int, bytes], None]] = {
         TRACKING: lambda t_ns, data: found.frames.append(_of(FrameTracked, t_ns, data)),
         GATE: lambda t_ns, data: found.gate.append(step_of(t_ns, data)),
+        EVENTS: lambda t_ns, data: found.events.append(Log.FromString(data).message),
         SENT: lambda t_ns, data: found.sent.extend(_poses(stream, data, found.config)),
     }
     for number in range(len(recording.found.chunks)):

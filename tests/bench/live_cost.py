@@ -27,7 +27,7 @@ from tests.support.autopilot.fake_wire import free_port
 from tests.support.processes.daemon_process import Daemon
 
 COUNTING = """
-import sys, threading, time, pickle, _pickle
+import os, sys, threading, time, pickle
 from multiprocessing import connection
 n = [0]
 def counted(function, length):
@@ -50,8 +50,9 @@ pickle.dump = dump_counted
 def tell():
     while True:
         time.sleep(0.5)
-        with open({path!r}, "w") as file:
+        with open({path!r} + ".new", "w") as file:
             file.write(str(n[0]))
+        os.replace({path!r} + ".new", {path!r})
 threading.Thread(target=tell, daemon=True).start()
 from companion.runtime.governor import Governor
 Governor.step = lambda self, t_ns, pressure: False
