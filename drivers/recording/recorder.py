@@ -13,20 +13,7 @@ from companion.config_file import to_toml, without_passwords
 from companion.errors import StageError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Similarity
-from companion.messages import (
-    ArmedSample,
-    AttitudeSample,
-    Frame,
-    HeightSample,
-    ImuSample,
-    MapUpdate,
-    Message,
-    Odometry,
-    PointChunk,
-    PositionSample,
-    RangeSample,
-    Warned,
-)
+from companion.messages import Frame, MapUpdate, Message, Odometry, PointChunk, Telemetry, Warned
 from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
 from drivers.recording.camera_document import calibration_bytes, camera_document
 from drivers.recording.disk_writer import DiskWriter, Entry
@@ -63,9 +50,6 @@ from drivers.recording.recording_topics import (
 CAMERA_JSON, CONFIG_TOML = "camera.json", "config.toml"
 NOTES = "companion"
 """Metadata: versions and other facts known at the beginning."""
-TELEMETRY = (
-    AttitudeSample, ImuSample, PositionSample, RangeSample, HeightSample, ArmedSample,
-)  # fmt: skip
 _TIMESYNC_ID, _TIMES = 111, struct.Struct("<qq")
 MOST_ROUND_TRIP_NS = 2_000_000_000
 
@@ -126,7 +110,7 @@ class Recorder:
             self._link(message)
         elif isinstance(message, Frame):
             self._frame(message)
-        elif isinstance(message, TELEMETRY):
+        elif isinstance(message, Telemetry):
             self._put(sample_topic(message), message.t_ns, sample_bytes(message))
         elif isinstance(message, Odometry):
             self._put(ODOMETRY, message.t_ns, odometry_bytes(message), message.seq)
