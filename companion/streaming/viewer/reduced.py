@@ -21,10 +21,11 @@ from companion.messages import (
     Warned,
 )
 from companion.streaming.scene_encoder import Watched
+from companion.streaming.status_facts import CURVES
 
 SHOWN = (
     Frame, Track, Odometry, MapUpdate, PointChunk, DepthMap, KeyframeAdded, PositionSample, Warned,
-    Health, GeoOrigin,
+    Health, GeoOrigin, *CURVES,
 )  # fmt: skip
 NO_FLOATS = np.zeros((0, 0), np.float32)
 NO_BYTES = np.zeros((0, 0), np.uint8)
