@@ -108,7 +108,21 @@ class ArmedSample:
     armed: bool
 
 
-Telemetry = AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
+@dataclass(frozen=True, slots=True, eq=False)
+class AirspeedSample:
+    """Indicated airspeed: by a pitot tube, for air as dense as at sea level, not calibrated."""
+
+    schema: ClassVar[Schema] = Schema(
+        "airspeed", "Airspeed indicated by a pitot tube, not calibrated", "m/s indicated airspeed"
+    )
+    t_ns: int
+    indicated_m_s: float
+
+
+Telemetry = (
+    AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
+    | AirspeedSample
+)  # fmt: skip
 TELEMETRY: tuple[type[Telemetry], ...] = get_args(Telemetry)
 """In order of their channels in a recording."""
 FIELDS = {kind: fields_of(kind) for kind in TELEMETRY}

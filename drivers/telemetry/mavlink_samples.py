@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import LinkConfig
 from companion.geometry.transforms import Array, quaternion_from_euler
 from companion.messages import (
+    AirspeedSample,
     AttitudeSample,
     HeightSample,
     ImuSample,
@@ -24,6 +25,8 @@ from companion.messages import (
 from drivers.telemetry.telemetry_log import GeodeticFix
 
 STANDARD_GRAVITY = 9.80665
+SEA_LEVEL_KG_M3 = 1.225
+"""Density of the air at sea level in the standard atmosphere (ISO 2533)."""
 GPS_RANGE_ERROR_M = 1.5
 """One sigma of a GPS position at dilution 1, where the receiver states no accuracy of its own."""
 UNKNOWN_16 = 65535
@@ -189,6 +192,18 @@ def _pressure(message: Any) -> Telemetry | None:
     return HeightSample(0, height_from_pressure(message.press_abs * 100))
 
 
+def _airspeed(message: Any) -> Telemetry | None:
+    """Indicated airspeed, by the pressure of a pitot tube; ARSPD_RATIO is not in it.
+
+    VFR_HUD and AIRSPEED have no time; the first is the ground speed where ArduCopter has no tube,
+    and PX4 does not send the second.
+    """
+    if message.press_diff == 0:  # what both firmwares send without a pitot tube
+        return None
+    pressure_pa = max(message.press_diff * 100, 0.0)  # below is noise
+    return AirspeedSample(0, math.sqrt(2 * pressure_pa / SEA_LEVEL_KG_M3))
+
+
 Reader = Callable[[Any], Telemetry | GeodeticFix | None]
 READERS: dict[int, tuple[Reader, ...]] = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: (_attitude,),
@@ -201,7 +216,7 @@ READERS: dict[int, tuple[Reader, ...]] = {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: (_global_position,),
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: (_gps,),
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: (_range,),
-    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: (_pressure,),
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: (_pressure, _airspeed),
 }
 """Readers of each message type: samples without a time yet, None without a valid value."""
 
