@@ -23,13 +23,11 @@ from companion.geometry.transforms import Array, Pose
 from companion.messages import (
     AttitudeSample,
     Frame,
-    HeightSample,
     KeyframeAdded,
     MapUpdate,
     Message,
     Odometry,
-    PositionSample,
-    RangeSample,
+    Telemetry,
     Track,
     TrackState,
     Warned,
@@ -113,7 +111,7 @@ class LocalisationStage:
             return self._frame(message)
         if isinstance(message, AttitudeSample):
             self._attitude.add(message)
-        elif isinstance(message, (PositionSample, RangeSample, HeightSample)):
+        elif isinstance(message, Telemetry):
             self._georeferencer.take(message)
         return []
 
