@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array, Pose, Similarity
+from companion.telemetry_schema import QUATERNION, VECTOR, Schema, fields_of
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -34,18 +35,24 @@ class Frame:
 class AttitudeSample:
     """Attitude of the autopilot: quaternion w x y z, body rates (3,) or None."""
 
+    schema: ClassVar[Schema] = Schema(
+        "attitude", "Attitude of the body (FRD) in NED: quaternion w x y z; body rates, rad/s"
+    )
     t_ns: int
-    ned_from_body: Array
-    rates_body_rad_s: Array | None = None
+    ned_from_body: Array = field(metadata=QUATERNION)
+    rates_body_rad_s: Array | None = field(default=None, metadata=VECTOR)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
     """Angular rate and specific force in the body frame, (3,) each."""
 
+    schema: ClassVar[Schema] = Schema(
+        "imu", "Angular rate and specific force in the body frame (FRD)"
+    )
     t_ns: int
-    gyro_rad_s: Array
-    accel_m_s2: Array
+    gyro_rad_s: Array = field(metadata=VECTOR)
+    accel_m_s2: Array = field(metadata=VECTOR)
 
 
 class PositionSource(Enum):
@@ -63,10 +70,11 @@ class PositionSample:
     All samples of a source share one origin, the reader's `GeoOrigin` where that is known.
     """
 
+    schema: ClassVar[Schema] = Schema("position", "Position and velocity of the body in local NED")
     t_ns: int
     source: PositionSource
-    position_ned_m: Array
-    velocity_ned_m_s: Array | None = None
+    position_ned_m: Array = field(metadata=VECTOR)
+    velocity_ned_m_s: Array | None = field(default=None, metadata=VECTOR)
     sigma_horizontal_m: float | None = None
     sigma_vertical_m: float | None = None
 
@@ -75,6 +83,7 @@ class PositionSample:
 class RangeSample:
     """Distance along the body's down axis to the ground, by rangefinder."""
 
+    schema: ClassVar[Schema] = Schema("range", "Distance to the ground along the body's down axis")
     t_ns: int
     distance_m: float
 
@@ -83,6 +92,9 @@ class RangeSample:
 class HeightSample:
     """Barometric height above an arbitrary, constant level; up is positive."""
 
+    schema: ClassVar[Schema] = Schema(
+        "height", "Barometric height above an arbitrary level, up positive"
+    )
     t_ns: int
     height_m: float
 
@@ -91,11 +103,30 @@ class HeightSample:
 class ArmedSample:
     """Whether the motors are armed."""
 
+    schema: ClassVar[Schema] = Schema("armed", "Whether the motors are armed")
     t_ns: int
     armed: bool
 
 
-Telemetry = AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
+@dataclass(frozen=True, slots=True, eq=False)
+class AirspeedSample:
+    """Indicated airspeed: by a pitot tube, for air as dense as at sea level, not calibrated."""
+
+    schema: ClassVar[Schema] = Schema(
+        "airspeed", "Airspeed indicated by a pitot tube, not calibrated", "m/s indicated airspeed"
+    )
+    t_ns: int
+    indicated_m_s: float
+
+
+Telemetry = (
+    AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
+    | AirspeedSample
+)  # fmt: skip
+TELEMETRY: tuple[type[Telemetry], ...] = get_args(Telemetry)
+"""In order of their channels in a recording."""
+FIELDS = {kind: fields_of(kind) for kind in TELEMETRY}
+"""Fields of each, without its time."""
 
 
 class TrackState(Enum):
@@ -377,45 +408,7 @@ class ClockReport:
     n_reboots: int
 
 
-@dataclass(frozen=True, slots=True)
-class LinkBytes:
-    """Bytes of the autopilot's wire; `outgoing` are those sent, ours or clients'."""
-
-    t_ns: int
-    monotonic_ns: int
-    outgoing: bool
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class GateStep:
-    """One call of the pose gate, by which its poses can be made again; see `gate_journal`.
-
-    `t_ns` is the time of the call, `n_attitudes` of the autopilot's had come since the flight
-    began; `counter` is that of resets afterwards, and whether this boot was sent a pose. `sent`
-    tells whether the autopilot was heard, so that a pose was sent.
-    """
-
-    t_ns: int
-    what: str
-    n_attitudes: int
-    counter: int
-    counter_sent: bool
-    sent: bool
-    values: Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class HealthNote:
-    """Health of the daemon: status document, state of the clock filter, origin if known."""
-
-    t_ns: int
-    document: Mapping[str, Any]
-
-
 Message = (
     Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
-    | PointChunk | Warned | FrameTracked | Georeferenced | LinkBytes | HealthNote | GateStep
+    | PointChunk | Warned | Georeferenced | FrameTracked
 )  # fmt: skip
-
-Details = Mapping[str, Any]

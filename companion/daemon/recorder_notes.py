@@ -9,7 +9,7 @@ from typing import Any
 
 from companion.daemon.flights.flights import Flights
 from companion.daemon.health_watch import HealthWatch
-from companion.messages import HealthNote, LinkBytes
+from companion.flight_notes import HealthNote, LinkBytes
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 

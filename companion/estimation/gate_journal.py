@@ -14,7 +14,8 @@ from dataclasses import asdict
 from companion.config import FeedbackConfig
 from companion.estimation.pose_gate import PoseGate, PoseToSend
 from companion.estimation.reset_counter import ResetCounter
-from companion.messages import AttitudeSample, GateStep, Odometry
+from companion.flight_notes import GateStep
+from companion.messages import AttitudeSample, Odometry
 
 BEGIN, FRAME, DUE = "begin", "frame", "due"
 BOOTED, RESTARTED, WITHHELD, LIMITS = "booted", "restarted", "withheld", "limits"

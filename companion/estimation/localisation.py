@@ -24,13 +24,11 @@ from companion.messages import (
     AttitudeSample,
     Frame,
     FrameTracked,
-    HeightSample,
     KeyframeAdded,
     MapUpdate,
     Message,
     Odometry,
-    PositionSample,
-    RangeSample,
+    Telemetry,
     Track,
     TrackState,
     Warned,
@@ -80,7 +78,7 @@ class LocalisationStage:
         self._last: Track | None = None
         """The last frame with a pose, in the frame of the active segment."""
         self._t_ns = 0
-        self._samples: list[Message] = []
+        self._samples: list[Telemetry] = []
         """Telemetry since the last frame: taken with the next, while nothing is mapped."""
         self._n_samples = 0
         self._pruned_ns: int | None = None
@@ -117,14 +115,15 @@ class LocalisationStage:
         """
         if isinstance(message, Frame):
             return self._frame(message)
-        self._samples.append(message)
+        if isinstance(message, Telemetry):
+            self._samples.append(message)
         return []
 
     def _take_samples(self) -> None:
         for sample in self._samples:
             if isinstance(sample, AttitudeSample):
                 self._attitude.add(sample)
-            elif isinstance(sample, (PositionSample, RangeSample, HeightSample)):
+            else:
                 self._georeferencer.take(sample)
         self._n_samples += len(self._samples)
         self._samples.clear()

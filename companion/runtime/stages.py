@@ -9,30 +9,28 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
-from typing import get_args
 
+from companion.flight_notes import GateStep, HealthNote, LinkBytes
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import (
+    TELEMETRY,
     DepthMap,
     Frame,
     FrameTracked,
-    GateStep,
-    HealthNote,
     KeyframeAdded,
-    LinkBytes,
     LoopClosed,
     MapUpdate,
     Odometry,
     PointChunk,
     PositionSample,
-    Telemetry,
     Track,
     Warned,
 )
 from companion.runtime.mailbox import DropPolicy
 
-TELEMETRY: tuple[type, ...] = get_args(Telemetry)
+CURVES = tuple(kind for kind in TELEMETRY if kind.schema.curve)
+"""Telemetry of which viewers show a curve."""
 
 
 class Frames(Enum):
@@ -101,8 +99,8 @@ STAGES = (
     Stage(
         "viewers",
         (
-            Frame, PositionSample, Warned, Health, GeoOrigin, Odometry, Track, KeyframeAdded,
-            MapUpdate, DepthMap, PointChunk,
+            Frame, PositionSample, *CURVES, Warned, Health, GeoOrigin, Odometry, Track,
+            KeyframeAdded, MapUpdate, DepthMap, PointChunk,
         ),
         nice=10, frames=Frames.EVERY, answer_s=30.0, finish_s=3.0, with_flight=True,
     ),

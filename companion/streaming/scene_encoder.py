@@ -22,6 +22,7 @@ from companion.messages import (
     PointChunk,
     PositionSample,
     PositionSource,
+    Telemetry,
     Track,
     TrackState,
     Warned,
@@ -133,6 +134,8 @@ class SceneEncoder:
             out += self._placement.added(message)
         elif isinstance(message, PositionSample):
             out += self._autopilot(message)
+        elif isinstance(message, Telemetry):
+            self._facts.measured(message)
         elif isinstance(message, Warned):
             text = f"{message.what}: {message.detail}" if message.detail else message.what
             self._facts.warned(message)

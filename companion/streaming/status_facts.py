@@ -9,9 +9,11 @@ from collections import deque
 from typing import Any
 
 from companion.health import Health
-from companion.messages import MapUpdate, Track, Warned
+from companion.messages import FIELDS, TELEMETRY, MapUpdate, Telemetry, Track, Warned
 from companion.streaming.items import Shown
 
+CURVES = {kind: f"telemetry/{kind.schema.name}" for kind in TELEMETRY if kind.schema.curve}
+"""Name of the fact, and of the plot, of telemetry that has a curve."""
 RATE_OVER_NS = 2_000_000_000
 RECENT_NS = 30_000_000_000
 """Time for which a warning is shown."""
@@ -31,6 +33,7 @@ class StatusFacts:
         self._n_points_in_all = 0
         self._update: MapUpdate | None = None
         self._warned: dict[str, int] = {}
+        self._measured: dict[str, float] = {}
         self._t_ns = 0
 
     def tracked(self, track: Track) -> None:
@@ -56,8 +59,15 @@ class StatusFacts:
             self._warned.pop(warning.what, None)
             self._warned[warning.what] = warning.t_ns
 
+    def measured(self, sample: Telemetry) -> None:
+        """Take telemetry."""
+        kind = type(sample)
+        if kind in CURVES:
+            self._measured[CURVES[kind]] = getattr(sample, FIELDS[kind][0].name)
+
     def facts(self, quality: int) -> dict[str, Any]:
-        """All values by name."""
+        """All values by name; telemetry once, so that a curve ends with its sensor."""
+        measured, self._measured = self._measured, {}
         found = self._update.georeference if self._update is not None else None
         span_ns = self._tracked[-1] - self._tracked[0] if len(self._tracked) > 1 else 0
         recent = [w for w, t in self._warned.items() if t > self._t_ns - RECENT_NS]
@@ -74,6 +84,7 @@ class StatusFacts:
             "n_keyframes": self._update.n_keyframes if self._update is not None else None,
             "n_points": self._n_points_in_all or None,
             "warnings": recent[-MOST_WARNINGS:] or None,
+            **measured,
         }
         if self.health is not None:
             facts.update(_of_health(self.health))

@@ -23,7 +23,7 @@ from companion.pilot_messages import PilotText
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.commands import NO_ANSWER, TRIES, Commands
-from drivers.mavlink.message_rates import MessageRates, wanted
+from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.status_text import TextLimit, status_text
 from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
 from drivers.mavlink.vehicle import Vehicle, is_autopilot, vehicle_of
@@ -31,7 +31,7 @@ from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.wire import run_together
 from drivers.system.within import within
 from drivers.telemetry.live_samples import LiveSamples
-from drivers.telemetry.mavlink_samples import SAMPLE_OF
+from drivers.telemetry.mavlink_samples import READERS, wanted
 
 FIRST_SYSTEM = 1
 """System id that we use until the vehicle is heard: on UDP it may send only then."""
@@ -45,7 +45,7 @@ AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 REFUSALS = (
     mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
 )  # fmt: skip
-COUNTED = {*SAMPLE_OF, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME}
+COUNTED = {*READERS, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME}
 
 Take = Callable[[Any, int], None]
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
-from companion.config import LinkConfig
+from drivers.telemetry.mavlink_samples import Wanted
 
 CHECK_NS = 3_000_000_000
 """Window in which a rate is measured."""
@@ -15,47 +13,7 @@ SHORT = 0.5
 """Share of the requested rate below which it counts as missing."""
 FIRST_AGAIN_NS, MOST_AGAIN_NS = 3_000_000_000, 60_000_000_000
 """Backoff of repeated requests, doubling."""
-GPS_HZ, TIME_HZ = 5.0, 1.0
-"""More than receivers give, and enough to map GPS time to boot time."""
 NEVER_NS = 2**62
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """A quantity: message types that carry it, best first, and the rate needed."""
-
-    ids: tuple[int, ...]
-    rate_hz: float
-    always: bool = True
-    """Whether it is always sent; a position or a range may be unknown."""
-
-
-def wanted(config: LinkConfig) -> list[Wanted]:
-    """Quantities that the samples of a flight need."""
-    # both firmwares have all of these; ArduPilot's older versions lack the first of some
-    rates = [
-        Wanted(
-            (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_ATTITUDE),
-            config.attitude_hz,
-        ),
-        Wanted(
-            (
-                mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
-                mavlink.MAVLINK_MSG_ID_SCALED_IMU,
-                mavlink.MAVLINK_MSG_ID_RAW_IMU,
-            ),
-            config.imu_hz,
-        ),
-        Wanted((mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,), config.position_hz, always=False),
-        Wanted((mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,), config.position_hz, always=False),
-        Wanted(
-            (mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,), min(config.position_hz, GPS_HZ), always=False
-        ),
-        Wanted((mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,), config.height_hz),
-        Wanted((mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,), config.height_hz, always=False),
-        Wanted((mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,), TIME_HZ),
-    ]
-    return [each for each in rates if each.rate_hz > 0]
 
 
 @dataclass(slots=True)

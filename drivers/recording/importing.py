@@ -15,7 +15,7 @@ from drivers.recording.camera_document import calibration_bytes, camera_document
 from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.picture_codec import picture_encoder
-from drivers.recording.recorded_content import event_bytes, fields_bytes, json_bytes, sample_topic
+from drivers.recording.recorded_content import event_bytes, json_bytes, sample_bytes, sample_topic
 from drivers.recording.recorder import CAMERA_JSON, NOTES
 from drivers.recording.recording_topics import CALIBRATION, EVENTS, HEALTH, PROFILE, open_channels
 
@@ -86,6 +86,6 @@ def _write(flight: Flight, file: GrowingFile, on_progress: Callable[[int], None]
         elif isinstance(message, Warned):
             put(EVENTS, message.t_ns, event_bytes(message))
         else:
-            put(sample_topic(message), message.t_ns, fields_bytes(message))  # type: ignore[arg-type]
+            put(sample_topic(message), message.t_ns, sample_bytes(message))  # type: ignore[arg-type]
     writer.finish()
     return n

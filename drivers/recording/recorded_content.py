@@ -9,6 +9,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -17,43 +18,23 @@ from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
+from companion.flight_notes import GateStep, LinkBytes
 from companion.geometry.transforms import Similarity, quaternion_from_rotation
 from companion.messages import (
-    ArmedSample,
-    AttitudeSample,
+    FIELDS,
+    TELEMETRY,
     FrameTracked,
-    GateStep,
-    HeightSample,
-    ImuSample,
-    LinkBytes,
     Odometry,
     PointChunk,
-    PositionSample,
-    PositionSource,
-    RangeSample,
     Telemetry,
     Warned,
 )
-from drivers.recording.recording_topics import MavlinkBytes
+from companion.telemetry_schema import Field
+from drivers.recording.recording_topics import MavlinkBytes, telemetry_topic
 
 WORLD, MAP = "local_ned", "map"
 """Coordinate frames for Foxglove."""
-_SAMPLES: dict[str, type[Any]] = {
-    "/telemetry/attitude": AttitudeSample,
-    "/telemetry/imu": ImuSample,
-    "/telemetry/position": PositionSample,
-    "/telemetry/range": RangeSample,
-    "/telemetry/height": HeightSample,
-    "/telemetry/armed": ArmedSample,
-}
-_TOPIC_OF = {kind: topic for topic, kind in _SAMPLES.items()}
-_LISTS = {
-    "ned_from_body": 4, "rates_body_rad_s": 3, "gyro_rad_s": 3, "accel_m_s2": 3,
-    "position_ned_m": 3, "velocity_ned_m_s": 3,
-}  # fmt: skip
-_MAY_LACK = {
-    "rates_body_rad_s", "velocity_ned_m_s", "sigma_horizontal_m", "sigma_vertical_m",
-}  # fmt: skip
+_KINDS = {telemetry_topic(kind): kind for kind in TELEMETRY}
 
 
 def json_bytes(values: Mapping[str, Any]) -> bytes:
@@ -63,19 +44,23 @@ def json_bytes(values: Mapping[str, Any]) -> bytes:
 
 def sample_topic(sample: Telemetry) -> str:
     """Topic of a sample."""
-    return _TOPIC_OF[type(sample)]
+    return telemetry_topic(type(sample))
 
 
-def fields_bytes(message: Telemetry | FrameTracked | GateStep) -> bytes:
-    """A message of plain fields, without its time."""
-    return json_bytes(
-        {f.name: getattr(message, f.name) for f in dataclasses.fields(message) if f.name != "t_ns"}
-    )
+def sample_bytes(sample: Telemetry) -> bytes:
+    """A sample without its time."""
+    return json_bytes({f.name: getattr(sample, f.name) for f in FIELDS[type(sample)]})
+
+
+def decision_bytes(decision: FrameTracked | GateStep) -> bytes:
+    """A decision without its time."""
+    names = [each.name for each in dataclasses.fields(decision) if each.name != "t_ns"]
+    return json_bytes({name: getattr(decision, name) for name in names})
 
 
 def is_sample_topic(topic: str) -> bool:
     """Whether a topic holds telemetry."""
-    return topic in _SAMPLES
+    return topic in _KINDS
 
 
 def sample_of(topic: str, t_ns: int, data: bytes) -> Telemetry:
@@ -83,14 +68,8 @@ def sample_of(topic: str, t_ns: int, data: bytes) -> Telemetry:
     given = json.loads(data)
     if not isinstance(given, dict):
         raise ValueError("no object")
-    kind = _SAMPLES[topic]
-    values = {
-        f.name: _value(f.name, given.get(f.name))
-        for f in dataclasses.fields(kind)
-        if f.name != "t_ns"
-    }
-    sample: Telemetry = kind(t_ns=t_ns, **values)
-    return sample
+    kind = _KINDS[topic]
+    return kind(t_ns=t_ns, **{f.name: _value(f, given.get(f.name)) for f in FIELDS[kind]})
 
 
 def link_bytes(taken: LinkBytes) -> bytes:
@@ -185,7 +164,7 @@ def _plain(value: Any) -> Any:
         return [_plain(each) for each in value.tolist()]
     if isinstance(value, (list, tuple)):
         return [_plain(each) for each in value]
-    if isinstance(value, PositionSource):
+    if isinstance(value, Enum):
         return value.value
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
@@ -200,17 +179,17 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def _value(name: str, given: Any) -> Any:
-    if given is None and name in _MAY_LACK:
+def _value(field: Field, given: Any) -> Any:
+    if given is None and field.may_lack:
         return None
-    if name in _LISTS:
-        if not isinstance(given, list) or len(given) != _LISTS[name]:
-            raise ValueError(f"{name} is {given!r}")
+    if field.size is not None:
+        if not isinstance(given, list) or len(given) != field.size:
+            raise ValueError(f"{field.name} is {given!r}")
         return np.array([_number(each) for each in given])
-    if name == "source":
-        return PositionSource(given)
-    if name == "armed":
+    if field.words is not None:
+        return field.words(given)
+    if field.is_flag:
         if not isinstance(given, bool):
-            raise ValueError(f"{name} is {given!r}")
+            raise ValueError(f"{field.name} is {given!r}")
         return given
     return _number(given)

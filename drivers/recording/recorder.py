@@ -11,24 +11,17 @@ from pathlib import Path
 from companion.config import Config
 from companion.config_file import to_toml, without_passwords
 from companion.errors import StageError
+from companion.flight_notes import FlightNote, GateStep, HealthNote, LinkBytes
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Similarity
 from companion.messages import (
-    ArmedSample,
-    AttitudeSample,
     Frame,
     FrameTracked,
-    GateStep,
-    HealthNote,
-    HeightSample,
-    ImuSample,
-    LinkBytes,
     MapUpdate,
     Message,
     Odometry,
     PointChunk,
-    PositionSample,
-    RangeSample,
+    Telemetry,
     Warned,
 )
 from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
@@ -40,12 +33,13 @@ from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.picture_codec import EncodedPicture, picture_encoder
 from drivers.recording.recorded_content import (
     cloud_bytes,
+    decision_bytes,
     event_bytes,
-    fields_bytes,
     json_bytes,
     link_bytes,
     odometry_bytes,
     pose_bytes,
+    sample_bytes,
     sample_topic,
 )
 from drivers.recording.recording_topics import (
@@ -67,9 +61,6 @@ from drivers.recording.recording_topics import (
 CAMERA_JSON, CONFIG_TOML = "camera.json", "config.toml"
 NOTES = "companion"
 """Metadata: versions and other facts known at the beginning."""
-TELEMETRY = (
-    AttitudeSample, ImuSample, PositionSample, RangeSample, HeightSample, ArmedSample,
-)  # fmt: skip
 _TIMESYNC_ID, _TIMES = 111, struct.Struct("<qq")
 MOST_ROUND_TRIP_NS = 2_000_000_000
 
@@ -123,15 +114,15 @@ class Recorder:
         """Longest time to write and sync a chunk."""
         return self._disk.slowest_s
 
-    def take(self, message: Message | LinkBytes | HealthNote | GateStep) -> None:
+    def take(self, message: Message | FlightNote) -> None:
         """Record a message; of the map only the points, and those if configured."""
         self._newest_ns = max(self._newest_ns, message.t_ns)
         if isinstance(message, LinkBytes):
             self._link(message)
         elif isinstance(message, Frame):
             self._frame(message)
-        elif isinstance(message, TELEMETRY):
-            self._put(sample_topic(message), message.t_ns, fields_bytes(message))
+        elif isinstance(message, Telemetry):
+            self._put(sample_topic(message), message.t_ns, sample_bytes(message))
         elif isinstance(message, Odometry):
             self._put(ODOMETRY, message.t_ns, odometry_bytes(message), message.seq)
             pose = pose_bytes(message)
@@ -139,7 +130,7 @@ class Recorder:
                 self._put(POSE, message.t_ns, pose, message.seq)
         elif isinstance(message, FrameTracked | GateStep):
             topic = TRACKING if isinstance(message, FrameTracked) else GATE
-            self._put(topic, message.t_ns, fields_bytes(message))
+            self._put(topic, message.t_ns, decision_bytes(message))
         elif isinstance(message, Warned):
             self._put(EVENTS, message.t_ns, event_bytes(message))
         elif isinstance(message, HealthNote):

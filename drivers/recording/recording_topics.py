@@ -20,6 +20,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
+from companion.messages import FIELDS, TELEMETRY, ArmedSample, Telemetry
+from companion.telemetry_schema import Field
 from drivers.recording.mcap_writer import McapWriter
 
 PROFILE = "companion"
@@ -34,11 +36,17 @@ EVENTS, HEALTH = "/events", "/health"
 TRACKING, GATE = "/decisions/tracking", "/decisions/pose_gate"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
 """Topics of images, of which a flight has one."""
-ARMED = "/telemetry/armed"
-LASTING = frozenset({CALIBRATION, HEALTH, ARMED})
-"""Topics whose messages hold until the next one, which may never come."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
+
+
+def telemetry_topic(kind: type[Telemetry]) -> str:
+    """Topic of a kind of telemetry."""
+    return f"/telemetry/{kind.schema.name}"
+
+
+LASTING = frozenset({CALIBRATION, HEALTH, telemetry_topic(ArmedSample)})
+"""Topics whose messages hold until the next one, which may never come."""
 
 
 def _own_messages() -> descriptor_pb2.FileDescriptorProto:
@@ -82,6 +90,19 @@ NUMBERS = {"type": "array", "items": {"type": ["number", "null"]}}
 OBJECTS = {"type": "array", "items": OBJECT}
 INTEGER = {"type": "integer"}
 
+
+def _telemetry_json(kind: type[Telemetry]) -> _Json:
+    """JSON object of a kind of telemetry."""
+    properties = {field.name: _json_type(field) for field in FIELDS[kind]}
+    return _Json(f"companion.{kind.__name__}", kind.schema.says, properties)
+
+
+def _json_type(field: Field) -> Mapping[str, Any]:
+    if field.size is not None:
+        return NUMBERS
+    return FLAG if field.is_flag else TEXT if field.words is not None else NUMBER
+
+
 TOPICS: dict[str, Any] = {
     IMAGE: CompressedImage,
     VIDEO: CompressedVideo,
@@ -95,35 +116,7 @@ TOPICS: dict[str, Any] = {
         "Unix ns of our clock at asking and at the answer, and the autopilot's between",
         {"sent_ns": INTEGER, "autopilot_ns": INTEGER, "received_ns": INTEGER},
     ),
-    "/telemetry/attitude": _Json(
-        "companion.AttitudeSample",
-        "Attitude of the body (FRD) in NED: quaternion w x y z; body rates, rad/s",
-        {"ned_from_body": NUMBERS, "rates_body_rad_s": NUMBERS},
-    ),
-    "/telemetry/imu": _Json(
-        "companion.ImuSample",
-        "Angular rate and specific force in the body frame (FRD)",
-        {"gyro_rad_s": NUMBERS, "accel_m_s2": NUMBERS},
-    ),
-    "/telemetry/position": _Json(
-        "companion.PositionSample",
-        "Position and velocity of the body in local NED",
-        {
-            "source": TEXT, "position_ned_m": NUMBERS, "velocity_ned_m_s": NUMBERS,
-            "sigma_horizontal_m": NUMBER, "sigma_vertical_m": NUMBER,
-        },
-    ),
-    "/telemetry/range": _Json(
-        "companion.RangeSample", "Distance to the ground along the body's down axis",
-        {"distance_m": NUMBER},
-    ),
-    "/telemetry/height": _Json(
-        "companion.HeightSample", "Barometric height above an arbitrary level, up positive",
-        {"height_m": NUMBER},
-    ),
-    ARMED: _Json(
-        "companion.ArmedSample", "Whether the motors are armed", {"armed": FLAG}
-    ),
+    **{telemetry_topic(kind): _telemetry_json(kind) for kind in TELEMETRY},
     POSE: PoseInFrame,
     ODOMETRY: _Json(
         "companion.Odometry",

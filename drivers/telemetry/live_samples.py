@@ -20,7 +20,7 @@ from companion.messages import PositionSample, PositionSource, Telemetry, Warned
 from companion.timing.link_clock import ClockFilter
 from companion.timing.stamp_filter import MAX_BOOT_NS
 from drivers.telemetry.live_positions import LivePositions
-from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, SAMPLE_OF, boot_ns
+from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, READERS, boot_ns, samples_of
 from drivers.telemetry.telemetry_log import GeodeticFix, is_finite
 
 LATE_NS, AHEAD_NS = 2_000_000_000, 100_000_000
@@ -66,7 +66,7 @@ class LiveSamples:
         if kind == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
             self._take_origin(message, receive_ns)
             return
-        if kind not in SAMPLE_OF and kind != mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
+        if kind not in READERS and kind != mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
             return
         try:
             with np.errstate(all="ignore"):  # what comes of infinities is looked at afterwards
@@ -96,14 +96,11 @@ class LiveSamples:
         if self._wild:
             self._warn_once(WILD, receive_ns, self._wild)
             self._wild = ""
-        sample = SAMPLE_OF[kind](message) if kind in SAMPLE_OF else None
-        if sample is None:
-            return
-        if not is_finite(sample) or not _on_earth(sample):
-            self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
-            return
-        if all(choice.takes(kind, receive_ns) for choice in self._choices):
-            self._pass_on(sample, remote_ns, receive_ns, message.get_type())
+        for sample in samples_of(message):
+            if not is_finite(sample) or not _on_earth(sample):
+                self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: impossible values")
+            elif all(choice.takes(kind, receive_ns) for choice in self._choices):
+                self._pass_on(sample, remote_ns, receive_ns, message.get_type())
 
     def _pass_on(
         self, content: Telemetry | GeodeticFix, remote_ns: int, receive_ns: int, name: str

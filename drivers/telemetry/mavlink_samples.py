@@ -1,16 +1,19 @@
-"""MAVLink messages as samples: units, axes and markers of invalid fields."""
+"""MAVLink messages as samples: units, axes and markers of invalid fields; and the rates needed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.config import LinkConfig
 from companion.geometry.transforms import Array, quaternion_from_euler
 from companion.messages import (
+    AirspeedSample,
     AttitudeSample,
     HeightSample,
     ImuSample,
@@ -22,6 +25,8 @@ from companion.messages import (
 from drivers.telemetry.telemetry_log import GeodeticFix
 
 STANDARD_GRAVITY = 9.80665
+SEA_LEVEL_KG_M3 = 1.225
+"""Density of the air at sea level in the standard atmosphere (ISO 2533)."""
 GPS_RANGE_ERROR_M = 1.5
 """One sigma of a GPS position at dilution 1, where the receiver states no accuracy of its own."""
 UNKNOWN_16 = 65535
@@ -38,8 +43,44 @@ IMU_IDS = (
     mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
     mavlink.MAVLINK_MSG_ID_RAW_IMU,
 )
-HEIGHT_IDS = (mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,)
-RANGE_IDS = (mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,)
+"""Message types of one quantity, best first."""
+GPS_HZ, TIME_HZ = 5.0, 1.0
+"""More than receivers give, and enough to map GPS time to boot time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A quantity: message types that carry it, best first, and the rate needed."""
+
+    ids: tuple[int, ...]
+    rate_hz: float
+    always: bool = True
+    """Whether it is always sent; a position or a range may be unknown."""
+
+
+def wanted(config: LinkConfig) -> list[Wanted]:
+    """Quantities that the samples of a flight need."""
+    # both firmwares have all of these; ArduPilot's older versions lack the first of some
+    rates = [
+        Wanted(ATTITUDE_IDS, config.attitude_hz),
+        Wanted(
+            (
+                mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+                mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+                mavlink.MAVLINK_MSG_ID_RAW_IMU,
+            ),
+            config.imu_hz,
+        ),
+        Wanted((mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,), config.position_hz, always=False),
+        Wanted((mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,), config.position_hz, always=False),
+        Wanted(
+            (mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,), min(config.position_hz, GPS_HZ), always=False
+        ),
+        Wanted((mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,), config.height_hz),
+        Wanted((mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,), config.height_hz, always=False),
+        Wanted((mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,), TIME_HZ),
+    ]
+    return [each for each in rates if each.rate_hz > 0]
 
 
 def boot_ns(message: Any, unix_minus_boot_ns: int | None) -> int | None:
@@ -151,17 +192,36 @@ def _pressure(message: Any) -> Telemetry | None:
     return HeightSample(0, height_from_pressure(message.press_abs * 100))
 
 
-SAMPLE_OF: dict[int, Callable[[Any], Telemetry | GeodeticFix | None]] = {
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _attitude_quaternion,
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: _scaled_imu,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: _scaled_imu,
-    mavlink.MAVLINK_MSG_ID_RAW_IMU: _scaled_imu,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _global_position,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: _gps,
-    mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: _range,
-    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: _pressure,
+def _airspeed(message: Any) -> Telemetry | None:
+    """Indicated airspeed, by the pressure of a pitot tube; ARSPD_RATIO is not in it.
+
+    VFR_HUD and AIRSPEED have no time; the first is the ground speed where ArduCopter has no tube,
+    and PX4 does not send the second.
+    """
+    if message.press_diff == 0:  # what both firmwares send without a pitot tube
+        return None
+    pressure_pa = max(message.press_diff * 100, 0.0)  # below is noise
+    return AirspeedSample(0, math.sqrt(2 * pressure_pa / SEA_LEVEL_KG_M3))
+
+
+Reader = Callable[[Any], Telemetry | GeodeticFix | None]
+READERS: dict[int, tuple[Reader, ...]] = {
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: (_attitude,),
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: (_attitude_quaternion,),
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: (_highres_imu,),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: (_scaled_imu,),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: (_scaled_imu,),
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: (_scaled_imu,),
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: (_local_position,),
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: (_global_position,),
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: (_gps,),
+    mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: (_range,),
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: (_pressure, _airspeed),
 }
-"""Sample of each message type; samples have no time yet, None without a valid value."""
+"""Readers of each message type: samples without a time yet, None without a valid value."""
+
+
+def samples_of(message: Any) -> list[Telemetry | GeodeticFix]:
+    """Samples of a message that have a valid value; none of a type without a reader."""
+    found = [read(message) for read in READERS.get(message.get_msgId(), ())]
+    return [sample for sample in found if sample is not None]

@@ -1,47 +1,49 @@
 """Telemetry table `telemetry.csv`: on the flight's clock, about one origin, nothing rounded.
 
 A line is `unix_ns,kind,values`; what a sample does not have is empty. Comments before hold the
-origin, how the clocks were put together, and warnings about the source of the samples.
-
-| kind | values |
-|---|---|
-| attitude | w x y z, ned from body; body rates, rad/s |
-| imu | gyro, rad/s; accelerometer, m/s2 |
-| local position, global position, GPS | north east down, m; velocity, m/s; sigmas, m |
-| range, height | m |
-| armed | 0 or 1 |
+origin, how the clocks were put together, and warnings about the source of the samples. The kind is
+the name of the sample's schema, of a position its source; the values are its fields in order
+(companion/messages.py), arrays spread out, flags as 0 or 1.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from companion.errors import FlightError
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import (
-    ArmedSample,
-    AttitudeSample,
+    FIELDS,
+    TELEMETRY,
     ClockReport,
-    HeightSample,
-    ImuSample,
     PositionSample,
     PositionSource,
-    RangeSample,
     Telemetry,
     Warned,
 )
+from companion.telemetry_schema import Field
 from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector, TelemetryLog, kind_of
 
 NAME = "telemetry.csv"
 HEADER = "unix_ns,kind,values"
 WARNING = "# warning"
-SOURCES = {source.value: source for source in PositionSource}
-WIDTHS = {"attitude": 7, "imu": 6, "range": 1, "height": 1, "armed": 1, **dict.fromkeys(SOURCES, 8)}
+KINDS: dict[str, type[Telemetry]] = {
+    **{kind.schema.name: kind for kind in TELEMETRY if kind is not PositionSample},
+    **{source.value: PositionSample for source in PositionSource},
+}
+WIDTHS: dict[str, int] = {
+    name: sum(field.size or 1 for field in FIELDS[kind] if field.words is None)
+    for name, kind in KINDS.items()
+}
+"""Number of values of each kind."""
 MAX_BYTES = 4_000_000_000
 
 
@@ -90,50 +92,39 @@ def read_telemetry_csv(path: Path) -> LogContent:
     return LogContent(collected, lambda remote_ns, segment: remote_ns, clock, tuple(warnings))
 
 
-def _values(sample: Telemetry) -> list[float | None]:
-    if isinstance(sample, AttitudeSample):
-        rates = sample.rates_body_rad_s
-        return [*sample.ned_from_body, *([None] * 3 if rates is None else rates)]
-    if isinstance(sample, ImuSample):
-        return [*sample.gyro_rad_s, *sample.accel_m_s2]
-    if isinstance(sample, PositionSample):
-        velocity = sample.velocity_ned_m_s
-        return [
-            *sample.position_ned_m, *([None] * 3 if velocity is None else velocity),
-            sample.sigma_horizontal_m, sample.sigma_vertical_m,
-        ]  # fmt: skip
-    if isinstance(sample, RangeSample):
-        return [sample.distance_m]
-    return [sample.height_m if isinstance(sample, HeightSample) else float(sample.armed)]
+def _values(sample: Telemetry) -> Iterator[float | None]:
+    for field in FIELDS[type(sample)]:
+        value = getattr(sample, field.name)
+        if field.size is not None:
+            yield from [None] * field.size if value is None else value
+        elif field.words is None:
+            yield value
 
 
 def _sample(words: list[str]) -> Telemetry | None:
     if len(words) < 3 or len(words) - 2 != WIDTHS.get(words[1]):
         return None
-    kind = words[1]
     try:
         t_ns = int(words[0])
-        values = np.array([float(word) if word else np.nan for word in words[2:]])
+        numbers = [float(word) if word else None for word in words[2:]]
     except ValueError:
         return None
     if not 0 <= t_ns < 2**62:
         return None
-    first = values[:3]
-    if kind == "attitude":
-        return AttitudeSample(t_ns, values[:4], None if words[6] == "" else values[4:])
-    if kind == "imu":
-        return ImuSample(t_ns, first, values[3:])
-    if kind in SOURCES:
-        horizontal, vertical = (None if w == "" else float(w) for w in words[8:10])
-        return PositionSample(
-            t_ns, SOURCES[kind], first, None if words[5] == "" else values[3:6],
-            horizontal, vertical,
-        )  # fmt: skip
-    if kind == "range":
-        return RangeSample(t_ns, float(values[0]))
-    if kind == "height":
-        return HeightSample(t_ns, float(values[0]))
-    return ArmedSample(t_ns, bool(values[0] == 1))
+    kind, rest = KINDS[words[1]], iter(numbers)
+    return kind(t_ns=t_ns, **{f.name: _value(f, words[1], rest) for f in FIELDS[kind]})
+
+
+def _value(field: Field, kind: str, rest: Iterator[float | None]) -> Any:
+    """Value of a field by the kind or the next numbers of a line."""
+    if field.words is not None:
+        return field.words(kind)
+    numbers = list(islice(rest, field.size or 1))
+    if numbers[0] is None and field.may_lack:
+        return None
+    if field.size is not None:
+        return np.array(numbers, np.float64)
+    return numbers[0] == 1 if field.is_flag else math.nan if numbers[0] is None else numbers[0]
 
 
 def _origin(words: list[str]) -> GeoOrigin | None:

@@ -152,7 +152,7 @@ def kind_of(sample: Telemetry) -> str:
     """Kind of a sample, in words."""
     if isinstance(sample, PositionSample):
         return sample.source.value
-    return type(sample).__name__.removesuffix("Sample").lower()
+    return sample.schema.name
 
 
 def is_finite(content: Telemetry | GeodeticFix) -> bool:

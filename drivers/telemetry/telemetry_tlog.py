@@ -17,14 +17,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.messages import ArmedSample, Warned
 from companion.timing.log_clock import BootSegments, estimate_clock
 from companion.timing.stamp_filter import valid_stamps
-from drivers.telemetry.mavlink_samples import (
-    ATTITUDE_IDS,
-    HEIGHT_IDS,
-    IMU_IDS,
-    RANGE_IDS,
-    SAMPLE_OF,
-    boot_ns,
-)
+from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, READERS, boot_ns, samples_of
 from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector
 from drivers.telemetry.tlog_records import LEAST_US, MOST_US, Record, TlogRecords
 
@@ -117,10 +110,10 @@ class _Reader:
             return
         if kind == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME and message.time_unix_usec:
             self._unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
-        sample = SAMPLE_OF[kind](message) if kind in SAMPLE_OF else None
+        samples = samples_of(message)
         remote_ns = boot_ns(message, self._unix_minus_boot_ns)
         if remote_ns is None:
-            if sample is not None:
+            if samples:
                 self._collected.count("messages without boot time left out")
             return
         segment = self._segments.segment_of(remote_ns)
@@ -132,7 +125,7 @@ class _Reader:
                     message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3
                 ),
             )
-        elif sample is not None:
+        for sample in samples:
             self._collected.add(remote_ns, segment, sample)
 
     def _take_timesync(self, tc1: int, ts1: int, receive_ns: int) -> None:
@@ -149,17 +142,13 @@ class _Reader:
 def _chosen(counts: Counter[int]) -> set[int]:
     """Ids of the messages to read: one type for each quantity that several carry."""
     chosen = {
+        *READERS,
         mavlink.MAVLINK_MSG_ID_TIMESYNC,
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
         mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
-        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-    }
-    # of attitudes the more frequent; of the others the first that there is
+    }.difference(ATTITUDE_IDS, IMU_IDS)
+    # of attitudes the more frequent; of IMUs the first that there is
     chosen.add(max(ATTITUDE_IDS, key=lambda kind: counts[kind]))
-    for kinds in (IMU_IDS, HEIGHT_IDS, RANGE_IDS):
-        present = [kind for kind in kinds if counts[kind]]
-        chosen.update(present[:1])
+    chosen.update([kind for kind in IMU_IDS if counts[kind]][:1])
     return chosen

@@ -20,9 +20,10 @@ import cv2
 import numpy as np
 
 from companion.config import CameraConfig, Config, RecorderConfig
+from companion.flight_notes import LinkBytes
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import quaternion_from_euler
-from companion.messages import AttitudeSample, Bytes, Frame, LinkBytes
+from companion.messages import AttitudeSample, Bytes, Frame
 from drivers.open_flight import open_flight
 from drivers.recording.recorder import Recorder
 from tests.support.flights.recorded import link_bytes

@@ -11,8 +11,9 @@ from companion.config import Config
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.kept_map_place import kept_map_path
 from companion.daemon.flights.live_flight import Listener, LiveFlight
+from companion.flight_notes import FlightNote
 from companion.geometry.camera import Camera
-from companion.messages import Frame, GateStep, HealthNote, LinkBytes, Telemetry, Warned
+from companion.messages import Frame, Telemetry, Warned
 from companion.products.flight_result import RunFacts
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import KeepMap
@@ -96,7 +97,7 @@ class Flights:
         if flight is not None:
             flight.frame(frame)
 
-    def take(self, message: Telemetry | Warned | LinkBytes | HealthNote | GateStep) -> None:
+    def take(self, message: Telemetry | Warned | FlightNote) -> None:
         """Take telemetry, a warning, or a note for the recorder."""
         if self.current is not None:
             self.current.take(message)

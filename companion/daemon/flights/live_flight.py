@@ -12,15 +12,13 @@ from pathlib import Path
 
 from companion.config import Config
 from companion.daemon.flights.viewing import Viewing
+from companion.flight_notes import FlightNote
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import (
     Frame,
-    GateStep,
     Georeferenced,
-    HealthNote,
-    LinkBytes,
     MapUpdate,
     Odometry,
     PointChunk,
@@ -137,7 +135,7 @@ class LiveFlight:
             self.n_frames += 1
             self._publish(Parcel.of(frame))
 
-    def take(self, message: Telemetry | Warned | LinkBytes | HealthNote | GateStep) -> None:
+    def take(self, message: Telemetry | Warned | FlightNote) -> None:
         """Take telemetry, a warning for the log, or a note for the recorder; never waits."""
         if self._takes:
             self._publish(Parcel.of(message))

@@ -42,6 +42,7 @@ from companion.streaming.items import (
     SparseItem,
     StatusItem,
 )
+from companion.streaming.status_facts import CURVES
 from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.layout import TIMELINE
 from companion.streaming.viewer.status_panel import status_text
@@ -56,12 +57,14 @@ STATE_LEVEL = {
 PLOTTED = {
     "rate_hz": ("rate", 1.0), "latency_ms": ("latency", 1.0), "link_kbit_s": ("link", 1.0),
     "cpu_share": ("cpu", 100.0), "scale_m": ("scale", 1.0),
+    **{name: (name, 1.0) for name in CURVES.values()},
 }  # fmt: skip
 """Values that are plotted: name of the plot, and factor."""
 SERIES = {
     "height": "m above home", "speed": "m/s", "quality": "% sure", "rate": "poses a second",
     "latency": "ms late", "link": "kbit/s", "cpu": "% busy", "scale": "m per unit of the map",
     "points": "points found", "state": "3 tracking, 2 coasting, 1 initialising, 0 lost",
+    **{name: kind.schema.curve for kind, name in CURVES.items()},
 }  # fmt: skip
 COLOUR_PATH = [255, 176, 32]
 COLOUR_AUTOPILOT = [120, 150, 255]

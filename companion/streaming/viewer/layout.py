@@ -5,10 +5,12 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
+from companion.streaming.status_facts import CURVES
+
 TIMELINE = "flight"
 PLOTS = {
-    "Flying": ("height", "speed"), "Quality": ("quality", "cpu"), "Poses": ("rate", "latency"),
-    "Link": ("link",),
+    "Flying": ("height", "speed", *CURVES.values()), "Quality": ("quality", "cpu"),
+    "Poses": ("rate", "latency"), "Link": ("link",),
 }  # fmt: skip
 """Units are in the names of the series; see `drawing`."""
 LIVE_ONLY = ("Link",)

@@ -11,16 +11,15 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig, Config, RecorderConfig
+from companion.flight_notes import HealthNote, LinkBytes
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import (
     ArmedSample,
     AttitudeSample,
     Frame,
-    HealthNote,
     HeightSample,
     ImuSample,
-    LinkBytes,
     Message,
     Odometry,
     PositionSample,

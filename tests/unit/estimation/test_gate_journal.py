@@ -12,10 +12,11 @@ from companion.config import FeedbackConfig
 from companion.estimation.gate_journal import JournaledGate, poses_as_sent
 from companion.estimation.pose_gate import PoseToSend
 from companion.estimation.reset_counter import ResetCounter
+from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
-from companion.messages import AttitudeSample, GateStep, Odometry, TrackState
+from companion.messages import AttitudeSample, Odometry, TrackState
 from drivers.recording.decisions import step_of
-from drivers.recording.recorded_content import fields_bytes
+from drivers.recording.recorded_content import decision_bytes
 
 MS = 1_000_000
 
@@ -102,7 +103,7 @@ class Flight:
 
 def recorded(step: GateStep) -> GateStep:
     """A step as it comes back from a recording."""
-    return step_of(step.t_ns, fields_bytes(step))
+    return step_of(step.t_ns, decision_bytes(step))
 
 
 @pytest.mark.parametrize("n", range(2))
@@ -138,5 +139,5 @@ def test_a_step_that_is_missing_shows() -> None:
 
 def test_steps_are_read_back_to_the_last_bit() -> None:
     step = GateStep(123, "frame", 4, 2, True, False, {"seq": 9, "down_m": -0.1234567890123456789})
-    assert json.loads(fields_bytes(step))["values"]["down_m"] == -0.1234567890123456789
+    assert json.loads(decision_bytes(step))["values"]["down_m"] == -0.1234567890123456789
     assert recorded(step) == step

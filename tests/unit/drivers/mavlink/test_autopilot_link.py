@@ -29,12 +29,13 @@ from companion.pilot_messages import CAMERA_RECOVERED, position_lost
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.commands import NO_ANSWER
-from drivers.mavlink.message_rates import MessageRates, Wanted, wanted
+from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
 from drivers.mavlink.vehicle import vehicle_of
 from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 from drivers.telemetry.live_positions import LivePositions
+from drivers.telemetry.mavlink_samples import Wanted, wanted
 from drivers.telemetry.telemetry_log import GeodeticFix, kind_of
 from drivers.telemetry.telemetry_tlog import read_tlog
 from tests.support.autopilot.fake_autopilot import FakeAutopilot

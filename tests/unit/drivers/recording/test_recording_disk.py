@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from companion.config import CameraConfig, Config, RecorderConfig, TelemetryConfig
-from companion.messages import Frame, LinkBytes, Warned
+from companion.flight_notes import LinkBytes
+from companion.messages import Frame, Warned
 from drivers.recording.disk_writer import FULL, PRUNED, SLOW
 from drivers.recording.flights_folder import flights_in, may_go
 from drivers.recording.recorded_flight import RecordedFlight, open_recording
