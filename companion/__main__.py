@@ -11,6 +11,8 @@ for variable in (
     "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM",
 ):  # fmt: skip
     os.environ.setdefault(variable, "1")
+# OpenCV would load an OpenCL driver with its compiler, 40 MB, for what it then does not do
+os.environ.setdefault("OPENCV_OPENCL_RUNTIME", "disabled")
 
 from companion.app.cli import main  # noqa: E402
 

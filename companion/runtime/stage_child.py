@@ -20,6 +20,8 @@ for variable in (
     "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM",
 ):  # fmt: skip
     os.environ.setdefault(variable, "1")
+# OpenCV would load an OpenCL driver with its compiler, 40 MB, for what it then does not do
+os.environ.setdefault("OPENCV_OPENCL_RUNTIME", "disabled")
 
 import threading  # noqa: E402
 from collections.abc import Callable  # noqa: E402
