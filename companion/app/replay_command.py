@@ -106,7 +106,7 @@ def replay(
     watched = Watched()
     live: LiveViewer | None = None
     names = ("localisation", "depth", "results") if config.depth.enabled else LEAST
-    setup = Setup(config, camera, out, log.origin, is_live=False)
+    setup = Setup(config, camera, out, origin=log.origin, is_live=False)
 
     def watch(message: Message) -> None:
         watched.take(message)

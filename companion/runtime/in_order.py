@@ -29,12 +29,12 @@ APART = "depth"
 class InOrder:
     """The given stages; feed it messages in order of time.
 
-    `watch` sees every message, `say` takes remarks of the stages. CompanionError where a stage
-    cannot begin.
+    `watch` sees every message; one for which it gives False goes no further. `say` takes remarks of
+    the stages. CompanionError where a stage cannot begin.
     """
 
     def __init__(
-        self, stages: Iterable[Stage], setup: Setup, watch: Callable[[Message], None],
+        self, stages: Iterable[Stage], setup: Setup, watch: Callable[[Message], object],
         say: Callable[[str], None],
     ) -> None:  # fmt: skip
         self._watch = watch
@@ -63,6 +63,10 @@ class InOrder:
         if not isinstance(message, Warned):
             self._t_ns = message.t_ns
         self._pass(message)
+        self.collect()
+
+    def collect(self) -> None:
+        """Pass on what depth has made since; `feed` does so itself."""
         if self._depth is not None:
             self._publish(self._depth.collect())
             self._warn_fault()
@@ -86,7 +90,8 @@ class InOrder:
 
     def _pass(self, message: Message) -> None:
         """The last stages first: an image is there before its pose."""
-        self._watch(message)
+        if self._watch(message) is False:
+            return
         for stage in reversed(self._stages):
             if not isinstance(message, stage.listens):
                 continue

@@ -24,6 +24,8 @@ class Setup:
     config: Config
     camera: Camera
     folder: Path | None = None
+    viewer_file: str = "flight.rrd"
+    """Name of the viewer's recording in the folder."""
     origin: GeoOrigin | None = None
     is_live: bool = True
     failed_devices: Mapping[str, str] = field(default_factory=dict)

@@ -30,7 +30,7 @@ class _Results(Work):
             FileViewer(
                 setup.config.viewer,
                 setup.camera,
-                self._folder / "flight.rrd",
+                self._folder / setup.viewer_file,
                 setup.origin,
                 indexed=not setup.is_live,
             )

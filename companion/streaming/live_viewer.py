@@ -61,7 +61,7 @@ class LiveViewer:
         self._ground: subprocess.Popen[bytes] | None = None
         self._stage = StageProcess(STAGE, self._take_port, lambda why: self._has_port.set())
         settings = replace(Config(), viewer=config, stream=self._stream)
-        self._stage.begin(Setup(settings, camera, Path(name) if name else None, origin))
+        self._stage.begin(Setup(settings, camera, Path(name) if name else None, origin=origin))
         if where != NOWHERE:
             try:
                 self.look(where)

@@ -109,6 +109,8 @@ class SceneEncoder:
             return self._origin_if_known()
         out: list[Item] = []
         if isinstance(message, Frame):
+            if not message.rgb.size:
+                return []  # a grey one, for depth alone
             self._images[message.seq] = ImageItem(message.t_ns, message.rgb)
             if len(self._images) > MOST_IMAGES_HELD:
                 out.append(self._images.popitem(last=False)[1])

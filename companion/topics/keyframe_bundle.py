@@ -32,6 +32,9 @@ STATES = list(TrackState)
 MOST_FRAMES, MOST_TRACKS, MOST_KEYFRAMES = 256, 4096, 64
 
 
+NO_COLOUR = np.zeros((0, 0, 3), np.uint8)
+
+
 @dataclass(frozen=True, slots=True)
 class Picture:
     """A frame as JPEG; in colour if it is a keyframe's."""
@@ -107,7 +110,7 @@ def frame_of(picture: Picture, camera: Camera) -> Frame:
     """Frame of the camera's size, without colours if grey; StreamError if invalid."""
     image = image_of(picture.jpeg, camera.width, camera.height, picture.in_colour)
     if not picture.in_colour:
-        return Frame(picture.seq, picture.t_ns, image, np.repeat(image[..., None], 3, axis=2))
+        return Frame(picture.seq, picture.t_ns, image, NO_COLOUR)
     grey = image_of(picture.jpeg, camera.width, camera.height, False)
     return Frame(picture.seq, picture.t_ns, grey, image)
 

@@ -48,7 +48,7 @@ class DepthNode:
     def __init__(self, config: Config, is_stopped: Callable[[], bool]) -> None:
         self._config, self._is_stopped = config, is_stopped
         self._journal = Journal()
-        self._devices = choose_devices(config.opencl, self._journal.say)
+        choose_devices(config.opencl, self._journal.say)  # an error now, not with a flight
         self._bus = ZenohBus(config.distributed)
         for topic in ("depth", "cloud"):
             self._bus.declare_publisher(topic, LAST)
@@ -71,6 +71,7 @@ class DepthNode:
             if self._flight is None:
                 worked = self._look()
             else:
+                self._flight.step()
                 worked = self._fetch(self._flight)
             if not worked:
                 wait_s(self._never, AGAIN_S if self._is_heard else NOBODY_S)
@@ -110,7 +111,7 @@ class DepthNode:
             vehicle = self._config.distributed.vehicle
             folder = Path(self._config.daemon.flights) / f"{vehicle}-{flight}"
             self._flight = RemoteFlight(
-                self._config, flight, camera, self._devices, folder, self._publish, self._journal
+                self._config, flight, camera, folder, self._publish, self._journal
             )
             before = len(self._flight.kept.found)
             more = f", going on with {before} keyframes" if before else ""

@@ -11,15 +11,14 @@ from companion.config import Config
 from companion.config_file import command_shown, shown
 from companion.daemon.flights.viewing import Viewing
 from companion.daemon.nodes.kept_chunks import KeptChunks
-from companion.dense.depth_stage import DepthStage
-from companion.dense.device_takeover import Devices
 from companion.geometry.camera import Camera
 from companion.messages import DepthMap, MapUpdate, Message, PointChunk, Warned
-from companion.products.flight_result import FlightResult, RunFacts
-from companion.products.report.write_results import write_results
+from companion.products.flight_result import RunFacts
 from companion.products.surroundings import peak_memory_mb, versions
-from companion.streaming.viewer import FileViewer
-from companion.timing.clock import StageTimes, monotonic_s
+from companion.runtime.in_order import InOrder
+from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stages import Stage, stage_named
+from companion.timing.clock import monotonic_s
 from companion.topics.envelope import Envelope
 from companion.topics.keyframe_bundle import Bundle, MapMirror, frame_of
 from companion.topics.message_codec import cloud_envelope, depth_envelope
@@ -27,6 +26,7 @@ from drivers.system.journal import WARNING, Journal
 
 Publish = Callable[[str, Callable[[], Envelope]], None]
 """Takes a topic, and a function that makes its envelope."""
+STAGES = ("depth", "results")
 MOST_NUMBERS = 200
 """Most keyframes whose bundle number is remembered."""
 
@@ -38,40 +38,32 @@ class RemoteFlight:
     """
 
     def __init__(
-        self, config: Config, flight: str, camera: Camera, devices: Devices, folder: Path,
-        publish: Publish, journal: Journal,
+        self, config: Config, flight: str, camera: Camera, folder: Path, publish: Publish,
+        journal: Journal,
     ) -> None:  # fmt: skip
         self.flight, self.camera, self.folder = flight, camera, folder
         self.n_missed = 0
         """Bundles evicted before they could be fetched."""
-        self._config, self._devices = config, devices
-        self._publish, self._journal = publish, journal
+        self.n_points = self.n_depth_maps = 0
+        """Points so far, and depth maps made by this process."""
+        self._config, self._publish, self._journal = config, publish, journal
         folder.mkdir(parents=True, exist_ok=True)
         self.kept = KeptChunks(folder)
-        self._times = StageTimes()
         self._began_s = monotonic_s()
-        self._depth = DepthStage(config.depth, config.cloud, camera, devices, self._times)
-        self._result = FlightResult(folder, config.cloud.memory_mb)
+        self._n_frames = 0
         self._mirror = MapMirror()
         self._update: MapUpdate | None = None
+        self._is_new = False
+        """Whether points are made here; those before were found."""
         self._numbers: OrderedDict[int, tuple[str, int]] = OrderedDict()
-        self._recording = FileViewer(config.viewer, camera, _free(folder), indexed=False)
-        self._recording.__enter__()
         self._viewing: Viewing | None = None
         if config.stream.listen or config.daemon.viewer != "none":
             self._viewing = Viewing(config, camera, flight, self._warn)
+        setup = Setup(config, camera, folder, _free(folder), is_live=False)
+        self._stages = InOrder(map(stage_named, STAGES), setup, self._watch, journal.say)
         for kept in self.kept.found:
-            self._show(kept.chunk)
-
-    @property
-    def n_points(self) -> int:
-        """Points so far."""
-        return self._result.n_points
-
-    @property
-    def n_depth_maps(self) -> int:
-        """Depth maps made by this process."""
-        return self._result.n_depth_maps
+            self._stages.feed(kept.chunk)
+        self._is_new = True
 
     def take(self, bundle: Bundle) -> None:
         """Process a bundle. StreamError for undecodable images; the rest of it counts."""
@@ -79,71 +71,64 @@ class RemoteFlight:
             self._numbers[keyframe.keyframe_id] = (bundle.run, bundle.number)
         while len(self._numbers) > MOST_NUMBERS:
             self._numbers.popitem(last=False)
-        frames = [frame_of(picture, self.camera) for picture in bundle.pictures]
-        for picture, frame in zip(bundle.pictures, frames, strict=True):
-            self._step(frame)
-            self._result.take(frame)
-            if picture.in_colour:
-                self._look(frame)
-        messages: list[Message] = [*bundle.tracks, *bundle.keyframes]
-        for message in messages:
-            self._step(message)
-            self._show(message)
+        messages: list[Message] = [frame_of(each, self.camera) for each in bundle.pictures]
+        self._n_frames += len(messages)
+        messages += [*bundle.tracks, *bundle.keyframes]
         if bundle.change is not None:
             self._update = self._mirror.take(bundle.change)
-            self._show(self._update)
-            self._step(self._update)
+            messages.append(self._update)
+        for message in messages:
+            self._stages.feed(message)
+
+    def step(self) -> None:
+        """Pass on what was made since the last bundle; to be called often."""
+        self._stages.collect()
 
     def close(self, hurry: bool) -> None:
         """Complete open depth maps, and write all results; the page only without `hurry`.
 
         Where no map has come, nothing is known of the points' places: earlier results stay.
         """
-        for out in self._depth.flush():
-            self._give(out)
+
+        def finish(stage: Stage) -> Finish:
+            writes = stage.name == "results" and self._update is not None
+            return Finish(hurry, self._facts() if writes else None)
+
+        self._stages.finish(finish)
         self.kept.close()
-        self._recording.__exit__(None, None, None)
         if self._viewing is not None:
             self._viewing.close(hurry)
-        if self._update is not None:
-            self._write(page=not hurry)
-        self._result.close()
 
-    def _write(self, page: bool) -> None:
-        facts = RunFacts(
-            stage_times=self._times.summary(), wall_s=monotonic_s() - self._began_s, clock=None,
-            origin=None, device=self._devices.described, config=shown(self._config),
+    def _facts(self) -> RunFacts:
+        return RunFacts(
+            stage_times=self._stages.times, wall_s=monotonic_s() - self._began_s, clock=None,
+            origin=None, device=self._stages.works["depth"].device, config=shown(self._config),
             versions=versions(), command=command_shown(sys.argv),
-            peak_memory_mb=peak_memory_mb(), camera=self.camera,
-            n_frames_total=self._result.n_frames, completed=True,
-            dropped={"bundles": self.n_missed},
+            peak_memory_mb=peak_memory_mb(), camera=self.camera, n_frames_total=self._n_frames,
+            completed=True, dropped={"bundles": self.n_missed},
         )  # fmt: skip
-        write_results(self.folder, self._result, facts, self._config.cloud.voxel_m, page=page)
 
-    def _step(self, message: Message) -> None:
-        for out in self._depth.step(message):
-            self._give(out)
-
-    def _give(self, message: Message) -> None:
+    def _watch(self, message: Message) -> bool:
+        """Publish and show; False for points of a keyframe that has some already."""
         if isinstance(message, PointChunk):
-            run, number = self._numbers.get(message.keyframe_id, ("", -1))
-            if not self.kept.put(self.flight, message, run, number):
-                return
-            self._publish("cloud", lambda: cloud_envelope(self.flight, message, self._update))
+            if self._is_new and not self._keep(message):
+                return False
+            self.n_points += len(message.points_camera)
         elif isinstance(message, DepthMap):
+            self.n_depth_maps += 1
             self._publish("depth", lambda: depth_envelope(self.flight, message, self._update))
         elif isinstance(message, Warned):
             self._warn(message.what, message.detail, message.good)
-        self._show(message)
-
-    def _show(self, message: Message) -> None:
-        self._result.take(message)
-        self._look(message)
-
-    def _look(self, message: Message) -> None:
-        self._recording.take(message)
         if self._viewing is not None:
             self._viewing.take(message)
+        return True
+
+    def _keep(self, chunk: PointChunk) -> bool:
+        run, number = self._numbers.get(chunk.keyframe_id, ("", -1))
+        is_first = self.kept.put(self.flight, chunk, run, number)
+        if is_first:
+            self._publish("cloud", lambda: cloud_envelope(self.flight, chunk, self._update))
+        return is_first
 
     def _warn(self, what: str, detail: str, good: bool) -> None:
         if good:
@@ -152,7 +137,7 @@ class RemoteFlight:
             self._journal.say(f"warning: {what}: {detail}", WARNING)
 
 
-def _free(folder: Path) -> Path:
-    """Path of a recording that does not exist yet."""
+def _free(folder: Path) -> str:
+    """Name of a recording that does not exist yet."""
     names = ["flight.rrd", *(f"flight-{n}.rrd" for n in range(2, 1000))]
-    return next(folder / name for name in names if not (folder / name).exists())
+    return next(name for name in names if not (folder / name).exists())

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import companion.streaming.viewer  # noqa: F401 - Rerun keeps a runtime from its import on
 from companion.config import Config, DaemonConfig, DistributedConfig, StreamConfig
 from companion.daemon.nodes.depth_node import DepthNode
 from companion.runtime.stage_protocol import Setup
