@@ -35,7 +35,7 @@ def test_version() -> None:
 
 def test_check_config_prints_what_it_read(tmp_path: Path) -> None:
     given = tmp_path / "given.toml"
-    given.write_text("[mapping]\nwindow = 7\n")
+    given.write_text("[depth]\nstride = 7\n")
     result = companion("check-config", "--config", given, "--set", "opencl.device=gpu")
     assert (result.returncode, result.stderr) == (0, "")
     printed = tmp_path / "printed.toml"
@@ -45,7 +45,7 @@ def test_check_config_prints_what_it_read(tmp_path: Path) -> None:
 
 def test_unknown_key_is_one_line() -> None:
     line = refused(companion("check-config", "--set", "features.nfeatures=3"))
-    assert "features.n_features" in line
+    assert "expert.features.n_features" in line
 
 
 def test_configuration_that_is_not_there() -> None:

@@ -178,6 +178,20 @@ def test_a_file_that_a_power_cut_has_damaged_sends_nothing(tmp_path: Path, data:
     file.close(0.0)
 
 
+def test_limits_held_by_the_version_before_count_by_their_keys_now(
+    autopilot: Autopilot, tmp_path: Path
+) -> None:
+    strict = {"expert.georeference.max_sigma_scale": 0.05, "expert.tracking.min_inliers": 30}
+    in_flight(autopilot, tmp_path, strict)
+    now = (tmp_path / FILE).read_text("ascii")
+    assert "expert.tracking.min_inliers" in now
+    (tmp_path / FILE).write_text(now.replace("expert.", ""), "ascii")
+    after, file = autopilot.arming(tmp_path)
+    found = after.resume(READ)
+    assert (found.config, found.by_ground) == (with_values(READ, strict), strict)
+    file.close(0.0)
+
+
 def test_where_there_can_be_no_file_nothing_is_held(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert read_settings(tmp_path / "file" / "flights", READ) == (None, "")
