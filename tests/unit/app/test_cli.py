@@ -52,6 +52,17 @@ def test_configuration_that_is_not_there() -> None:
     assert "none.toml" in refused(companion("check-config", "--config", "none.toml"))
 
 
+def test_an_old_configuration_is_written_anew(tmp_path: Path) -> None:
+    given = tmp_path / "given.toml"
+    given.write_text("[features]\nn_features = 700\n")
+    line = f"companion: {given}: features.n_features is now expert.features.n_features\n"
+    assert companion("check-config", "--config", given).stderr == line
+    assert companion("check-config", "--config", given, "--migrate").returncode == 0
+    result = companion("check-config", "--config", given)
+    assert (result.stderr, "n_features = 700" in result.stdout) == ("", True)
+    assert "--config" in refused(companion("check-config", "--migrate"))
+
+
 def test_flight_that_is_not_there(tmp_path: Path) -> None:
     line = refused(companion("replay", tmp_path / "no-flight", "--out", tmp_path / "out"))
     assert "no-flight" in line
