@@ -102,8 +102,6 @@ def current_key(name: str) -> str:
 
 def with_value(config: Config, name: str, value: Any, where: str) -> Config:
     """A configuration with one value changed, checked as one of a file; `where` it comes from."""
-    if name not in _types():
-        raise _unknown(name, where)
     try:
         checked = msgspec.convert(value, _types()[name])
     except msgspec.ValidationError as error:
