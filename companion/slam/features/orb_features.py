@@ -20,7 +20,8 @@ FAST_THRESHOLD, MIN_FAST_THRESHOLD, MAX_FAST_THRESHOLD = 12, 4, 60
 """Grey levels, initial and least: lower than ORB-SLAM2's 20 and 7, for ground of low contrast. The
 largest is for scenes so rich that all corners would take too long."""
 CELL_PX = 32
-"""Cell size of the grid over which features are distributed; ORB-SLAM2 has 30."""
+"""Cell size of the grid over which features are distributed; ORB-SLAM2 has 30.
+Twice as large changes the error of the sample flight by 1 mm, half as large by 8 of 53."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

