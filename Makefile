@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 FLIGHT ?= sample/survey
 OUT ?= out/demo
 
-.PHONY: demo test lint opencl clean reference regression deb system-test docs
+.PHONY: demo test lint opencl clean reference regression settings deb system-test docs
 
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
@@ -33,6 +33,10 @@ reference: opencl
 	$(BIN)/companion replay sample/survey --out out/reference --set cloud.voxel_m=0.5
 	mkdir -p sample/reference
 	cp out/reference/trajectory.tum out/reference/cloud.ply out/reference/report.json sample/reference
+
+# config/companion.toml and docs/settings.md, after a change to companion/config.py.
+settings: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.support.settings_text
 
 # A device for the dense map: nothing is installed where one works.
 opencl: $(VENV)/.installed

@@ -1,7 +1,8 @@
-"""Configuration files: TOML and `section.key=value` overrides as a checked `Config`, and back.
+"""Configuration files: TOML and `KEY=VALUE` overrides as a checked `Config`, and back.
 
-What is wrong is a ConfigError of one line: where, which key, what was wanted, and the nearest key
-known. Nothing is guessed and nothing unknown is passed over.
+A key is named as files have it: `camera.width`, `expert.features.n_features`. What is wrong is a
+ConfigError of one line: where, which key, what was wanted, and the nearest key known. Nothing is
+guessed and nothing unknown is passed over; a key of the version before is told with its successor.
 """
 
 from __future__ import annotations
@@ -9,16 +10,17 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
-import math
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from companion.config import Config, OneOf, Range
+import msgspec
+
+from companion.config import EXPERT, Config
 from companion.errors import ConfigError
 
 if sys.version_info >= (3, 11):
@@ -26,75 +28,133 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_KINDS = {
-    bool: "true or false", int: "a whole number", float: "a number", str: "a string",
-    tuple: "a list of strings",
+CONSTANTS: Mapping[str, Any] = {
+    "link.timesync_hz": 10.0, "features.fast_threshold": 12, "features.min_fast_threshold": 4,
+    "features.max_fast_threshold": 60, "features.cell_px": 32,
+    "tracking.min_init_parallax_deg": 1.0, "tracking.keyframe_min_share": 0.75,
+    "tracking.keyframe_parallax_deg": 3.0, "tracking.keyframe_max_s": 3.0, "mapping.window": 10,
+    "mapping.n_fixed": 10, "mapping.iterations": 6, "mapping.final_iterations": 8,
+    "mapping.keyframe_spacing_deg": 1.0, "depth.n_updates": 7, "depth.lag_keyframes": 2,
+    "depth.noise_grey": 1.0,
 }  # fmt: skip
+"""Keys of version 0.1.0 that are no more, with the value that counts instead."""
+
 _PASSWORD = re.compile(r"(://[^:/@\s]*):[^@/\s]+@")
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Key:
-    kind: type
-    limits: tuple[Range | OneOf, ...]
+@cache
+def warn_on_stderr(line: str) -> None:
+    """Say a line once: a program reads its configuration several times."""
+    print(f"companion: {line}", file=sys.stderr, flush=True)
 
 
-def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
-    """The defaults, changed by a TOML file if any, then by overrides `section.key=value` in order.
+Warn = Callable[[str], None]
+
+
+def load_config(
+    path: Path | None, overrides: Sequence[str] = (), warn: Warn = warn_on_stderr
+) -> Config:
+    """The defaults, changed by a TOML file if any, then by overrides `KEY=VALUE` in order.
 
     An override's value is TOML; text that is not is taken as a string, so that quotes may be left
-    out.
+    out. `warn` takes a line for each key of the version before.
     """
-    changed: dict[str, dict[str, Any]] = {section: {} for section in _sections()}
-    if path is not None:
-        for name, value in _read(path).items():
-            _take(changed, name, value, str(path))
+    config = Config() if path is None else changed_by(Config(), path, warn)
     for override in overrides:
-        section, key, text = _split(override)
-        where = f"--set {override}"
-        wanted = _key(section, key, where)
-        changed[section][key] = _checked(section, key, _parse(text, wanted.kind), where)
-    return _changed(Config(), changed)
+        name, text = _split(override)
+        for current in _current({name: text}, f"--set {override}", warn):
+            value = _parse(text, current)
+            config = with_value(config, current, value, f"--set {override}")
+    return config
 
 
-def changed_by(config: Config, path: Path) -> Config:
+def changed_by(config: Config, path: Path, warn: Warn = warn_on_stderr) -> Config:
     """A configuration changed by a TOML file."""
-    changed: dict[str, dict[str, Any]] = {section: {} for section in _sections()}
-    for name, value in _read(path).items():
-        _take(changed, name, value, str(path))
-    return _changed(config, changed)
+    for name, value in _current(values_in(path), str(path), warn).items():
+        config = with_value(config, name, value, str(path))
+    return config
 
 
-def config_of_text(text: str, where: str) -> Config:
+def config_of_text(text: str, where: str, warn: Warn = warn_on_stderr) -> Config:
     """A configuration in the words of a TOML file, as recordings have it; `where` it comes from."""
-    changed: dict[str, dict[str, Any]] = {section: {} for section in _sections()}
-    for name, value in _parsed(text, where).items():
-        _take(changed, name, value, where)
-    return _changed(Config(), changed)
+    config = Config()
+    for name, value in _current(values_of(text, where), where, warn).items():
+        config = with_value(config, name, value, where)
+    return config
 
 
-def with_value(config: Config, section: str, key: str, value: Any, where: str) -> Config:
+def values_in(path: Path) -> dict[str, Any]:
+    """Value of each key in a TOML file of this version or the one before; neither is checked."""
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ConfigError(f"{path}: cannot read the configuration: {reason}") from error
+    return values_of(text, str(path))
+
+
+def values_of(text: str, where: str) -> dict[str, Any]:
+    """The same of the text of a file."""
+    try:
+        return dict(_flat(tomllib.loads(text), "", where))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{where}: not valid TOML: {error}") from error
+
+
+def current_key(name: str) -> str:
+    """The key that a key of the version before is now; "" for a constant, any other as it is."""
+    if name in CONSTANTS:
+        return ""
+    return f"{EXPERT}.{name}" if f"{EXPERT}.{name}" in _types() else name
+
+
+def with_value(config: Config, name: str, value: Any, where: str) -> Config:
     """A configuration with one value changed, checked as one of a file; `where` it comes from."""
-    return _changed(config, {section: {key: _checked(section, key, value, where)}})
+    try:
+        checked = msgspec.convert(value, _types()[name])
+    except msgspec.ValidationError as error:
+        words = ", ".join(words_of(name))
+        wanted = f"wanted one of {words}" if words else str(error)
+        raise ConfigError(f"{where}: {name}: {wanted}, given is {value!r}") from error
+    return with_values(config, {name: checked})
 
 
-def words_of(section: str, key: str) -> tuple[str, ...]:
+def with_values(config: Config, values: Mapping[str, Any]) -> Config:
+    """The configuration with other values for some keys, not validated."""
+    for name, value in values.items():
+        section, key = name.split(".")[-2:]
+        part = dataclasses.replace(getattr(config, section), **{key: value})
+        config = dataclasses.replace(config, **{section: part})
+    return config
+
+
+def value_of_key(config: Config, name: str) -> Any:
+    """Value of a key."""
+    section, key = name.split(".")[-2:]
+    return getattr(getattr(config, section), key)
+
+
+def words_of(name: str) -> tuple[str, ...]:
     """The words that a key may be; none where it is not one of a few."""
-    limits = _key(section, key, "words_of").limits
-    return next((limit.words for limit in limits if isinstance(limit, OneOf)), ())
+    kind = _kind(name)
+    return get_args(kind) if get_origin(kind) is Literal else ()
 
 
-def dump(config: Config) -> dict[str, dict[str, Any]]:
-    """Every section and key with its value."""
-    return dataclasses.asdict(config)
+def dump(config: Config) -> dict[str, Any]:
+    """Every key with its value."""
+    return {name: value_of_key(config, name) for name in _types()}
 
 
-def shown(config: Config) -> dict[str, dict[str, Any]]:
-    """The same, without the passwords of URLs."""
-    return {
-        section: {k: without_passwords(v) if isinstance(v, str) else v for k, v in values.items()}
-        for section, values in dump(config).items()
-    }
+def shown(config: Config) -> dict[str, Any]:
+    """The same as tables of tables, without the passwords of URLs."""
+    out: dict[str, Any] = {}
+    for name, value in dump(config).items():
+        *tables, key = name.split(".")
+        table = out
+        for each in tables:
+            table = table.setdefault(each, {})
+        table[key] = without_passwords(value) if isinstance(value, str) else value
+    return out
 
 
 def without_passwords(text: str) -> str:
@@ -109,11 +169,11 @@ def command_shown(argv: Sequence[str]) -> str:
 
 def to_toml(config: Config) -> str:
     """The whole configuration as a TOML file that `load_config` reads back."""
-    blocks = []
-    for section, values in dump(config).items():
-        lines = [f"{key} = {toml_value(value)}" for key, value in values.items()]
-        blocks.append("\n".join([f"[{section}]", *lines]) + "\n")
-    return "\n".join(blocks)
+    tables: dict[str, list[str]] = {}
+    for name, value in dump(config).items():
+        table, _, key = name.rpartition(".")
+        tables.setdefault(table, [f"[{table}]"]).append(f"{key} = {toml_value(value)}")
+    return "\n\n".join("\n".join(lines) for lines in tables.values()) + "\n"
 
 
 def toml_value(value: Any) -> str:
@@ -123,61 +183,73 @@ def toml_value(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _changed(config: Config, changed: Mapping[str, Mapping[str, Any]]) -> Config:
-    return dataclasses.replace(
-        config,
-        **{
-            section: dataclasses.replace(getattr(config, section), **values)
-            for section, values in changed.items()
-        },
-    )
+@cache
+def _types() -> Mapping[str, Any]:
+    """Type of each key, with its bounds; keys of experts come last."""
+    found: dict[str, Any] = {}
+    of_experts: dict[str, Any] = {}
+    for section, of_section in get_type_hints(Config).items():
+        for key, hint in get_type_hints(of_section, include_extras=True).items():
+            if EXPERT in getattr(hint, "__metadata__", ()):
+                of_experts[f"{EXPERT}.{section}.{key}"] = hint
+            else:
+                found[f"{section}.{key}"] = hint
+    return found | of_experts
 
 
 @cache
-def _sections() -> Mapping[str, Mapping[str, _Key]]:
-    sections: dict[str, dict[str, _Key]] = {}
-    for name, section in get_type_hints(Config).items():
-        sections[name] = {}
-        for key, hint in get_type_hints(section, include_extras=True).items():
-            kind, *limits = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-            sections[name][key] = _Key(get_origin(kind) or kind, tuple(limits))
-    return sections
+def _sections() -> frozenset[str]:
+    """Every section of this version and the one before."""
+    known = {name.rpartition(".")[0] for name in [*_types(), *CONSTANTS]}
+    return frozenset({EXPERT, *known, *(name.removeprefix(f"{EXPERT}.") for name in known)})
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ConfigError(f"{path}: cannot read the configuration: {reason}") from error
-    return _parsed(text, str(path))
+def _kind(name: str) -> Any:
+    hint = _types()[name]
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
 
 
-def _parsed(text: str, where: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: not valid TOML: {error}") from error
+def _flat(table: Mapping[str, Any], prefix: str, where: str) -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        name = prefix + key
+        if name in _sections():
+            if not isinstance(value, dict):
+                wanted = f"write [{name}] and its keys below"
+                raise ConfigError(f"{where}: {name} is a section: {wanted}")
+            yield from _flat(value, f"{name}.", where)
+        elif isinstance(value, dict):
+            raise _unknown(f"{name}.", where)
+        else:
+            yield name, value
 
 
-def _take(changed: dict[str, dict[str, Any]], section: str, values: Any, where: str) -> None:
-    if section not in _sections():
-        raise ConfigError(f"{where}: unknown section [{section}]{_nearest_section(section)}")
-    if not isinstance(values, dict):
-        raise ConfigError(f"{where}: {section} is a section: write [{section}] and its keys below")
-    for key, value in values.items():
-        changed[section][key] = _checked(section, key, value, where)
+def _current(values: Mapping[str, Any], where: str, warn: Warn) -> dict[str, Any]:
+    """The values by the keys of this version."""
+    out = {}
+    for name, value in values.items():
+        current = current_key(name)
+        if not current:
+            warn(f"{where}: {name} has no effect any more, {CONSTANTS[name]} counts: take it out")
+            continue
+        if current not in _types():
+            raise _unknown(name, where)
+        if current != name:
+            if current in values:
+                raise ConfigError(f"{where}: {name} is now {current}, which is set too: remove one")
+            warn(f"{where}: {name} is now {current}")
+        out[current] = value
+    return out
 
 
-def _split(override: str) -> tuple[str, str, str]:
+def _split(override: str) -> tuple[str, str]:
     name, equals, text = override.partition("=")
-    section, dot, key = name.strip().partition(".")
-    if not (equals and dot and section and key):
+    section, _, key = name.strip().rpartition(".")
+    if not (equals and section and key):
         raise ConfigError(f"--set {override}: wanted section.key=value")
-    return section, key, text.strip()
+    return name.strip(), text.strip()
 
 
-def _parse(text: str, kind: type) -> Any:
+def _parse(text: str, name: str) -> Any:
     try:
         table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
@@ -186,53 +258,23 @@ def _parse(text: str, kind: type) -> Any:
         return text
     value = table["value"]
     # A device may be called 3090: what is wanted as text and was not quoted is text.
-    return text if kind is str and not isinstance(value, str) else value
+    is_text = _kind(name) is str or words_of(name)
+    return text if is_text and not isinstance(value, str) else value
 
 
-def _key(section: str, key: str, where: str) -> _Key:
-    if section not in _sections():
-        raise ConfigError(f"{where}: unknown section [{section}]{_nearest_section(section)}")
-    if key not in _sections()[section]:
-        raise ConfigError(f"{where}: unknown key {section}.{key}{_nearest_key(section, key)}")
-    return _sections()[section][key]
-
-
-def _checked(section: str, key: str, value: Any, where: str) -> Any:
-    wanted = _key(section, key, where)
-    if wanted.kind is float and type(value) is int:
-        value = float(value)
-    if wanted.kind is tuple and type(value) is list and all(type(v) is str for v in value):
-        value = tuple(value)
-    if type(value) is not wanted.kind:
-        given = _KINDS.get(type(value), f"a {type(value).__name__}")
-        raise ConfigError(
-            f"{where}: {section}.{key} wants {_KINDS[wanted.kind]}, given is {given}: {value!r}"
-        )
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{where}: {section}.{key} wants a finite number, given is {value}")
-    allowed: Any = value
-    for limit in wanted.limits:
-        if not limit.allows(allowed):
-            raise ConfigError(f"{where}: {section}.{key} wants {limit}, given is {value!r}")
-    return allowed
-
-
-def _nearest_section(section: str) -> str:
-    return _nearest(section, [f"[{name}]" for name in _sections()])
-
-
-def _nearest_key(section: str, key: str) -> str:
-    here = difflib.get_close_matches(key, _sections()[section], n=1)
-    if here:
-        return f"; did you mean {section}.{here[0]}?"
-    elsewhere = [
-        f"{other}.{known}" for other, keys in _sections().items() for known in keys if known == key
-    ]
-    return _nearest(f"{section}.{key}", elsewhere or _all_keys())
-
-
-def _all_keys() -> list[str]:
-    return [f"{section}.{key}" for section, keys in _sections().items() for key in keys]
+def _unknown(name: str, where: str) -> ConfigError:
+    section, _, key = name.rpartition(".")
+    if section and section not in _sections():
+        known = {each.rpartition(".")[0]: None for each in _types()}
+        near = _nearest(f"[{section}]", [f"[{each}]" for each in known])
+        return ConfigError(f"{where}: unknown section [{section}]{near}")
+    same = section.split(".")[-1]
+    here = {each.split(".")[-1]: each for each in _types() if each.split(".")[-2] == same}
+    elsewhere = [each for each in _types() if each.endswith(f".{key}")]
+    close = difflib.get_close_matches(key, here, n=1)
+    others = elsewhere or list(_types())
+    near = f"; did you mean {here[close[0]]}?" if close else _nearest(name, others)
+    return ConfigError(f"{where}: unknown key {name}{near}")
 
 
 def _nearest(name: str, known: Sequence[str]) -> str:

@@ -24,6 +24,6 @@ class MissingDevices:
                 detail = f" ({source.detail})" if source.detail else ""
                 return (
                     f"the {source.name} has been {source.state} for {self._limit_s:g} s{detail}; "
-                    "daemon.missing_device_s says how long to wait"
+                    "expert.daemon.missing_device_s says how long to wait"
                 )
         return ""

@@ -16,6 +16,7 @@ from companion.dense.device_takeover import Devices, TestedEngine
 from companion.dense.engine import DepthEngine
 from companion.dense.fusion import Fusion, measured_only
 from companion.dense.undistortion import Undistortion
+from companion.dense.view_selection import MAX_VIEWS
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity
 from companion.messages import (
@@ -30,9 +31,13 @@ from companion.messages import (
 )
 from companion.timing.clock import Timer
 
+LAG_KEYFRAMES = 2
+"""Later keyframes waited for, whose frames and adjusted poses are used."""
 MAX_FRAMES = 100
 FIRST_BASELINE = 0.01
 """Ratio of the median depth: with a short baseline the search is hardly ambiguous."""
+N_UPDATES = MAX_VIEWS + 1
+"""Frames offered for a depth map: one may be passed over."""
 
 
 @dataclass(slots=True, eq=False)
@@ -92,7 +97,7 @@ class DepthStage:
         elif isinstance(message, MapUpdate):
             self._update = message
             out: list[Message] = []
-            while len(self._waiting) > self._config.lag_keyframes:
+            while len(self._waiting) > LAG_KEYFRAMES:
                 with self._times("depth"):
                     out += self._process(self._waiting.pop(0))
             return [*self._engine.announced(message.t_ns), *out]
@@ -198,7 +203,7 @@ class DepthStage:
         if not candidates:
             return []
         longest = min(self._config.max_baseline, candidates[-1][0])
-        targets = np.geomspace(min(FIRST_BASELINE, longest), longest, self._config.n_updates)
+        targets = np.geomspace(min(FIRST_BASELINE, longest), longest, N_UPDATES)
         chosen, used = [], set()
         for index, target in enumerate(targets):
             side = index % 2

@@ -20,6 +20,8 @@ AREA = 25
 NOISE_BOUND = 1.8
 """99 % quantile of window noise relative to its expectation (chi squared, 24 degrees of freedom).
 """
+MIN_TEXTURE_GREY = 1.0
+"""Patches whose grey levels vary less than this, an image's rounding, have no texture."""
 NOISE_BLOCK, NOISE_QUANTILE = 16, 0.1
 """Side in pixels of the blocks in which noise is measured, and the quantile used."""
 MAX_NOISE_GREY = 6.0
@@ -62,7 +64,7 @@ class Verification:
         )  # fmt: skip
         max_similar = NOISE_BOUND * AREA * 2.0 * noise_grey**2
         limits = np.array(
-            [config.min_zncc, config.noise_grey, MAX_DISTANCE_PX, max_similar], np.float32
+            [config.min_zncc, MIN_TEXTURE_GREY, MAX_DISTANCE_PX, max_similar], np.float32
         )
         for slot, rows in enumerate(projections.astype(np.float32).reshape(-1, 3, 4)):
             run(

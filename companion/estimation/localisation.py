@@ -39,6 +39,8 @@ from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
 from companion.timing.clock import Timer
 
+FINAL_ITERATIONS = 8
+"""Of the global adjustment at the end: 4 and 16 end the sample flight within 0.1 mm of this."""
 MIN_DEAD_RECKONING_NS = 150_000_000
 MAX_DEAD_RECKONING_NS, MAX_DEAD_RECKONING_NO_ATTITUDE_NS = 4_000_000_000, 400_000_000
 """Longest dead reckoning without tracking, with and without attitude."""
@@ -178,9 +180,7 @@ class LocalisationStage:
         self._take_samples()
         with self._times("final adjustment"):
             for segment in self._segments() if adjust else ():
-                self._tracker.atlas.mapper_of(segment).adjust_all(
-                    self._config.mapping.final_iterations
-                )
+                self._tracker.atlas.mapper_of(segment).adjust_all(FINAL_ITERATIONS)
         if self._segments():
             out.append(self._georeferences.update(self._segments(), self._t_ns, final=True))
         return out

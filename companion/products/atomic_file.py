@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 
 
-def write_atomically(path: Path, data: bytes | Iterable[bytes], durable: bool = False) -> None:
+def write_atomically(
+    path: Path, data: bytes | Iterable[bytes], durable: bool = False, like: Path | None = None
+) -> None:
     """Put `data`, whole or in parts, at `path`, replacing the old file in one step.
 
     Raises OSError. A failed write leaves the old file as it was, and no partial file. With
-    `durable` it waits until the data is on disk, and so survives a loss of power.
+    `durable` it waits until the data is on disk, and so survives a loss of power. Owner and mode
+    are those of `like`, if any.
     """
     part = path.with_name(f".{path.name}.part")
     try:
         with part.open("wb") as file:
+            if like is not None:
+                theirs = like.stat()
+                os.fchown(file.fileno(), theirs.st_uid, theirs.st_gid)
+                os.fchmod(file.fileno(), stat.S_IMODE(theirs.st_mode))
             for some in [data] if isinstance(data, bytes) else data:
                 file.write(some)
             if durable:

@@ -135,7 +135,7 @@ class V4l2Camera:
             codes = [wanted]
         else:
             raise ConfigError(
-                f"{path}: camera.pixel_format = {config.pixel_format!r} is none of those that it "
+                f"{path}: expert.camera.pixel_format = {config.pixel_format!r} is none of those it "
                 f"has ({', '.join(offered)}) and we read ({', '.join(CODES)})"
             )
         if not codes:

@@ -51,9 +51,9 @@ def apply_controls(path: str, node: CaptureNode, config: CameraConfig) -> tuple[
     if config.gain >= 0:
         if v4l2.CID_AUTOGAIN in controls:
             node.set_control(v4l2.CID_AUTOGAIN, 0)
-        put("camera.gain", (v4l2.CID_GAIN, v4l2.CID_ANALOGUE_GAIN), config.gain)
+        put("expert.camera.gain", (v4l2.CID_GAIN, v4l2.CID_ANALOGUE_GAIN), config.gain)
     if config.focus >= 0:
         if v4l2.CID_FOCUS_AUTO in controls:
             node.set_control(v4l2.CID_FOCUS_AUTO, 0)
-        put("camera.focus", (v4l2.CID_FOCUS_ABSOLUTE,), config.focus)
+        put("expert.camera.focus", (v4l2.CID_FOCUS_ABSOLUTE,), config.focus)
     return exposure_ns, remarks

@@ -110,7 +110,7 @@ class _Opening:
         if wanted:
             if wanted not in found:
                 raise FlightError(
-                    f"{self._path}: camera.topic {wanted!r} is none of its {what}: "
+                    f"{self._path}: expert.camera.topic {wanted!r} is none of its {what}: "
                     + (", ".join(found) or "there are none")
                 )
             return wanted

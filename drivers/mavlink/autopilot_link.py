@@ -38,6 +38,8 @@ FIRST_SYSTEM = 1
 HEARTBEAT_NS, HEARTBEAT_TICK_S = 1_000_000_000, 0.05
 WATCH_S, ORIGIN_S = 0.1, 5.0
 ANSWER_S, REQUEST_S = 1.0, 0.4
+TIMESYNC_S = 0.1
+"""Interval of requests, as PX4's own."""
 MAX_ROUND_TRIP_NS = 2_000_000_000
 MAX_QUESTIONS = 64
 """TIMESYNC requests without an answer that are remembered."""
@@ -325,7 +327,7 @@ class AutopilotLink:
                 now_ns = self._clock.now_ns()
                 self._questions[now_ns] = None
                 self.send(TimesyncMessage(0, now_ns, (self.vehicle.system_id, AUTOPILOT)))
-            await asyncio.sleep(1 / self._config.timesync_hz)
+            await asyncio.sleep(TIMESYNC_S)
 
     async def _watch(self) -> None:
         while True:

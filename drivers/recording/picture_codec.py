@@ -133,7 +133,7 @@ class H264:
             self.name = name
             return
         raise ConfigError(
-            f"recorder.h264_encoder = {wanted!r}: it does not encode {width} x {height} here; "
+            f"expert.recorder.h264_encoder = {wanted!r}: it encodes no {width} x {height} here; "
             "set it to auto, or recorder.codec to mjpeg"
         )
 

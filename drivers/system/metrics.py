@@ -69,7 +69,8 @@ class Metrics:
         except OSError as error:
             listening.close()
             raise ConfigError(
-                f"daemon.prometheus_port: {HOST}:{self._port}: {error.strerror}; choose another"
+                f"expert.daemon.prometheus_port: {HOST}:{self._port}: {error.strerror}; "
+                "choose another"
             ) from error
         self._port = listening.getsockname()[1]
         self._answers = ShortAnswers(listening, self._answer, self._warn)

@@ -30,7 +30,7 @@ MAX_DOCUMENT = 4 << 20
 
 
 def own_socket_path(setting: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """Path of a daemon's socket; `setting` is `daemon.socket`."""
+    """Path of a daemon's socket; `setting` is `expert.daemon.socket`."""
     return Path(setting) if setting != "auto" else _own_folders(environment)[0] / NAME
 
 
@@ -82,7 +82,8 @@ class StatusSocket:
             listening = _bind(self.path)
         except OSError as error:
             self._unlock()
-            raise ConfigError(f"daemon.socket: {self.path}: {error.strerror or error}") from error
+            reason = error.strerror or error
+            raise ConfigError(f"expert.daemon.socket: {self.path}: {reason}") from error
         except ConfigError:
             self._unlock()
             raise
@@ -112,9 +113,9 @@ def _private_folder(folder: Path) -> None:
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     state = folder.stat()
     if state.st_uid not in (os.getuid(), 0):
-        raise ConfigError(f"daemon.socket: {folder}: belongs to another user; set daemon.socket")
+        raise ConfigError(f"expert.daemon.socket: {folder}: belongs to another user; set another")
     if state.st_mode & stat.S_IWOTH and not state.st_mode & stat.S_ISVTX:
-        raise ConfigError(f"daemon.socket: {folder}: anyone may write there; set daemon.socket")
+        raise ConfigError(f"expert.daemon.socket: {folder}: anyone may write there; set another")
 
 
 def _lock(path: Path) -> int:
@@ -128,18 +129,18 @@ def _lock(path: Path) -> int:
     except (BlockingIOError, PermissionError) as error:
         os.close(fd)
         raise ConfigError(
-            f"daemon.socket: {path}: another companion runs here already; stop it, or set"
-            " daemon.socket"
+            f"expert.daemon.socket: {path}: another companion runs here already; stop it, or set"
+            " expert.daemon.socket"
         ) from error
     return fd
 
 
 def _bind(path: Path) -> socket.socket:
     if len(os.fsencode(path)) > MAX_PATH:
-        raise ConfigError(f"daemon.socket: {path}: longer than {MAX_PATH} bytes")
+        raise ConfigError(f"expert.daemon.socket: {path}: longer than {MAX_PATH} bytes")
     if path.is_symlink() or path.exists():
         if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise ConfigError(f"daemon.socket: {path}: is there and is no socket")
+            raise ConfigError(f"expert.daemon.socket: {path}: is there and is no socket")
         path.unlink()
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:

@@ -111,7 +111,8 @@ def aligned(content: LogContent, pictures: Pictures, config: TelemetryConfig) ->
     if host_ns is None and len(content.collected):
         if not config.starts_with_video:
             what = "telemetry has no absolute time and is not used"
-            detail = f"{content.collected.source}; telemetry.starts_with_video takes it as it is"
+            detail = f"{content.collected.source}; "
+            detail += "expert.telemetry.starts_with_video takes it as it is"
             warnings.append(Warned(pictures.start_ns, what, detail))
             return TelemetryLog(content.collected.source, (), warnings=tuple(warnings))
         what = "telemetry has no absolute time and is taken to begin with the video"
@@ -154,5 +155,5 @@ def _of_another_time(path: Path, log: TelemetryLog, pictures: Pictures) -> str:
     return (
         f"{path}: it is of another time than the pictures: telemetry {first_s:.1f} to {last_s:.1f}"
         f" s, pictures {pictures.start_ns * 1e-9:.1f} to {pictures.stop_ns * 1e-9:.1f} s Unix time;"
-        " set telemetry.offset_s if a clock was wrong"
+        " set expert.telemetry.offset_s if a clock was wrong"
     )

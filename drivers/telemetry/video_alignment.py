@@ -36,7 +36,7 @@ def read_unaligned(
 ) -> TelemetryLog:  # fmt: skip
     """Log of a video with times of its own; of several the one whose rotation correlates best.
 
-    As `telemetry.align` says. FlightError where no log correlates well enough.
+    As `expert.telemetry.align` says. FlightError where no log correlates well enough.
     """
     if not paths or config.align == "never" or config.offset_s:
         return read_telemetry(paths, pictures, config)
@@ -51,7 +51,7 @@ def read_unaligned(
     raise FlightError(
         f"{pictures.path}: no log can be put on its time by rotation ({'; '.join(reasons)}); "
         "say the shift by --offset S, seconds added to the log's times, or give frames.csv, or "
-        "--set telemetry.align=never to trust the clocks"
+        "--set expert.telemetry.align=never to trust the clocks"
     )
 
 

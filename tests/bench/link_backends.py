@@ -98,7 +98,7 @@ def send(port: int, seconds: float) -> None:
     out.close()
 
 
-async def by_port(way: str, port: int, measured: Measured) -> None:
+async def by_port(way: Any, port: int, measured: Measured) -> None:
     clock = FlightClock()
     config = LinkConfig(url=f"udpin:127.0.0.1:{port}", backend=way)
 

@@ -30,7 +30,7 @@ from tests.support.flights.recorded import link_bytes
 
 SIZE, RATE_HZ, LINK_HZ, ATTITUDE_HZ = (640, 480), 30.0, 120, 50
 N_PICTURES = 60
-CASES: list[tuple[str, dict[str, Any]]] = [
+CASES: list[tuple[Any, dict[str, Any]]] = [
     ("mjpeg", {"jpeg_quality": 80}), ("mjpeg", {}), ("mjpeg", {"jpeg_quality": 95}), ("h264", {}),
     ("png", {}), ("raw", {}), ("mjpeg", {"flush_s": 0.1}), ("mjpeg", {"flush_s": 1.0}),
 ]  # fmt: skip

@@ -133,9 +133,9 @@ def fly(arguments: argparse.Namespace) -> Soak:
     port = free_port()
     begins_s = time.time() + LEAD_S
     settings = [
-        "camera.source=file", f"camera.path={arguments.flight.absolute()}", "camera.repeat=true",
-        f"camera.starts_at_unix_s={begins_s}", f"link.url=udpin:127.0.0.1:{port}",
-        "feedback.mode=odometry", *arguments.set,
+        "camera.source=file", f"camera.path={arguments.flight.absolute()}",
+        "expert.camera.repeat=true", f"expert.camera.starts_at_unix_s={begins_s}",
+        f"link.url=udpin:127.0.0.1:{port}", "feedback.mode=odometry", *arguments.set,
     ]  # fmt: skip
     autopilot = FakeAutopilot(
         "ardupilot", f"udpout:127.0.0.1:{port}", RecordedFlight(arguments.flight)

@@ -121,7 +121,7 @@ def begin(camera: Camera, seen: list[Seen], fault: Fault) -> dict[str, Any]:
     """One start: frames that it took, errors in rad, ms of the processor in all and each time."""
     cpu_s: list[float] = []
     rng = np.random.default_rng(seen[0].frame.seq)
-    trial = Bootstrap(Config().tracking, camera)
+    trial = Bootstrap(camera)
     of_seq = {s.frame.seq: s for s in seen}
     for k, each in enumerate(seen):
         now = fault(each, rng)

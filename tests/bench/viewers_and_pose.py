@@ -56,7 +56,7 @@ def measured(flight: Path | None, rounds: int) -> dict[str, np.ndarray]:
         folder = Path(name)
         camera: tuple[str, ...] = ("camera.source=pattern", f"camera.rate_hz={RATE_HZ:g}")
         if flight is not None:
-            camera = "camera.source=file", f"camera.path={flight}", "camera.repeat=true"
+            camera = "camera.source=file", f"camera.path={flight}", "expert.camera.repeat=true"
         settings = (
             *camera, "daemon.flight=always", f"stream.listen=127.0.0.1:{port}",
             "depth.enabled=false",

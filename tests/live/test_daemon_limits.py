@@ -44,14 +44,14 @@ def test_a_device_that_stays_missing_ends_it(tmp_path: Path, missing: str) -> No
         "camera": ("camera.source=network", f"camera.url=http://127.0.0.1:{free_port()}/stream"),
         "autopilot": PATTERN,
     }[missing]
-    settings = (*there, NO_DEPTH, "daemon.missing_device_s=1.5")
+    settings = (*there, NO_DEPTH, "expert.daemon.missing_device_s=1.5")
     with FakeAutopilot("ardupilot", f"udpout:127.0.0.1:{free_port()}") as autopilot:
         url = autopilot.url if missing == "camera" else f"udpin:127.0.0.1:{free_port()}"
         with Daemon(tmp_path, *settings, f"link.url={url}") as daemon:
             run = daemon.ended(60)
     assert run.status == 1
     (line,) = [line for line in run.stderr.splitlines() if "companion: error: " in line]
-    assert f"the {missing} has been" in line and "daemon.missing_device_s" in line
+    assert f"the {missing} has been" in line and "expert.daemon.missing_device_s" in line
 
 
 def test_before_there_is_anything(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def flying(folder: Path) -> Iterator[Flying]:
     settings = (
         f'router.clients=["tcpin:127.0.0.1:{PORT}"]', f"stream.listen=127.0.0.1:{VIEWERS}",
         f"control.keep={folder}/kept.toml", "depth.enabled=true", "depth.stride=8",
-        "feedback.min_quality=15", "features.n_features=500",
+        "feedback.min_quality=15", "expert.features.n_features=500",
     )  # fmt: skip
     with Flying(folder, *settings, program=UNGOVERNED) as begun:
         begun.until_source("camera", "running")
@@ -71,7 +71,7 @@ def test_before_take_off(flying: Flying, ground: GroundStation) -> None:
     assert health["feedback"]["mode"] == "odometry"
     table = subprocess.run(
         [sys.executable, "-m", "companion", "status",
-         "--set", f"daemon.socket={flying.daemon.socket}"],
+         "--set", f"expert.daemon.socket={flying.daemon.socket}"],
         capture_output=True, text=True, check=True, timeout=30,
     ).stdout  # fmt: skip
     assert "feedback.min_quality = 20 (by the ground)" in table

@@ -20,7 +20,7 @@ PORT = free_port(socket.SOCK_STREAM)
 
 @pytest.fixture(scope="module")
 def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
-    settings = (f'router.clients=["tcpin:127.0.0.1:{PORT}"]', "router.queue_kb=16")
+    settings = (f'router.clients=["tcpin:127.0.0.1:{PORT}"]', "expert.router.queue_kb=16")
     with Flying(tmp_path_factory.mktemp("router"), *settings) as begun:
         begun.until_source("camera", "running")
         begun.until_source("autopilot", "running")

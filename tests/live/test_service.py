@@ -68,7 +68,7 @@ def test_it_is_ready_when_its_stages_are(tmp_path: Path, manager: ServiceManager
 
 def test_without_a_camera_it_is_not_ready(tmp_path: Path, manager: ServiceManager) -> None:
     missing = ("camera.source=v4l2", f"camera.device={tmp_path / 'video0'}")
-    with Daemon(tmp_path, *missing, "daemon.missing_device_s=7") as daemon:
+    with Daemon(tmp_path, *missing, "expert.daemon.missing_device_s=7") as daemon:
         assert daemon.ended(60).status == 1
         assert manager.last_s("EXTEND_TIMEOUT_USEC=") is not None
         assert manager.last_s("READY=1") is None

@@ -139,7 +139,7 @@ class Nodes:
             f'distributed.listen=["tcp/{self._air.DRONE}:{PORT}"]', "--set", "camera.source=file",
             "--set", f"camera.path={self._flight}",
             "--set", f"camera.calibration={FLIGHT}/camera.json",
-            "--set", f"daemon.socket={self.socket}", "--set", "recorder.enabled=false",
+            "--set", f"expert.daemon.socket={self.socket}", "--set", "recorder.enabled=false",
             "--set", f"daemon.flights={self.folder}/drone",
         )  # fmt: skip
 

@@ -71,8 +71,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
 
     settings = (
         "camera.source=file", f"camera.path={SAMPLE}", f"camera.calibration={SAMPLE}/camera.json",
-        f"camera.starts_at_unix_s={out.begins_unix_s}", f"link.url=udpin:127.0.0.1:{udp_port}",
-        "feedback.mode=odometry", f"daemon.prometheus_port={metrics_port}",
+        f"expert.camera.starts_at_unix_s={out.begins_unix_s}",
+        f"link.url=udpin:127.0.0.1:{udp_port}", "feedback.mode=odometry",
+        f"expert.daemon.prometheus_port={metrics_port}",
     )  # fmt: skip
     with Daemon(folder, *settings) as daemon:
         daemon.until(lambda health: True, 20, "it answers")
@@ -91,7 +92,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
             out.health = daemon.status()
             out.table = subprocess.run(
                 [sys.executable, "-m", "companion", "status",
-                 "--set", f"daemon.socket={daemon.socket}"],
+                 "--set", f"expert.daemon.socket={daemon.socket}"],
                 capture_output=True, text=True, check=True, timeout=20,
             ).stdout  # fmt: skip
             with urllib.request.urlopen(f"http://127.0.0.1:{metrics_port}/metrics") as answer:

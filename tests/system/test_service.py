@@ -28,6 +28,7 @@ CONFIG = """
 source = "file"
 path = "/mnt/sample/survey"
 calibration = "/mnt/sample/survey/camera.json"
+[expert.camera]
 repeat = true
 [link]
 url = "udpin:127.0.0.1:14550"

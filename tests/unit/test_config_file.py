@@ -9,15 +9,21 @@ import pytest
 from companion.config import Config
 from companion.config_file import (
     command_shown,
+    current_key,
     dump,
     load_config,
     shown,
     to_toml,
+    value_of_key,
+    values_in,
     without_passwords,
 )
 from companion.errors import ConfigError
+from tests.support.settings_text import described_toml, settings, settings_page
 
-DESCRIBED = Path(__file__).parents[2] / "config" / "companion.toml"
+ROOT = Path(__file__).parents[2]
+DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
+BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
 
 
 def write(folder: Path, text: str) -> Path:
@@ -34,23 +40,27 @@ def refusal(path: Path | None, *overrides: str) -> str:
     return message
 
 
+def no_warning(line: str) -> None:
+    raise AssertionError(line)
+
+
 def test_nothing_given_is_the_defaults() -> None:
     assert load_config(None) == Config()
 
 
 def test_file_changes_its_keys_and_no_others(tmp_path: Path) -> None:
-    path = write(tmp_path, '[opencl]\ndevice = "gpu"\n[mapping]\nwindow = 7\n')
+    path = write(tmp_path, '[opencl]\ndevice = "gpu"\n[depth]\nstride = 7\n')
     config = load_config(path)
     assert config.opencl.device == "gpu"
-    assert config.mapping.window == 7
-    unchanged = dataclasses.replace(config, opencl=Config().opencl, mapping=Config().mapping)
+    assert config.depth.stride == 7
+    unchanged = dataclasses.replace(config, opencl=Config().opencl, depth=Config().depth)
     assert unchanged == Config()
-    assert config.mapping.n_fixed == Config().mapping.n_fixed
+    assert config.depth.min_zncc == Config().depth.min_zncc
 
 
 def test_overrides_win_over_the_file_and_the_last_one_wins(tmp_path: Path) -> None:
-    path = write(tmp_path, "[mapping]\nwindow = 7\n")
-    assert load_config(path, ["mapping.window=8", "mapping.window = 9"]).mapping.window == 9
+    path = write(tmp_path, "[depth]\nstride = 7\n")
+    assert load_config(path, ["depth.stride=8", "depth.stride = 6"]).depth.stride == 6
 
 
 @pytest.mark.parametrize("text", ["gpu", '"gpu"', "'gpu'", " gpu "])
@@ -78,15 +88,26 @@ def test_unknown_key_names_the_nearest(tmp_path: Path) -> None:
     message = refusal(write(tmp_path, "[features]\nnfeatures = 500\n"))
     assert "flight.toml" in message
     assert "features.nfeatures" in message
-    assert "did you mean features.n_features?" in message
+    assert "did you mean expert.features.n_features?" in message
 
 
-def test_key_in_the_wrong_section_is_found_in_its_own() -> None:
-    assert "did you mean mapping.window?" in refusal(None, "tracking.window=3")
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("tracking.stride", "depth.stride"),
+        ("expert.camera.source", "camera.source"),
+        ("expert.camera.gian", "expert.camera.gain"),
+        ("expert.stride", "depth.stride"),
+    ],
+)
+def test_key_in_the_wrong_section_is_found_in_its_own(name: str, meant: str) -> None:
+    assert f"did you mean {meant}?" in refusal(None, f"{name}=3")
 
 
 def test_unknown_section_names_the_nearest(tmp_path: Path) -> None:
     assert "[opencl]" in refusal(write(tmp_path, "[open_cl]\ndevice = 'x'\n"))
+    assert "[opencl]" in refusal(write(tmp_path, "[open_cl]\n"))
+    assert "[expert.features]" in refusal(write(tmp_path, "[expert.fatures]\n"))
     assert "[opencl]" in refusal(None, "opncl.device=x")
 
 
@@ -98,17 +119,20 @@ def test_key_outside_a_section(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "wanted", "given"),
     [
-        ("mapping.window=2.5", "a whole number", "2.5"),
-        ("mapping.window=true", "a whole number", "true or false"),
-        ("depth.enabled=1", "true or false", "a whole number"),
-        ("depth.enabled=yes", "true or false", "'yes'"),
-        ("cloud.voxel_m=wide", "a number", "'wide'"),
-        ("cloud.voxel_m=[1]", "a number", "list"),
-        ("cloud.voxel_m=", "a number", "''"),
-        ("cloud.voxel_m=nan", "finite", "nan"),
-        ("cloud.voxel_m=inf", "finite", "inf"),
-        ("cloud.voxel_m=-1", "0.001 to 100", "-1"),
-        ("mapping.window=1", "2 to 100", "1"),
+        ("depth.stride=2.5", "`int`", "2.5"),
+        ("depth.stride=true", "`int`", "True"),
+        ("depth.enabled=1", "`bool`", "1"),
+        ("depth.enabled=yes", "`bool`", "'yes'"),
+        ("cloud.voxel_m=wide", "`float`", "'wide'"),
+        ("cloud.voxel_m=[1]", "`float`", "[1]"),
+        ("cloud.voxel_m=", "`float`", "''"),
+        ("cloud.voxel_m=nan", "", "nan"),
+        ("cloud.voxel_m=inf", "<= 100", "inf"),
+        ("cloud.voxel_m=-1", ">= 0.001", "-1"),
+        ("depth.stride=9", "<= 8", "9"),
+        ("depth.stride=0", ">= 1", "0"),
+        ("feedback.mode=on", "off, odometry, vision_position", "'on'"),
+        ("router.clients=[1]", "`str`", "[1]"),
     ],
 )
 def test_wrong_value_says_what_was_wanted_and_given(
@@ -116,11 +140,11 @@ def test_wrong_value_says_what_was_wanted_and_given(
 ) -> None:
     message = refusal(None, override)
     assert override.split("=")[0] in message
-    assert wanted in message.split(" wants ")[1]
-    assert given in message.split(" given is ")[1]
+    assert wanted in message.split(": ", 2)[2]
+    assert message.endswith(f", given is {given}")
 
 
-@pytest.mark.parametrize("override", ["", "=", "window=3", "mapping=3", "mapping.=3", ".window=3"])
+@pytest.mark.parametrize("override", ["", "=", "stride=3", "depth=3", "depth.=3", ".stride=3"])
 def test_override_without_its_parts(override: str) -> None:
     assert "section.key=value" in refusal(None, override)
 
@@ -138,27 +162,68 @@ def test_written_configuration_reads_back_the_same(tmp_path: Path) -> None:
     assert load_config(write(tmp_path, to_toml(config))) == config
 
 
-def test_described_file_changes_nothing_as_it_stands() -> None:
-    assert load_config(DESCRIBED) == Config()
+def test_described_file_and_page_are_made_of_the_code() -> None:
+    assert DESCRIBED.read_text("utf-8") == described_toml()
+    assert PAGE.read_text("utf-8") == settings_page()
 
 
-def test_described_file_has_every_key_with_its_default(tmp_path: Path) -> None:
+def test_each_key_has_a_text() -> None:
+    for expert in (False, True):
+        for section in dataclasses.fields(Config):
+            for each in settings(section.name, expert):
+                assert re.fullmatch(r".{9,}\.", each.text), each.name
+
+
+def test_described_file_has_every_public_key_with_its_default(tmp_path: Path) -> None:
+    assert load_config(DESCRIBED, warn=no_warning) == Config()
     opened = re.sub(r"^#(?=\w+ = )", "", DESCRIBED.read_text("utf-8"), flags=re.MULTILINE)
-    assert load_config(write(tmp_path, opened)) == Config()
-    named = {
-        section.split("]")[0]: set(re.findall(r"^(\w+) = ", section, flags=re.MULTILINE))
-        for section in opened.split("\n[")[1:]
-    }
-    assert named == {section: set(keys) for section, keys in dump(Config()).items()}
-
-
-def test_described_file_says_something_before_the_first_key_of_each_section() -> None:
-    for section in DESCRIBED.read_text("utf-8").split("\n[")[1:]:
-        assert section.splitlines()[1].startswith("# ")
+    path = write(tmp_path, opened)
+    assert load_config(path, warn=no_warning) == Config()
+    assert set(values_in(path)) == {name for name in dump(Config()) if "expert." not in name}
 
 
 def test_defaults_are_themselves_allowed(tmp_path: Path) -> None:
-    assert load_config(write(tmp_path, to_toml(Config()))) == Config()
+    assert load_config(write(tmp_path, to_toml(Config())), warn=no_warning) == Config()
+
+
+def test_a_file_of_the_version_before_counts_and_each_old_key_is_told() -> None:
+    told: list[str] = []
+    config = load_config(BEFORE, warn=told.append)
+    before = values_in(BEFORE)
+    for name, value in before.items():
+        now = current_key(name)
+        line = f"{BEFORE}: {name} is now {now}" if now else f"{BEFORE}: {name} has no effect"
+        assert any(each.startswith(line) for each in told) == (now != name)
+        if now:
+            wanted = tuple(value) if isinstance(value, list) else value
+            assert value_of_key(config, now) == wanted != value_of_key(Config(), now)
+    assert len(told) == sum(current_key(name) != name for name in before)
+    assert {current_key(name) for name in before} - {""} == set(dump(Config()))
+
+
+def test_an_old_key_on_the_command_line_counts() -> None:
+    told: list[str] = []
+    config = load_config(None, ["features.n_features=500", "mapping.window=3"], told.append)
+    assert config == load_config(None, ["expert.features.n_features=500"])
+    assert told == [
+        "--set features.n_features=500: features.n_features is now expert.features.n_features",
+        "--set mapping.window=3: mapping.window has no effect any more, 10 counts: take it out",
+    ]
+
+
+def test_a_key_set_by_both_names_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, "[camera]\ngain = 3\n[expert.camera]\ngain = 4\n")
+    assert "camera.gain is now expert.camera.gain, which is set too" in refusal(path)
+
+
+def test_keys_that_decide_which_poses_are_sent_keep_their_names() -> None:
+    assert not [name for name in dump(Config()) if name.startswith("expert.feedback")]
+
+
+def test_each_line_is_said_once(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = write(tmp_path, "[camera]\ngain = 3\n")
+    assert load_config(path) == load_config(path)
+    assert capsys.readouterr().err == f"companion: {path}: camera.gain is now expert.camera.gain\n"
 
 
 def test_passwords_are_not_shown() -> None:

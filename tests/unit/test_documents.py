@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from companion import __version__
+from companion.config_file import current_key, load_config
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -100,6 +101,20 @@ def test_files_and_pages_that_texts_name_are_there() -> None:
             missing += [f"{name_of(file)}: {each}" for each in path.findall(text)
                         if not (ROOT / each).exists()]  # fmt: skip
     assert not missing
+
+
+def test_settings_in_texts_are_those_of_this_version(tmp_path: Path) -> None:
+    old = []
+    for file in [*PAGES, *ROOT.glob("systemd/*"), *ROOT.glob("packaging/**/*")]:
+        if not file.is_file() or file.name == "CHANGELOG.md":
+            continue
+        text = file.read_text("utf-8")
+        names = re.findall(r"(?<![\w.])[a-z]+\.[a-z][a-z0-9_]*", text)
+        old += [f"{name_of(file)}: {name}" for name in names if current_key(name) != name]
+        for block in re.findall(r"^ *```toml\n(.*?)^ *```$", text, re.M | re.S):
+            (tmp_path / "block.toml").write_text(block, "utf-8")
+            load_config(tmp_path / "block.toml", warn=old.append)
+    assert not old
 
 
 def test_benchmarks_that_texts_name_are_there() -> None:

@@ -11,6 +11,7 @@ from companion.app.cli.options import Command, configuration, json_option, names
 from companion.app.stopping import StopSignals
 from companion.config import Config
 from companion.config_file import load_config, to_toml
+from companion.errors import InputError
 
 
 def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -53,7 +54,14 @@ def _view(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
 
 def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
-    print(to_toml(load_config(arguments.config, arguments.set)), end="")
+    if not arguments.migrate:
+        print(to_toml(load_config(arguments.config, arguments.set)), end="")
+        return 0
+    from companion.app.migrate_command import migrate
+
+    if arguments.config is None or arguments.set:
+        raise InputError("--migrate wants --config FILE, and no --set")
+    migrate(arguments.config, sys.stdout)
     return 0
 
 
@@ -111,8 +119,12 @@ def add_parsers(commands: Any) -> None:
         help="what the colours of the cloud tell (default: %(default)s)",
     )  # fmt: skip
 
-    commands.add_parser(
+    check = commands.add_parser(
         "check-config", parents=[configuration()],
         help="print the configuration that would be used",
         description="Check a configuration and print the whole of it as TOML.",
+    )  # fmt: skip
+    check.add_argument(
+        "--migrate", action="store_true",
+        help="write FILE anew with the keys of this version; it stays beside that as FILE.bak",
     )  # fmt: skip

@@ -17,7 +17,7 @@ def configuration() -> argparse.ArgumentParser:
     """--config and --set, for `parents`."""
     options = argparse.ArgumentParser(add_help=False)
     options.add_argument(
-        "--config", type=Path, metavar="FILE", help="TOML file; see config/companion.toml"
+        "--config", type=Path, metavar="FILE", help="TOML file; see docs/settings.md"
     )
     options.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE",

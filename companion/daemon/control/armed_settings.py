@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import Config
-from companion.config_file import with_value
-from companion.daemon.control.tightening import WHILE_ARMED, tightened, value_of_key, with_values
+from companion.config_file import current_key, value_of_key, with_value, with_values
+from companion.daemon.control.tightening import WHILE_ARMED, tightened
 from companion.errors import ConfigError
 
 FILE = ".armed.json"
@@ -98,11 +98,12 @@ def read_settings(flights: Path, config: Config) -> tuple[ArmedSettings | None, 
     try:
         document = json.loads(path.read_bytes())
         checked = {
-            name: _checked(config, name, value)
-            for name, value in document["values"].items()
+            name: value_of_key(with_value(config, name, value, FILE), name)
+            for name, value in _current(document["values"]).items()
             if name in WHILE_ARMED
         }
-        by_ground = {name: checked[name] for name in document["by_ground"] if name in checked}
+        told = _current(document["by_ground"])
+        by_ground = {name: checked[name] for name in told if name in checked}
         boot_s = document["autopilot_boot_s"]
         return ArmedSettings(
             checked, by_ground, str(document["computer_boot"]),
@@ -115,6 +116,6 @@ def read_settings(flights: Path, config: Config) -> tuple[ArmedSettings | None, 
         return ArmedSettings(off, off, ANOTHER_BOOT, None, 0.0), f"{path}: {error}"
 
 
-def _checked(config: Config, name: str, value: Any) -> Any:
-    section, key = name.split(".")
-    return value_of_key(with_value(config, section, key, value, FILE), name)
+def _current(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by the keys of this version: an update may have come since they were written."""
+    return {current_key(name): value for name, value in values.items()}

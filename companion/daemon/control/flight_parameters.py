@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.config import Config
-from companion.config_file import words_of
+from companion.config_file import value_of_key, words_of
 from companion.errors import ConfigError
 
 DIGITS = 7
@@ -22,47 +22,41 @@ class FlightParameter:
     """A configuration key under a name of at most 16 characters."""
 
     name: str
-    section: str
-    key: str
+    full_key: str
     at_once: bool = False
     """Whether it takes effect at once; else with the next map."""
-
-    @property
-    def full_key(self) -> str:
-        """Name of the key in the configuration."""
-        return f"{self.section}.{self.key}"
 
 
 def _table() -> dict[str, FlightParameter]:
     found = (
-        FlightParameter("FB_MODE", "feedback", "mode", at_once=True),
-        FlightParameter("FB_RATE_HZ", "feedback", "rate_hz", at_once=True),
-        FlightParameter("FB_MAX_SIGMA_M", "feedback", "max_sigma_m", at_once=True),
-        FlightParameter("FB_MIN_QUALITY", "feedback", "min_quality", at_once=True),
-        FlightParameter("FB_MAX_GAP_MS", "feedback", "max_gap_ms", at_once=True),
-        FlightParameter("FB_RESUME_S", "feedback", "resume_after_s", at_once=True),
-        FlightParameter("FB_MAX_JUMP_M", "feedback", "max_jump_m"),
-        FlightParameter("MAP_DENSE", "depth", "enabled", at_once=True),
-        FlightParameter("MAP_STRIDE", "depth", "stride"),
-        FlightParameter("MAP_MIN_ZNCC", "depth", "min_zncc"),
-        FlightParameter("MAP_MIN_INLIERS", "depth", "min_inlier_ratio"),
-        FlightParameter("MAP_SIGMA", "depth", "converged_sigma"),
-        FlightParameter("MAP_VOXEL_M", "cloud", "voxel_m"),
-        FlightParameter("MAP_AGREEING", "cloud", "min_agreeing"),
-        FlightParameter("MAP_AGREEMENT", "cloud", "agreement"),
-        FlightParameter("TRK_MIN_INLIERS", "tracking", "min_inliers"),
-        FlightParameter("TRK_RESTART_S", "tracking", "restart_after_s"),
-        FlightParameter("TRK_FEATURES", "features", "n_features"),
-        FlightParameter("GEO_MIN_TRAVEL_M", "georeference", "min_travel_m"),
-        FlightParameter("GEO_MAX_SIGMA", "georeference", "max_sigma_scale"),
-        FlightParameter("STR_KBIT_S", "stream", "budget_kbit_s", at_once=True),
-        FlightParameter("VIEW_JPEG", "viewer", "jpeg_quality"),
-        FlightParameter("REC_ENABLED", "recorder", "enabled"),
-        FlightParameter("REC_CLOUD", "recorder", "point_cloud"),
-        FlightParameter("REC_JPEG", "recorder", "jpeg_quality"),
-        FlightParameter("REC_LEAST_MB", "recorder", "least_free_mb"),
-        FlightParameter("DMN_HOT_C", "daemon", "hot_c", at_once=True),
-        FlightParameter("DMN_STATUS_S", "daemon", "status_every_s", at_once=True),
+        FlightParameter("FB_MODE", "feedback.mode", at_once=True),
+        FlightParameter("FB_RATE_HZ", "feedback.rate_hz", at_once=True),
+        FlightParameter("FB_MAX_SIGMA_M", "feedback.max_sigma_m", at_once=True),
+        FlightParameter("FB_MIN_QUALITY", "feedback.min_quality", at_once=True),
+        FlightParameter("FB_MAX_GAP_MS", "feedback.max_gap_ms", at_once=True),
+        FlightParameter("FB_RESUME_S", "feedback.resume_after_s", at_once=True),
+        FlightParameter("FB_MAX_JUMP_M", "feedback.max_jump_m"),
+        FlightParameter("MAP_DENSE", "depth.enabled", at_once=True),
+        FlightParameter("MAP_STRIDE", "depth.stride"),
+        FlightParameter("MAP_MIN_ZNCC", "expert.depth.min_zncc"),
+        FlightParameter("MAP_MIN_INLIERS", "expert.depth.min_inlier_ratio"),
+        FlightParameter("MAP_SIGMA", "expert.depth.converged_sigma"),
+        FlightParameter("MAP_VOXEL_M", "cloud.voxel_m"),
+        FlightParameter("MAP_AGREEING", "expert.cloud.min_agreeing"),
+        FlightParameter("MAP_AGREEMENT", "expert.cloud.agreement"),
+        FlightParameter("TRK_MIN_INLIERS", "expert.tracking.min_inliers"),
+        FlightParameter("TRK_RESTART_S", "expert.tracking.restart_after_s"),
+        FlightParameter("TRK_FEATURES", "expert.features.n_features"),
+        FlightParameter("GEO_MIN_TRAVEL_M", "expert.georeference.min_travel_m"),
+        FlightParameter("GEO_MAX_SIGMA", "expert.georeference.max_sigma_scale"),
+        FlightParameter("STR_KBIT_S", "stream.budget_kbit_s", at_once=True),
+        FlightParameter("VIEW_JPEG", "expert.viewer.jpeg_quality"),
+        FlightParameter("REC_ENABLED", "recorder.enabled"),
+        FlightParameter("REC_CLOUD", "expert.recorder.point_cloud"),
+        FlightParameter("REC_JPEG", "expert.recorder.jpeg_quality"),
+        FlightParameter("REC_LEAST_MB", "recorder.least_free_mb"),
+        FlightParameter("DMN_HOT_C", "daemon.hot_c", at_once=True),
+        FlightParameter("DMN_STATUS_S", "expert.daemon.status_every_s", at_once=True),
     )
     return {parameter.name: parameter for parameter in found}
 
@@ -72,9 +66,9 @@ PARAMETERS = _table()
 
 def number_of(config: Config, parameter: FlightParameter) -> float:
     """Parameter value of a key's value."""
-    value: Any = getattr(getattr(config, parameter.section), parameter.key)
+    value: Any = value_of_key(config, parameter.full_key)
     if isinstance(value, str):
-        return float(words_of(parameter.section, parameter.key).index(value))
+        return float(words_of(parameter.full_key).index(value))
     return float(value)
 
 
@@ -83,12 +77,12 @@ def value_of(config: Config, parameter: FlightParameter, number: float) -> Any:
 
     The range is not checked here.
     """
-    now: Any = getattr(getattr(config, parameter.section), parameter.key)
+    now: Any = value_of_key(config, parameter.full_key)
     wants = ""
     if not math.isfinite(number):
         wants = "a finite number"
     elif isinstance(now, str):
-        words = words_of(parameter.section, parameter.key)
+        words = words_of(parameter.full_key)
         if number in range(len(words)):
             return words[int(number)]
         wants = ", ".join(f"{place} ({word})" for place, word in enumerate(words))

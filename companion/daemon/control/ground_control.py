@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from companion.config import Config
+from companion.config_file import value_of_key
 from companion.daemon.control import kept_settings
 from companion.daemon.control.armed_settings import NOT_KEPT
 from companion.daemon.control.flight_parameters import (
@@ -20,7 +21,7 @@ from companion.daemon.control.flight_parameters import (
     number_of,
     value_of,
 )
-from companion.daemon.control.tightening import may_change, value_of_key
+from companion.daemon.control.tightening import may_change
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.live_flight import depth_elsewhere
 from companion.daemon.flights.new_map import NewMap

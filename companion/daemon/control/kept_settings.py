@@ -12,7 +12,7 @@ from companion.daemon.control.flight_parameters import PARAMETERS, FlightParamet
 from companion.errors import ConfigError
 
 HEAD = "# What the ground has set over MAVLink; control.keep names this file.\n"
-KEYS = [(parameter.section, parameter.key) for parameter in PARAMETERS.values()]
+KEYS = {parameter.full_key for parameter in PARAMETERS.values()}
 
 
 def kept_over(load: Callable[[], Config]) -> tuple[Config, dict[str, Any]]:
@@ -24,22 +24,17 @@ def kept_over(load: Callable[[], Config]) -> tuple[Config, dict[str, Any]]:
     if not config.control.keep or not Path(config.control.keep).exists():
         return config, {}
     kept = changed_by(config, Path(config.control.keep))
-    settable, changed = {f"{section}.{key}" for section, key in KEYS}, differences(config, kept)
+    changed = differences(config, kept)
     for name in changed:
-        if name not in settable:
+        if name not in KEYS:
             raise ConfigError(f"{config.control.keep}: {name} is nothing that the ground sets")
     return kept, changed
 
 
 def differences(config: Config, other: Config) -> dict[str, Any]:
     """Values of the other for each key in which they differ."""
-    before, after = dump(config), dump(other)
-    return {
-        f"{section}.{key}": value
-        for section, values in after.items()
-        for key, value in values.items()
-        if value != before[section][key]
-    }
+    before = dump(config)
+    return {name: value for name, value in dump(other).items() if value != before[name]}
 
 
 def encoded(changed: Mapping[str, Any]) -> bytes:
@@ -50,4 +45,4 @@ def encoded(changed: Mapping[str, Any]) -> bytes:
 
 def checked(config: Config, parameter: FlightParameter, value: Any) -> Config:
     """The configuration with a value from the ground, validated as one of a file."""
-    return with_value(config, parameter.section, parameter.key, value, parameter.name)
+    return with_value(config, parameter.full_key, value, parameter.name)

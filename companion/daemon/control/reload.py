@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
-
 from companion.config import Config
-from companion.config_file import dump
+from companion.config_file import dump, with_values
 
 FIXED_SECTIONS = frozenset({"camera", "mount", "link", "router", "distributed"})
 FIXED_KEYS = frozenset({
-    "daemon.socket", "daemon.prometheus_port", "feedback.mode", "feedback.obstacle_distance",
+    "expert.daemon.socket", "expert.daemon.prometheus_port", "feedback.mode",
+    "feedback.obstacle_distance",
 })  # fmt: skip
 """Keys read at the start only. All others take effect at once or with the next flight."""
 
 
 def reloaded(running: Config, read: Config) -> tuple[Config, list[str]]:
     """Configuration in force after a reload, and the changed keys that need a restart."""
-    old, new = dump(running), dump(read)
+    old = dump(running)
     cannot = [
-        f"{section}.{key}"
-        for section, keys in new.items()
-        for key, value in keys.items()
-        if value != old[section][key]
-        and (section in FIXED_SECTIONS or f"{section}.{key}" in FIXED_KEYS)
+        name
+        for name, value in dump(read).items()
+        if value != old[name] and (name.split(".")[-2] in FIXED_SECTIONS or name in FIXED_KEYS)
     ]
-    kept: dict[str, Any] = {}
-    for name in cannot:
-        section, key = name.split(".")
-        part = kept.get(section, getattr(read, section))
-        kept[section] = dataclasses.replace(part, **{key: getattr(getattr(running, section), key)})
-    return dataclasses.replace(read, **kept), cannot
+    return with_values(read, {name: old[name] for name in cannot}), cannot

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import Config
+from companion.config_file import value_of_key, with_values
 from companion.daemon.control.armed_settings import FILE, read_settings
 from companion.daemon.control.arming import Arming
 from companion.daemon.control.kept_settings import kept_over
 from companion.daemon.control.reload import reloaded
-from companion.daemon.control.tightening import tightened, value_of_key, with_values
+from companion.daemon.control.tightening import tightened
 from companion.errors import CompanionError
 from companion.pilot_messages import (
     LIMITS_WAIT,

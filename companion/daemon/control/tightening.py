@@ -7,11 +7,11 @@ that starts in the air.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from companion.config import Config
+from companion.config_file import value_of_key, with_values
 
 MayChange = Callable[[Any, Any], bool]
 """Whether a value may be replaced by another while armed."""
@@ -55,26 +55,11 @@ WHILE_ARMED: Mapping[str, MayChange] = {
     # obstacle avoidance of the autopilot relies on these messages
     "feedback.obstacle_distance": _not_at_all,
     # a map begun in the air accepts its scale, and its frames, by these
-    "georeference.min_travel_m": _to_more,
-    "georeference.max_sigma_scale": _to_less,
-    "tracking.min_inliers": _to_more,
+    "expert.georeference.min_travel_m": _to_more,
+    "expert.georeference.max_sigma_scale": _to_less,
+    "expert.tracking.min_inliers": _to_more,
 }
 """Every key of [feedback], and those of other sections that decide which poses are sent."""
-
-
-def value_of_key(config: Config, name: str) -> Any:
-    """Value of `section.key`."""
-    section, key = name.split(".")
-    return getattr(getattr(config, section), key)
-
-
-def with_values(config: Config, values: Mapping[str, Any]) -> Config:
-    """The configuration with other values for keys `section.key`, not validated."""
-    for name, value in values.items():
-        section, key = name.split(".")
-        part = dataclasses.replace(getattr(config, section), **{key: value})
-        config = dataclasses.replace(config, **{section: part})
-    return config
 
 
 def may_change(name: str, now: Any, wanted: Any) -> bool:

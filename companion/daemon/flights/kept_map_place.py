@@ -17,7 +17,7 @@ SHARED_MEMORY = Path("/dev/shm")
 
 
 def kept_map_path(setting: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """Path beside the socket; `setting` is `daemon.socket`.
+    """Path beside the socket; `setting` is `expert.daemon.socket`.
 
     systemd's RuntimeDirectory and a user's XDG_RUNTIME_DIR are in memory. Where there is neither,
     the socket lies in /tmp, which may be on a disk: then a folder in shared memory is used.

@@ -22,12 +22,12 @@ def with_stages(config: Config, stages: Sequence[str] | None, join: Sequence[str
         distributed = replace(distributed, enabled=True, connect=tuple(join))
     if frozenset(distributed.stages) not in SETS:
         raise InputError(
-            f"distributed.stages = {','.join(distributed.stages) or 'none'}: "
+            f"expert.distributed.stages = {','.join(distributed.stages) or 'none'}: "
             "wanted tracking, or depth,cloud, or tracking,depth,cloud"
         )
     if TRACKING not in distributed.stages:
         if not distributed.enabled:
-            raise InputError("distributed.stages without tracking: wanted distributed.enabled too")
+            raise InputError("stages without tracking: wanted distributed.enabled too")
         if not (distributed.connect or distributed.listen):
             raise InputError("--join ENDPOINT is missing: where the node with tracking is")
         if not config.depth.enabled:

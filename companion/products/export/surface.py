@@ -56,7 +56,7 @@ def surface_of(cloud: Cloud, frame: MapFrame, cell_m: float) -> Surface:
     if width * height > MAX_CELLS:
         raise InputError(
             f"a grid of {width} x {height} cells of {cell:g} m is too large: set "
-            "export.cell_m larger"
+            "expert.export.cell_m larger"
         )
     column = np.minimum((points[:, 0] - west) / cell, width - 1).astype(np.int64)
     row = np.clip((north - points[:, 1]) / cell, 0, height - 1).astype(np.int64)

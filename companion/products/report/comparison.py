@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from companion.config_file import CONSTANTS, current_key
 from companion.errors import InputError
 from companion.geometry.transforms import Array
 from companion.products.cloud import Cloud
@@ -92,7 +93,7 @@ def compare_runs(a: FinishedRun, b: FinishedRun) -> Comparison:
         CloudDifference(_distances(a.cloud, b.cloud), _distances(b.cloud, a.cloud)),
         {name: (a.report.get(name), b.report.get(name)) for name in COUNTS},
         _side_by_side(a.report.get("stages"), b.report.get("stages")),
-        _differing(_flat(a.report.get("config")), _flat(b.report.get("config"))),
+        _differing(_settings(a.report), _settings(b.report)),
         _differing(_flat(a.report.get("versions")), _flat(b.report.get("versions"))),
         "m" if a.metric and b.metric else "map units",
     )
@@ -157,6 +158,12 @@ def _side_by_side(
 ) -> dict[str, tuple[Mapping[str, float] | None, Mapping[str, float] | None]]:
     of_a, of_b = (each if isinstance(each, Mapping) else {} for each in (a, b))
     return {name: (of_a.get(name), of_b.get(name)) for name in sorted({*of_a, *of_b})}
+
+
+def _settings(report: Mapping[str, Any]) -> dict[str, Any]:
+    """By the keys of this version; what is a constant now only where it was another."""
+    values = _flat(report.get("config")).items()
+    return {current_key(k) or k: v for k, v in values if CONSTANTS.get(k) != v}
 
 
 def _flat(values: Any, before: str = "") -> dict[str, Any]:

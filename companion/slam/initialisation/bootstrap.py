@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.config import TrackingConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Frame
@@ -18,9 +17,9 @@ from companion.slam.initialisation.initializer import MIN_POINTS, initialise
 from companion.slam.initialisation.third_view import middle_view, third_view_rejects
 
 MAX_PENDING = 150
-MIN_PARALLAX_PX = 8.0
-"""Lower bound in pixels: in low-resolution images the same angle spans fewer, equally uncertain
-pixels."""
+MIN_PARALLAX_DEG, MIN_PARALLAX_PX = 1.0, 8.0
+"""Least parallax of the two views: the angle as in ORB-SLAM; in pixels too, as in low-resolution
+images the same angle spans fewer, equally uncertain ones."""
 FORWARD_IS_NORTH = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Attitude `ned_from_camera` assumed where none is measured: level and looking north."""
 
@@ -45,15 +44,14 @@ class Bootstrap:
     """
 
     def __init__(
-        self, config: TrackingConfig, camera: Camera, reference: View | None = None,
-        min_parallax_ratio: float = 1.0,
-    ) -> None:  # fmt: skip
+        self, camera: Camera, reference: View | None = None, min_parallax_ratio: float = 1.0
+    ) -> None:
         self._camera = camera
         self.pending: deque[View] = deque(maxlen=MAX_PENDING)
         self._reference = reference
         self._given = reference
         self._min_parallax_rad = min_parallax_ratio * max(
-            np.radians(config.min_init_parallax_deg), MIN_PARALLAX_PX / camera.focal_px
+            np.radians(MIN_PARALLAX_DEG), MIN_PARALLAX_PX / camera.focal_px
         )
 
     def step(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from companion.config import FeaturesConfig, MappingConfig
+from companion.config import FeaturesConfig
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, angle_between
 from companion.messages import LoopClosed
@@ -49,12 +49,10 @@ class Atlas:
     """
 
     def __init__(
-        self, features: FeaturesConfig, mapping: MappingConfig, camera: Camera, map_lock: MapLock,
-        background: bool = False,
-    ) -> None:  # fmt: skip
+        self, features: FeaturesConfig, camera: Camera, map_lock: MapLock, background: bool = False
+    ) -> None:
         self._background = background
-        self._features, self._mapping = features, mapping
-        self._camera, self._map_lock = camera, map_lock
+        self._features, self._camera, self._map_lock = features, camera, map_lock
         self._relocalizer = Relocalizer(camera)
         self._database = KeyframeDatabase()
         self._finder = LoopDetector(self._database, self._relocalizer)
@@ -80,7 +78,7 @@ class Atlas:
 
     def mapper_of(self, segment: SlamMap) -> Mapper:
         """Mapper of a map."""
-        return Mapper(self._mapping, self._camera, segment, self._map_lock, self.displacements_of)
+        return Mapper(self._camera, segment, self._map_lock, self.displacements_of)
 
     def new_map(self, level: bool) -> None:
         """Activate a new map; an active one that is too young is discarded."""

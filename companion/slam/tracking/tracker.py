@@ -77,7 +77,7 @@ class Tracker:
         self._next_keyframe_id = 0
         self.map_lock = MapLock(order)
         """Held by whoever else reads the map."""
-        self.atlas = Atlas(config.features, config.mapping, camera, self.map_lock, background)
+        self.atlas = Atlas(config.features, camera, self.map_lock, background)
         self._worker: MappingWorker = (
             BackgroundMapping(self.map_lock, self.atlas.adjust_pending)
             if background
@@ -85,7 +85,7 @@ class Tracker:
         )
         self._frame_tracker = FrameTracker(self._config, camera, self.atlas)
         self.state = TrackState.INITIALISING
-        self._bootstrap = Bootstrap(self._config, camera)
+        self._bootstrap = Bootstrap(camera)
         self._lost_since_ns: int | None = None
         self._reset()
 
@@ -130,7 +130,7 @@ class Tracker:
         """Drop a map; where it is active, initialise another."""
         if self.atlas.drop_map(first_keyframe_id):
             self._reset()
-            self._bootstrap = Bootstrap(self._config, self._camera)
+            self._bootstrap = Bootstrap(self._camera)
             self.state, self._lost_since_ns = TrackState.INITIALISING, None
 
     @property
@@ -155,9 +155,7 @@ class Tracker:
         self.atlas.discard_map(keep)
         self._reset()
         self.state, self._lost_since_ns = TrackState.INITIALISING, None
-        self._bootstrap = Bootstrap(
-            self._config, self._camera, min_parallax_ratio=PARALLAX_RATIO**number
-        )
+        self._bootstrap = Bootstrap(self._camera, min_parallax_ratio=PARALLAX_RATIO**number)
 
     def close(self) -> Done:
         """Finish pending mapping; its results."""
@@ -305,7 +303,7 @@ class Tracker:
             start = self._last_tracked
             if start is not None:
                 start = replace(start, point_ids=np.full(len(start.features), -1))
-            self._bootstrap = Bootstrap(self._config, self._camera, start)
+            self._bootstrap = Bootstrap(self._camera, start)
         self.state = TrackState.LOST
         return self._initialise(frame, features, prior)
 
@@ -318,9 +316,9 @@ class Tracker:
             since_ns = (
                 reference.t_ns if self._reference_since_ns is None else self._reference_since_ns
             )
-            if not needs_keyframe(self._config, self.map, reference, view, since_ns):
+            if not needs_keyframe(self.map, reference, view, since_ns):
                 return False
-        equivalent = equivalent_keyframe(self._config, self.map, view)
+        equivalent = equivalent_keyframe(self.map, view)
         if equivalent is None:
             return True
         self._reference, self._reference_since_ns = equivalent, view.t_ns

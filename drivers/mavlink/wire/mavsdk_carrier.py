@@ -34,7 +34,7 @@ def check_library() -> None:
     except AttributeError:
         raise ConfigError(
             f"mavsdk {mavsdk.__version__} cannot be kept from sending heartbeats of its own; set "
-            'link.backend = "pymavlink"'
+            'expert.link.backend = "pymavlink"'
         ) from None
     intercept.argtypes = [ctypes.c_void_p, mavsdk_types.InterceptJsonCallback, ctypes.c_void_p]
     intercept.restype = ctypes.c_void_p

@@ -48,7 +48,7 @@ class MavsdkWire(Wire):
         super().__init__(str(endpoint), NETWORK_BYTES_PER_S, PacketQueue(QUEUE_BYTES))
         if ":" in endpoint.host:
             raise ConfigError(
-                f'link.url: "{endpoint}": MAVSDK has no IPv6; set link.backend = "pymavlink"'
+                f'link.url: "{endpoint}": MAVSDK has no IPv6; set expert.link.backend = "pymavlink"'
             )
         check_library()
         self.n_overrun = 0

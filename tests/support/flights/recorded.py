@@ -120,7 +120,7 @@ HEALTH: dict[str, Any] = {
 
 
 def record(
-    folder: Path, n: int = 30, codec: str = "mjpeg", *, grey_is_of_colours: bool = True,
+    folder: Path, n: int = 30, codec: Any = "mjpeg", *, grey_is_of_colours: bool = True,
     config: RecorderConfig | None = None, per_chunk: int | None = None,
 ) -> Recorder:  # fmt: skip
     """Record `n` frames and what goes with them, so many in a chunk; the folder is made."""

@@ -60,7 +60,8 @@ class Daemon:
         self.socket = folder / "run" / "status.sock"
         self.lines: list[Line] = []
         own = [
-            f"daemon.socket={self.socket}", f"daemon.flights={self.flights}", "stream.listen=",
+            f"expert.daemon.socket={self.socket}", f"daemon.flights={self.flights}",
+            "stream.listen=",
         ]  # fmt: skip
         self.settings = [*own, *settings]
         self._command = [sys.executable, *program, "run"]

@@ -26,13 +26,15 @@ def free_endpoint() -> str:
 
 def drone_config(endpoint: str, **changes: object) -> DistributedConfig:
     """Of a node with tracking that listens there."""
-    config = DistributedConfig(True, ("tracking",), listen=(endpoint,), budget_kbit_s=0.0)
+    config = DistributedConfig(
+        enabled=True, stages=("tracking",), listen=(endpoint,), budget_kbit_s=0.0
+    )
     return replace(config, **changes)  # type: ignore[arg-type]
 
 
 def joined_config(endpoint: str) -> DistributedConfig:
     """Of a node with depth and cloud that joins there."""
-    return DistributedConfig(True, ("depth", "cloud"), connect=(endpoint,))
+    return DistributedConfig(enabled=True, stages=("depth", "cloud"), connect=(endpoint,))
 
 
 @contextmanager

@@ -35,7 +35,7 @@ def test_version() -> None:
 
 def test_check_config_prints_what_it_read(tmp_path: Path) -> None:
     given = tmp_path / "given.toml"
-    given.write_text("[mapping]\nwindow = 7\n")
+    given.write_text("[depth]\nstride = 7\n")
     result = companion("check-config", "--config", given, "--set", "opencl.device=gpu")
     assert (result.returncode, result.stderr) == (0, "")
     printed = tmp_path / "printed.toml"
@@ -45,11 +45,22 @@ def test_check_config_prints_what_it_read(tmp_path: Path) -> None:
 
 def test_unknown_key_is_one_line() -> None:
     line = refused(companion("check-config", "--set", "features.nfeatures=3"))
-    assert "features.n_features" in line
+    assert "expert.features.n_features" in line
 
 
 def test_configuration_that_is_not_there() -> None:
     assert "none.toml" in refused(companion("check-config", "--config", "none.toml"))
+
+
+def test_an_old_configuration_is_written_anew(tmp_path: Path) -> None:
+    given = tmp_path / "given.toml"
+    given.write_text("[features]\nn_features = 700\n")
+    line = f"companion: {given}: features.n_features is now expert.features.n_features\n"
+    assert companion("check-config", "--config", given).stderr == line
+    assert companion("check-config", "--config", given, "--migrate").returncode == 0
+    result = companion("check-config", "--config", given)
+    assert (result.stderr, "n_features = 700" in result.stdout) == ("", True)
+    assert "--config" in refused(companion("check-config", "--migrate"))
 
 
 def test_flight_that_is_not_there(tmp_path: Path) -> None:

@@ -69,6 +69,19 @@ def test_what_differs_is_measured_and_shown(
     assert page.count("<svg") == 2
 
 
+def test_settings_of_the_version_before_are_compared_by_their_keys_now(tmp_path: Path) -> None:
+    a, b = run(tmp_path / "a"), run(tmp_path / "b")
+    for folder, settings in (
+        (a, {"camera": {"gain": 3}, "mapping": {"window": 5, "n_fixed": 10}}),
+        (b, {"camera": {}, "expert": {"camera": {"gain": 3}}, "depth": {"stride": 1}}),
+    ):
+        report = json.loads((folder / "report.json").read_text())
+        (folder / "report.json").write_text(json.dumps(report | {"config": settings}))
+    assert compared(a, b, "--out", tmp_path / "out") == 0
+    told = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert told["config"] == {"depth.stride": [None, 1], "mapping.window": [5, None]}
+
+
 def test_limits_that_are_not_kept_fail(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a, b = run(tmp_path / "a"), run(tmp_path / "b", 0.05)
     assert compared(a, b, "--max-apart", 1, "--max-cloud", 1) == 0

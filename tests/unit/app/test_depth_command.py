@@ -195,7 +195,7 @@ def test_all_references_make_one_cloud(
 ) -> None:
     write_tum(tmp_path / "set", rendered)
     out = tmp_path / "out"
-    sets = ["--set", "depth.max_baseline=0.4", "--set", "depth.reference_step=0.05"]
+    sets = ["--set", "expert.depth.max_baseline=0.4", "--set", "expert.depth.reference_step=0.05"]
     command = ["depth", str(tmp_path / "set"), "--out", str(out), "--range", "7:16"]
     assert main([*command, *sets, "--frames", "1:9"]) == 0
     maps = sorted(out.glob("depth_*.npz"))

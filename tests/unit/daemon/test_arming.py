@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 
 from companion.config import Config, FeedbackConfig
+from companion.config_file import with_values
 from companion.daemon.control import armed_settings, arming
 from companion.daemon.control.armed_settings import FILE, read_settings
 from companion.daemon.control.arming import CERTAIN_S, Arming
-from companion.daemon.control.tightening import WHILE_ARMED, with_values
+from companion.daemon.control.tightening import WHILE_ARMED
 from companion.products.newest_file import NewestFile
 
 READ = Config(feedback=FeedbackConfig(mode="odometry"))
@@ -175,6 +176,20 @@ def test_a_file_that_a_power_cut_has_damaged_sends_nothing(tmp_path: Path, data:
     assert began.resume(READ).config == with_values(READ, OFF)
     began.take(False, 10.0)  # on the ground it is over at once
     assert began.step(10.0 + CERTAIN_S)
+    file.close(0.0)
+
+
+def test_limits_held_by_the_version_before_count_by_their_keys_now(
+    autopilot: Autopilot, tmp_path: Path
+) -> None:
+    strict = {"expert.georeference.max_sigma_scale": 0.05, "expert.tracking.min_inliers": 30}
+    in_flight(autopilot, tmp_path, strict)
+    now = (tmp_path / FILE).read_text("ascii")
+    assert "expert.tracking.min_inliers" in now
+    (tmp_path / FILE).write_text(now.replace("expert.", ""), "ascii")
+    after, file = autopilot.arming(tmp_path)
+    found = after.resume(READ)
+    assert (found.config, found.by_ground) == (with_values(READ, strict), strict)
     file.close(0.0)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from companion.config import Config, ControlConfig, DistributedConfig, FeedbackConfig, LinkConfig
-from companion.config_file import to_toml
+from companion.config_file import to_toml, value_of_key
 from companion.daemon.component_state import (
     ACTIVE,
     BOOT,
@@ -24,7 +24,7 @@ from companion.daemon.control.flight_parameters import PARAMETERS, number_of, va
 from companion.daemon.control.ground_control import CHANGES_AT_ONCE, TEXTS_AT_ONCE, GroundControl
 from companion.daemon.control.kept_settings import kept_over
 from companion.daemon.control.reload import FIXED_KEYS, FIXED_SECTIONS
-from companion.daemon.control.tightening import may_change, value_of_key
+from companion.daemon.control.tightening import may_change
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flights import Flights
 from companion.errors import ConfigError
@@ -70,7 +70,7 @@ def control_of(config: Config) -> tuple[GroundControl, Controlled, MemoryPort]:
 def test_names_fit_and_keys_can_change_in_flight() -> None:
     assert all(0 < len(name) <= LONGEST_NAME and name.isascii() for name in PARAMETERS)
     for parameter in PARAMETERS.values():
-        assert parameter.section not in FIXED_SECTIONS
+        assert parameter.full_key.split(".")[-2] not in FIXED_SECTIONS
         assert parameter.full_key not in FIXED_KEYS - {"feedback.mode"}
 
 
@@ -79,8 +79,8 @@ def test_what_is_read_can_be_set(name: str) -> None:
     config, parameter = Config(), PARAMETERS[name]
     number = number_of(config, parameter)
     value = value_of(config, parameter, number)
-    assert value == getattr(getattr(config, parameter.section), parameter.key)
-    assert type(value) is type(getattr(getattr(config, parameter.section), parameter.key))
+    assert value == value_of_key(config, parameter.full_key)
+    assert type(value) is type(value_of_key(config, parameter.full_key))
 
 
 @pytest.mark.parametrize(
@@ -198,6 +198,17 @@ def test_what_the_ground_has_set_is_kept_if_the_configuration_says_so(tmp_path: 
     without, _, _ = control_of(Config())
     without.set("MAP_DENSE", 0.0)
     assert [each.name for each in tmp_path.iterdir()] == ["kept.toml"]
+
+
+def test_a_kept_file_of_the_version_before_counts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "kept.toml"
+    path.write_text("features.n_features = 700\nfeedback.mode = 'odometry'\n", "utf-8")
+    kept, changed = kept_over(loader(Config(control=ControlConfig(keep=str(path)))))
+    assert changed == {"expert.features.n_features": 700, "feedback.mode": "odometry"}
+    assert (kept.features.n_features, kept.feedback.mode) == (700, "odometry")
+    assert "features.n_features is now expert.features.n_features" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("text", ["link.url = 'x'", "depth.stride = 99", "depth.strid = 1", "?"])

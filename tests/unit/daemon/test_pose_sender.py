@@ -43,7 +43,7 @@ class SetClock(FlightClock):
 class Vehicle:
     """An autopilot on a link without a wire, and the process that sends it poses."""
 
-    def __init__(self, path: Path, mode: str = "odometry") -> None:
+    def __init__(self, path: Path, mode: Any = "odometry") -> None:
         self.path, self.mode = path, mode
         self.clock, self.port = SetClock(), MemoryPort()
         self.armed, self.boot_ns = True, self.clock.t_ns - 60 * 10**9

@@ -8,27 +8,22 @@ from typing import Any
 import pytest
 
 from companion.config import Config, FeedbackConfig, GeoreferenceConfig, TrackingConfig
+from companion.config_file import value_of_key, with_values
 from companion.daemon.control.flight_parameters import PARAMETERS
-from companion.daemon.control.tightening import (
-    WHILE_ARMED,
-    may_change,
-    tightened,
-    value_of_key,
-    with_values,
-)
+from companion.daemon.control.tightening import WHILE_ARMED, may_change, tightened
 
 FLYING = Config(feedback=FeedbackConfig(mode="odometry"))
 TIGHTER: dict[str, Any] = {
     "feedback.mode": "off", "feedback.max_sigma_m": 0.5, "feedback.min_quality": 40,
     "feedback.max_gap_ms": 100.0, "feedback.resume_after_s": 2.0, "feedback.max_jump_m": 0.5,
-    "georeference.min_travel_m": 6.0, "georeference.max_sigma_scale": 0.05,
-    "tracking.min_inliers": 30,
+    "expert.georeference.min_travel_m": 6.0, "expert.georeference.max_sigma_scale": 0.05,
+    "expert.tracking.min_inliers": 30,
 }  # fmt: skip
 LOOSER: dict[str, Any] = {
     "feedback.mode": "vision_position", "feedback.max_sigma_m": 2.0, "feedback.min_quality": 10,
     "feedback.max_gap_ms": 300.0, "feedback.resume_after_s": 0.5, "feedback.max_jump_m": 2.0,
-    "georeference.min_travel_m": 1.0, "georeference.max_sigma_scale": 0.3,
-    "tracking.min_inliers": 10,
+    "expert.georeference.min_travel_m": 1.0, "expert.georeference.max_sigma_scale": 0.3,
+    "expert.tracking.min_inliers": 10,
 }  # fmt: skip
 FREE = {"feedback.rate_hz": 60.0}
 FIXED: dict[str, Any] = {

@@ -236,7 +236,7 @@ def test_surface_model(run: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_cells_are_not_too_many(run: FinishedRun, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"set export\.cell_m"):
+    with pytest.raises(InputError, match=r"set expert\.export\.cell_m"):
         exported(run, tmp_path, "dsm", cell_m=1e-4)
 
 

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from companion.config import Config, MappingConfig
+from companion.config import Config
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity, rotation_from_vector
 from companion.messages import Frame, LoopClosed, Track
@@ -119,7 +119,7 @@ def test_additions_during_adjustment_move_with_their_references() -> None:
 def test_adjustment_is_dropped_after_another_loop() -> None:
     slam_map = disturbed()
     before = [k.camera_from_map for k in slam_map.keyframes.values()]
-    mapper = Mapper(MappingConfig(), CAMERA, slam_map, MapLock())
+    mapper = Mapper(CAMERA, slam_map, MapLock())
     mapper.adjust_all_in_background(2, lambda: None, lambda: False)
     assert all(
         k.camera_from_map is pose

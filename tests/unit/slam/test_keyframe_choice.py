@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.config import TrackingConfig
 from companion.geometry.transforms import Pose, Similarity
 from companion.slam.features.orb_features import Ints
 from companion.slam.features.view import View
@@ -36,24 +35,24 @@ def view_from(ground: Ground, slam_map: SlamMap, place: Pose, share: float = 1.0
 
 
 def test_return_pass_reuses_an_older_keyframe() -> None:
-    config, ground = TrackingConfig(), Ground(np.random.default_rng(11))
+    ground = Ground(np.random.default_rng(11))
     slam_map = mapped(ground, THERE, Similarity.identity())
     newest = slam_map.keyframes[max(slam_map.keyframes)]
     again = view_from(ground, slam_map, flown(np.array([-5.1, 0.1])))
-    assert needs_keyframe(config, slam_map, newest, again, again.t_ns)
-    cover = equivalent_keyframe(config, slam_map, again)
+    assert needs_keyframe(slam_map, newest, again, again.t_ns)
+    cover = equivalent_keyframe(slam_map, again)
     assert cover is not None
     assert np.linalg.norm(cover.centre - flown(np.array([-5.1, 0.1])).translation) < 0.5
-    assert not needs_keyframe(config, slam_map, cover, again, again.t_ns)
+    assert not needs_keyframe(slam_map, cover, again, again.t_ns)
 
 
 def test_newest_and_weakly_tracked_keyframes_are_not_reused() -> None:
-    config, ground = TrackingConfig(), Ground(np.random.default_rng(12))
+    ground = Ground(np.random.default_rng(12))
     slam_map = mapped(ground, THERE, Similarity.identity())
     newest = list(slam_map.keyframes.values())[-N_NEWEST_EXCLUDED:]
     ahead = view_from(ground, slam_map, newest[-1].camera_from_map.inverse())
-    assert equivalent_keyframe(config, slam_map, ahead) is None
+    assert equivalent_keyframe(slam_map, ahead) is None
     weak = view_from(ground, slam_map, flown(np.array([-5.1, 0.1])), share=0.4)
-    assert equivalent_keyframe(config, slam_map, weak) is None
+    assert equivalent_keyframe(slam_map, weak) is None
     aside = view_from(ground, slam_map, flown(np.array([-5.1, 1.5])))
-    assert equivalent_keyframe(config, slam_map, aside) is None
+    assert equivalent_keyframe(slam_map, aside) is None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.config import MappingConfig
 from companion.geometry.transforms import Array, Pose, Similarity, angle_between
 from companion.slam.features.patches import image_levels
 from companion.slam.map.sparse_map import SlamMap
@@ -94,5 +93,5 @@ def test_long_flight_is_adjusted_in_windows(
         return float(np.median(np.concatenate(errors)))
 
     assert error_px() > 2.0
-    Mapper(MappingConfig(), CAMERA, slam_map, MapLock()).adjust_all(4)
+    Mapper(CAMERA, slam_map, MapLock()).adjust_all(4)
     assert error_px() < 0.6

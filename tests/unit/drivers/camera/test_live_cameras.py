@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,7 +48,7 @@ def taken(source: CameraSource, n: int, limit_s: float = 3.0) -> list[Picture]:
 @pytest.mark.parametrize(
     ("source", "key"), [("gstreamer", "pipeline"), ("network", "url"), ("file", "path")]
 )
-def test_what_a_camera_needs_is_asked_for(source: str, key: str) -> None:
+def test_what_a_camera_needs_is_asked_for(source: Any, key: str) -> None:
     with pytest.raises(ConfigError, match=rf"camera\.{key} is not set"):
         camera_source(CameraConfig(source=source))
 

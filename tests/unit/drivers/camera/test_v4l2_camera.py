@@ -112,7 +112,7 @@ def test_controls_are_set_and_automatics_put_off(webcam: FakeV4l2, camera: V4l2C
         v4l2.CID_FOCUS_ABSOLUTE: 20,
     }  # fmt: skip
     assert camera.remarks == [
-        f"{webcam.stable_path}: camera.focus is 20 in its steps, 23 was asked"
+        f"{webcam.stable_path}: expert.camera.focus is 20 in its steps, 23 was asked"
     ]
 
 
@@ -128,7 +128,7 @@ def test_what_is_left_to_the_camera_is_not_touched(webcam: FakeV4l2, camera: V4l
     ("keys", "words"),
     [
         ({"width": 800, "height": 600}, ["800 x 600", "640 x 480, 1280 x 720"]),
-        ({"gain": 256}, ["camera.gain", "0 to 255"]),
+        ({"gain": 256}, ["expert.camera.gain", "0 to 255"]),
         ({"pixel_format": "H264"}, ["H264", "YUYV, MJPG"]),
     ],
 )
@@ -144,7 +144,7 @@ def test_what_the_camera_cannot_do(
 
 def test_a_camera_without_the_control(webcam: FakeV4l2) -> None:
     del webcam.controls[v4l2.CID_FOCUS_ABSOLUTE]
-    with pytest.raises(ConfigError, match=r"no such control: leave camera\.focus"):
+    with pytest.raises(ConfigError, match=r"no such control: leave expert\.camera\.focus"):
         V4l2Camera(CameraConfig(focus=3)).open()
 
 

@@ -151,7 +151,7 @@ def test_only_loopback_listens() -> None:
 def test_a_port_in_use_is_named() -> None:
     async def test() -> None:
         async with served() as (port, _):
-            with pytest.raises(ConfigError, match=f"daemon.prometheus_port: 127.0.0.1:{port}: "):
+            with pytest.raises(ConfigError, match=f"prometheus_port: 127.0.0.1:{port}: "):
                 await Metrics(port, lambda: HEALTH, print).start()
 
     asyncio.run(test())

@@ -225,7 +225,7 @@ def test_places_that_cannot_be_are_named(tmp_path: Path) -> None:
             async with served(tmp_path / ("x" * 108)):
                 pass
         (tmp_path / "file").write_text("")
-        with pytest.raises(ConfigError, match=r"daemon\.socket: .*/file/status\.sock"):
+        with pytest.raises(ConfigError, match=r"expert\.daemon\.socket: .*/file/status\.sock"):
             async with served(tmp_path / "file" / "status.sock"):
                 pass
         open_to_all = tmp_path / "open"
@@ -324,7 +324,7 @@ def test_status_ends_quietly_where_its_reader_has_gone(path: Path) -> None:
         async with served(path):
             for options in ([], ["--json"], ["--watch"]):
                 status, said = await asyncio.to_thread(
-                    into_closed_pipe, "status", *options, "--set", f"daemon.socket={path}"
+                    into_closed_pipe, "status", *options, "--set", f"expert.daemon.socket={path}"
                 )
                 assert (status, said) == (READER_GONE, "")
 
