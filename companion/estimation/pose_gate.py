@@ -174,7 +174,7 @@ class PoseGate:
     def due(self, now_ns: int) -> PoseToSend | None:
         """A predicted pose, where the camera is slower than the output rate, or a frame is late.
 
-        To be polled every few milliseconds; also detects timeouts.
+        To be polled, at `due_ns` at the latest; also detects timeouts.
         """
         accepted = self._accepted
         if not self.sending or accepted is None:
@@ -183,17 +183,29 @@ class PoseGate:
         if since_ns > self._max_gap_ns:
             self._time_out()
             return None
+        step_ns, wait_ns = self._next_step()
+        if since_ns < wait_ns:
+            return None
+        self._n_predicted += 1
+        predicted = self._predicted(accepted, self._n_predicted * step_ns)
+        return self._stamped(predicted) if predicted is not None else None
+
+    @property
+    def due_ns(self) -> int | None:
+        """Time of the next predicted pose, if no frame comes before; None where none is sent."""
+        if not self.sending or self._accepted is None:
+            return None
+        return self._accepted_at_ns + self._next_step()[1]
+
+    def _next_step(self) -> tuple[int, int]:
+        """Interval of poses, and time after a frame of the next that is to be predicted, ns."""
         period_ns = self._period_ns()
         n_steps = max(1, int(np.ceil(period_ns * 1e-9 * self._config.rate_hz - 0.1)))
         step_ns = period_ns // n_steps
         number = self._n_predicted + 1
         # give a frame that is due itself some slack
         slack_ns = step_ns // 2 if number >= n_steps else 0
-        if since_ns < number * step_ns + slack_ns:
-            return None
-        self._n_predicted = number
-        predicted = self._predicted(accepted, number * step_ns)
-        return self._stamped(predicted) if predicted is not None else None
+        return step_ns, number * step_ns + slack_ns
 
     @property
     def _max_gap_ns(self) -> int:

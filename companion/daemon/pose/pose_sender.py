@@ -24,8 +24,8 @@ from drivers.mavlink.autopilot_height import AutopilotHeight
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.pose_messages import pose_messages
 
-TICK_S = 0.005
-IDLE_TICK_S = 0.05
+TICK_S, IDLE_TICK_S = 0.002, 0.05
+"""Between two polls of the gate."""
 UNHEARD = "the autopilot is silent"
 SWITCHED_OFF = "switched off"
 
@@ -93,11 +93,15 @@ class PoseSender:
     async def run(self) -> None:
         """Send predicted poses when due, and report when poses cease; until cancelled."""
         while True:
-            await asyncio.sleep(TICK_S if self._gate.sending else IDLE_TICK_S)
+            due_ns = self._gate.due_ns
+            wait_s = IDLE_TICK_S
+            if due_ns is not None:  # a frame that comes meanwhile only puts it off
+                wait_s = min(max(1e-9 * (due_ns - self._clock.now_ns()), TICK_S), IDLE_TICK_S)
+            await asyncio.sleep(wait_s)
             self.step()
 
     def step(self) -> None:
-        """Send a predicted pose if one is due; to be called every few milliseconds."""
+        """Send a predicted pose if one is due; to be called when it is."""
         self._counter.step(self._gate)
         if self._config.mode != "off" or self._last_text == "":
             self._send(self._gate.due(self._clock.now_ns()))
