@@ -42,7 +42,6 @@ HEADER = "unix_ns,kind,values"
 WARNING = "# warning"
 SOURCES = {source.value: source for source in PositionSource}
 WIDTHS = {"attitude": 7, "imu": 6, "range": 1, "height": 1, "armed": 1, **dict.fromkeys(SOURCES, 8)}
-MAX_BYTES = 4_000_000_000
 
 
 def telemetry_csv(log: TelemetryLog, warnings: Sequence[Warned] = ()) -> Iterator[str]:
