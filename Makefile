@@ -50,7 +50,7 @@ docs: $(VENV)/.installed-docs
 deb:
 	sh packaging/build_deb.sh
 
-# The package on a booted Debian; what it needs is said in tests/system/test_service.py.
+# The package on a booted Debian, and ArduCopter in its simulator; tests/system says what they need.
 system-test: $(VENV)/.installed-dev
 	$(BIN)/pytest -s tests/system
 

@@ -11,9 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 PREFIX = "Companion: "
-MOST_BYTES = 50
-"""Of the text of a STATUSTEXT (mavlink.io, common.xml)."""
-ERROR, WARNING, NOTICE, INFO = 3, 4, 5, 6
+WARNING, NOTICE, INFO = 4, 5, 6
 """Of MAV_SEVERITY."""
 OTHER_VALUE = "?"
 LONGEST_NAME, LONGEST_NUMBER, LONGEST_REASON = 16, 10, 17
@@ -129,11 +127,6 @@ GROUND_TOO_OFTEN = PilotMessage(NOTICE, "too many ground requests")
 LEFT_OUT = PilotMessage(NOTICE, "{n} messages left out, see its log", {"n": 3})
 OTHER = PilotMessage(NOTICE, "warning, see its log")
 """For what is warned of and has no row of its own."""
-
-TABLE: Mapping[str, PilotMessage] = {
-    name: each for name, each in globals().items() if isinstance(each, PilotMessage)
-}
-"""All rows, by name."""
 
 REASONS: Mapping[str, str] = {
     "no pose yet": "no position yet",

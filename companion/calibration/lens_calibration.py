@@ -55,8 +55,6 @@ class Calibration:
     """RMS error in held-out views."""
     sigmas: Array
     """Standard deviations of fx fy cx cy k..."""
-    tried_px: dict[str, float]
-    """Held-out error of each candidate model."""
     coverage: Coverage
 
     @property
@@ -124,8 +122,7 @@ def calibrate_lens(views: Sequence[View], lit: Mask, wanted: str) -> Calibration
     lens = fits[chosen]
     return Calibration(
         lens, tuple(kept), tuple(rejected), n_corners, tried[chosen],
-        standard_deviations(lens, kept), {_label(model): px for model, px in tried.items()},
-        coverage(kept, lit),
+        standard_deviations(lens, kept), coverage(kept, lit),
     )  # fmt: skip
 
 
@@ -238,7 +235,3 @@ def _held_out(
             if np.isfinite(error):
                 out[model] = error
     return out
-
-
-def _label(model: LensModel) -> str:
-    return f"{model.distortion.value} {model.n_free}"

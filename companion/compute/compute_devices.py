@@ -35,12 +35,6 @@ def remeasured_devices() -> list[MeasuredDevice]:
     return [*_measured(listed, {}, listed, say_on_stderr, report=False), *failed]
 
 
-def known_devices(say: Say = say_on_stderr) -> list[MeasuredDevice]:
-    """All devices with cached results, or tested and timed now."""
-    listed, failed = listed_devices()
-    return [*_measured(listed, _known(listed, listed), listed, say), *failed]
-
-
 def choose_device(config: OpenclConfig, say: Say = say_on_stderr) -> ComputeDevice:
     """The first of `choose_devices`."""
     device = choose_devices(config, say).current

@@ -31,7 +31,6 @@ N_PERIODS = 20
 MAX_ATTITUDE_GAP_NS = 2 * MAX_EXTRAPOLATION_NS
 """Between two attitude samples: no time is further from one than extrapolation reaches."""
 
-OFF = "off"
 NOT_YET = "no pose yet"
 INITIALISING = "initialising"
 LOST = "lost"

@@ -18,7 +18,7 @@ from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Array
 
 INK, SOFT, GRID, CARD = "#1c1d1f", "#6b6e73", "#dddbd6", "#ffffff"
-PATH, OTHER, BAD, IDLE = "#0b6bcb", "#e08a1e", "#d64545", "#9aa0a6"
+PATH, OTHER, BAD = "#0b6bcb", "#e08a1e", "#d64545"
 STYLE: Any = {
     "font.size": 10.0,
     "axes.edgecolor": GRID, "axes.labelcolor": SOFT, "axes.titlecolor": INK,

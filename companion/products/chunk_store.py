@@ -74,11 +74,6 @@ class ChunkStore:
         return keyframe_id in self._held or keyframe_id in self._stored
 
     @property
-    def n_bytes_on_disk(self) -> int:
-        """Size of the file."""
-        return self._end
-
-    @property
     def keyframe_ids(self) -> list[int]:
         """Keyframes that have a chunk, ascending."""
         return sorted([*self._held, *self._stored])

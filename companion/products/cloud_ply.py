@@ -23,13 +23,8 @@ AT_ONCE = 100_000
 KINDS = {"f": "float", "u": "uchar"}
 
 
-def cloud_ply(cloud: Cloud, unit: str, origin: GeoOrigin | None) -> bytes:
-    """Vertices with x y z, nx ny nz, red green blue, confidence and sigma, as in `Cloud`."""
-    return b"".join(ply_parts(cloud, unit, origin))
-
-
 def ply_parts(cloud: Cloud, unit: str, origin: GeoOrigin | None) -> Iterator[bytes]:
-    """The same, in parts."""
+    """Parts of the file: x y z, nx ny nz, red green blue, confidence, sigma, as in `Cloud`."""
     head = [
         "ply",
         "format binary_little_endian 1.0",

@@ -17,10 +17,8 @@ from companion.products.cloud import Cloud
 from companion.products.cloud_ply import KINDS, VERTEX
 from companion.products.flight_result import WorldPose
 
-FORMER_NAMES = ("x", "y", "z", "red", "green", "blue", "confidence")
 MAX_HEAD = 4096
-FORMER_VERTEX = np.dtype([(name, VERTEX[name]) for name in FORMER_NAMES])
-"""Vertex of earlier versions, without normals and standard deviations."""
+PROPERTIES = [f"property {KINDS[VERTEX[name].kind]} {name}" for name in VERTEX.names or ()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,24 +106,14 @@ def _cloud(path: Path) -> Cloud:
     data = _bytes(path)
     end = data[:MAX_HEAD].find(b"end_header\n")
     lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
-    said = [line for line in lines if line.startswith("property")]
     counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
-    layout = next((v for v in (VERTEX, FORMER_VERTEX) if said == _properties(v)), None)
-    if layout is None or len(counts) != 1:
+    if [line for line in lines if line.startswith("property")] != PROPERTIES or len(counts) != 1:
         raise InputError(f"{path}: not a cloud as a run writes it")
     body = data[end + len(b"end_header\n") :]
-    if not counts[0].isdigit() or len(body) != int(counts[0]) * layout.itemsize:
+    if not counts[0].isdigit() or len(body) != int(counts[0]) * VERTEX.itemsize:
         raise InputError(f"{path}: cut short, or longer than it says: {counts[0]} points")
-    vertices = np.frombuffer(body, layout)
+    vertices = np.frombuffer(body, VERTEX)
     points = np.stack([vertices[axis] for axis in "xyz"], 1)
     rgb = np.stack([vertices[channel] for channel in ("red", "green", "blue")], 1)
-    if layout is FORMER_VERTEX:
-        normals, sigma = np.zeros_like(points), np.full(len(points), np.nan, np.float32)
-    else:
-        normals = np.stack([vertices[axis] for axis in ("nx", "ny", "nz")], 1)
-        sigma = vertices["sigma"].copy()
-    return Cloud(points, rgb, vertices["confidence"].copy(), normals, sigma)
-
-
-def _properties(layout: np.dtype[Any]) -> list[str]:
-    return [f"property {KINDS[layout[name].kind]} {name}" for name in layout.names or ()]
+    normals = np.stack([vertices[axis] for axis in ("nx", "ny", "nz")], 1)
+    return Cloud(points, rgb, vertices["confidence"].copy(), normals, vertices["sigma"].copy())

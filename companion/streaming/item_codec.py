@@ -74,7 +74,6 @@ class Kind(IntEnum):
 TIME = struct.Struct("<q")
 POSE_FORM = struct.Struct("<qBbHff3f4h")
 PLACE = struct.Struct("<if3f4h")
-PLACE_BYTES = PLACE.size
 PIECE = struct.Struct("<qIi")
 POINTS = struct.Struct("<qiB")
 PICTURE = struct.Struct("<qHH")

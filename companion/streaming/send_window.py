@@ -85,10 +85,6 @@ class SendWindow:
         self.round_trip_s = now_s - went_s
         self._adjust(now_s, self.round_trip_s, n_new)
 
-    def oldest_age_s(self, now_s: float) -> float:
-        """Age of the oldest bytes in flight, seconds."""
-        return now_s - self._in_flight[0][1] if self._in_flight else 0.0
-
     @property
     def rate_bytes_s(self) -> float:
         """Recent goodput; 0 before any acknowledgement."""

@@ -58,7 +58,6 @@ class TimeAlignment:
     score: float
     second: float
     second_offset_s: float
-    overlap_s: float
     rms_rate_rad_s: float
 
     @property
@@ -106,11 +105,9 @@ def align_rotations(
     outside_peak = np.abs(lags - lags[best]) * step_s > PEAK_WIDTH_S
     second_best = int(np.argmax(np.where(outside_peak, scores, -np.inf)))
     fine_s, sigma_s, score = _refine(camera, log, offset_s, step_s, log_from_camera)
-    first = max(camera.t_s[0], log.t_s[0] + fine_s)
-    last = min(camera.t_s[-1], log.t_s[-1] + fine_s)
     return TimeAlignment(
         fine_s, sigma_s, score, float(scores[second_best]) if outside_peak.any() else 0.0,
-        float(grid[0][0] - grid[1][0] - lags[second_best] * step_s), float(last - first),
+        float(grid[0][0] - grid[1][0] - lags[second_best] * step_s),
         float(np.sqrt((rates**2).sum(1).mean())),
     )  # fmt: skip
 

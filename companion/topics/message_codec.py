@@ -1,4 +1,4 @@
-"""Messages of each topic as envelopes, and back; schema in docs/topics.md.
+"""Messages of each topic as envelopes, those read here too back; schema in docs/topics.md.
 
 Data that are not of our making are a StreamError. Frames, tracks and corrections of the map travel
 in bundles (companion.topics.keyframe_bundle) to the depth node.
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from companion.errors import StreamError
-from companion.geometry.transforms import Array, Pose, Similarity
+from companion.geometry.transforms import Pose, Similarity
 from companion.messages import (
     DepthMap,
     Floats,
@@ -20,18 +20,10 @@ from companion.messages import (
     MapUpdate,
     Odometry,
     PointChunk,
-    TrackState,
 )
 from companion.topics.envelope import Envelope, finite_or_none
-from companion.topics.image_jpeg import image_of, jpeg_of
-from companion.topics.pose_rows import (
-    PLACE_NUMBERS,
-    POSE_NUMBERS,
-    place_of,
-    place_row,
-    pose_of,
-    pose_row,
-)
+from companion.topics.image_jpeg import jpeg_of
+from companion.topics.pose_rows import PLACE_NUMBERS, place_of, place_row, pose_row
 
 MOST_POINTS = 2_000_000
 MOST_KEYFRAMES = 1_000_000
@@ -57,27 +49,6 @@ def pose_envelope(flight: str, odometry: Odometry) -> Envelope:
     }, {})  # fmt: skip
 
 
-def pose_of_envelope(envelope: Envelope) -> Odometry:
-    """Back from `pose`."""
-    pose: Pose | None = None
-    if envelope.known("world_from_body"):
-        pose = pose_of(_row(envelope, "world_from_body", POSE_NUMBERS))
-    velocity: Array | None = None
-    if envelope.known("velocity_world_m_s"):
-        velocity = np.array(_row(envelope, "velocity_world_m_s", 3))
-    sigmas = [
-        envelope.number(name, 0) if envelope.known(name) else UNKNOWN
-        for name in (
-            "sigma_position_m", "sigma_velocity_m_s", "sigma_attitude_rad", "sigma_yaw_rad"
-        )
-    ]  # fmt: skip
-    return Odometry(
-        envelope.integer("seq"), envelope.integer("t_ns"), state_of(envelope.text("state")),
-        envelope.integer("reset_counter"), envelope.integer("quality", -1, 100), pose, velocity,
-        *sigmas,
-    )  # fmt: skip
-
-
 def keyframe_envelope(
     flight: str, keyframe: KeyframeAdded, update: MapUpdate | None, jpeg: bytes
 ) -> Envelope:
@@ -99,15 +70,6 @@ def map_envelope(flight: str, update: MapUpdate) -> Envelope:
     }, places_arrays(update, list(update.map_from_camera)))  # fmt: skip
 
 
-def map_of_envelope(envelope: Envelope) -> MapUpdate:
-    """Back from `map`; without sparse points."""
-    places = places_of(envelope)
-    return map_update(
-        envelope.integer("revision"), envelope.integer("t_ns"), places,
-        georeference_of(envelope), envelope.integer("n_retired", 0, MOST_ID),
-    )  # fmt: skip
-
-
 def depth_envelope(flight: str, depth_map: DepthMap, update: MapUpdate | None) -> Envelope:
     """Topic `depth`: dense depth of a keyframe, in its undistorted image."""
     return Envelope("depth", {
@@ -120,21 +82,6 @@ def depth_envelope(flight: str, depth_map: DepthMap, update: MapUpdate | None) -
         "inlier_ratio": depth_map.inlier_ratio,
         "jpeg": np.frombuffer(jpeg_of(depth_map.rgb, DEPTH_JPEG_QUALITY), np.uint8),
     })  # fmt: skip
-
-
-def depth_of_envelope(envelope: Envelope) -> DepthMap:
-    """Back from `depth`; its colours are those of a JPEG."""
-    depth = envelope.array("depth", "<f4", -1, -1)
-    height, width = depth.shape
-    layers = [envelope.array(name, "<f4", height, width) for name in ("sigma", "inlier_ratio")]
-    fx, fy, cx, cy = _row(envelope, "intrinsics", 4)
-    times = envelope.part("kernel_ms")
-    return DepthMap(
-        envelope.integer("keyframe_id", 0, MOST_ID), envelope.integer("t_ns"), (fx, fy, cx, cy),
-        depth, layers[0], envelope.array("state", "|u1", height, width), layers[1],
-        image_of(envelope.array("jpeg", "|u1", -1).tobytes(), width, height, colour=True),
-        envelope.integer("n_updates"), {name: times.number(name) for name in times.fields},
-    )  # fmt: skip
 
 
 def cloud_envelope(flight: str, chunk: PointChunk, update: MapUpdate | None) -> Envelope:
@@ -164,14 +111,6 @@ def cloud_of_envelope(envelope: Envelope) -> PointChunk:
         envelope.array("normals_camera", "<f4", n, 3), envelope.array("sigma", "<f4", n),
         dict(zip(span_ids.tolist(), span_lengths.tolist(), strict=True)),
     )  # fmt: skip
-
-
-def state_of(text: str) -> TrackState:
-    """Tracking state of that name."""
-    try:
-        return TrackState(text)
-    except ValueError as error:
-        raise StreamError(f"there is no state {text!r}") from error
 
 
 def places_arrays(update: MapUpdate, keyframe_ids: list[int]) -> dict[str, Any]:

@@ -36,7 +36,6 @@ class MessageRates:
 
     def __init__(self, wants: Sequence[Wanted]) -> None:
         self._streams = [_Stream(want) for want in wants]
-        self.n_asked = 0
         self.missing: list[int] = []
         """Messages that this autopilot has reported as unsupported."""
 
@@ -62,7 +61,6 @@ class MessageRates:
 
     def asked(self, message_id: int, refused: bool, now_ns: int) -> None:
         """A request was sent, and refused for good or not."""
-        self.n_asked += 1
         for stream in self._streams:
             if stream.message_id != message_id:
                 continue

@@ -18,8 +18,6 @@ class ServiceManager:
     """The service manager that started this process, where there is one."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        self.watchdog_s = _watchdog_s(environment)
-        """Interval for `alive` (half of the watchdog's); None without a watchdog."""
         self.n_lost = 0
         """Notifications that could not be sent."""
         self.problem = ""
@@ -51,7 +49,7 @@ class ServiceManager:
         self._send(_status(text))
 
     def alive(self) -> None:
-        """WATCHDOG=1; to be sent at least every `watchdog_s`, only while the work goes on."""
+        """WATCHDOG=1; to be sent more often than WatchdogSec, only while the work goes on."""
         self._send("WATCHDOG=1")
 
     def reloading(self) -> None:
@@ -86,15 +84,3 @@ class ServiceManager:
 def _status(text: str) -> str:
     # A line break would begin another assignment.
     return "STATUS=" + " ".join(text.split())[:MAX_STATUS] if text else ""
-
-
-def _watchdog_s(environment: Mapping[str, str]) -> float | None:
-    """Half the watchdog interval; None without a watchdog."""
-    try:
-        interval_us = int(environment.get("WATCHDOG_USEC", "0"))
-        pid = int(environment.get("WATCHDOG_PID", "0"))
-    except ValueError:
-        return None
-    if interval_us <= 0 or pid not in (0, os.getpid()):
-        return None
-    return interval_us * 0.5e-6

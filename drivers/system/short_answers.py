@@ -36,7 +36,6 @@ class ShortAnswers:
         self._server: asyncio.AbstractServer | None = None
         self._clients: set[asyncio.Task[None]] = set()
         self._faults = FaultTraces()
-        self.n_answered = 0
         self.n_refused = 0
 
     async def start(self) -> None:
@@ -71,7 +70,6 @@ class ShortAnswers:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             await within(self._reply(reader, writer), TIMEOUT_S)
-            self.n_answered += 1
         except (OSError, EOFError, asyncio.TimeoutError):
             self.n_refused += 1
         except Exception as error:  # a bug in making an answer, which must not end the daemon

@@ -49,8 +49,6 @@ class LiveSamples:
         self.positions = LivePositions()
         self.n_dropped: Counter[str] = Counter()
         """By reason."""
-        self.gps_fix_type = 0
-        """GPS_FIX_TYPE of the newest GPS_RAW_INT; 0 without a GPS."""
         self._unix_minus_boot_ns: int | None = None
         self._segment = clock.n_segments
         self._stamps: dict[int, int] = {}
@@ -77,8 +75,6 @@ class LiveSamples:
     def _take(self, kind: int, message: Any, receive_ns: int) -> None:
         if kind == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME and message.time_unix_usec:
             self._unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
-        if kind == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
-            self.gps_fix_type = message.fix_type
         remote_ns = boot_ns(message, self._unix_minus_boot_ns)
         if remote_ns is None:
             self.n_dropped["telemetry without boot time"] += 1

@@ -34,7 +34,6 @@ FIX_3D = 3
 UNIX_SINCE_NS = 10**17
 """Larger stamps count from 1970, smaller ones from boot."""
 ACCEL_AND_GYRO = 0x3F
-PRESSURE_ALTITUDE = 0x800
 
 ATTITUDE_IDS = (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_ATTITUDE)
 IMU_IDS = (

@@ -44,7 +44,6 @@ WIDTHS: dict[str, int] = {
     for name, kind in KINDS.items()
 }
 """Number of values of each kind."""
-MAX_BYTES = 4_000_000_000
 
 
 def telemetry_csv(log: TelemetryLog, warnings: Sequence[Warned] = ()) -> Iterator[str]:

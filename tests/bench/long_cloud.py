@@ -69,8 +69,7 @@ def main() -> None:
         for k in range(wanted.keyframes):
             result.take(chunk(k, wanted.points, rng))
             if (k + 1) % max(wanted.keyframes // 6, 1) == 0:
-                store = result._chunks
-                row = (k + 1, result.n_points, mb() - before, store.n_bytes_on_disk / 1e6)
+                row = (k + 1, result.n_points, mb() - before, result._chunks._end / 1e6)
                 print("| {} | {} | {:.0f} | {:.0f} |".format(*row), flush=True)
         poses = {k: place(k, wanted.step_m) for k in range(wanted.keyframes)}
         metric = Georeference(Similarity.identity(), 0.01, 0.01, "made up", 9, 0.1)

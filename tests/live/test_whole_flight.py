@@ -40,7 +40,6 @@ class Flown:
     """When its first picture was due."""
     armed_ns: int = 0
     disarmed_ns: int = 0
-    over_ns: int = 0
     folders_before_arming: list[Path] = field(default_factory=list)
     folder: Path = Path()
     second: Run | None = None
@@ -100,7 +99,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
             wait_until(DISARMS_S)
             autopilot.disarm()
             out.disarmed_ns = time.monotonic_ns()
-            out.over_ns = daemon.line("flight over", 40).monotonic_ns
+            daemon.line("flight over", 40)
             (out.folder,) = daemon.flown()
             out.health_after = daemon.status()
             out.stop_s = daemon.stop()

@@ -19,15 +19,14 @@ from companion.messages import Warned
 from companion.pilot_messages import (
     INFO,
     JOURNAL_ONLY,
-    MOST_BYTES,
     NOTICE,
     OF_WARNING,
     OTHER,
     PARTS,
     PREFIX,
     REASONS,
-    TABLE,
     WARNING,
+    PilotMessage,
     of_warning,
     position_lost,
 )
@@ -41,6 +40,10 @@ from drivers.telemetry import live_samples
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "pilot_messages.md"
 SEVERITIES = {"WARNING": WARNING, "NOTICE": NOTICE, "INFO": INFO}
+MOST_BYTES = 50
+"""Of the text of a STATUSTEXT (mavlink.io, common.xml)."""
+TABLE = {name: row for name, row in vars(pilot_messages).items() if isinstance(row, PilotMessage)}
+"""All rows, by name."""
 
 
 @pytest.mark.parametrize("name", TABLE)

@@ -99,9 +99,7 @@ def _placed(run: FinishedRun, axes: Axes | MapFrame) -> list[str]:
         f"{o.longitude_deg:.8f} (WGS84), {o.altitude_m:.3f} m {level}."
     )
     if isinstance(axes, MapFrame):
-        shift = "UTM by Krueger's series, error below a micrometre"
-        how = shift if axes.name.startswith("WGS 84 / UTM") else "projected by PROJ from WGS84"
-        coordinates += f" (EPSG:{axes.epsg}); {how}"
+        coordinates += f" (EPSG:{axes.epsg}); projected by PROJ from WGS84"
     lines = [f"Coordinates: {coordinates}."]
     if against:
         lines.append("Heights: NOT above mean sea level. " + "; ".join(against) + ".")

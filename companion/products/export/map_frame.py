@@ -11,44 +11,33 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.enums import WktVersion
+from pyproj.exceptions import CRSError
 
 from companion.errors import InputError
 from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry.transforms import Array, nearest_rotation
-from companion.geometry.utm import UtmZone, utm_from_geodetic, utm_zone
 
-WGS84 = (
-    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563,'
-    'AUTHORITY["EPSG","7030"]],AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0,'
-    'AUTHORITY["EPSG","8901"]],UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],'
-    'AUTHORITY["EPSG","4326"]]'
-)
-EGM96 = (
-    'VERT_CS["EGM96 height",VERT_DATUM["EGM96 geoid",2005,AUTHORITY["EPSG","5171"]],'
-    'UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Gravity-related height",UP],'
-    'AUTHORITY["EPSG","5773"]]'
-)
+UTM_NORTH, UTM_SOUTH = 32600, 32700
+"""EPSG numbers of zones, less their own numbers: UTM on WGS84."""
+EGM96 = 5773
+MAX_LATITUDE_DEG, MIN_LATITUDE_DEG = 84.0, -80.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapFrame:
     """East, north and height (N, 3) of points (N, 3) in local NED; `wkt` is "" for a local frame.
 
-    `wkt` is of the plane, `wkt_with_height` of plane and heights, both as OGC WKT 1.
+    `wkt` is of the plane, `wkt_with_height` of the heights too if they are above mean sea level,
+    both as OGC WKT 1.
     """
 
     name: str
     epsg: int | None
     wkt: str
+    wkt_with_height: str
     coordinates: Callable[[Array], Array]
-    above_sea: bool = True
-
-    @property
-    def wkt_with_height(self) -> str:
-        """WKT with the vertical frame, if heights are above mean sea level."""
-        if not (self.wkt and self.above_sea):
-            return self.wkt
-        return f'COMPD_CS["{self.name} + EGM96 height",{self.wkt},{EGM96}]'
 
     def directions(self, vectors_ned: NDArray[np.floating], about: NDArray[np.floating]) -> Array:
         """Unit vectors (N, 3) in local NED, or zeros, in this frame.
@@ -78,43 +67,9 @@ def map_frame(
                 "says why); leave the number out for local coordinates"
             )
         if not metric:
-            return MapFrame("the map's own axes and units", None, "", _same)
-        return MapFrame("local east, north, up in metres", None, "", _enu)
-    zone = _zone_of(epsg) if epsg else utm_zone(origin.latitude_deg, origin.longitude_deg)
-    if zone is None:
-        return _by_proj(origin, epsg, above_sea)
-
-    def coordinates(points_ned: Array) -> Array:
-        places = geodetic_from_ned(points_ned, origin)
-        return np.column_stack([utm_from_geodetic(places[:, 0], places[:, 1], zone), places[:, 2]])
-
-    return MapFrame(zone.name, zone.epsg, _utm_wkt(zone), coordinates, above_sea)
-
-
-def _enu(points_ned: Array) -> Array:
-    return np.asarray(points_ned, np.float64)[:, [1, 0, 2]] * [1, 1, -1]
-
-
-def _same(points: Array) -> Array:
-    return np.asarray(points, np.float64)
-
-
-def _zone_of(epsg: int) -> UtmZone | None:
-    number = epsg % 100
-    if epsg - number in (32600, 32700) and 1 <= number <= 60:
-        return UtmZone(number, epsg < 32700)
-    return None
-
-
-def _by_proj(origin: GeoOrigin, epsg: int, above_sea: bool) -> MapFrame:
-    try:
-        from pyproj import CRS, Transformer
-        from pyproj.enums import WktVersion
-        from pyproj.exceptions import CRSError
-    except ImportError as error:
-        raise InputError(
-            f"EPSG:{epsg} is not UTM on WGS84 and wants PROJ: pip install pyproj"
-        ) from error
+            return MapFrame("the map's own axes and units", None, "", "", _same)
+        return MapFrame("local east, north, up in metres", None, "", "", _enu)
+    epsg = epsg or utm_epsg(origin.latitude_deg, origin.longitude_deg)
     try:
         crs = CRS.from_epsg(epsg)
     except CRSError as error:
@@ -132,17 +87,29 @@ def _by_proj(origin: GeoOrigin, epsg: int, above_sea: bool) -> MapFrame:
             raise InputError(f"EPSG:{epsg} ({crs.name}) does not reach to where the flight was")
         return out
 
-    wkt = crs.to_wkt(WktVersion.WKT1_GDAL)
-    return MapFrame(crs.name, epsg, wkt, coordinates, above_sea)
+    with_heights = CRS.from_user_input(f"EPSG:{epsg}+{EGM96}") if above_sea else crs
+    return MapFrame(
+        crs.name, epsg, crs.to_wkt(WktVersion.WKT1_GDAL),
+        with_heights.to_wkt(WktVersion.WKT1_GDAL), coordinates,
+    )  # fmt: skip
 
 
-def _utm_wkt(zone: UtmZone) -> str:
-    return (
-        f'PROJCS["{zone.name}",{WGS84},PROJECTION["Transverse_Mercator"],'
-        'PARAMETER["latitude_of_origin",0],'
-        f'PARAMETER["central_meridian",{zone.central_meridian_deg:g}],'
-        'PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
-        f'PARAMETER["false_northing",{0 if zone.north else 10000000}],'
-        'UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH],'
-        f'AUTHORITY["EPSG","{zone.epsg}"]]'
-    )
+def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
+    """EPSG number of the UTM zone, with the exceptions of Norway; InputError near the poles."""
+    if not MIN_LATITUDE_DEG <= latitude_deg <= MAX_LATITUDE_DEG:
+        raise InputError(f"latitude {latitude_deg:.4f} is beyond UTM; give an EPSG number")
+    longitude = (longitude_deg + 180.0) % 360.0 - 180.0
+    number = int((longitude + 180.0) // 6.0) + 1
+    if 56.0 <= latitude_deg < 64.0 and 3.0 <= longitude < 12.0:
+        number = 32
+    elif latitude_deg >= 72.0 and 0.0 <= longitude < 42.0:
+        number = 31 + 2 * int((longitude + 3.0) // 12.0)
+    return number + (UTM_NORTH if latitude_deg >= 0 else UTM_SOUTH)
+
+
+def _enu(points_ned: Array) -> Array:
+    return np.asarray(points_ned, np.float64)[:, [1, 0, 2]] * [1, 1, -1]
+
+
+def _same(points: Array) -> Array:
+    return np.asarray(points, np.float64)

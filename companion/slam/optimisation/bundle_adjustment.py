@@ -44,13 +44,11 @@ class Bundle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustmentResult:
-    """Adjusted poses and points, inlier mask of observations (O,), cost before and after."""
+    """Adjusted poses and points, inlier mask of observations (O,)."""
 
     poses: list[Pose]
     points: Array
     inlier: Bools
-    cost_before: float
-    cost_after: float
 
 
 def adjust(
@@ -66,7 +64,6 @@ def adjust(
         rotation, translation, points, b.camera, b.point, b.normalised, b.whitening
     )
     cost += sum(factor.cost(rotation, translation) for factor in b.factors)
-    first_cost = cost
     damping = 1e-4
     moving = np.flatnonzero(b.camera < n_var)
     by_point = moving[np.argsort(b.point[moving], kind="stable")]
@@ -125,4 +122,4 @@ def adjust(
             damping *= 10
     inlier = ((residual * residual).sum(1) < CHI2_2D) & (p[:, 2] > 0)
     poses = [Pose(rotation[i], translation[i]) for i in range(len(b.poses))]
-    return AdjustmentResult(poses, points, inlier, first_cost, cost)
+    return AdjustmentResult(poses, points, inlier)

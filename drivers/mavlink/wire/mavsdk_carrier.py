@@ -1,43 +1,21 @@
 """MAVSDK as a carrier of raw packets, unchanged in both directions.
 
 Between a connection and its raw bytes MAVSDK passes packets on unchanged, whatever their message,
-system or signature. It gets an identity of its own that nobody speaks to, since it keeps packets
-for itself; and its own messages (heartbeats, requests for versions) are suppressed, so that one
-component is on the link: ours.
+system or signature. It is a component of its own on the link; nobody speaks to it, since it keeps
+packets for itself.
 """
 
 from __future__ import annotations
 
-import ctypes
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import mavsdk
-from mavsdk import logging as mavsdk_logging
-from mavsdk import types as mavsdk_types
-from mavsdk.cmavsdk_loader import _cmavsdk_lib as library
 
-from companion.errors import ConfigError
-
-NOBODY = (254, 25)
+ITSELF = (254, 25)
 """System and component."""
-DROP = 0
+MAVLINK_2 = 0xFD
 HANDLED = True
-WARNING = 2
-
-
-def check_library() -> None:
-    """ConfigError unless this MAVSDK can be kept silent, by a function of its C interface."""
-    try:
-        intercept = library.mavsdk_subscribe_outgoing_messages_json
-    except AttributeError:
-        raise ConfigError(
-            f"mavsdk {mavsdk.__version__} cannot be kept from sending heartbeats of its own; set "
-            'expert.link.backend = "pymavlink"'
-        ) from None
-    intercept.argtypes = [ctypes.c_void_p, mavsdk_types.InterceptJsonCallback, ctypes.c_void_p]
-    intercept.restype = ctypes.c_void_p
 
 
 class Carrier:
@@ -52,21 +30,17 @@ class Carrier:
         self._take = take
         self._lock = threading.Lock()
         self._held: mavsdk.Mavsdk | None = None
-        self._silencer: Any = None
 
     def start(self) -> None:
         """Open the connection; MavsdkError if that is impossible now."""
         with self._lock:
             complaints.listen()
-            configuration = mavsdk.Configuration.create_manual(*NOBODY, False)
+            configuration = mavsdk.Configuration.create_manual(*ITSELF, False)
             self._held = held = mavsdk.Mavsdk(configuration)
             configuration.destroy()
-            # kept for as long as MAVSDK may call it
-            self._silencer = mavsdk_types.InterceptJsonCallback(lambda message, data: DROP)
-            library.mavsdk_subscribe_outgoing_messages_json(held._handle, self._silencer, None)
             on = mavsdk.ForwardingOption.ON
             held.add_any_connection_with_handle_and_forwarding("raw://", on)
-            held.subscribe_raw_bytes_to_be_sent(self._take)
+            held.subscribe_raw_bytes_to_be_sent(self._came)
             held.add_any_connection_with_handle_and_forwarding(self._url, on)
 
     def send(self, packet: bytes) -> None:
@@ -80,7 +54,11 @@ class Carrier:
             held, self._held = self._held, None
             if held is not None:
                 held.destroy()
-            self._silencer = None
+
+    def _came(self, packet: bytes) -> None:
+        if packet[0] == MAVLINK_2 and tuple(packet[5:7]) == ITSELF:
+            return  # what it says of its own goes out at every end
+        self._take(packet)
 
 
 class Complaints:
@@ -88,18 +66,18 @@ class Complaints:
 
     def __init__(self) -> None:
         self.newest = ""
-        self._callback: Any = None
+        self._listening = False
 
     def listen(self) -> None:
         """Clear the newest warning; from now on nothing is printed."""
         self.newest = ""
-        if self._callback is None:
-            self._callback = mavsdk_logging.LogCallback(self._hear)
-            library.mavsdk_log_subscribe(self._callback, None)
+        if not self._listening:
+            self._listening = True
+            mavsdk.log_subscribe(self._hear)
 
-    def _hear(self, level: int, text: bytes | None, *_: Any) -> bool:
-        if level >= WARNING:
-            self.newest = (text or b"").decode("utf-8", "replace")
+    def _hear(self, level: mavsdk.LogLevel, text: str, *_: object) -> bool:
+        if level >= mavsdk.LogLevel.WARN:
+            self.newest = text
         return HANDLED
 
 

@@ -12,8 +12,8 @@ from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 class MavsdkPort(PymavlinkPort):
     """Link to the autopilot through MAVSDK: the same messages, router and signing.
 
-    MAVSDK's own messages go through JSON, which has no NaN: integers of PX4's parameters and
-    unknown covariances would be lost. So raw packets are used. See docs/links.md.
+    MAVSDK gives out messages as JSON, which has no NaN: integers of PX4's parameters and unknown
+    covariances would be lost. So raw packets are used. See docs/links.md.
     """
 
     def __init__(self, config: LinkConfig, router: RouterConfig, clock: FlightClock) -> None:

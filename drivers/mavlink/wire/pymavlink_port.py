@@ -43,8 +43,6 @@ class PymavlinkPort:
         )
         self.n_received = 0
         self.n_sent = 0
-        self.n_lost = 0
-        """Packets of others that never came, by their sequence numbers."""
         self.n_unsigned = 0
         """Packets of the link rejected without a valid signature."""
         self._n_unpacked = 0
@@ -60,7 +58,6 @@ class PymavlinkPort:
             self._writer.signing.secret_key = self._signing.key
             self._writer.signing.sign_outgoing = True
         self._seq_out: dict[tuple[int, int], int] = {}
-        self._seq_in: dict[tuple[int, int], int] = {}
         self._on_message: OnMessage = _ignore
 
     @property
@@ -128,7 +125,6 @@ class PymavlinkPort:
     def opened(self) -> None:
         """See `WireEnd`."""
         self._stream.restart()
-        self._seq_in.clear()
 
     def received(self, data: bytes, monotonic_ns: int) -> int:
         """See `WireEnd`."""
@@ -140,7 +136,6 @@ class PymavlinkPort:
         self.n_received += len(packets)
         try:
             for packet in packets:
-                self._follow(packet)
                 if self._is_signed(packet, monotonic_ns):
                     self._n_refused = 0
                     self._deliver(packet, monotonic_ns)
@@ -150,15 +145,6 @@ class PymavlinkPort:
         finally:
             self.router.from_link(packets, monotonic_ns)
         return sum(packet.known for packet in packets)
-
-    def _follow(self, packet: Packet) -> None:
-        source = packet.system, packet.component
-        last = self._seq_in.get(source)
-        self._seq_in[source] = packet.seq
-        if last is not None:
-            missing = (packet.seq - last - 1) % 256
-            if missing < 128:  # else it came twice or late
-                self.n_lost += missing
 
     def _is_signed(self, packet: Packet, monotonic_ns: int) -> bool:
         """Whether it is signed as required."""

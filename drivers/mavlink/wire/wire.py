@@ -68,7 +68,6 @@ class Wire(ABC):
         self.connected = False
         self.trouble = ""
         """Reason why it is not connected, or problem of its input; "" without one."""
-        self.n_opened = 0
         self.n_unsent = 0
         """Packets dropped while the wire was not open."""
         self.tap: Tap | None = None
@@ -108,7 +107,6 @@ class Wire(ABC):
         self._lost = loop.create_future()
         self._progress_ns = time.monotonic_ns()
         self.connected, self.trouble = True, ""
-        self.n_opened += 1
         try:
             end.opened()
             loop.add_reader(fd, self._readable, end)

@@ -107,11 +107,6 @@ class Flown:
     truth: Path | None = None
 
     @property
-    def placed_s(self) -> list[float]:
-        """Times of the frames that have a pose in the end, seconds since the start."""
-        return [(p.t_ns - START_NS) * 1e-9 for p in self.result.poses()]
-
-    @property
     def placed_share(self) -> float:
         return len(self.result.poses()) / len(self.frames_ns)
 

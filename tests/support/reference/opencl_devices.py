@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
-from companion.compute.compute_devices import choose_devices, known_devices
+from companion.compute.compute_devices import _known, _measured, choose_devices, say_on_stderr
+from companion.compute.device_probe import listed_devices
 from companion.config import OpenclConfig
 from companion.dense.device_choice import MeasuredDevice, in_order
 from companion.dense.device_takeover import Devices
@@ -14,7 +15,8 @@ from companion.dense.opencl import ComputeDevice, open_device
 @cache
 def known() -> list[MeasuredDevice]:
     """All devices there are, each with its verdict."""
-    return known_devices()
+    listed, failed = listed_devices()
+    return [*_measured(listed, _known(listed, listed), listed, say_on_stderr), *failed]
 
 
 def working() -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
@@ -80,16 +81,9 @@ def score(run: Trajectory, truth: Trajectory) -> Score:
 
 
 def read_ply(path: Path) -> NDArray[np.void]:
-    """Vertices of a binary little-endian PLY file without lists, as a structured array."""
-    kinds = {"float": "<f4", "double": "<f8", "uchar": "u1", "ushort": "<u2", "int": "<i4"}
-    head, _, body = path.read_bytes().partition(b"end_header\n")
-    lines = head.decode("ascii").splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    (n,) = (int(line.split()[2]) for line in lines if line.startswith("element vertex "))
-    properties = [line.split()[1:] for line in lines if line.startswith("property ")]
-    kind = np.dtype([(name, kinds[of]) for of, name in properties])
-    assert len(body) == n * kind.itemsize
-    return np.frombuffer(body, kind)
+    """Vertices as a structured array, by somebody else's reader."""
+    vertices: NDArray[np.void] = PlyData.read(path, mmap=False)["vertex"].data
+    return vertices
 
 
 def depth_errors(points: Array, flight: Path, truth: Trajectory) -> Array:

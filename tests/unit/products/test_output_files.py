@@ -11,7 +11,7 @@ from companion.geometry.transforms import angle_between, rotation_from_quaternio
 from companion.messages import TrackState
 from companion.products.atomic_file import write_atomically
 from companion.products.cloud import no_cloud
-from companion.products.cloud_ply import cloud_ply
+from companion.products.cloud_ply import ply_parts
 from companion.products.flight_result import FlightResult
 from companion.products.report.report_json import report, report_json, state_spans
 from companion.products.report.write_results import write_results
@@ -71,7 +71,7 @@ def test_seconds_lose_no_nanosecond(t_ns: int, text: str) -> None:
 def test_cloud_reads_back_as_it_was(tmp_path: Path, result: FlightResult) -> None:
     cloud = result.cloud(0.5)
     path = tmp_path / "cloud.ply"
-    path.write_bytes(cloud_ply(cloud, "m", flown.facts().origin))
+    path.write_bytes(b"".join(ply_parts(cloud, "m", flown.facts().origin)))
     read = read_ply(path)
     assert read.dtype.names == (
         "x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "confidence", "sigma"
@@ -85,7 +85,7 @@ def test_cloud_reads_back_as_it_was(tmp_path: Path, result: FlightResult) -> Non
 
 def test_an_empty_cloud_is_a_file_too(tmp_path: Path) -> None:
     path = tmp_path / "cloud.ply"
-    path.write_bytes(cloud_ply(no_cloud(), "map units", None))
+    path.write_bytes(b"".join(ply_parts(no_cloud(), "map units", None)))
     assert len(read_ply(path)) == 0
 
 

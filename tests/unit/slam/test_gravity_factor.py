@@ -83,7 +83,6 @@ def test_climb_over_a_plane_stays_upright(rng: np.random.Generator, wrong: bool)
             () if factor is None else (factor,),
         )  # fmt: skip
         result = adjust(bundle, 15)
-        assert result.cost_after < result.cost_before
         cosine = [
             float((result.poses[i].rotation.T @ truth[k].rotation @ DOWN)[2])
             for i, k in enumerate(order)

@@ -19,12 +19,10 @@ from companion.topics.message_codec import (
     cloud_envelope,
     cloud_of_envelope,
     depth_envelope,
-    depth_of_envelope,
     map_envelope,
-    map_of_envelope,
     pose_envelope,
-    pose_of_envelope,
 )
+from companion.topics.pose_rows import place_of, pose_of
 from tests.support.flights import flown, topic_flight
 
 
@@ -46,19 +44,23 @@ def test_what_is_no_envelope_is_refused() -> None:
         unpack(good.replace(b"[4]", b"[9]"))
 
 
-def test_a_pose_is_as_it_was() -> None:
+def test_a_pose_is_as_documented() -> None:
     where = Pose(flown.WORLD_FROM_MAP.rotation, np.array([1.0, 2.0, -3.5]))
     sent = Odometry(
         5, 123, TrackState.TRACKING, 2, 80, where, np.array([0.1, 0.2, 0.3]), 0.05, 0.02, 0.01, 0.04
     )
-    back = pose_of_envelope(unpack(pose_envelope("f", sent).pack()))
-    assert back.world_from_body is not None and back.velocity_world_m_s is not None
-    assert np.allclose(back.world_from_body.matrix(), where.matrix(), atol=1e-12)
-    assert np.allclose(back.velocity_world_m_s, [0.1, 0.2, 0.3])
-    assert (back.seq, back.quality, back.sigma_position_m) == (5, 80, 0.05)
-    assert (back.sigma_attitude_rad, back.sigma_yaw_rad) == (0.01, 0.04)
-    lost = pose_of_envelope(unpack(pose_envelope("f", Odometry(6, 124, TrackState.LOST, 2)).pack()))
-    assert lost.world_from_body is None and lost.sigma_position_m == float("inf")
+    head = unpack(pose_envelope("f", sent).pack()).fields
+    back = pose_of(head["world_from_body"])
+    assert back is not None and np.allclose(back.matrix(), where.matrix(), atol=1e-12)
+    assert head["velocity_world_m_s"] == [0.1, 0.2, 0.3]
+    assert (head["seq"], head["t_ns"], head["state"]) == (5, 123, "tracking")
+    assert (head["reset_counter"], head["quality"]) == (2, 80)
+    sigmas = [
+        head[f"sigma_{name}"] for name in ("position_m", "velocity_m_s", "attitude_rad", "yaw_rad")
+    ]
+    assert sigmas == [0.05, 0.02, 0.01, 0.04]
+    lost = unpack(pose_envelope("f", Odometry(6, 124, TrackState.LOST, 2)).pack()).fields
+    assert lost["world_from_body"] is None and lost["sigma_position_m"] is None
 
 
 def test_a_cloud_says_where_it_lies_in_the_world() -> None:
@@ -77,18 +79,25 @@ def test_a_cloud_says_where_it_lies_in_the_world() -> None:
     assert before.fields["world_from_camera"] is None
 
 
-def test_map_and_depth_are_as_they_were() -> None:
+def test_map_and_depth_are_as_documented() -> None:
     update = replace(flown.update(), scale_of={2: 1.5}, n_retired=1)
-    back = map_of_envelope(unpack(map_envelope("f", update).pack()))
-    assert list(back.map_from_camera) == list(update.map_from_camera) and back.n_retired == 1
-    assert back.georeference is not None and back.georeference.method == "GPS positions"
-    place, true = back.place_of(2), update.place_of(2)
-    assert place is not None and true is not None and place.scale == 1.5
+    of_map = unpack(map_envelope("f", update).pack())
+    assert of_map.fields["n_retired"] == 1
+    assert of_map.fields["georeference"]["method"] == "GPS positions"
+    ids = of_map.arrays["ids"].tolist()
+    assert ids == list(update.map_from_camera)
+    place, true = place_of(of_map.arrays["map_from_camera"][ids.index(2)]), update.place_of(2)
+    assert true is not None and place.scale == 1.5
     assert np.allclose(place.rotation, true.rotation, atol=1e-12)
     depth = flown.depth_map(4)
-    got = depth_of_envelope(unpack(depth_envelope("f", depth, update).pack()))
-    assert np.array_equal(got.depth, depth.depth) and got.kernel_ms == dict(depth.kernel_ms)
-    assert np.abs(got.rgb.astype(int) - depth.rgb).mean() < 8
+    of_depth = unpack(depth_envelope("f", depth, update).pack())
+    assert of_depth.fields["kernel_ms"] == dict(depth.kernel_ms)
+    assert tuple(of_depth.fields["intrinsics"]) == tuple(depth.intrinsics)
+    for name in ("depth", "sigma", "state", "inlier_ratio"):
+        assert np.array_equal(of_depth.arrays[name], getattr(depth, name))
+    height, width = depth.depth.shape
+    rgb = image_of(of_depth.arrays["jpeg"].tobytes(), width, height, colour=True)
+    assert np.abs(rgb.astype(int) - depth.rgb).mean() < 8
 
 
 def test_cameras_are_as_they_were() -> None:

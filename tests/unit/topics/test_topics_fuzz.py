@@ -16,21 +16,12 @@ from companion.config import Config
 from companion.daemon.nodes.kept_chunks import NAME, KeptChunks
 from companion.dense.depth_stage import DepthStage
 from companion.errors import StreamError
-from companion.messages import Message, Odometry, TrackState
+from companion.messages import Message
 from companion.timing.clock import StageTimes
 from companion.topics.camera_fields import camera_fields, camera_of
 from companion.topics.envelope import LENGTH, Envelope, unpack
 from companion.topics.keyframe_bundle import MapMirror, bundle_of, frame_of
-from companion.topics.message_codec import (
-    cloud_envelope,
-    cloud_of_envelope,
-    depth_envelope,
-    depth_of_envelope,
-    map_envelope,
-    map_of_envelope,
-    pose_envelope,
-    pose_of_envelope,
-)
+from companion.topics.message_codec import cloud_envelope, cloud_of_envelope
 from tests.support.flights import flown, topic_flight
 from tests.support.reference import opencl_devices
 
@@ -40,12 +31,6 @@ NASTY: list[Any] = [
 ]  # fmt: skip
 
 KINDS: dict[str, tuple[Envelope, Callable[[Envelope], object]]] = {
-    "pose": (
-        pose_envelope("f", Odometry(1, 2, TrackState.TRACKING, 0, 50, flown.map_from_camera(3))),
-        pose_of_envelope,
-    ),
-    "map": (map_envelope("f", flown.update()), map_of_envelope),
-    "depth": (depth_envelope("f", flown.depth_map(2), flown.update()), depth_of_envelope),
     "cloud": (cloud_envelope("f", flown.chunk(2, 30), flown.update()), cloud_of_envelope),
     "bundle": (unpack(topic_flight.bundles(8)[1].pack()), bundle_of),
     "flight": (

@@ -407,7 +407,6 @@ def test_without_gps_positions_are_those_that_the_autopilot_was_given(firmware: 
                 for each in heard.samples:  # PX4 tells its height before it knows its place
                     if isinstance(each, PositionSample):
                         assert firmware == "px4" and not each.position_ned_m[:2].any()
-                assert heard.link.samples.gps_fix_type == 1
                 heard.link.send(
                     mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 489000)
                 )

@@ -92,7 +92,7 @@ def test_without_a_manager_nothing_is_said() -> None:
     assert not manager.present
     manager.ready()
     manager.alive()
-    assert (manager.n_lost, manager.problem, manager.watchdog_s) == (0, "", None)
+    assert (manager.n_lost, manager.problem) == (0, "")
 
 
 @pytest.mark.parametrize("address", ["vsock:2:1234", "relative", "/", "@"])
@@ -100,23 +100,6 @@ def test_an_address_of_another_kind_is_named(address: str) -> None:
     manager = ServiceManager({"NOTIFY_SOCKET": address})
     assert not manager.present
     assert address in manager.problem
-
-
-@pytest.mark.parametrize(
-    ("environment", "wanted_s"),
-    [
-        ({"WATCHDOG_USEC": "10000000"}, 5.0),
-        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": str(os.getpid())}, 5.0),
-        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),
-        ({"WATCHDOG_USEC": "0"}, None),
-        ({"WATCHDOG_USEC": "soon"}, None),
-        ({}, None),
-    ],
-)
-def test_watchdog_is_told_twice_as_often_as_it_must(
-    environment: dict[str, str], wanted_s: float | None
-) -> None:
-    assert ServiceManager(environment).watchdog_s == wanted_s
 
 
 def settings() -> dict[str, str]:
