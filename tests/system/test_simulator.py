@@ -3,7 +3,7 @@
     ARDUCOPTER=…/build/sitl/bin/arducopter make system-test
 
 MAVSDK does by its public interface what it is made for: it sets parameters, arms, takes off, lands,
-and listens. It holds the wire too where `expert.link.backend` says so. Without the firmware skipped;
+and listens. It holds the wire too where `expert.link.backend` says so. Without firmware skipped;
 a minute for each backend.
 """
 
