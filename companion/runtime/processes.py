@@ -6,6 +6,7 @@ own state: the table says whether it begins again within the flight, or ends it.
 
 from __future__ import annotations
 
+import resource
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -41,10 +42,17 @@ class Supervisor:
     """A stage could never start because of the user's input."""
 
 
+def _allow_descriptors() -> None:
+    """Raise this process's limit, and its children's: each large message that waits holds one."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+
+
 class Processes:
     """Processes of the given stages. `publish` may be called from any thread, and never waits."""
 
     def __init__(self, stages: Iterable[Stage], supervisor: Supervisor) -> None:
+        _allow_descriptors()
         self._supervisor = supervisor
         self._rows = {stage.name: stage for stage in stages}
         self._listens = {

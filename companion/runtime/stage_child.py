@@ -29,7 +29,7 @@ from typing import Any  # noqa: E402
 
 from companion.errors import CompanionError, InputError  # noqa: E402
 from companion.messages import Frame  # noqa: E402
-from companion.runtime.mailbox import DropPolicy, Mailbox  # noqa: E402
+from companion.runtime.mailbox import Mailbox  # noqa: E402
 from companion.runtime.parcel import Parcel  # noqa: E402
 from companion.runtime.stage_protocol import (  # noqa: E402
     Failed,
@@ -41,7 +41,7 @@ from companion.runtime.stage_protocol import (  # noqa: E402
     Taken,
 )
 from companion.runtime.stage_work import Work, WorkModule, module_of  # noqa: E402
-from companion.runtime.stages import DROPPED, Frames, Stage, stage_named  # noqa: E402
+from companion.runtime.stages import Stage, drop_policy, stage_named  # noqa: E402
 from companion.timing.clock import monotonic_s, wait_s  # noqa: E402
 
 IN_BYTES = 64 << 20
@@ -95,17 +95,13 @@ class _Loop:
     """Processes one message after the other, and reports progress, also of a step that hangs."""
 
     def __init__(self, stage: Stage, work: Work) -> None:
-        self._stage, self._work = stage, work
+        self._work = work
         self._inbox: Mailbox[Parcel] = Mailbox(
-            self._policy_of, lambda parcel: parcel.n_bytes, IN_BYTES
-        )
+            lambda parcel: drop_policy(stage, parcel.kind, in_daemon=False),
+            lambda parcel: parcel.n_bytes, IN_BYTES,
+        )  # fmt: skip
         self._n_done = 0
         self._busy_since_s: float | None = None
-
-    def _policy_of(self, parcel: Parcel) -> DropPolicy:
-        if parcel.kind == "Frame" and self._stage.frames is Frames.NEWEST:
-            return DropPolicy.LATEST_WINS
-        return DROPPED.get(parcel.kind, DropPolicy.LOSSLESS)
 
     def read(self, daemon: socket.socket, send: Callable[[Any], None]) -> None:
         """Put what comes into the inbox, until the daemon is gone."""

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from companion.runtime.mailbox import DropPolicy, Mailbox
+from companion.runtime.mailbox import Mailbox
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_protocol import (
     DriverAtWork,
@@ -25,11 +25,10 @@ from companion.runtime.stage_protocol import (
     Setup,
     Taken,
 )
-from companion.runtime.stages import DROPPED, QUEUE_BYTES, UNREAD_BYTES, Frames, Stage
+from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Stage, drop_policy
 from companion.timing.clock import monotonic_s
 
 CHILD = "companion.runtime.stage_child"
-FRAME = "Frame"
 BY_DRIVER = (
     signal.SIGABRT, signal.SIGALRM, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV,
 )  # fmt: skip
@@ -65,7 +64,10 @@ class StageProcess:
         """Bytes of shared memory, so far."""
         self._was_taken = threading.Condition()
         self._gone = False
-        self._outbox: Mailbox[Parcel] = Mailbox(self._policy_of, _bytes_of, QUEUE_BYTES)
+        self._outbox: Mailbox[Parcel] = Mailbox(
+            lambda parcel: drop_policy(stage, parcel.kind, in_daemon=True),
+            lambda parcel: parcel.n_bytes, QUEUE_BYTES,
+        )  # fmt: skip
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._child = subprocess.Popen(
             [sys.executable, "-m", CHILD, stage.name, str(theirs.fileno())],
@@ -172,11 +174,6 @@ class StageProcess:
                 thread.join()
         self._socket.close()
 
-    def _policy_of(self, parcel: Parcel) -> DropPolicy:
-        if parcel.kind == FRAME and self.stage.frames is not Frames.EVERY:
-            return DropPolicy.LATEST_WINS
-        return DROPPED.get(parcel.kind, DropPolicy.LOSSLESS)
-
     def _write(self) -> None:
         try:
             while (parcel := self._outbox.get()) is not None:
@@ -232,10 +229,6 @@ class StageProcess:
 
 
 REPORTS = {kind.__name__ for kind in (Taken, Progress, DriverAtWork, Failed, Finished)}
-
-
-def _bytes_of(parcel: Parcel) -> int:
-    return parcel.n_bytes
 
 
 def _in_words(status: int) -> str:

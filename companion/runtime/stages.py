@@ -131,6 +131,14 @@ DROPPED = {
 """What happens to messages where a queue is full, by kind; all others are LOSSLESS."""
 
 
+def drop_policy(stage: Stage, kind: str, in_daemon: bool) -> DropPolicy:
+    """What happens to a message that waits for a stage, in the daemon or in its own process."""
+    replaced = stage.frames is Frames.NEWEST or (in_daemon and stage.frames is Frames.RECENT)
+    if kind == Frame.__name__ and replaced:
+        return DropPolicy.LATEST_WINS
+    return DROPPED.get(kind, DropPolicy.LOSSLESS)
+
+
 def stage_named(name: str) -> Stage:
     """Row of a stage."""
     return next(stage for stage in STAGES if stage.name == name)
