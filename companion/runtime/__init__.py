@@ -1,4 +1,4 @@
-"""Execution of stages: in order or as processes; mailboxes, frame ring, load levels, gaps.
+"""Execution of stages: one table, in order or as processes; parcels, queues, load levels, gaps.
 
 Knows stages by their messages only; their work is in `stages`.
 """
