@@ -21,8 +21,9 @@ from companion.estimation.localisation import (
     LocalisationStage,
 )
 from companion.geometry.camera import Camera
-from companion.messages import AttitudeSample, Frame, Odometry
+from companion.messages import Frame, Odometry
 from companion.products.atomic_file import write_atomically
+from companion.telemetry import AttitudeSample
 from companion.timing.clock import StageTimes
 from drivers.recording.decisions import Decisions, decisions_of, payloads_of
 from drivers.recording.flights_folder import RECORDING

@@ -13,9 +13,10 @@ from companion.config import Config
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.errors import StageError
-from companion.messages import Frame, Odometry, Telemetry, Warned
+from companion.messages import Frame, Odometry, Warned
 from companion.products.flight_result import RunFacts
 from companion.runtime.stages import START_S
+from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock, monotonic_s, wait_s
 
 TICK_S = 0.05

@@ -34,23 +34,14 @@ from companion.daemon.vehicle_reports import VehicleReports
 from companion.errors import CompanionError
 from companion.geometry.camera import Camera
 from companion.health import LatencyMeter
-from companion.messages import (
-    ArmedSample,
-    AttitudeSample,
-    Frame,
-    MapUpdate,
-    Odometry,
-    PointChunk,
-    Telemetry,
-    Track,
-    Warned,
-)
+from companion.messages import Frame, MapUpdate, Odometry, PointChunk, Track, Warned
 from companion.pilot_messages import (
     PilotText,
     of_warning,
 )
 from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import Snapshot
+from companion.telemetry import ArmedSample, AttitudeSample, Telemetry
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_registry import camera_source

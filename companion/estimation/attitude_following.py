@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array, vectors_from_rotations
-from companion.messages import AttitudeSample
+from companion.telemetry import AttitudeSample
 
 Ints = NDArray[np.int64]
 

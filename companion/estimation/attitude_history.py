@@ -11,7 +11,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     vector_from_rotation,
 )
-from companion.messages import AttitudeSample
+from companion.telemetry import AttitudeSample
 
 MAX_GAP_NS = 500_000_000
 MAX_EXTRAPOLATION_NS = 120_000_000

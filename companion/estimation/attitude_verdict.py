@@ -15,7 +15,8 @@ from companion.estimation.attitude_following import RotationAgreement, RotationC
 from companion.estimation.attitude_history import AttitudeHistory
 from companion.estimation.map_tilt import MapTilt, RotationOf
 from companion.geometry.transforms import Array, angle_between
-from companion.messages import AttitudeSample, Warned
+from companion.messages import Warned
+from companion.telemetry import AttitudeSample
 
 CHECK_NS, CHECK_OLD_NS = 200_000_000, 1_000_000_000
 """Period of tilt checks, in maps not yet known to be consistent, and later."""

@@ -15,7 +15,8 @@ from companion.estimation.attitude_verdict import AttitudeVerdict
 from companion.estimation.map_tilt import RotationOf
 from companion.estimation.mount_estimation import RATE_STEP_NS, MountEstimate, MountEstimator
 from companion.geometry.transforms import Array, Pose, angle_between, rotation_from_vector
-from companion.messages import AttitudeSample, Track, Warned
+from companion.messages import Track, Warned
+from companion.telemetry import AttitudeSample
 
 MOUNT_EVERY_NS = 3_000_000_000
 MIN_MOUNT_RAD, MIN_DELAY_S = np.radians(0.3), 0.006

@@ -15,7 +15,8 @@ from companion.config import FeedbackConfig
 from companion.estimation.pose_gate import PoseGate, PoseToSend
 from companion.estimation.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
-from companion.messages import AttitudeSample, Odometry
+from companion.messages import Odometry
+from companion.telemetry import AttitudeSample
 
 BEGIN, FRAME, DUE = "begin", "frame", "due"
 BOOTED, RESTARTED, WITHHELD, LIMITS = "booted", "restarted", "withheld", "limits"

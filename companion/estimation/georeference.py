@@ -22,14 +22,8 @@ from companion.estimation.trajectory_alignment import (
     reconciled,
 )
 from companion.geometry.transforms import Array, Pose, Similarity
-from companion.messages import (
-    Georeference,
-    HeightSample,
-    PositionSample,
-    PositionSource,
-    RangeSample,
-    Telemetry,
-)
+from companion.messages import Georeference
+from companion.telemetry import HeightSample, PositionSample, PositionSource, RangeSample, Telemetry
 
 MIN_RANGES = 4
 """Ranges required for a median."""

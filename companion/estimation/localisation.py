@@ -21,14 +21,12 @@ from companion.estimation.smooth_odometry import SIGMA_DEAD_RECKONING_M_S, Smoot
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
-    AttitudeSample,
     Frame,
     FrameTracked,
     KeyframeAdded,
     MapUpdate,
     Message,
     Odometry,
-    Telemetry,
     Track,
     TrackState,
     Warned,
@@ -37,6 +35,7 @@ from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.map_part import map_of, part_around
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
+from companion.telemetry import AttitudeSample, Telemetry
 from companion.timing.clock import Timer
 
 FINAL_ITERATIONS = 8

@@ -18,7 +18,8 @@ from companion.config import FeedbackConfig
 from companion.estimation.attitude_history import MAX_EXTRAPOLATION_NS, AttitudeHistory
 from companion.estimation.reset_counter import ResetCounter
 from companion.geometry.transforms import Array, Pose
-from companion.messages import AttitudeSample, Odometry, TrackState
+from companion.messages import Odometry, TrackState
+from companion.telemetry import AttitudeSample
 
 MAX_TILT_ERROR_RAD = np.radians(8.0)
 MAX_AGE_NS = 300_000_000

@@ -24,8 +24,6 @@ from companion.messages import (
     MapUpdate,
     Message,
     PointChunk,
-    PositionSample,
-    PositionSource,
     Track,
     Warned,
 )
@@ -34,6 +32,7 @@ from companion.products.cloud import Cloud, no_cloud, placed
 from companion.products.depth_pictures import DepthPicture, DepthPictures
 from companion.products.gathered_cloud import gathered
 from companion.products.track_store import TrackStore
+from companion.telemetry import PositionSample, PositionSource
 from companion.timing.clock import StageTimes
 
 POSITION_STEP_NS = 100_000_000

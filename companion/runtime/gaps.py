@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from companion.messages import AttitudeSample, Bytes, Frame, Message, PositionSample, Warned
+from companion.messages import Bytes, Frame, Message, Warned
+from companion.telemetry import AttitudeSample, PositionSample
 
 GAP_IN_INTERVALS = 5
 """Silence of this many median intervals is a gap."""

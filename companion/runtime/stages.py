@@ -14,7 +14,6 @@ from companion.flight_notes import GateStep, HealthNote, LinkBytes
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import (
-    TELEMETRY,
     DepthMap,
     Frame,
     FrameTracked,
@@ -23,11 +22,11 @@ from companion.messages import (
     MapUpdate,
     Odometry,
     PointChunk,
-    PositionSample,
     Track,
     Warned,
 )
 from companion.runtime.mailbox import DropPolicy
+from companion.telemetry import TELEMETRY, PositionSample
 
 CURVES = tuple(kind for kind in TELEMETRY if kind.schema.curve)
 """Telemetry of which viewers show a curve."""

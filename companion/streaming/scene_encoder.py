@@ -20,9 +20,6 @@ from companion.messages import (
     Message,
     Odometry,
     PointChunk,
-    PositionSample,
-    PositionSource,
-    Telemetry,
     Track,
     TrackState,
     Warned,
@@ -45,6 +42,7 @@ from companion.streaming.items import (
 )
 from companion.streaming.keyframe_placement import KeyframePlacement
 from companion.streaming.status_facts import StatusFacts
+from companion.telemetry import PositionSample, PositionSource, Telemetry
 
 Watched = Message | Health | GeoOrigin
 """Messages that can be shown."""

@@ -9,8 +9,9 @@ from collections import deque
 from typing import Any
 
 from companion.health import Health
-from companion.messages import FIELDS, TELEMETRY, MapUpdate, Telemetry, Track, Warned
+from companion.messages import MapUpdate, Track, Warned
 from companion.streaming.items import Shown
+from companion.telemetry import FIELDS, TELEMETRY, Telemetry
 
 CURVES = {kind: f"telemetry/{kind.schema.name}" for kind in TELEMETRY if kind.schema.curve}
 """Name of the fact, and of the plot, of telemetry that has a curve."""

@@ -12,7 +12,8 @@ from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Array, Pose
-from companion.messages import Telemetry, Warned
+from companion.messages import Warned
+from companion.telemetry import Telemetry
 from drivers.datasets.bag_frames import StaticFrames
 from drivers.datasets.bag_pictures import BagPictures, rgb_of
 from drivers.datasets.bag_reader import Bag, BagMessage, open_bag_file

@@ -17,7 +17,7 @@ from companion.geometry.transforms import (
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
-from companion.messages import (
+from companion.telemetry import (
     AttitudeSample,
     HeightSample,
     ImuSample,

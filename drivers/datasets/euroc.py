@@ -19,7 +19,7 @@ from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose
-from companion.messages import ImuSample
+from companion.telemetry import ImuSample
 from drivers.datasets.flight_folder import camera_of
 from drivers.flight import Flight, TruePose
 from drivers.images.calibration_file import MODELS, body_from_camera_of

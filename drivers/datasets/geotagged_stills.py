@@ -14,7 +14,8 @@ from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, quaternion_from_euler
-from companion.messages import AttitudeSample, PositionSource, Warned
+from companion.messages import Warned
+from companion.telemetry import AttitudeSample, PositionSource
 from drivers.datasets.flight_folder import camera_of
 from drivers.flight import Flight
 from drivers.images.calibration_file import FORWARD_UPRIGHT, read_calibration

@@ -18,8 +18,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import LinkConfig
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import RateMeter, SourceHealth, SourceMeter
-from companion.messages import ArmedSample, Telemetry, Warned
+from companion.messages import Warned
 from companion.pilot_messages import PilotText
+from companion.telemetry import ArmedSample, Telemetry
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.commands import NO_ANSWER, TRIES, Commands

@@ -18,7 +18,8 @@ from companion.errors import FlightError
 from companion.estimation.pose_gate import PoseToSend
 from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose
-from companion.messages import FrameTracked, Odometry, Telemetry, TrackState
+from companion.messages import FrameTracked, Odometry, TrackState
+from companion.telemetry import Telemetry
 from drivers.mavlink.pose_messages import pose_messages
 from drivers.mavlink.wire.packet_stream import MavlinkStream
 from drivers.recording.recorded_content import is_sample_topic, sample_of

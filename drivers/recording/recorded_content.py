@@ -20,15 +20,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
 from companion.flight_notes import GateStep, LinkBytes
 from companion.geometry.transforms import Similarity, quaternion_from_rotation
-from companion.messages import (
-    FIELDS,
-    TELEMETRY,
-    FrameTracked,
-    Odometry,
-    PointChunk,
-    Telemetry,
-    Warned,
-)
+from companion.messages import FrameTracked, Odometry, PointChunk, Warned
+from companion.telemetry import FIELDS, TELEMETRY, Telemetry
 from companion.telemetry_schema import Field
 from drivers.recording.recording_topics import MavlinkBytes, telemetry_topic
 

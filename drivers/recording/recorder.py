@@ -14,16 +14,8 @@ from companion.errors import StageError
 from companion.flight_notes import FlightNote, GateStep, HealthNote, LinkBytes
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Similarity
-from companion.messages import (
-    Frame,
-    FrameTracked,
-    MapUpdate,
-    Message,
-    Odometry,
-    PointChunk,
-    Telemetry,
-    Warned,
-)
+from companion.messages import Frame, FrameTracked, MapUpdate, Message, Odometry, PointChunk, Warned
+from companion.telemetry import Telemetry
 from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
 from drivers.recording.camera_document import calibration_bytes, camera_document
 from drivers.recording.disk_writer import DiskWriter, Entry

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from companion.errors import FlightError
-from companion.messages import Bytes, Telemetry, Warned
+from companion.messages import Bytes, Warned
+from companion.telemetry import Telemetry
 from drivers.recording.mcap_file import DAMAGED, ChunkPlace, McapMessage
 from drivers.recording.picture_codec import is_intra, still
 from drivers.recording.recorded_content import is_sample_topic, sample_of

@@ -20,7 +20,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from companion.messages import FIELDS, TELEMETRY, ArmedSample, Telemetry
+from companion.telemetry import FIELDS, TELEMETRY, ArmedSample, Telemetry
 from companion.telemetry_schema import Field
 from drivers.recording.mcap_writer import McapWriter
 

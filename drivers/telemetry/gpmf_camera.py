@@ -12,7 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from companion.geometry.transforms import Array
-from companion.messages import PositionSource, Warned
+from companion.messages import Warned
+from companion.telemetry import PositionSource
 from drivers.telemetry.gpmf_records import GpmfError, read_streams
 from drivers.telemetry.telemetry_log import GeodeticFix, TelemetryCollector
 

@@ -12,7 +12,7 @@ import dataclasses
 
 from companion.geometry.geodesy import GeoOrigin, ned_from_geodetic, origin_of
 from companion.geometry.transforms import Array
-from companion.messages import PositionSample, PositionSource
+from companion.telemetry import PositionSample, PositionSource
 from drivers.telemetry.telemetry_log import PAIR_NS, GeodeticFix
 
 WAIT_NS = 2_000_000_000

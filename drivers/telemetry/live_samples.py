@@ -16,7 +16,8 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.geodesy import GeoOrigin
-from companion.messages import PositionSample, PositionSource, Telemetry, Warned
+from companion.messages import Warned
+from companion.telemetry import PositionSample, PositionSource, Telemetry
 from companion.timing.link_clock import ClockFilter
 from companion.timing.stamp_filter import MAX_BOOT_NS
 from drivers.telemetry.live_positions import LivePositions

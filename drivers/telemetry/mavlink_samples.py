@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import LinkConfig
 from companion.geometry.transforms import Array, quaternion_from_euler
-from companion.messages import (
+from companion.telemetry import (
     AirspeedSample,
     AttitudeSample,
     HeightSample,

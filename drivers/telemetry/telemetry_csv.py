@@ -3,7 +3,7 @@
 A line is `unix_ns,kind,values`; what a sample does not have is empty. Comments before hold the
 origin, how the clocks were put together, and warnings about the source of the samples. The kind is
 the name of the sample's schema, of a position its source; the values are its fields in order
-(companion/messages.py), arrays spread out, flags as 0 or 1.
+(companion/telemetry.py), arrays spread out, flags as 0 or 1.
 """
 
 from __future__ import annotations
@@ -20,15 +20,8 @@ import numpy as np
 
 from companion.errors import FlightError
 from companion.geometry.geodesy import GeoOrigin
-from companion.messages import (
-    FIELDS,
-    TELEMETRY,
-    ClockReport,
-    PositionSample,
-    PositionSource,
-    Telemetry,
-    Warned,
-)
+from companion.messages import ClockReport, Warned
+from companion.telemetry import FIELDS, TELEMETRY, PositionSample, PositionSource, Telemetry
 from companion.telemetry_schema import Field
 from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector, TelemetryLog, kind_of
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, quaternion_from_euler
-from companion.messages import (
+from companion.messages import Warned
+from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
     HeightSample,
@@ -24,7 +25,6 @@ from companion.messages import (
     PositionSource,
     RangeSample,
     Telemetry,
-    Warned,
 )
 from companion.timing.log_clock import clock_from_utc
 from companion.timing.stamp_filter import MAX_BOOT_NS, valid_stamps

@@ -16,15 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array, quaternion_from_euler
-from companion.messages import (
+from companion.messages import ClockReport, Warned
+from companion.telemetry import (
     AttitudeSample,
-    ClockReport,
     HeightSample,
     ImuSample,
     PositionSample,
     PositionSource,
     Telemetry,
-    Warned,
 )
 from companion.timing.stamp_filter import MAX_BOOT_NS, valid_stamps
 from drivers.telemetry.gpmf_camera import HEIGHTS, camera_fixes

@@ -18,15 +18,14 @@ from numpy.typing import NDArray
 
 from companion.geometry.geodesy import GeoOrigin, ned_from_geodetic, origin_of
 from companion.geometry.transforms import Array
-from companion.messages import (
+from companion.messages import ClockReport, Warned
+from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
-    ClockReport,
     ImuSample,
     PositionSample,
     PositionSource,
     Telemetry,
-    Warned,
 )
 
 PAIR_NS = 100_000_000

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, quaternion_from_euler
-from companion.messages import AttitudeSample, HeightSample, PositionSource, Warned
+from companion.messages import Warned
+from companion.telemetry import AttitudeSample, HeightSample, PositionSource
 from drivers.images.calibration_file import FORWARD_UPRIGHT
 from drivers.images.exif import FILM_DIAGONAL_MM
 from drivers.telemetry.telemetry_log import GeodeticFix, LogContent, TelemetryCollector

@@ -14,7 +14,8 @@ from pathlib import Path
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.geodesy import GeoOrigin
-from companion.messages import ArmedSample, Warned
+from companion.messages import Warned
+from companion.telemetry import ArmedSample
 from companion.timing.log_clock import BootSegments, estimate_clock
 from companion.timing.stamp_filter import valid_stamps
 from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, READERS, boot_ns, samples_of

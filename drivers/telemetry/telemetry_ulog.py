@@ -16,7 +16,8 @@ from pyulog.exceptions import ULogException
 
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array
-from companion.messages import (
+from companion.messages import Warned
+from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
     HeightSample,
@@ -25,7 +26,6 @@ from companion.messages import (
     PositionSource,
     RangeSample,
     Telemetry,
-    Warned,
 )
 from companion.timing.log_clock import clock_from_utc
 from companion.timing.stamp_filter import valid_stamps

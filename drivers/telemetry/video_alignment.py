@@ -17,7 +17,8 @@ from companion.config import TelemetryConfig
 from companion.errors import FlightError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, rotation_from_quaternion, vector_from_rotation
-from companion.messages import AttitudeSample, ClockReport, Frame, ImuSample, Telemetry, Warned
+from companion.messages import ClockReport, Frame, Warned
+from companion.telemetry import AttitudeSample, ImuSample, Telemetry
 from companion.timing.image_rotation import RotationMeter
 from companion.timing.rotation_alignment import RotationRecord, TimeAlignment, align_rotations
 from drivers.telemetry.gpmf_gyro import gyro_rotation

@@ -40,8 +40,9 @@ from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.daemon.health_watch import HealthWatch
 from companion.geometry.camera import Camera
 from companion.health import LatencyMeter
-from companion.messages import Frame, MapUpdate, Odometry, PointChunk, Telemetry, Track, Warned
+from companion.messages import Frame, MapUpdate, Odometry, PointChunk, Track, Warned
 from companion.products.flight_result import RunFacts
+from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_registry import camera_source

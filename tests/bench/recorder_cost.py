@@ -23,7 +23,8 @@ from companion.config import CameraConfig, Config, RecorderConfig
 from companion.flight_notes import LinkBytes
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import quaternion_from_euler
-from companion.messages import AttitudeSample, Bytes, Frame
+from companion.messages import Bytes, Frame
+from companion.telemetry import AttitudeSample
 from drivers.open_flight import open_flight
 from drivers.recording.recorder import Recorder
 from tests.support.flights.recorded import link_bytes

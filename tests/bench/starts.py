@@ -30,10 +30,11 @@ from companion.geometry.transforms import (
     rotation_from_quaternion,
     rotation_from_vector,
 )
-from companion.messages import AttitudeSample, Frame
+from companion.messages import Frame
 from companion.runtime.in_order import in_order_of_time
 from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.initialisation.bootstrap import Bootstrap
+from companion.telemetry import AttitudeSample
 from drivers.open_flight import open_flight
 
 MAX_FRAMES = 60

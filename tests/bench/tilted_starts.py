@@ -19,8 +19,9 @@ from companion.config import Config
 from companion.estimation.attitude_history import AttitudeHistory
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.pose_gate import MAX_TILT_ERROR_RAD
-from companion.messages import AttitudeSample, Frame, Odometry, TrackState, Warned
+from companion.messages import Frame, Odometry, TrackState, Warned
 from companion.runtime.in_order import in_order_of_time
+from companion.telemetry import AttitudeSample
 from drivers.open_flight import open_flight
 from tests.support.flights.tilted_start import KINDS, tilted_starts
 

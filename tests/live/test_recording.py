@@ -12,7 +12,8 @@ import psutil
 import pytest
 
 from companion.config import CameraConfig
-from companion.messages import Frame, PositionSample
+from companion.messages import Frame
+from companion.telemetry import PositionSample
 from drivers.camera.pattern_camera import world_from_body
 from drivers.open_flight import open_flight
 from drivers.recording.disk_writer import FAILED

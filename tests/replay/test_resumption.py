@@ -25,10 +25,11 @@ from companion.geometry.transforms import (
     rotation_from_quaternion,
     rotation_from_vector,
 )
-from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
+from companion.messages import Frame, Message, Odometry, Warned
 from companion.runtime.stage_protocol import Finish, KeepMap, Setup
 from companion.stages.localisation_work import work
 from companion.stages.map_keeper import MapKeeper
+from companion.telemetry import AttitudeSample, Telemetry
 from drivers.open_flight import open_flight
 from tests.support.autopilot.received_poses import TrueFlight
 from tests.support.flights.return_pass import back_and_forth, reordered

@@ -19,11 +19,12 @@ from companion.geometry.transforms import (
     rotation_from_quaternion,
     rotation_from_vector,
 )
-from companion.messages import AttitudeSample, Frame, Message, Odometry, Telemetry, Warned
+from companion.messages import Frame, Message, Odometry, Warned
 from companion.runtime.in_order import in_order_of_time
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
 from companion.stages.localisation_work import work
+from companion.telemetry import AttitudeSample, Telemetry
 from drivers.flight import Flight
 from drivers.open_flight import open_flight
 from tests.support.flights.tilted_start import KINDS, tilted_starts

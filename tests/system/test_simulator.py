@@ -26,8 +26,8 @@ from mavsdk.plugins.param import Param
 from mavsdk.plugins.telemetry import Telemetry
 
 from companion.config import LinkConfig, RouterConfig
-from companion.messages import ArmedSample, PositionSample, PositionSource
-from companion.messages import Telemetry as Sample
+from companion.telemetry import ArmedSample, PositionSample, PositionSource
+from companion.telemetry import Telemetry as Sample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.parameters import Parameters

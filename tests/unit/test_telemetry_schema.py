@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.messages import (
+from companion.telemetry import (
     TELEMETRY,
     ArmedSample,
     AttitudeSample,

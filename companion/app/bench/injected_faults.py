@@ -13,15 +13,8 @@ import numpy as np
 
 from companion.geometry.transforms import quaternion_from_rotation, rotation_from_quaternion
 from companion.geometry.transforms import rotation_from_vector as turn_by
-from companion.messages import (
-    AttitudeSample,
-    Bytes,
-    Frame,
-    ImuSample,
-    PositionSample,
-    Telemetry,
-    Warned,
-)
+from companion.messages import Bytes, Frame, Warned
+from companion.telemetry import AttitudeSample, ImuSample, PositionSample, Telemetry
 
 Samples = list[Telemetry]
 Pictures = Iterable[Frame | Warned]

@@ -13,10 +13,11 @@ from companion.daemon.flights.kept_map_place import kept_map_path
 from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.flight_notes import FlightNote
 from companion.geometry.camera import Camera
-from companion.messages import Frame, Telemetry, Warned
+from companion.messages import Frame, Warned
 from companion.products.flight_result import RunFacts
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import KeepMap
+from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock
 from drivers.recording.flights_folder import COUNTER, flight_name, next_number
 from drivers.system.journal import WARNING, Journal

@@ -16,16 +16,7 @@ from companion.flight_notes import FlightNote
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
-from companion.messages import (
-    Frame,
-    Georeferenced,
-    MapUpdate,
-    Odometry,
-    PointChunk,
-    Telemetry,
-    Track,
-    Warned,
-)
+from companion.messages import Frame, Georeferenced, MapUpdate, Odometry, PointChunk, Track, Warned
 from companion.products.flight_result import RunFacts
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor
@@ -39,6 +30,7 @@ from companion.runtime.stage_protocol import (
     TakeSnapshot,
 )
 from companion.runtime.stages import STAGES, Stage, stage_named
+from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock, monotonic_s
 
 RESTARTED = "a stage has died and is started again"

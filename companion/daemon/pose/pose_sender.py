@@ -17,8 +17,9 @@ from companion.estimation.pose_gate import PoseToSend
 from companion.estimation.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth, LatencyMeter, RateMeter
-from companion.messages import AttitudeSample, Odometry, Warned
+from companion.messages import Odometry, Warned
 from companion.pilot_messages import POSITION_ON, position_lost
+from companion.telemetry import AttitudeSample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_height import AutopilotHeight
 from drivers.mavlink.autopilot_link import AutopilotLink

@@ -23,7 +23,7 @@ from companion.geometry.transforms import (
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
-from companion.messages import AttitudeSample, PositionSample, PositionSource
+from companion.telemetry import AttitudeSample, PositionSample, PositionSource
 from tests.support.flights.sequences import Piece
 
 ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])

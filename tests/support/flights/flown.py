@@ -17,13 +17,12 @@ from companion.messages import (
     Message,
     PixelState,
     PointChunk,
-    PositionSample,
-    PositionSource,
     Track,
     TrackState,
     Warned,
 )
 from companion.products.flight_result import RunFacts
+from companion.telemetry import PositionSample, PositionSource
 
 START_NS = 1_700_000_000_123_456_789
 STEP_NS = 50_000_000

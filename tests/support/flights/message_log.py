@@ -25,7 +25,6 @@ from companion.messages import (
     MapUpdate,
     Message,
     PointChunk,
-    PositionSample,
     Track,
     Warned,
 )
@@ -33,6 +32,7 @@ from companion.runtime.in_order import InOrder, in_order_of_time
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stages import stage_named
 from companion.streaming.reduced import reduced
+from companion.telemetry import PositionSample
 from drivers.open_flight import open_flight
 
 KEPT = (Track, MapUpdate, PointChunk, DepthMap, KeyframeAdded, PositionSample, Warned)

@@ -14,20 +14,16 @@ from companion.config import CameraConfig, Config, RecorderConfig
 from companion.flight_notes import HealthNote, LinkBytes
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
-from companion.messages import (
+from companion.messages import Frame, Message, Odometry, TrackState, Warned
+from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
-    Frame,
     HeightSample,
     ImuSample,
-    Message,
-    Odometry,
     PositionSample,
     PositionSource,
     RangeSample,
     Telemetry,
-    TrackState,
-    Warned,
 )
 from drivers.camera.pattern_camera import PatternScene, pattern_optics, world_from_camera
 from drivers.recording.recorder import Recorder

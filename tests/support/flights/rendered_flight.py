@@ -13,22 +13,17 @@ from companion.config import Config
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, quaternion_from_rotation, rotation_from_vector
-from companion.messages import (
+from companion.messages import Bytes, Frame, KeyframeAdded, Odometry, Track, Warned
+from companion.products.flight_result import FlightResult
+from companion.products.trajectory_error import Path, PathErrors, path_errors
+from companion.runtime.in_order import in_order_of_time
+from companion.telemetry import (
     AttitudeSample,
-    Bytes,
-    Frame,
-    KeyframeAdded,
-    Odometry,
     PositionSample,
     PositionSource,
     RangeSample,
     Telemetry,
-    Track,
-    Warned,
 )
-from companion.products.flight_result import FlightResult
-from companion.products.trajectory_error import Path, PathErrors, path_errors
-from companion.runtime.in_order import in_order_of_time
 from tests.support.flights.scene import texture
 
 CAMERA_DOWN = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))

@@ -7,14 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from companion.messages import (
-    AttitudeSample,
-    Frame,
-    HeightSample,
-    PositionSample,
-    RangeSample,
-    Telemetry,
-)
+from companion.messages import Frame
+from companion.telemetry import AttitudeSample, HeightSample, PositionSample, RangeSample, Telemetry
 
 KINDS = (AttitudeSample, PositionSample, RangeSample, HeightSample)
 

@@ -17,7 +17,8 @@ import numpy as np
 from companion.config import CameraConfig
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose, quaternion_from_rotation
-from companion.messages import Frame, Telemetry
+from companion.messages import Frame
+from companion.telemetry import Telemetry
 from drivers.open_flight import open_flight
 from tests.support.reference.scoring import read_tum
 

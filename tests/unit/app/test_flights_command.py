@@ -8,7 +8,8 @@ import pytest
 
 from companion.app.cli import main
 from companion.config import CameraConfig
-from companion.messages import ArmedSample, Frame
+from companion.messages import Frame
+from companion.telemetry import ArmedSample
 from drivers.open_flight import open_flight
 from drivers.recording import trimming
 from drivers.recording.importing import write_recording

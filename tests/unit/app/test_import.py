@@ -15,11 +15,10 @@ from companion.config import CameraConfig, Config
 from companion.errors import FlightError, InputError
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
-from companion.messages import (
+from companion.messages import ClockReport, Frame
+from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
-    ClockReport,
-    Frame,
     HeightSample,
     ImuSample,
     PositionSample,

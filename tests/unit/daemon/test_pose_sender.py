@@ -18,8 +18,9 @@ from companion.daemon.pose import kept_counter
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.geometry.transforms import Pose
-from companion.messages import AttitudeSample, Odometry, Telemetry, TrackState, Warned
+from companion.messages import Odometry, TrackState, Warned
 from companion.products.atomic_file import write_atomically
+from companion.telemetry import AttitudeSample, Telemetry
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from tests.support.autopilot.memory_port import MemoryPort

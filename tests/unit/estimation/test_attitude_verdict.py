@@ -26,7 +26,7 @@ from companion.geometry.transforms import (
     rotation_from_quaternion,
     rotation_from_vector,
 )
-from companion.messages import AttitudeSample
+from companion.telemetry import AttitudeSample
 from tests.support.flights.scene import DOWN_LOOKING
 
 T0_NS = 10**12

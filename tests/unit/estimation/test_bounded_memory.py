@@ -15,18 +15,16 @@ from companion.config import Config
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.sample_series import SampleSeries
 from companion.geometry.transforms import Array, Pose
-from companion.messages import (
+from companion.messages import Frame, Track, TrackState
+from companion.products.flight_result import FlightResult
+from companion.telemetry import (
     AttitudeSample,
-    Frame,
     HeightSample,
     PositionSample,
     PositionSource,
     RangeSample,
     Telemetry,
-    Track,
-    TrackState,
 )
-from companion.products.flight_result import FlightResult
 from companion.timing.clock import StageTimes
 from tests.support.flights.topic_flight import CAMERA
 

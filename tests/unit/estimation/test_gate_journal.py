@@ -14,7 +14,8 @@ from companion.estimation.pose_gate import PoseToSend
 from companion.estimation.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
-from companion.messages import AttitudeSample, Odometry, TrackState
+from companion.messages import Odometry, TrackState
+from companion.telemetry import AttitudeSample
 from drivers.recording.decisions import step_of
 from drivers.recording.recorded_content import decision_bytes
 

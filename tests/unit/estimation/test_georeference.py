@@ -8,7 +8,7 @@ import pytest
 from companion.config import GeoreferenceConfig
 from companion.estimation.georeference import AlignmentSample, Georeferencer
 from companion.geometry.transforms import Pose, Similarity, rotation_from_vector, yaw_rotation
-from companion.messages import HeightSample, PositionSample, PositionSource, RangeSample
+from companion.telemetry import HeightSample, PositionSample, PositionSource, RangeSample
 
 TRUTH = Similarity(
     3.7, rotation_from_vector(np.array([0.02, -0.01, 0.8])), np.array([12.0, -5.0, -30.0])

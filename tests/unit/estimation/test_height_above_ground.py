@@ -17,7 +17,8 @@ from companion.geometry.transforms import (
     quaternion_from_rotation,
     rotation_from_vector,
 )
-from companion.messages import AttitudeSample, Frame, KeyframeAdded, MapUpdate, RangeSample
+from companion.messages import Frame, KeyframeAdded, MapUpdate
+from companion.telemetry import AttitudeSample, RangeSample
 from tests.support.flights.scene import PlaneWorld
 
 DOWN = np.array([0.0, 0.0, 1.0])

@@ -15,7 +15,7 @@ from companion.geometry.transforms import (
     vector_from_rotation,
     yaw_rotation,
 )
-from companion.messages import AttitudeSample
+from companion.telemetry import AttitudeSample
 
 STEP_NS = 50_000_000
 

@@ -14,7 +14,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     yaw_rotation,
 )
-from companion.messages import AttitudeSample
+from companion.telemetry import AttitudeSample
 from tests.support.flights.scene import DOWN_LOOKING
 
 SECONDS = 20.0

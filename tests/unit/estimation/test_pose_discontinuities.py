@@ -10,7 +10,8 @@ from companion.estimation.pose_gate import PoseGate, PoseToSend
 from companion.estimation.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity
-from companion.messages import AttitudeSample, Georeference, Track, TrackState
+from companion.messages import Georeference, Track, TrackState
+from companion.telemetry import AttitudeSample
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 PLACED = Georeference(Similarity(1.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "GPS", 50, 0.3)

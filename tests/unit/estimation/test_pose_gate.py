@@ -13,7 +13,8 @@ import pytest
 from companion.config import FeedbackConfig
 from companion.estimation.pose_gate import PoseGate, PoseToSend
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
-from companion.messages import AttitudeSample, Odometry, TrackState
+from companion.messages import Odometry, TrackState
+from companion.telemetry import AttitudeSample
 from drivers.mavlink.pose_messages import euler_of, odometry_message, vision_messages
 
 MS = 1_000_000

@@ -10,8 +10,9 @@ from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.georeference import Georeferencer
 from companion.estimation.segment_georeference import SegmentGeoreferences
 from companion.geometry.transforms import Array, Pose, Similarity, quaternion_from_rotation
-from companion.messages import AttitudeSample, Georeference, RangeSample
+from companion.messages import Georeference
 from companion.slam.map.sparse_map import SlamMap
+from companion.telemetry import AttitudeSample, RangeSample
 from tests.support.reference.synthetic_map import HEIGHT, Ground, flown, mapped
 
 MOUNT = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))

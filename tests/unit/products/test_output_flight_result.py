@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from companion.geometry.transforms import angle_between
-from companion.messages import PositionSample, PositionSource, Track, TrackState, Warned
+from companion.messages import Track, TrackState, Warned
 from companion.products.flight_result import FlightResult
+from companion.telemetry import PositionSample, PositionSource
 from tests.support.flights import flown
 
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from companion.geometry.camera import Camera
-from companion.messages import PointChunk, PositionSample, PositionSource
+from companion.messages import PointChunk
 from companion.products.flight_result import FlightResult
 from companion.products.report.report_json import report
 from companion.products.report.report_page import number, path_segments, report_page, when
+from companion.telemetry import PositionSample, PositionSource
 from tests.support.flights import flown
 
 VOID = {"meta", "img", "br", "path", "use", "polyline", "rect", "link"}

@@ -5,15 +5,9 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from companion.messages import (
-    AttitudeSample,
-    Frame,
-    Message,
-    PositionSample,
-    PositionSource,
-    Warned,
-)
+from companion.messages import Frame, Message, Warned
 from companion.runtime.gaps import with_gap_warnings
+from companion.telemetry import AttitudeSample, PositionSample, PositionSource
 
 S = 1_000_000_000
 

@@ -11,21 +11,13 @@ import pytest
 
 from companion.config import Config
 from companion.geometry.transforms import Pose
-from companion.messages import (
-    Frame,
-    KeyframeAdded,
-    Message,
-    PointChunk,
-    RangeSample,
-    Track,
-    TrackState,
-    Warned,
-)
+from companion.messages import Frame, KeyframeAdded, Message, PointChunk, Track, TrackState, Warned
 from companion.runtime import in_order
 from companion.runtime.in_order import DEPTH_FAILED, DEPTH_QUEUE_BYTES, InOrder, in_order_of_time
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
 from companion.runtime.stages import stage_named
+from companion.telemetry import RangeSample
 from tests.support.flights.topic_flight import CAMERA
 
 MS = 1_000_000

@@ -5,12 +5,13 @@ import pytest
 
 from companion.config import Config
 from companion.geometry.transforms import Pose
-from companion.messages import AttitudeSample, DepthMap, Frame, MapUpdate
+from companion.messages import DepthMap, Frame, MapUpdate
 from companion.runtime.mailbox import DropPolicy, Mailbox
 from companion.runtime.message_size import ENTRY_BYTES, SMALL_BYTES, size_bytes
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stages import DROPPED
+from companion.telemetry import AttitudeSample
 from tests.support.flights.topic_flight import CAMERA
 
 Sent = tuple[DropPolicy, int, str]

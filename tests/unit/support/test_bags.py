@@ -15,14 +15,8 @@ from companion.config import CameraConfig
 from companion.errors import FlightError
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import angle_between, rotation_from_quaternion
-from companion.messages import (
-    AttitudeSample,
-    Frame,
-    ImuSample,
-    PositionSample,
-    PositionSource,
-    Warned,
-)
+from companion.messages import Frame, Warned
+from companion.telemetry import AttitudeSample, ImuSample, PositionSample, PositionSource
 from drivers.datasets.bag_pictures import rgb_of
 from drivers.flight import Flight
 from drivers.open_flight import format_of, open_flight

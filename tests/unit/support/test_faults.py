@@ -6,14 +6,13 @@ import numpy as np
 
 from companion.app.bench.injected_faults import FAULTS, Fault, Span
 from companion.geometry.transforms import angle_between, rotation_from_quaternion
-from companion.messages import (
+from companion.messages import Frame, Warned
+from companion.telemetry import (
     AttitudeSample,
-    Frame,
     HeightSample,
     PositionSample,
     PositionSource,
     Telemetry,
-    Warned,
 )
 
 SPAN = Span(1_000_000_000, 11_000_000_000)

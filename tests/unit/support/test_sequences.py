@@ -13,7 +13,8 @@ from companion.config import CameraConfig
 from companion.errors import FlightError
 from companion.geometry.camera import Distortion
 from companion.geometry.transforms import Array, Pose
-from companion.messages import Frame, ImuSample, Warned
+from companion.messages import Frame, Warned
+from companion.telemetry import ImuSample
 from drivers.flight import Flight, TruePose
 from drivers.open_flight import format_of, open_flight
 from tests.support.flights.sequences import (

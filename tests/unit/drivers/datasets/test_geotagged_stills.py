@@ -13,7 +13,8 @@ import pytest
 from companion.config import CameraConfig
 from companion.errors import FlightError
 from companion.geometry.transforms import rotation_from_quaternion
-from companion.messages import AttitudeSample, Frame, PositionSample, Warned
+from companion.messages import Frame, Warned
+from companion.telemetry import AttitudeSample, PositionSample
 from drivers.flight import Flight
 from drivers.images.exif import read_photo
 from drivers.open_flight import format_of, open_flight

@@ -16,16 +16,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import LinkConfig, RouterConfig
 from companion.geometry.geodesy import GeoOrigin
-from companion.messages import (
+from companion.messages import Warned
+from companion.pilot_messages import CAMERA_RECOVERED, position_lost
+from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
     HeightSample,
     PositionSample,
     PositionSource,
     Telemetry,
-    Warned,
 )
-from companion.pilot_messages import CAMERA_RECOVERED, position_lost
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.commands import NO_ANSWER

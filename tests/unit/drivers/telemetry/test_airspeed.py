@@ -11,8 +11,8 @@ from rerun.chunk import RrdReader
 
 from companion.config import ViewerConfig
 from companion.geometry.camera import Camera
-from companion.messages import AirspeedSample, HeightSample, Telemetry
 from companion.streaming.viewer import FileViewer
+from companion.telemetry import AirspeedSample, HeightSample, Telemetry
 from companion.timing.link_clock import ClockFilter
 from drivers.recording.recorded_content import sample_bytes, sample_of, sample_topic
 from drivers.telemetry.live_samples import LiveSamples

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.geometry.transforms import quaternion_from_euler
-from companion.messages import ArmedSample, AttitudeSample, HeightSample, PositionSample
+from companion.telemetry import ArmedSample, AttitudeSample, HeightSample, PositionSample
 from drivers.telemetry.telemetry_dataflash import read_dataflash
 from drivers.telemetry.telemetry_log import LogContent, TelemetryLog
 from tests.support.flights.logs import dataflash_format, dataflash_record

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from companion.messages import PositionSample
+from companion.telemetry import PositionSample
 from drivers.telemetry.gpmf_camera import camera_fixes
 from drivers.telemetry.gpmf_records import GpmfError, read_streams
 from drivers.telemetry.telemetry_gpmf import _offset

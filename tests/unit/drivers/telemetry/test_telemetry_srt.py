@@ -13,7 +13,7 @@ import pytest
 
 from companion.config import CameraConfig
 from companion.geometry.transforms import rotation_from_quaternion
-from companion.messages import AttitudeSample, HeightSample, PositionSample
+from companion.telemetry import AttitudeSample, HeightSample, PositionSample
 from drivers.flight import Flight
 from drivers.open_flight import open_flight
 from drivers.telemetry.telemetry_srt import cues_of

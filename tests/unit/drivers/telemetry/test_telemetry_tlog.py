@@ -12,7 +12,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     yaw_rotation,
 )
-from companion.messages import (
+from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
     HeightSample,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.messages import (
+from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
     PositionSample,

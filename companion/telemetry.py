@@ -1,0 +1,111 @@
+"""Telemetry of the autopilot, and of sensors beside it: one message for each kind of sample.
+
+From its schema follow codec, recording topic, table and curve. See `messages` for time and arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import ClassVar, get_args
+
+from companion.geometry.transforms import Array
+from companion.telemetry_schema import QUATERNION, VECTOR, Schema, fields_of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeSample:
+    """Attitude of the autopilot: quaternion w x y z, body rates (3,) or None."""
+
+    schema: ClassVar[Schema] = Schema(
+        "attitude", "Attitude of the body (FRD) in NED: quaternion w x y z; body rates, rad/s"
+    )
+    t_ns: int
+    ned_from_body: Array = field(metadata=QUATERNION)
+    rates_body_rad_s: Array | None = field(default=None, metadata=VECTOR)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSample:
+    """Angular rate and specific force in the body frame, (3,) each."""
+
+    schema: ClassVar[Schema] = Schema(
+        "imu", "Angular rate and specific force in the body frame (FRD)"
+    )
+    t_ns: int
+    gyro_rad_s: Array = field(metadata=VECTOR)
+    accel_m_s2: Array = field(metadata=VECTOR)
+
+
+class PositionSource(Enum):
+    """Source of a position; earlier ones are preferred."""
+
+    LOCAL = "local position"
+    GLOBAL = "global position"
+    GPS = "GPS"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionSample:
+    """Position (3,) of the body in local NED, velocity (3,) where the autopilot gives it.
+
+    All samples of a source share one origin, the reader's `GeoOrigin` where that is known.
+    """
+
+    schema: ClassVar[Schema] = Schema("position", "Position and velocity of the body in local NED")
+    t_ns: int
+    source: PositionSource
+    position_ned_m: Array = field(metadata=VECTOR)
+    velocity_ned_m_s: Array | None = field(default=None, metadata=VECTOR)
+    sigma_horizontal_m: float | None = None
+    sigma_vertical_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeSample:
+    """Distance along the body's down axis to the ground, by rangefinder."""
+
+    schema: ClassVar[Schema] = Schema("range", "Distance to the ground along the body's down axis")
+    t_ns: int
+    distance_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightSample:
+    """Barometric height above an arbitrary, constant level; up is positive."""
+
+    schema: ClassVar[Schema] = Schema(
+        "height", "Barometric height above an arbitrary level, up positive"
+    )
+    t_ns: int
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmedSample:
+    """Whether the motors are armed."""
+
+    schema: ClassVar[Schema] = Schema("armed", "Whether the motors are armed")
+    t_ns: int
+    armed: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AirspeedSample:
+    """Indicated airspeed: by a pitot tube, for air as dense as at sea level, not calibrated."""
+
+    schema: ClassVar[Schema] = Schema(
+        "airspeed", "Airspeed indicated by a pitot tube, not calibrated", "m/s indicated airspeed"
+    )
+    t_ns: int
+    indicated_m_s: float
+
+
+Telemetry = (
+    AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
+    | AirspeedSample
+)  # fmt: skip
+TELEMETRY: tuple[type[Telemetry], ...] = get_args(Telemetry)
+"""In order of their channels in a recording."""
+FIELDS = {kind: fields_of(kind) for kind in TELEMETRY}
+"""Fields of each, without its time."""
