@@ -115,7 +115,11 @@ class Parcel:
     @classmethod
     def receive(cls, source: socket.socket) -> Parcel:
         """Wait for the next one; EOFError where nobody sends any more."""
-        packet, descriptors, _flags, _address = socket.recv_fds(source, MOST_BYTES, 1)
+        try:
+            packet, descriptors, _flags, _address = socket.recv_fds(source, MOST_BYTES, 1)
+        except ConnectionResetError:
+            # the other end has closed with something unread; what it sent before still waits here
+            packet, descriptors, _flags, _address = socket.recv_fds(source, MOST_BYTES, 1)
         if not packet:
             raise EOFError
         memory = _Memory(descriptors[0]) if descriptors else None

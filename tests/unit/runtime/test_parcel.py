@@ -102,6 +102,16 @@ def test_the_end_of_the_sender_is_told(ends: Ends) -> None:
         Parcel.receive(ends[1])
 
 
+def test_last_words_come_also_from_one_that_left_something_unread(ends: Ends) -> None:
+    """A stage that cannot begin says why, and ends with messages waiting for it."""
+    Parcel.of(Track(1, 1, TrackState.LOST)).send(ends[0])
+    Parcel.of(Track(2, 2, TrackState.LOST)).send(ends[1])
+    ends[1].close()
+    assert Parcel.receive(ends[0]).open().seq == 2
+    with pytest.raises(EOFError):
+        Parcel.receive(ends[0])
+
+
 def test_a_reader_that_is_gone_is_an_error(ends: Ends, rng: np.random.Generator) -> None:
     ends[1].close()
     before = n_descriptors()
