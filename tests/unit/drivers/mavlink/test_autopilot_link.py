@@ -259,11 +259,12 @@ def _same(replayed: Telemetry, live: Telemetry) -> bool:
     if isinstance(live, HeightSample):
         return isinstance(replayed, HeightSample) and live.height_m == replayed.height_m
     assert isinstance(live, PositionSample)
-    # the origin, which the log does not state, is known to the centimetres of global positions
+    # the origin, which the log does not state, is found anew from each: centimetres apart, on a busy
+    # machine a decimetre
     return (
         isinstance(replayed, PositionSample)
         and replayed.source is live.source
-        and np.allclose(live.position_ned_m, replayed.position_ned_m, atol=0.05)
+        and np.allclose(live.position_ned_m, replayed.position_ned_m, atol=0.15)
     )
 
 
