@@ -259,8 +259,8 @@ def _same(replayed: Telemetry, live: Telemetry) -> bool:
     if isinstance(live, HeightSample):
         return isinstance(replayed, HeightSample) and live.height_m == replayed.height_m
     assert isinstance(live, PositionSample)
-    # the origin, which the log does not state, is found anew from each: centimetres apart, on a busy
-    # machine a decimetre
+    # the origin, which the log does not state, is found anew from each: centimetres apart, on a
+    # busy machine a decimetre
     return (
         isinstance(replayed, PositionSample)
         and replayed.source is live.source
