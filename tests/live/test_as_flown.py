@@ -64,7 +64,7 @@ def again(path: Path, out: Path) -> tuple[Run, dict[str, Any]]:
 
 @pytest.mark.alone
 def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> None:
-    path = flown(tmp_path, "raw")  # which costs no time, of which there is none
+    path = flown(tmp_path, "png")
     done, found = again(path, tmp_path / "again")
     assert found["tracked_again"]
     assert found["frames_same"] == found["frames"] > 100
