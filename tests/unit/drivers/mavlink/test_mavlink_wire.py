@@ -223,7 +223,7 @@ def test_a_tcp_peer_that_never_reads_costs_the_oldest_and_no_time() -> None:
                         slowest_s = max(slowest_s, time.perf_counter() - begun_s)
                     assert wire.queue.n_bytes <= 64_000
                     assert wire.n_dropped > 0
-                    assert slowest_s < 1.0, "one that waited for the peer would never end"
+                    assert slowest_s < 0.05
                     # what does come through is whole packets, the newest among them
                     ear = Ear()
                     client.setblocking(False)
