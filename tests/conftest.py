@@ -14,8 +14,13 @@ import numpy as np
 import pytest
 
 from tests.support.left_behind import left_since, running, watch_tasks
+from tests.support.processes.steal import FlownAgain
 
 ALONE = [Path(__file__).with_name(name) for name in ("live", "system")]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(FlownAgain())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
