@@ -117,6 +117,13 @@ class MapLock:
             self.point += 1
             return look()
 
+    def end_order(self) -> None:
+        """No frame comes any more, also where the order has some left: mapping waits for none."""
+        with self._changed:
+            if self._order is not None:
+                self._order.clear()
+            self._changed.notify_all()
+
     def _acquire(self) -> None:
         with self._changed:
             self._changed.wait_for(self._may_map)

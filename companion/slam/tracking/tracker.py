@@ -159,6 +159,7 @@ class Tracker:
 
     def close(self) -> Done:
         """Finish pending mapping; its results."""
+        self.map_lock.end_order()
         self._worker.close()
         return self._worker.done()
 

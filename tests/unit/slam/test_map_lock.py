@@ -104,3 +104,24 @@ def test_a_reader_is_no_part_of_the_order() -> None:
     mapping.start()
     assert done.wait(5.0)
     mapping.join()
+
+
+def test_mapping_ends_where_the_frame_that_is_due_never_comes() -> None:
+    """The image of a frame may be missing in a recording: that is told, not waited for."""
+    lock = MapLock([1])
+    worker = BackgroundMapping(lock)
+    stands = threading.Event()
+
+    def job() -> Done:
+        stands.set()
+        lock.yield_to_tracking()
+        return list[KeyframeAdded]()  # type: ignore[return-value]
+
+    worker.submit(job)
+    assert stands.wait(5.0)
+    closing = threading.Thread(target=worker.close)
+    lock.end_order()
+    closing.start()
+    closing.join(5.0)
+    assert not closing.is_alive()
+    assert lock.point == 2
