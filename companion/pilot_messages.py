@@ -35,7 +35,7 @@ class PilotMessage:
     longest: Mapping[str, int] = field(default_factory=dict)
 
     def __call__(self, **values: str) -> PilotText:
-        """What is sent; a value that is too long is cut, and of what is not ASCII a ? is left."""
+        """The text with its values; too long ones are cut, and a ? replaces what is not ASCII."""
         fitting = {
             name: values.get(name, OTHER_VALUE).encode("ascii", "replace").decode("ascii")[:most]
             for name, most in self.longest.items()
@@ -148,7 +148,7 @@ REASONS: Mapping[str, str] = {
     "disk is slow": "disk slow",
     "autopilot rebooted": "autopilot reboot",
 }
-"""Why no pose is sent, as `estimation.pose_gate` and `daemon.pose.pose_sender` have it."""
+"""Texts by the reason for which no pose is sent, see `estimation.pose_gate`, `daemon.pose`."""
 OTHER_REASON = "see its log"
 SWITCHED_OFF = ("off", "switched off")
 """Reasons that are the pilot's own, or the ground's."""
@@ -215,7 +215,7 @@ JOURNAL_ONLY = frozenset({
     "the flight can be seen", "the viewer cannot be shown", "the viewer has gone",
     "the viewer does not keep up", "viewers cannot connect",
 })  # fmt: skip
-"""What a `Warned` may be of that no pilot has to do with."""
+"""Kinds of `Warned` that do not concern a pilot."""
 
 
 def of_warning(what: str, detail: str = "", good: bool = False) -> PilotText | None:

@@ -38,13 +38,13 @@ NO_DEPTH = "none (depth.enabled = false)"
 
 
 class Watched:
-    """What the progress line and the report need of the messages."""
+    """State and counts of the map, taken from its messages for the progress line and the report."""
 
     def __init__(self) -> None:
         self.state = TrackState.INITIALISING
         self.n_points = self.n_depth_maps = 0
         self.has_origin = False
-        """Whether the map is georeferenced to the log's origin."""
+        """True once the map is georeferenced to the log's origin."""
 
     def take(self, message: Message) -> None:
         """Take a message of any kind."""
@@ -60,7 +60,7 @@ class Watched:
 
 
 class RecordedInput:
-    """What is replayed of a flight; InputError where it cannot be."""
+    """Frames and telemetry of a recorded flight between two times; InputError where invalid."""
 
     def __init__(
         self, path: Path, config: Config, start_s: float | None, stop_s: float | None

@@ -387,7 +387,7 @@ class Daemon:
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are armed; the last known state where nothing is heard."""
+        """True while the motors are armed; the last known state while the autopilot is silent."""
         return self._settings.armed
 
     def take_over(self, config: Config) -> None:

@@ -93,7 +93,7 @@ class HealthWatch:
 
     @property
     def too_hot(self) -> bool:
-        """Whether the load level is reduced because of the temperature."""
+        """True while the load level is reduced because of the temperature."""
         return "hot" in self._governor.degraded
 
     def reconfigure(self, config: Config) -> None:
@@ -137,7 +137,7 @@ class HealthWatch:
 
     @property
     def up(self) -> bool:
-        """Whether the stages are ready for frames, and the link is open."""
+        """True if the stages are ready for frames, and the link is open."""
         link_open = self._link is None or self._link.health.state != "missing"
         return link_open and self._flights.stages_up
 

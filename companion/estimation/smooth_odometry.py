@@ -316,7 +316,7 @@ class SmoothOdometry:
         )
 
     def _reachable(self, before: Array, after: Array, dt_ns: int) -> bool:
-        """Whether the body can have moved between two positions (3,) in a time."""
+        """True if the body can have moved between two positions (3,), world, metres, in `dt_ns`."""
         dt_s = dt_ns * 1e-9
         expected = before + self._velocity * min(dt_s, 1.0)
         away_m = float(np.linalg.norm(after - expected))

@@ -48,7 +48,7 @@ class Camera:
     coefficients: tuple[float, ...] = ()
     body_from_camera: Pose | None = None
     assumed: bool = field(default=False)
-    """Whether the intrinsics are a guess, without calibration."""
+    """True if the intrinsics are a guess, without calibration."""
 
     @property
     def focal_px(self) -> float:

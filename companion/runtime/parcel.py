@@ -81,7 +81,7 @@ class Parcel:
 
     @property
     def is_shared(self) -> bool:
-        """Whether it lies in memory of its own, of which only a descriptor travels."""
+        """True if it lies in memory of its own, of which only a descriptor travels."""
         return self._memory is not None
 
     def open(self) -> Any:

@@ -129,7 +129,7 @@ class LiveViewer:
 
     @property
     def alive(self) -> bool:
-        """Whether the exporter runs."""
+        """True while the exporter runs."""
         return self._stage.alive
 
     def stalled_s(self, now_s: float) -> float:
@@ -142,7 +142,7 @@ class LiveViewer:
 
     @property
     def is_shown(self) -> bool:
-        """Whether the process of the viewer here runs."""
+        """True while the viewer that was started here runs."""
         return self._ground is not None and self._ground.poll() is None
 
     def __enter__(self) -> LiveViewer:

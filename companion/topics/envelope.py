@@ -61,7 +61,7 @@ class Envelope:
         return float(value)
 
     def known(self, name: str) -> bool:
-        """Whether a field is there and not null."""
+        """True if a field is there and not null."""
         return self.fields.get(name) is not None
 
     def text(self, name: str, most: int = 200) -> str:

@@ -34,7 +34,7 @@ SUSPECT_SHARE = 0.9
 
 
 def is_geotagged(path: Path) -> bool:
-    """Whether a folder holds stills, without a video, and one of the first is geotagged."""
+    """True if a folder holds stills, without a video, and one of the first is geotagged."""
     if any(p.suffix.lower() in VIDEO_SUFFIXES for p in path.iterdir()):
         return False
     files = _files(path)

@@ -20,7 +20,7 @@ class RequestLimit:
         self._askers: OrderedDict[tuple[int, int], RateLimit] = OrderedDict()
 
     def allows(self, asker: tuple[int, int], now_ns: int) -> bool:
-        """Whether a request is accepted; rejected ones are counted."""
+        """True if a request is accepted; rejected ones are counted."""
         own = self._askers.get(asker)
         if own is None:
             own = self._askers[asker] = RateLimit(EACH_HZ, EACH_BURST)

@@ -1,4 +1,4 @@
-"""What was decided in a recorded flight, and in which order it came: for a replay as flown."""
+"""Decisions of a recorded flight, in the order in which they came, for a replay as flown."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Decisions:
 
     config: Config
     lossless: bool
-    """Whether images are recorded as they were."""
+    """True if images are recorded without loss."""
     samples: list[Telemetry] = field(default_factory=list)
     frames: list[FrameTracked] = field(default_factory=list)
     gate: list[GateStep] = field(default_factory=list)

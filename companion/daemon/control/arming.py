@@ -47,12 +47,12 @@ class Arming:
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are armed; before the first report, whether they last were."""
+        """True while the motors are armed; before the first report, as of the previous process."""
         return self._held is not None if self._said is None else self._said
 
     @property
     def holds(self) -> bool:
-        """Whether a change is held until disarming."""
+        """True while changes are held back until disarming."""
         return self._held is not None
 
     def resume(self, read: Config) -> Resumed:
@@ -107,7 +107,7 @@ class Arming:
         self._file.put(encoded(settings))
 
     def _is_same_boot(self, now_s: float) -> bool:
-        """Whether the autopilot still runs in the boot in which it was armed."""
+        """True if the autopilot has not rebooted since it was armed; False where unknown."""
         held, boot_s = self._held, self._boot_s()
         if held is None or held.autopilot_boot_s is None or boot_s is None:
             return False

@@ -50,13 +50,13 @@ class SettingsInForce:
         self.by_ground |= resumed.by_ground
         """Values set from the ground, by key; changed in place."""
         self._stays_off = resumed.by_ground.get("feedback.mode") == "off"
-        """Whether the pilot is still to be told so, once the link is up."""
+        """True until the pilot was told, over the open link, that poses stay off."""
         if before is not None:
             self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are armed; the last known state where nothing is heard."""
+        """True while the motors are armed; the last known state while the autopilot is silent."""
         return self._arming.armed
 
     def set_armed(self, armed: bool) -> None:

@@ -71,7 +71,7 @@ class Comparison:
 
     @property
     def identical(self) -> bool:
-        """Whether poses and cloud are equal to the last bit."""
+        """True if poses and cloud are equal to the last bit."""
         return all(self.same_files.values())
 
 

@@ -42,7 +42,7 @@ class LoopClosure:
 
 
 LoopCheck = Callable[[LoopClosure, bool], bool]
-"""Whether other information allows a loop closure, and whether it is within one map."""
+"""(loop closure, True within one map) -> True if other measurements allow it."""
 
 
 class LoopDetector:

@@ -97,7 +97,7 @@ class SlamMap:
     first_keyframe_id: int = -1
     """Identifies the map among others; -1 before initialisation."""
     level: bool = False
-    """Whether the z axis is gravity-aligned (down)."""
+    """True if the z axis is gravity-aligned (down)."""
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     """Ordered by id."""
     retired: dict[int, Retired] = field(default_factory=dict)

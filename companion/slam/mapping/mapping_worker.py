@@ -139,7 +139,7 @@ class MappingWorker(Protocol):
 
     @property
     def busy(self) -> bool:
-        """Whether the queue is so long that another keyframe would be mapped too late."""
+        """True if the queue is so long that another keyframe would be mapped too late."""
 
     def submit(self, job: Job) -> None:
         """Queue a job."""
@@ -190,7 +190,7 @@ class BackgroundMapping:
 
     @property
     def busy(self) -> bool:
-        """Whether the queue is so long that another keyframe would be mapped too late."""
+        """True if the queue is so long that another keyframe would be mapped too late."""
         return self._waiting >= MAX_QUEUED
 
     def submit(self, job: Job) -> None:

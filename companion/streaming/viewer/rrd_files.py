@@ -36,7 +36,7 @@ class RrdFiles:
         self.recording = self._begin()
 
     def is_full(self) -> bool:
-        """Whether the next file is due; checks the disk only now and then.
+        """True if the next file is due; the disk is checked on every LOOK_EVERY-th call only.
 
         OSError where the recording cannot be written.
         """
