@@ -85,6 +85,15 @@ class Envelope:
             raise StreamError(f"{self.kind}: {name} is not an object")
         return Envelope(f"{self.kind}.{name}", value, {})
 
+    def numbers(self, name: str, n: int, below: float) -> list[float]:
+        """List of n numbers of magnitude less than `below`."""
+        values = self.fields.get(name)
+        if not isinstance(values, list) or len(values) != n:
+            raise StreamError(f"{self.kind}: {name} is not a list of {n} numbers")
+        if not all(type(v) in (int, float) and abs(v) < below for v in values):
+            raise StreamError(f"{self.kind}: {name} has what is no number")
+        return [float(v) for v in values]
+
     def array(self, name: str, dtype: str, *shape: int, finite: bool = True) -> NDArray[Any]:
         """Array of a type and shape, -1 being any length; finite unless stated otherwise."""
         array = self.arrays.get(name)
