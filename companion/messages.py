@@ -146,7 +146,7 @@ class Georeference:
 
     world_from_map: Similarity
     sigma_scale: float
-    """relative: 0.01 is one percent"""
+    """Standard deviation relative to the scale: 0.01 is one percent."""
     sigma_yaw_rad: float
     method: str
     n_positions: int

@@ -43,9 +43,9 @@ class Detection:
     ids: NDArray[np.int64]
     """Corner numbers, row by row."""
     image_px: Array
-    """(N, 2)"""
+    """Corners (N, 2), pixels."""
     board_m: Array
-    """(N, 3)"""
+    """The same corners (N, 3) on the board, metres."""
     edge_px: float
     """Width of black-white edges, in the direction where they are widest."""
 

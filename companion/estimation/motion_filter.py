@@ -26,7 +26,7 @@ without attitude."""
 
 
 VARIANCE_ALIGNMENT_RAD2 = 1e-4
-"""Of `map_from_ned` after one image: 0.6 degrees."""
+"""Variance of `map_from_ned` after one image: 0.6 degrees."""
 
 
 class MotionFilter:

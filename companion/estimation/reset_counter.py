@@ -57,7 +57,7 @@ class ResetCounter:
 
     def __init__(self) -> None:
         self.value = 0
-        """Of the next pose; its lowest eight bits are sent."""
+        """Counter of the next pose; its lowest eight bits are sent."""
         self.sent = False
         """True once a pose was sent in this boot, or may have been."""
 

@@ -17,7 +17,7 @@ from companion.geometry.transforms import Array, Pose
 MAX_OFF_AXIS_RAD = np.radians(80.0)
 """Larger angles from the optical axis have no usable normalised coordinates."""
 CONVERGED = 1e-12
-"""In normalised coordinates."""
+"""Convergence threshold, in normalised coordinates."""
 
 
 class Distortion(Enum):

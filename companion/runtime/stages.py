@@ -63,9 +63,9 @@ class Stage:
     """Longest step before it counts as hanging: room for a slow disk or network, and for depth a
     driver that compiles. Localisation is judged by its poses, and sooner."""
     finish_s: float = 60.0
-    """Time for its last results,"""
+    """Time for its last results, seconds."""
     hurried_s: float = 0.2
-    """and where the daemon is to end: three seconds for all."""
+    """The same where the daemon is to end, which has three seconds for all stages."""
     death: Death = Death.RESTARTED
     with_flight: bool = False
     """It begins with the flight, whose name or folder it needs; else it stands by."""

@@ -74,7 +74,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _in_order(photos: Sequence[Photo]) -> tuple[list[Photo], list[int]]:
-    """In order of time and name; those of one second are spread over it."""
+    """Stills in order of time and name; those of one second are spread over it."""
     offset_ns = _zone_ns(photos)
     whole = [
         (p.local_ns - offset_ns if p.local_ns is not None else p.utc_ns or 0, p) for p in photos

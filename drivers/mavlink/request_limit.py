@@ -12,7 +12,7 @@ MOST_ASKERS = 32
 
 
 class RequestLimit:
-    """Asks no clock; `now_ns` is any monotonic time."""
+    """Rate limit of requests, without a clock; `now_ns` is any monotonic time."""
 
     def __init__(self) -> None:
         self.n_refused = 0

@@ -30,9 +30,10 @@ SAME_BOOT_S, SAME_BOOT_SHARE = 5.0, 0.02
 
 
 class Arming:
-    """Used in the event loop. `boot_s` is the boot time of the autopilot (CLOCK_MONOTONIC).
+    """State of the motors, and the changes held until disarming. Used in the event loop.
 
-    `before` is left by a daemon that ended while armed. `heard` is whether the autopilot is heard.
+    `before` is left by a daemon that ended while armed. `boot_s` is the boot time of the autopilot
+    (CLOCK_MONOTONIC), None while unknown; `heard` is True while the autopilot is heard.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class Arming:
             self._put(replace(held, autopilot_boot_s=self._boot_s(), written_s=now_s))
         if self._disarmed_s is None or now_s - self._disarmed_s < CERTAIN_S or not self._heard():
             return False
-        # with another start of the computer all was without power, which nobody survives in the air
+        # after a reboot of the computer: the power was off, so that the vehicle was on the ground
         return held.computer_boot != computer_boot() or self._is_same_boot(now_s)
 
     def hold(self, config: Config, by_ground: Mapping[str, Any], now_s: float) -> None:

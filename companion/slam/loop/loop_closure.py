@@ -42,7 +42,7 @@ class LoopClosure:
 
 
 LoopCheck = Callable[[LoopClosure, bool], bool]
-"""(loop closure, True within one map) -> True if other measurements allow it."""
+"""Test of a loop closure by other measurements; its second argument is True within one map."""
 
 
 class LoopDetector:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 BAUDS = (921600, 57600, 115200, 460800, 230400, 1500000, 500000, 38400, 19200, 9600)
-"""In order of the search: the most common first."""
+"""Rates in the order of the search: the most common first."""
 SURE_PACKETS = 2
 SILENT_NS = 1_200_000_000
 """An autopilot sends at least a heartbeat every second."""
