@@ -157,7 +157,7 @@ class DepthStage:
         return [depth_map, *chunks]
 
     def _scheduled(self) -> bool:
-        """Whether this keyframe is due, under a reduced load ratio."""
+        """Count a keyframe; True if it is due at the present load ratio."""
         self._credit = min(self._credit + self._load_ratio, 1.0)
         if self._credit < 1.0 - 1e-9:
             return False
@@ -167,7 +167,7 @@ class DepthStage:
     def _sees_new_area(
         self, keyframe: KeyframeAdded, place: Similarity, median_depth: float
     ) -> bool:
-        """Whether a keyframe sees enough that the last reference did not."""
+        """True if a keyframe sees enough that the last reference did not."""
         last = self._last_reference
         update = self._update
         before = None if last is None or update is None else update.place_of(last)

@@ -206,7 +206,7 @@ class H264:
 
 
 def is_intra(h264: bytes | memoryview) -> bool:
-    """Whether an image of an H.264 byte stream can be decoded without those before it."""
+    """True if an image of an H.264 byte stream can be decoded without those before it."""
     return _IDR_OR_SPS.search(bytes(h264[:256])) is not None
 
 

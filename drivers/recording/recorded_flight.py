@@ -108,7 +108,7 @@ class RecordedFlight(Flight):
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is an MCAP of ours, whole or not."""
+    """True if a file is a recording of this program, whole or not."""
     try:
         with McapFile(path) as file:
             return file.profile() == PROFILE
@@ -128,7 +128,7 @@ def open_recording(path: Path, config: CameraConfig, telemetry: TelemetryConfig)
 
 
 def is_recorded_folder(path: Path) -> bool:
-    """Whether a folder is that of a recorded live flight."""
+    """True if a folder is that of a recorded live flight."""
     return (path / RECORDING).is_file()
 
 

@@ -132,7 +132,7 @@ class Recording:
                 self.health = document
 
     def lost_before(self, number: int) -> bool:
-        """Whether data is missing just before a chunk."""
+        """True if data is missing just before a chunk."""
         return self.found.chunks[number].after_loss or number - 1 in self._bad
 
 

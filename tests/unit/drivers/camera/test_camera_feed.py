@@ -301,9 +301,7 @@ def test_stamps_that_go_back_are_refused() -> None:
 def test_stamps_far_from_now_are_refused_and_do_no_lasting_harm(off_s: int) -> None:
     with running() as run:
         run.more()
-        run.source.making = lambda p: Picture(
-            p.monotonic_ns + off_s * 1_000_000_000, p.grey, p.rgb
-        )
+        run.source.making = lambda p: Picture(p.monotonic_ns + off_s * 1_000_000_000, p.grey, p.rgb)
         run.until(lambda: run.feed.health.n_dropped >= 5)
         n = len(run.frames)
         run.source.making = lambda picture: picture

@@ -135,9 +135,7 @@ def test_a_udp_caller_listens_to_whom_it_calls_only() -> None:
     async def scene() -> None:
         ear = Ear()
         with udp_socket() as friend, udp_socket() as stranger:
-            wire = UdpWire(
-                Endpoint("udpout", HOST, friend.getsockname()[1]), PacketQueue(64_000)
-            )
+            wire = UdpWire(Endpoint("udpout", HOST, friend.getsockname()[1]), PacketQueue(64_000))
             async with running(wire.run(ear)):
                 await until(lambda: wire.connected)
                 wire.write(b"x")
