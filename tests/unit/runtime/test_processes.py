@@ -18,6 +18,7 @@ from companion.messages import MapUpdate
 from companion.runtime import stage_process
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor
+from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stages import Stage
 from tests.support.flights.topic_flight import CAMERA
@@ -84,6 +85,14 @@ class Flight:
             self.processes.order(name, Do(1, "say", f"{name} up"))
         for name in names:
             self.heard.until_said("told", f"{name} up")
+
+    def process(self, name: str) -> StageProcess:
+        """Process of a stage."""
+        return self.processes.by_name[name]
+
+    def pids(self) -> list[int]:
+        """Of all processes."""
+        return [self.process(name).pid for name in self.processes.by_name]
 
     def until_ended(self, how: str, why: str) -> None:
         self.heard.until(lambda: Ended(how, why) in self.heard.all)
@@ -172,7 +181,7 @@ def test_a_stage_that_dies_begins_again_with_the_newest_map(flying: Flight) -> N
     flying.processes.publish(map_update(20))
     flying.processes.publish(map_update(21))
     flying.heard.until(lambda: flying.heard.texts("map").count("21") == 2)
-    source = flying.processes.by_name["source"]
+    source = flying.process("source")
     flying.do("reader", "drive", "gpu")
     flying.do("reader", "crash")
     flying.until_ended("restarted", "reader: killed by SIGSEGV")
@@ -181,7 +190,7 @@ def test_a_stage_that_dies_begins_again_with_the_newest_map(flying: Flight) -> N
     assert flying.began("reader")[1:] == [Began("reader", 1, ("the gpu: killed by SIGSEGV",))]
     assert flying.heard.texts("map").count("20") == 2, "the newest only"
     assert flying.processes.n_restarted["reader"] == 1
-    assert flying.processes.by_name["source"] is source and source.alive
+    assert flying.process("source") is source and source.alive
     assert not flying.processes.over and flying.processes.up
 
 
@@ -241,6 +250,7 @@ def test_last_words_of_sources_reach_the_others_before_these_end() -> None:
         flight.processes.fly()
         flight.until_up("source", "reader")
         asked: list[str] = []
+        pids = flight.pids()
 
         def finish_of(stage: Stage) -> Finish:
             asked.append(stage.name)
@@ -254,7 +264,7 @@ def test_last_words_of_sources_reach_the_others_before_these_end() -> None:
         assert spoken.index(Said(0, "last words", "at leisure")) < spoken.index(
             Said(0, "heard", "last words at leisure")
         )
-        assert not any(process.alive for process in flight.processes.by_name.values())
+        assert not any(psutil.pid_exists(pid) for pid in pids)
 
 
 @pytest.mark.parametrize("hurried", [False, True])
@@ -271,7 +281,7 @@ def test_stages_that_are_late_are_named_and_ended(hurried: bool) -> None:
         flight.do("reader", "be slow to finish")
         if hurried:
             flight.processes.hurry()
-        pids = [process.pid for process in flight.processes.by_name.values()]
+        pids = flight.pids()
         begun_s = time.monotonic()
         late = flight.processes.finish(lambda stage: Finish(flight.processes.hurried))
         assert late == {"source": GIVEN_UP, "reader": ""}
@@ -283,6 +293,7 @@ def test_stages_that_are_late_are_named_and_ended(hurried: bool) -> None:
 def test_without_a_flight_nothing_is_finished() -> None:
     flight = Flight(SOURCE)
     flight.until_up("source")
+    pids = flight.pids()
     assert flight.processes.finish(lambda stage: Finish(hurry=False)) == {}
     assert flight.heard.texts("last words") == []
-    assert not any(process.alive for process in flight.processes.by_name.values())
+    assert not any(psutil.pid_exists(pid) for pid in pids)

@@ -33,9 +33,10 @@ class Tiny:
     def __init__(self, stage: Stage) -> None:
         self.heard, self.ended = Heard(), Heard()
         self.process = StageProcess(stage, self.heard.parcel, self.ended.note)
+        self.stage = self.process
 
     def do(self, what: str, detail: str = "") -> None:
-        self.process.offer(Parcel.of(Do(1, what, detail)))
+        self.stage.offer(Parcel.of(Do(1, what, detail)))
 
     def until_up(self) -> None:
         """Wait until its work has begun."""
@@ -45,7 +46,7 @@ class Tiny:
     def until_reported(self, such: Callable[[Progress], bool]) -> None:
         """Wait until its newest report is as wanted."""
         until_s = monotonic_s() + SOON_S
-        while (progress := self.process.progress) is None or not such(progress):
+        while (progress := self.stage.progress) is None or not such(progress):
             assert monotonic_s() < until_s, progress
             threading.Event().wait(0.005)
 
@@ -101,18 +102,18 @@ def depth_map(number: int) -> Parcel:
 def test_messages_are_answered_in_order_and_the_last_words_are_heard(start: Start) -> None:
     tiny = start(READER)
     tiny.do("say", "too early")  # before its setup
-    assert tiny.process.progress is None
-    tiny.process.begin(SETUP)
+    assert tiny.stage.progress is None
+    tiny.stage.begin(SETUP)
     for n in range(50):
         tiny.do("say", str(n))
-    tiny.process.ask_to_finish(Finish(hurry=False))
+    tiny.stage.ask_to_finish(Finish(hurry=False))
     tiny.do("say", "too late")
-    assert tiny.process.wait(SOON_S)
+    assert tiny.stage.wait(SOON_S)
     assert tiny.why() == ""
     words = [("told", str(n)) for n in range(50)] + [("last words", "at leisure")]
     assert tiny.heard.all == [Said(0 if who == "last words" else 1, who, w) for who, w in words]
-    assert tiny.process.finished is not None
-    assert tiny.process.n_dropped == 1
+    assert tiny.stage.finished is not None
+    assert tiny.stage.n_dropped == 1
     assert not tiny.process.alive and tiny.process.driver is None
 
 
@@ -123,16 +124,16 @@ def test_what_dies_by_itself_says_why(start: Start, tmp_path: Path) -> None:
         ("give up", ""): GIVEN_UP,
     }
     refusing = start(READER)
-    refusing.process.begin(Setup(Config(), CAMERA, tmp_path / UNUSABLE))
+    refusing.stage.begin(Setup(Config(), CAMERA, tmp_path / UNUSABLE))
     begun = [(start(READER), told, why) for told, why in ends.items()]
     for tiny, told, _ in begun:
-        tiny.process.begin(SETUP)
+        tiny.stage.begin(SETUP)
         tiny.do("drive", "gpu")
         tiny.do(*told)
     for tiny, _, why in begun:
         assert tiny.why() == why
-        assert not tiny.process.was_interrupted and tiny.process.finished is None
-        failed, driver = tiny.process.failed, tiny.process.driver
+        assert not tiny.process.was_interrupted and tiny.stage.finished is None
+        failed, driver = tiny.stage.failed, tiny.process.driver
         assert (failed is not None) is (why == GIVEN_UP)
         if failed is not None:
             assert not failed.by_input
@@ -140,62 +141,62 @@ def test_what_dies_by_itself_says_why(start: Start, tmp_path: Path) -> None:
         else:
             assert driver is not None and (driver.identity, driver.named) == ("gpu", "the gpu")
     assert "cannot be used" in refusing.why()
-    assert refusing.process.failed is not None and refusing.process.failed.by_input
-    assert refusing.process.progress is None
+    assert refusing.stage.failed is not None and refusing.stage.failed.by_input
+    assert refusing.stage.progress is None
 
 
 def test_how_long_it_has_hung_and_its_end_by_interruption(start: Start) -> None:
     tiny = start(READER)
-    assert tiny.process.stalled_s(monotonic_s() + 100.0) == 0.0, "it has nothing to do"
-    tiny.process.begin(SETUP)
-    assert tiny.process.stalled_s(monotonic_s() + 100.0) == pytest.approx(100.0, abs=5.0)
+    assert tiny.stage.stalled_s(monotonic_s() + 100.0) == 0.0, "it has nothing to do"
+    tiny.stage.begin(SETUP)
+    assert tiny.stage.stalled_s(monotonic_s() + 100.0) == pytest.approx(100.0, abs=5.0)
     tiny.until_up()
-    tiny.process.offer(frame(7))
+    tiny.stage.offer(frame(7))
     tiny.heard.until_said("frame", "7")
     tiny.until_reported(lambda found: found.n_done == 1 and found.busy_since_s is None)
-    assert tiny.process.stalled_s(monotonic_s() + 100.0) == 0.0, "again it has nothing to do"
+    assert tiny.stage.stalled_s(monotonic_s() + 100.0) == 0.0, "again it has nothing to do"
     tiny.do("drive", "gpu")
     tiny.do("say", "driven")
     tiny.heard.until_said("told", "driven")
     tiny.do("hang")
     offered_s = monotonic_s()
-    assert tiny.process.stalled_s(offered_s + 100.0) == pytest.approx(100.0, abs=5.0)
+    assert tiny.stage.stalled_s(offered_s + 100.0) == pytest.approx(100.0, abs=5.0)
     tiny.process.interrupt("it hung")
     assert tiny.why() == "it hung"
     assert tiny.process.was_interrupted
     assert tiny.process.driver is not None, "which may be to blame"
-    assert tiny.process.stalled_s(offered_s + 100.0) == 0.0
+    assert tiny.stage.stalled_s(offered_s + 100.0) == 0.0
 
 
 def test_a_stage_that_is_asked_to_end_does_not_hang(start: Start) -> None:
     tiny = start(READER)
-    tiny.process.begin(SETUP)
+    tiny.stage.begin(SETUP)
     tiny.do("be slow to finish")
-    tiny.process.ask_to_finish(Finish(hurry=True))
-    assert tiny.process.stalled_s(monotonic_s() + 100.0) == 0.0
-    assert not tiny.process.wait(0.0)
+    tiny.stage.ask_to_finish(Finish(hurry=True))
+    assert tiny.stage.stalled_s(monotonic_s() + 100.0) == 0.0
+    assert not tiny.stage.wait(0.0)
     tiny.process.kill()
     assert tiny.why() == "", "it was asked to"
-    assert tiny.process.finished is None and tiny.heard.texts("last words") == []
+    assert tiny.stage.finished is None and tiny.heard.texts("last words") == []
 
 
 def test_frames_are_dropped_for_newer_ones_and_nothing_else_is(start: Start) -> None:
     tiny = start(SOURCE)
-    tiny.process.begin(SETUP)
+    tiny.stage.begin(SETUP)
     tiny.until_up()
     stopped = tiny.suspend()
     n = 6 * UNREAD_BYTES // FRAME_BYTES
     for seq in range(n):
-        tiny.process.offer(frame(seq))
+        tiny.stage.offer(frame(seq))
         tiny.do("say", str(seq))
-    waiting_bytes = tiny.process.waiting_bytes
+    waiting_bytes = tiny.stage.waiting_bytes
     assert waiting_bytes < 2 * FRAME_BYTES, "the newest only"
-    n_dropped = tiny.process.n_dropped
+    n_dropped = tiny.stage.n_dropped
     assert n_dropped >= n - (UNREAD_BYTES // FRAME_BYTES + 3)
     stopped.resume()
     tiny.heard.until_said("told", str(n - 1))
-    tiny.process.ask_to_finish(Finish(hurry=True))
-    assert tiny.process.wait(SOON_S)
+    tiny.stage.ask_to_finish(Finish(hurry=True))
+    assert tiny.stage.wait(SOON_S)
     seen = [int(text) for text in tiny.heard.texts("frame")]
     assert seen == sorted(seen) and seen[-1] == n - 1
     assert tiny.heard.texts("told") == ["up", *map(str, range(n))]
@@ -204,13 +205,13 @@ def test_frames_are_dropped_for_newer_ones_and_nothing_else_is(start: Start) -> 
 
 def test_what_waits_for_a_process_that_takes_nothing_is_bounded(start: Start) -> None:
     tiny = start(READER)
-    tiny.process.begin(SETUP)
+    tiny.stage.begin(SETUP)
     tiny.until_up()
     tiny.suspend()
     before_bytes = psutil.Process().memory_info().rss
     for number in range(100):
-        tiny.process.offer(depth_map(number))
-    assert 0 < tiny.process.waiting_bytes <= QUEUE_BYTES
+        tiny.stage.offer(depth_map(number))
+    assert 0 < tiny.stage.waiting_bytes <= QUEUE_BYTES
     assert psutil.Process().memory_info().rss - before_bytes < 2 * QUEUE_BYTES
-    assert tiny.process.n_dropped >= 100 - (QUEUE_BYTES + UNREAD_BYTES) // 5_000_000 - 3
-    assert tiny.process.stalled_s(monotonic_s() + 100.0) > 95.0
+    assert tiny.stage.n_dropped >= 100 - (QUEUE_BYTES + UNREAD_BYTES) // 5_000_000 - 3
+    assert tiny.stage.stalled_s(monotonic_s() + 100.0) > 95.0
