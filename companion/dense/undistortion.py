@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from companion.dense.view_selection import Intrinsics
 from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array
 from companion.messages import Bytes, Floats
 
 MAX_HFOV_RAD = np.radians(110.0)
@@ -27,13 +28,8 @@ class Undistortion:
         if camera.distortion.value == "equidistant" and fx < widest:
             fx, fy = widest, widest * camera.fy / camera.fx
         self.intrinsics = Intrinsics(fx, fy, camera.cx, camera.cy)
-        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        self._normalised = np.stack([(u - camera.cx) / fx, (v - camera.cy) / fy], -1)
-        d = camera.distort(self._normalised.reshape(-1, 2))
-        shape = (camera.height, camera.width)
-        self._map_u = (d[:, 0] * camera.fx + camera.cx).reshape(shape).astype(np.float32)
-        self._map_v = (d[:, 1] * camera.fy + camera.cy).reshape(shape).astype(np.float32)
-        self._fixed = cv2.convertMaps(self._map_u, self._map_v, cv2.CV_16SC2)
+        self._camera = camera
+        self._fixed = cv2.convertMaps(*self._maps(), cv2.CV_16SC2)
 
     def image(self, image: Bytes) -> Bytes:
         """The undistorted image, (H, W) or (H, W, 3)."""
@@ -45,9 +41,24 @@ class Undistortion:
 
     def nearest(self, values: NDArray[Any]) -> Floats:
         """Nearest-neighbour remap of values (H, W), such as depths; 0 outside."""
-        out = cv2.remap(values, self._map_u, self._map_v, cv2.INTER_NEAREST)
-        return np.asarray(out, np.float32)
+        return np.asarray(cv2.remap(values, *self._maps(), cv2.INTER_NEAREST), np.float32)
 
     def ray_length(self) -> Floats:
         """Length (H, W) of the ray to a point at depth 1."""
-        return np.asarray(np.sqrt((self._normalised**2).sum(-1) + 1), np.float32)
+        return np.asarray(np.sqrt((self._normalised() ** 2).sum(-1) + 1), np.float32)
+
+    def _normalised(self) -> Array:
+        """Normalised coordinates (H, W, 2) of the pixels of the undistorted image."""
+        camera, k = self._camera, self.intrinsics
+        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        return np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy], -1)
+
+    def _maps(self) -> tuple[Floats, Floats]:
+        """Columns and rows (H, W) in the distorted image."""
+        camera = self._camera
+        d = camera.distort(self._normalised().reshape(-1, 2))
+        shape = (camera.height, camera.width)
+        return (
+            (d[:, 0] * camera.fx + camera.cx).reshape(shape).astype(np.float32),
+            (d[:, 1] * camera.fy + camera.cy).reshape(shape).astype(np.float32),
+        )

@@ -18,6 +18,7 @@ from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import cache_errors
 from companion.stages.map_keeper import Kept, MapKeeper
 from companion.timing.clock import since_boot_ns
+from drivers.system.heap import give_back_heap
 from drivers.system.library_pages import give_back_library_pages
 
 KEEP_EVERY_NS = 1_000_000_000
@@ -40,6 +41,7 @@ class _Localisation(Work):
             setup.config, setup.camera, self.times, background=setup.is_live
         )
         if setup.is_live:  # in a process of its own; of the compiler of loops nothing is needed now
+            give_back_heap()
             give_back_library_pages()
         self._keeper: MapKeeper | None = None
         self._to_take_up: Kept | None = None

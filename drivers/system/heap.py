@@ -18,13 +18,16 @@ class _Bound(NamedTuple):
 
 BOUNDS = {
     "MALLOC_ARENA_MAX": _Bound(-8, 2),
-    "MALLOC_MMAP_THRESHOLD_": _Bound(-3, 1 << 20),
-    "MALLOC_TRIM_THRESHOLD_": _Bound(-1, 2 << 20),
+    "MALLOC_MMAP_THRESHOLD_": _Bound(-3, 8 << 20),
+    "MALLOC_TRIM_THRESHOLD_": _Bound(-1, 16 << 20),
 }
-"""By the variables that glibc reads when a process starts. Each thread would else have a heap of
-its own, from which little returns; and after the first large array is freed, such arrays, too,
-would come from the heap. With a quarter of a megabyte as the second a replay takes a tenth more of
-the processor: images would be mapped anew each time."""
+"""By the variables that glibc reads when a process starts: heaps, bytes from which an array is
+mapped by itself, free bytes at the end of a heap that are kept.
+
+Each thread would else have a heap of its own, from which little returns; and once a large array is
+freed, such arrays, too, would come from the heap. With a megabyte as the second, images are mapped
+anew each time, and the dense map takes half as much again of the processor.
+"""
 
 
 def bound_heap() -> None:

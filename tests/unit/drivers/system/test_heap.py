@@ -20,7 +20,7 @@ def resident_mib():
 
 def fill():
     del [np.ones(30 << 20, np.uint8)][:]  # after which glibc has as large arrays in the heap
-    both = [(np.ones(4 << 20, np.uint8), np.ones(200_000, np.uint8)) for _ in range(10)]
+    both = [(np.ones(16 << 20, np.uint8), np.ones(200_000, np.uint8)) for _ in range(3)]
     kept.extend(small for large, small in both)  # between the large ones
 
 if sys.argv[1] == "bound":
@@ -61,9 +61,9 @@ def test_what_is_kept_can_be_given_back() -> None:
 
 
 def test_processes_that_are_started_inherit_the_bounds() -> None:
-    assert told("bound")[2] == "2 1048576 2097152"
+    assert told("bound")[2] == "2 8388608 16777216"
     assert told("unbound")[2] == "None None None"
 
 
 def test_what_the_environment_sets_stays() -> None:
-    assert told("bound", MALLOC_ARENA_MAX="7")[2] == "7 1048576 2097152"
+    assert told("bound", MALLOC_ARENA_MAX="7")[2] == "7 8388608 16777216"
