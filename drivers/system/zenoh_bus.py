@@ -71,14 +71,6 @@ class ZenohBus:
 
         self._declared.append(self._session.declare_queryable(key, take))
 
-    def subscribe(self, topic: str, take: Callable[[bytes], None]) -> None:
-        """Subscribe to a topic; called back in a thread of its own."""
-        self._declared.append(
-            self._session.declare_subscriber(
-                f"{self._prefix}/{topic}", lambda sample: take(sample.payload.to_bytes())
-            )
-        )
-
     def ask(self, topic: str, data: bytes, timeout_s: float) -> bytes | None:
         """First answer to a query; None without one."""
         replies = self._session.get(

@@ -30,18 +30,6 @@ class MavlinkPort(Protocol):
         return ""
 
     @property
-    def n_received(self) -> int:
-        """Valid packets received, those of unknown messages too."""
-
-    @property
-    def n_sent(self) -> int:
-        """Messages given to the wire."""
-
-    @property
-    def n_dropped(self) -> int:
-        """Messages that could not be sent."""
-
-    @property
     def n_bad(self) -> int:
         """Rejected input: damaged packets, or missing or wrong signatures."""
 

@@ -84,11 +84,6 @@ class PymavlinkPort:
         """Breaks of the packet stream, and packets without a valid signature where required."""
         return self._stream.n_breaks + self.n_unsigned
 
-    @property
-    def n_bad_bytes(self) -> int:
-        """Bytes outside any packet."""
-        return self._stream.n_bad_bytes
-
     def clients(self) -> list[ClientCounts]:
         """See `MavlinkPort`."""
         return self.router.take_departed() + self.router.counts()
