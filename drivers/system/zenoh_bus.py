@@ -119,7 +119,7 @@ def _settings(config: DistributedConfig) -> dict[str, Any]:
         "connect/retry": {"period_init_ms": 500, "period_max_ms": 2000},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # memory shared with whoever connects: not with just anybody, and it would hide the link
+        # no shared memory: any peer may connect, and traffic on the link would not show
         "transport/shared_memory/enabled": False,
         "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
     }

@@ -37,7 +37,7 @@ class MavlinkPort(Protocol):
         """Counters of the router's clients; one that has left is listed once more."""
 
     def set_tap(self, tap: Tap | None) -> None:
-        """Call back with all bytes read from and written to the wire, whoever sent them."""
+        """Call back with all bytes read from and written to the wire, clients' bytes too."""
 
     async def run(self, on_message: OnMessage) -> None:
         """Receive until cancelled, reconnecting as needed."""

@@ -126,7 +126,7 @@ class PymavlinkPort:
         ours = self.identity
         packets = self._stream.feed(data, monotonic_ns)
         if any((packet.system, packet.component) == ours for packet in packets):
-            # an echo of what we sent: whoever joined the wire's ends, it goes no further
+            # echoes of our own packets, of a wire whose ends are joined: not passed on
             packets = [packet for packet in packets if (packet.system, packet.component) != ours]
         self.n_received += len(packets)
         try:
