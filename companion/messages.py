@@ -157,7 +157,7 @@ class Georeference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Georeferenced:
-    """Georeference of the newest map alone, for whoever needs no more of it."""
+    """Georeference of the newest map, without its keyframes and points."""
 
     t_ns: int
     georeference: Georeference | None

@@ -19,6 +19,8 @@ from companion.messages import DepthMap, Floats, MapUpdate, PixelState, PointChu
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 N_MAPS = 7
+N_AFTER = 2
+"""Later maps that a map is fused with."""
 MAX_SIGMA = 0.01
 """Largest relative standard deviation of depth used in the cloud."""
 
@@ -47,9 +49,8 @@ class _Agreement:
 class Fusion:
     """Buffers depth maps; fuses each once its neighbours have arrived."""
 
-    def __init__(self, config: CloudConfig, wait_for: int = 2) -> None:
+    def __init__(self, config: CloudConfig) -> None:
         self._config = config
-        self._wait_for = wait_for
         self._recent: OrderedDict[int, _RecentMap] = OrderedDict()
         self._pending: list[int] = []
 
@@ -61,7 +62,7 @@ class Fusion:
         )
         self._pending.append(depth_map.keyframe_id)
         out = []
-        while len(self._pending) > self._wait_for:
+        while len(self._pending) > N_AFTER:
             out.append(self._fuse(self._pending.pop(0), update))
         while len(self._recent) > N_MAPS:
             self._recent.popitem(last=False)

@@ -25,19 +25,10 @@ MIN_POINTS = 3
 """Fewer points in a sector count as outliers."""
 NEAR_SIGHT_M = 1.0
 """Largest distance of a line of sight from the vehicle to count for its surroundings."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reach:
-    """Volume searched for obstacles; nearer than `min_m` is the vehicle itself.
-
-    Heights are relative to the vehicle, along the vertical.
-    """
-
-    min_m: float = 0.3
-    max_m: float = 20.0
-    above_m: float = 1.0
-    below_m: float = 0.75
+MIN_M, MAX_M = 0.3, 20.0
+"""Horizontal distances searched for obstacles; what is nearer is the vehicle itself."""
+ABOVE_M, BELOW_M = 1.0, 0.75
+"""Heights searched, relative to the vehicle, along the vertical."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,11 +42,7 @@ class Obstacles:
 
 
 def obstacles_around(
-    t_ns: int,
-    world_from_body: Pose,
-    points_world_m: Array,
-    seen_from_world_m: Array,
-    reach: Reach = Reach(),
+    t_ns: int, world_from_body: Pose, points_world_m: Array, seen_from_world_m: Array
 ) -> Obstacles:
     """Distances from a pose to points (N, 3) seen from camera positions (N, 3).
 
@@ -67,16 +54,16 @@ def obstacles_around(
     distance_m = np.hypot(points[:, 0], points[:, 1])
     sector = _sector(points, world_from_body)
 
-    max_cm = round(reach.max_m * 100)
-    min_cm = round(reach.min_m * 100)
+    max_cm = round(MAX_M * 100)
+    min_cm = round(MIN_M * 100)
     distances_cm = np.full(N_SECTORS, UNKNOWN_CM, np.uint16)
-    far = distance_m > reach.max_m
-    through = _seen_through(points[far], eyes[far], reach)
+    far = distance_m > MAX_M
+    through = _seen_through(points[far], eyes[far])
     distances_cm[np.bincount(sector[far][through], minlength=N_SECTORS) >= MIN_POINTS] = max_cm + 1
 
     down_m = points[:, 2]
-    hit = (down_m >= -reach.above_m) & (down_m <= reach.below_m)
-    hit &= (distance_m >= reach.min_m) & (distance_m <= reach.max_m)
+    hit = (down_m >= -ABOVE_M) & (down_m <= BELOW_M)
+    hit &= (distance_m >= MIN_M) & (distance_m <= MAX_M)
     hit_m, hit_sector = distance_m[hit], sector[hit]
     order = np.lexsort((hit_m, hit_sector))
     hit_m, hit_sector = hit_m[order], hit_sector[order]
@@ -96,8 +83,8 @@ def _sector(points: Array, world_from_body: Pose) -> NDArray[np.int64]:
     return index % N_SECTORS
 
 
-def _seen_through(points: Array, eyes: Array, reach: Reach) -> NDArray[np.bool_]:
-    """Points beyond reach whose line of sight stays at the height of the vehicle.
+def _seen_through(points: Array, eyes: Array) -> NDArray[np.bool_]:
+    """Points beyond `MAX_M` whose line of sight stays at the height of the vehicle.
 
     The line starts at the camera and passes close to the vehicle, at the origin.
     """
@@ -107,13 +94,13 @@ def _seen_through(points: Array, eyes: Array, reach: Reach) -> NDArray[np.bool_]
     along_m = np.clip(-(eyes * direction).sum(1), 0.0, length_m)
     closest = eyes + along_m[:, None] * direction
     level = np.hypot(direction[:, 0], direction[:, 1])
-    end_down_m = closest[:, 2] + direction[:, 2] / np.maximum(level, 1e-9) * reach.max_m
+    end_down_m = closest[:, 2] + direction[:, 2] / np.maximum(level, 1e-9) * MAX_M
     through: NDArray[np.bool_] = (
         (np.linalg.norm(closest, axis=1) <= NEAR_SIGHT_M)
-        & (closest[:, 2] >= -reach.above_m)
-        & (closest[:, 2] <= reach.below_m)
-        & (end_down_m >= -reach.above_m)
-        & (end_down_m <= reach.below_m)
+        & (closest[:, 2] >= -ABOVE_M)
+        & (closest[:, 2] <= BELOW_M)
+        & (end_down_m >= -ABOVE_M)
+        & (end_down_m <= BELOW_M)
     )
     return through
 

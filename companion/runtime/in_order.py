@@ -3,7 +3,7 @@
 Nothing is lost, and results do not depend on anybody's speed. Localisation works in the caller's
 thread. Depth, to which no stage above it listens, has a thread of its own, fed in order through a
 bounded queue that makes the caller wait. A depth stage that fails is left out from there on:
-trajectory, map and what there is of the cloud stay.
+trajectory, map and the cloud so far stay.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class InOrder:
             for stage in self._stages:
                 if stage.is_source and stage.name != APART:
                     last += self.works[stage.name].finish(finish(stage))
-        finally:  # what there is is written, whatever has failed
+        finally:  # results so far are written, whatever has failed
             # before the final map comes: what it is measured by is that of its own time
             if self._depth is not None:
                 self._publish(self._depth.close())

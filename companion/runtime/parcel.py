@@ -2,7 +2,7 @@
 
 A message is pickled with its arrays apart (PEP 574). A small one travels whole. A large one is
 written into a file in memory without a name (memfd_create(2)), and only its descriptor travels:
-whoever passes it on copies nothing and opens nothing. The memory is freed with the last process
+passing it on copies nothing and opens nothing. The memory is freed with the last process
 that holds it, however that one ends; nothing is overwritten, so that no reader comes too late.
 Readers map it privately: what one writes into its arrays no other sees.
 

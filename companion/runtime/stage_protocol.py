@@ -114,7 +114,7 @@ class Taken:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """A line for whoever runs the stage, on a device that was refused, say."""
+    """A line of text for the user, on a device that was refused, say."""
 
     text: str
 

@@ -57,7 +57,7 @@ class Exporter:
         """Accept viewers at a socket; from any thread."""
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
-        with contextlib.suppress(OSError):  # somebody has that port: poses go with all else
+        with contextlib.suppress(OSError):  # the port is in use: poses go over TCP with all else
             datagrams = Datagrams(listener)
             self._datagrams.append(datagrams)
             self._selector.register(datagrams.socket, selectors.EVENT_READ)

@@ -160,7 +160,7 @@ def _stamps_of_packets(container: av.container.InputContainer, stream: av.VideoS
             if stamp is not None and not packet.is_discard:
                 stamps.append(stamp)
     except av.error.FFmpegError:
-        pass  # cut short: what came so far is what there is
+        pass  # cut short: the images so far count
     return sorted(set(stamps))
 
 

@@ -109,11 +109,6 @@ class AutopilotLink:
     # -- what others ask -------------------------------------------------------------------------
 
     @property
-    def n_reboots(self) -> int:
-        """Reboots of the autopilot seen."""
-        return self._n_reboots
-
-    @property
     def rates_hz(self) -> dict[str, float]:
         """Measured rates of messages that make samples, by name, over the last seconds."""
         now_ns = self._clock.now_ns()
@@ -182,24 +177,20 @@ class AutopilotLink:
 
         return await self._commands.ask(command, make, timeout_s, tries)
 
-    async def command_at(
-        self, command: int, place: GeoOrigin, *params: float, timeout_s: float = ANSWER_S,
-        tries: int = TRIES,
-    ) -> int:  # fmt: skip
+    async def command_at(self, command: int, place: GeoOrigin) -> int:
         """Send a COMMAND_INT for a geodetic position, altitude above mean sea level; likewise."""
-        values = [*params, *[0.0] * (4 - len(params))]
         system = self._target()
 
         def make(_attempt: int) -> Any:
             return mavlink.MAVLink_command_int_message(
-                system, AUTOPILOT, mavlink.MAV_FRAME_GLOBAL, command, 0, 0, *values,
-                round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7),
-                place.altitude_m,
+                system, AUTOPILOT, mavlink.MAV_FRAME_GLOBAL, command, 0, 0,
+                0.0, 0.0, 0.0, 0.0,
+                round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7), place.altitude_m,
             )  # fmt: skip
 
-        return await self._commands.ask(command, make, timeout_s, tries)
+        return await self._commands.ask(command, make, ANSWER_S, TRIES)
 
-    async def request_message(self, message_id: int, timeout_s: float = ANSWER_S) -> Any | None:
+    async def request_message(self, message_id: int) -> Any | None:
         """Request a message that is not streamed; None if it does not come."""
         came: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
@@ -209,13 +200,11 @@ class AutopilotLink:
 
         end = self.listen(message_id, take)
         try:
-            result = await self.command(
-                mavlink.MAV_CMD_REQUEST_MESSAGE, message_id, timeout_s=timeout_s
-            )
+            result = await self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
             if result in REFUSALS and not came.done():
                 return None
             with contextlib.suppress(asyncio.TimeoutError):
-                return await within(came, timeout_s)
+                return await within(came, ANSWER_S)
             return None
         finally:
             end()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -16,27 +15,15 @@ UNKNOWN_I16 = 0x7FFF
 UNKNOWN_U32 = 0xFFFFFFFF
 PRIMARY = 0
 STORAGE = {"hdd": 0, "ssd": 1, "emmc": 2, "sd": 4}
-LINK = {"serial": 0, "network": 10}
 BOARD_SENSORS = ("board", "acpitz")
 CORE_SENSORS = ("cpu", "core", "x86_pkg", "soc", "tj")
 DISK_FULL_MIB = 100.0
 
 
-@dataclass(frozen=True, slots=True)
-class LinkLoad:
-    """Data rate of a link, KiB/s; `capacity_kib_s` is None where unknown."""
-
-    kind: Literal["serial", "network"]
-    sent_kib_s: float
-    received_kib_s: float
-    capacity_kib_s: float | None = None
-
-
-def computer_status(
-    t_ns: int, load: ComputerLoad, links: Sequence[LinkLoad] = (), *, too_hot: bool = False
-) -> Any:
-    """The message. `too_hot` marks a load level reduced because of the temperature."""
+def computer_status(t_ns: int, load: ComputerLoad, *, too_hot: bool = False) -> Any:
+    """ONBOARD_COMPUTER_STATUS without links; `too_hot`: the load level is reduced for heat."""
     unknown_slices = [UNKNOWN_U8] * 10  # of the last second: not measured so finely
+    no_links = [UNKNOWN_U32] * 6
     full = load.disk_free_mib is not None and load.disk_free_mib < DISK_FULL_MIB
     return mavlink.MAVLink_onboard_computer_status_message(
         time_usec=t_ns // 1000,
@@ -56,11 +43,11 @@ def computer_status(
         storage_type=_filled([STORAGE.get(load.disk_kind, UNKNOWN_U32)], 4, UNKNOWN_U32),
         storage_usage=_filled([_whole(load.disk_used_mib)], 4, UNKNOWN_U32),
         storage_total=_filled([_whole(load.disk_total_mib)], 4, UNKNOWN_U32),
-        link_type=_filled((LINK[link.kind] for link in links), 6, UNKNOWN_U32),
-        link_tx_rate=_filled((_whole(link.sent_kib_s) for link in links), 6, UNKNOWN_U32),
-        link_rx_rate=_filled((_whole(link.received_kib_s) for link in links), 6, UNKNOWN_U32),
-        link_tx_max=_filled((_whole(link.capacity_kib_s) for link in links), 6, UNKNOWN_U32),
-        link_rx_max=_filled((_whole(link.capacity_kib_s) for link in links), 6, UNKNOWN_U32),
+        link_type=no_links,
+        link_tx_rate=no_links,
+        link_rx_rate=no_links,
+        link_tx_max=no_links,
+        link_rx_max=no_links,
         status_flags=(mavlink.COMPUTER_STATUS_FLAGS_THERMAL_THROTTLE if too_hot else 0)
         | (mavlink.COMPUTER_STATUS_FLAGS_DISK_FULL if full else 0),
     )

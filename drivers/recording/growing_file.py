@@ -16,7 +16,7 @@ class GrowingFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        fcntl.flock(self._fd, fcntl.LOCK_EX)  # whoever just looks at it is done at once
+        fcntl.flock(self._fd, fcntl.LOCK_EX)  # a check by `is_growing` holds it for a moment only
         self._size = 0
         for folder in (path.parent, path.parent.parent):
             _sync_folder(folder)  # else a power cut could leave a file without a name

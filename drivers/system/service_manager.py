@@ -56,9 +56,9 @@ class ServiceManager:
         """RELOADING=1; `ready` ends it."""
         self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
-    def stopping(self, status: str = "") -> None:
+    def stopping(self) -> None:
         """STOPPING=1."""
-        self._send("STOPPING=1", _status(status))
+        self._send("STOPPING=1")
 
     def extend_timeout(self, seconds: float) -> None:
         """Extend the start or stop timeout by this much from now on."""

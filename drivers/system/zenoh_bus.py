@@ -71,14 +71,6 @@ class ZenohBus:
 
         self._declared.append(self._session.declare_queryable(key, take))
 
-    def subscribe(self, topic: str, take: Callable[[bytes], None]) -> None:
-        """Subscribe to a topic; called back in a thread of its own."""
-        self._declared.append(
-            self._session.declare_subscriber(
-                f"{self._prefix}/{topic}", lambda sample: take(sample.payload.to_bytes())
-            )
-        )
-
     def ask(self, topic: str, data: bytes, timeout_s: float) -> bytes | None:
         """First answer to a query; None without one."""
         replies = self._session.get(
@@ -127,7 +119,7 @@ def _settings(config: DistributedConfig) -> dict[str, Any]:
         "connect/retry": {"period_init_ms": 500, "period_max_ms": 2000},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # memory shared with whoever connects: not with just anybody, and it would hide the link
+        # no shared memory: any peer may connect, and traffic on the link would not show
         "transport/shared_memory/enabled": False,
         "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
     }

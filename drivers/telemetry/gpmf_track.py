@@ -32,5 +32,5 @@ def blocks_of(video: Path) -> list[tuple[int, int, bytes]]:
                     end_ns = begin_ns + round((packet.duration or 0) * unit_ns)
                     out.append((begin_ns, end_ns, bytes(packet)))
     except av.error.FFmpegError:
-        pass  # the video is cut short: what came so far is what there is
+        pass  # the video is cut short: the part before counts
     return out

@@ -151,7 +151,7 @@ def _inside(video: Path) -> Iterator[tuple[int, str]]:
                     t_ns = round(packet.pts * stream.time_base * 1_000_000_000)
                     yield t_ns, bytes(packet)[:MAX_CUE].decode("utf-8", "replace")
     except (av.error.FFmpegError, ValueError):
-        return  # the video is cut short: what came so far is what there is
+        return  # the video is cut short: the part before counts
 
 
 def _numbers(text: str) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Cloud snapshots in flight, and their progress for whoever asked."""
+"""Cloud snapshots in flight, and their progress for the ground station that asked."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ class Viewing:
         if self._last_warning == "" and self._was_shown:
             self._tell(GONE, self._where)
             if self._where == "native":
-                self._where = NOWHERE  # its window was closed by whoever looked at it
+                self._where = NOWHERE  # the user has closed its window
                 return LOOK_S
         try:
             self._viewer.look(self._where)

@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 from companion.geometry.transforms import Array
 from companion.messages import Floats
 from companion.slam.compiled.compiling import (
-    Bools,
     Ints,
     compiled,
-    flags,
     integer,
     integers,
     number,
@@ -67,12 +65,12 @@ def _in_cells(pixels: Floats, n_columns: int, n_rows: int) -> tuple[Ints, Ints]:
 
 
 @compiled(
-    pairs, integers, words, integers, numbers, single_pairs, words, integers, flags,
+    pairs, integers, words, integers, numbers, single_pairs, words, integers,
     number, number, integer,
 )  # fmt: skip
 def search(
     projected: Array, ids: Ints, point_words: Words, levels: Ints, radius: Array,
-    pixels: Floats, feature_words: Words, octaves: Ints, usable: Bools,
+    pixels: Floats, feature_words: Words, octaves: Ints,
     max_distance: float, ratio: float, max_octave_gap: int,
 ) -> tuple[Ints, Ints]:  # fmt: skip
     """Indices into `ids` (M,) and features, each at most once, ordered by feature.
@@ -111,7 +109,7 @@ def search(
         for k in range(n_near):
             i = near[k]
             bits[k] = _FAR
-            if usable[i] and abs(octaves[i] - levels[m]) <= max_octave_gap:
+            if abs(octaves[i] - levels[m]) <= max_octave_gap:
                 bits[k] = _differing_bits(point_words[ids[m]], feature_words[i])
             if bits[k] <= max_distance and (best < 0 or bits[k] < bits[best]):
                 best = k

@@ -1,4 +1,4 @@
-"""Feature matching: by descriptor alone, along epipolar lines, and by projection.
+"""Feature matching: by descriptor alone, and along epipolar lines.
 
 Descriptors have 256 bits; distances are Hamming. A match passes a threshold, the ratio test against
 the second best, and is mutual.
@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.geometry.transforms import Array, Pose, skew
+from companion.geometry.transforms import Pose, skew
 from companion.messages import Bytes, Floats
-from companion.slam.compiled.searching import search, search_along
-from companion.slam.features.orb_features import Bools, Features, Ints
+from companion.slam.compiled.searching import search_along
+from companion.slam.features.orb_features import Features, Ints
 
-MAX_DISTANCE = 64
-"""Largest distance, bits, between views of the same corner."""
 MAX_DISTANCE_STRICT = 50
+"""Largest distance, bits, between views of the same corner."""
 MAX_OCTAVE_GAP = 4
 FAR = np.float32(1000.0)
 
@@ -42,13 +41,11 @@ def mutual_matches(distances: Floats, max_distance: float, ratio: float) -> tupl
     return rows[good], best[good]
 
 
-def match_descriptors(
-    a: Features, b: Features, max_distance: float = MAX_DISTANCE_STRICT, ratio: float = 0.8
-) -> tuple[Ints, Ints]:
+def match_descriptors(a: Features, b: Features) -> tuple[Ints, Ints]:
     """Match two images by descriptors only."""
     if len(a) == 0 or len(b) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return mutual_matches(hamming_matrix(a.descriptors, b.descriptors), max_distance, ratio)
+    return mutual_matches(hamming_matrix(a.descriptors, b.descriptors), MAX_DISTANCE_STRICT, 0.8)
 
 
 def match_epipolar(
@@ -73,34 +70,3 @@ def match_epipolar(
         MAX_OCTAVE_GAP, MAX_DISTANCE_STRICT, 0.9,
     )  # fmt: skip
     return index_a[ia], index_b[ib]
-
-
-def match_projected(
-    projected_px: Array,
-    ids: Ints,
-    descriptors: Bytes,
-    octaves: Ints,
-    features: Features,
-    radius_px: Array,
-    usable: Bools | None = None,
-    max_distance: float = MAX_DISTANCE,
-    ratio: float = 0.85,
-    max_octave_gap: int = 2,
-) -> tuple[Ints, Ints]:
-    """Match M projected points at `projected_px` (M, 2) with the features around them.
-
-    Their descriptors are rows `ids` (M,) of `descriptors` (P, 32); `octaves` (M,) the predicted
-    pyramid levels; `radius_px` (M,) the search radii; `usable` (N,) masks features that may be
-    taken. Returns indices into ids and features, each at most once.
-    """
-    none = np.zeros(0, np.int64)
-    if len(projected_px) == 0 or len(features) < 2:
-        return none, none
-    points, found = search(
-        projected_px, ids, descriptors.view(np.uint64),
-        octaves, radius_px,
-        features.pixels, features.descriptors.view(np.uint64), features.octaves,
-        np.ones(len(features), bool) if usable is None else usable, max_distance, ratio,
-        max_octave_gap,
-    )  # fmt: skip
-    return points, found

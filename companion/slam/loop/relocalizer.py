@@ -143,18 +143,18 @@ def _candidate_matches(
         nearest, found = mutual_matches(distances, MAX_DISTANCE_STRICT, 0.8)
         return ids[nearest], found
     seen, ids = slam_map.observations_of(keyframe)
-    ia, ib = match_descriptors(keyframe.features, features, ratio=0.8)
+    ia, ib = match_descriptors(keyframe.features, features)
     at = np.full(len(keyframe.features), -1)
     at[seen] = ids
     known = at[ia] >= 0
     return at[ia][known], ib[known]
 
 
-def covisible_points(slam_map: SlamMap, keyframe: Keyframe, n: int = N_COVISIBLE) -> Ints:
-    """Points observed by a keyframe and its `n` most covisible ones."""
+def covisible_points(slam_map: SlamMap, keyframe: Keyframe) -> Ints:
+    """Points observed by a keyframe and its `N_COVISIBLE` most covisible ones."""
     _, own = slam_map.observations_of(keyframe)
     mask = np.zeros(slam_map.n_points, bool)
     mask[own] = True
-    for _, key in slam_map.covisible(own)[: n + 1]:
+    for _, key in slam_map.covisible(own)[: N_COVISIBLE + 1]:
         mask[slam_map.observations_of(slam_map.keyframes[key])[1]] = True
     return np.flatnonzero(mask)

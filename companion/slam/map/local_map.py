@@ -15,11 +15,14 @@ from companion.slam.compiled.projecting import (
     RADTAN,
     visible,
 )
-from companion.slam.features.matching import match_projected
-from companion.slam.features.orb_features import Bools, Features, Ints
+from companion.slam.compiled.searching import search
+from companion.slam.features.orb_features import Features, Ints
 from companion.slam.map.sparse_map import SlamMap
 
 N_NEAREST = 8
+MAX_DISTANCE, RATIO, MAX_OCTAVE_GAP = 64, 0.85, 2
+"""Largest distance of matching descriptors, bits; its largest ratio to the second best; largest
+difference from the predicted pyramid level."""
 _MODELS = {
     Distortion.NONE: NO_LENS, Distortion.RADTAN: RADTAN, Distortion.EQUIDISTANT: EQUIDISTANT
 }  # fmt: skip
@@ -63,23 +66,21 @@ class Projector:
         return Visible(found, px, octaves)
 
     def search(
-        self,
-        slam_map: SlamMap,
-        seen: Visible,
-        features: Features,
-        radius_px: float,
-        usable: Bools | None = None,
-        max_distance: float = 64,
-        max_octave_gap: int = 2,
-    ) -> tuple[Ints, Ints]:
+        self, slam_map: SlamMap, seen: Visible, features: Features, radius_px: float,
+        max_distance: float = MAX_DISTANCE,
+    ) -> tuple[Ints, Ints]:  # fmt: skip
         """Match visible points with features within a radius, in px at pyramid level 0.
 
-        Returns point ids (K,) and feature indices (K,).
+        Descriptors differ by `max_distance` bits at most. Returns point ids (K,) and feature
+        indices (K,), each at most once.
         """
+        if len(seen.ids) == 0 or len(features) < 2:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
         radius = radius_px * slam_map.scale_factor ** seen.octaves.astype(np.float64)
-        points, found = match_projected(
-            seen.pixels, seen.ids, slam_map.descriptors, seen.octaves, features, radius,
-            usable, max_distance, max_octave_gap=max_octave_gap,
+        points, found = search(
+            seen.pixels, seen.ids, slam_map.descriptors.view(np.uint64), seen.octaves, radius,
+            features.pixels, features.descriptors.view(np.uint64), features.octaves,
+            max_distance, RATIO, MAX_OCTAVE_GAP,
         )  # fmt: skip
         return seen.ids[points], found
 

@@ -1,7 +1,7 @@
 """The tracking state machine: a pose for every frame, or LOST.
 
 Initialising (two views) -> tracking (project the local map, refine) -> lost (relocalise) and back.
-Knows no clock: times come with the frames, durations are measured by whoever provides `times`.
+Knows no clock: times come with the frames, durations are measured by the given `times`.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Tracker:
         self._extractor = FeatureExtractor(config.features, camera)
         self._next_keyframe_id = 0
         self.map_lock = MapLock(order)
-        """Held by whoever else reads the map."""
+        """Lock to be held by all other readers of the map."""
         self.atlas = Atlas(config.features, camera, self.map_lock, background)
         self._worker: MappingWorker = (
             BackgroundMapping(self.map_lock, self.atlas.adjust_pending)

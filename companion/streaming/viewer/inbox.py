@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from companion.messages import Frame
 from companion.runtime.message_size import size_bytes
 from companion.streaming.scene_encoder import Watched
 
@@ -23,26 +22,17 @@ class Inbox:
         self._closed = False
         self._changed = threading.Condition()
 
-    def __len__(self) -> int:
-        return len(self._held)
-
     def put(self, message: Watched) -> None:
         """Add a message; waits for capacity. Ignored once the inbox is closed."""
         size = size_bytes(message)
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._fits(size, self._capacity_bytes))
+            self._changed.wait_for(
+                lambda: self._closed or not self._held or self._bytes + size <= self._capacity_bytes
+            )
             if not self._closed:
-                self._append(message, size)
-
-    def offer(self, message: Watched) -> bool:
-        """Add a message if there is capacity now; images leave half of it to small messages."""
-        size = size_bytes(message)
-        capacity = self._capacity_bytes // 2 if isinstance(message, Frame) else self._capacity_bytes
-        with self._changed:
-            if self._closed or not self._fits(size, capacity):
-                return False
-            self._append(message, size)
-            return True
+                self._held.append((message, size))
+                self._bytes += size
+                self._changed.notify_all()
 
     def get(self) -> Watched | None:
         """Oldest message; waits for one. None once it is closed and empty."""
@@ -60,11 +50,3 @@ class Inbox:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-
-    def _fits(self, size: int, capacity: int) -> bool:
-        return not self._held or self._bytes + size <= capacity
-
-    def _append(self, message: Watched, size: int) -> None:
-        self._held.append((message, size))
-        self._bytes += size
-        self._changed.notify_all()

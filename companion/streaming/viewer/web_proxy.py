@@ -1,7 +1,7 @@
 """Flow-controlled proxy between browsers and Rerun's server; detects browsers that lag.
 
 Rerun's server sends all it is given, and buffers without limit what a thin link cannot carry.
-Behind this proxy it is given no more than the browsers take: whoever draws waits for them.
+Behind this proxy it is given no more than the browsers take: drawing waits for them.
 """
 
 from __future__ import annotations

@@ -30,18 +30,6 @@ class MavlinkPort(Protocol):
         return ""
 
     @property
-    def n_received(self) -> int:
-        """Valid packets received, those of unknown messages too."""
-
-    @property
-    def n_sent(self) -> int:
-        """Messages given to the wire."""
-
-    @property
-    def n_dropped(self) -> int:
-        """Messages that could not be sent."""
-
-    @property
     def n_bad(self) -> int:
         """Rejected input: damaged packets, or missing or wrong signatures."""
 
@@ -49,7 +37,7 @@ class MavlinkPort(Protocol):
         """Counters of the router's clients; one that has left is listed once more."""
 
     def set_tap(self, tap: Tap | None) -> None:
-        """Call back with all bytes read from and written to the wire, whoever sent them."""
+        """Call back with all bytes read from and written to the wire, clients' bytes too."""
 
     async def run(self, on_message: OnMessage) -> None:
         """Receive until cancelled, reconnecting as needed."""

@@ -1,6 +1,6 @@
 """Packet framing: finds MAVLink packets in a byte stream, without decoding them.
 
-pymavlink decodes (`decode`), but only packets that somebody wants to read.
+pymavlink decodes (`decode`), but only packets with a reader.
 """
 
 from __future__ import annotations

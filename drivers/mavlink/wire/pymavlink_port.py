@@ -84,11 +84,6 @@ class PymavlinkPort:
         """Breaks of the packet stream, and packets without a valid signature where required."""
         return self._stream.n_breaks + self.n_unsigned
 
-    @property
-    def n_bad_bytes(self) -> int:
-        """Bytes outside any packet."""
-        return self._stream.n_bad_bytes
-
     def clients(self) -> list[ClientCounts]:
         """See `MavlinkPort`."""
         return self.router.take_departed() + self.router.counts()
@@ -131,7 +126,7 @@ class PymavlinkPort:
         ours = self.identity
         packets = self._stream.feed(data, monotonic_ns)
         if any((packet.system, packet.component) == ours for packet in packets):
-            # an echo of what we sent: whoever joined the wire's ends, it goes no further
+            # echoes of our own packets, of a wire whose ends are joined: not passed on
             packets = [packet for packet in packets if (packet.system, packet.component) != ours]
         self.n_received += len(packets)
         try:

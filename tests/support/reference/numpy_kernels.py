@@ -111,7 +111,7 @@ def visible(
 
 def match_projected(
     projected_px: Array, descriptors: Bytes, octaves: Ints, features: Features, radius_px: Array,
-    usable: Bools, max_distance: float = 64, ratio: float = 0.85, max_octave_gap: int = 2,
+    max_distance: float = 64, ratio: float = 0.85, max_octave_gap: int = 2,
 ) -> tuple[Ints, Ints]:  # fmt: skip
     """Indices of mutually best points and features."""
     n, far = len(features), np.float32(1000.0)
@@ -119,7 +119,6 @@ def match_projected(
     candidates = candidates.astype(np.int64)
     valid = near_px <= radius_px[:, None]
     valid &= np.abs(features.octaves[candidates] - octaves[:, None]) <= max_octave_gap
-    valid &= usable[candidates]
     bits = np.unpackbits(descriptors[:, None] ^ features.descriptors[candidates], axis=2)
     distance = bits.sum(2).astype(np.float32)
     distance[~valid] = far

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.dense.obstacles import UNKNOWN_CM, Reach, RecentCloud, obstacles_around
+from companion.dense.obstacles import UNKNOWN_CM, RecentCloud, obstacles_around
 from companion.geometry.transforms import (
     Array,
     Pose,
@@ -136,7 +136,7 @@ def test_message_is_as_autopilots_read_it() -> None:
     points = np.concatenate([at(170, 8.0), at(130, 40.0)])
     pose = vehicle(130)
     eyes = np.broadcast_to(PLACE, points.shape)
-    found = obstacles_around(1_790_000_000_123_456_789, pose, points, eyes, Reach())
+    found = obstacles_around(1_790_000_000_123_456_789, pose, points, eyes)
     link = mavlink.MAVLink(None, 1, 197)
     message = link.parse_buffer(obstacle_distance(found).pack(link))[0]
     assert message.get_type() == "OBSTACLE_DISTANCE"

@@ -97,12 +97,11 @@ def test_projected_matches_match_numpy(radius_px: float, n: int) -> None:
     off = rng.normal(scale=0.4 * radius_px, size=(len(ids), 2))
     projected: Array = features.pixels[which[ids]] + off
     levels = np.clip(features.octaves[which[ids]] + rng.integers(-2, 3, len(ids)), 0, 7)
-    usable = rng.random(n) < 0.9
     points, found = Projector(LENSES[0]).search(
-        slam_map, Visible(ids, projected, levels), features, radius_px, usable
+        slam_map, Visible(ids, projected, levels), features, radius_px
     )
     wanted, there = numpy_kernels.match_projected(
-        projected, slam_map.descriptors[ids], levels, features, radius_px * 1.2**levels, usable
+        projected, slam_map.descriptors[ids], levels, features, radius_px * 1.2**levels
     )
     np.testing.assert_array_equal(points, ids[wanted])
     np.testing.assert_array_equal(found, there)

@@ -19,7 +19,6 @@ from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import Frame
-from companion.runtime.message_size import size_bytes
 from companion.streaming.ground_link import GroundLink
 from companion.streaming.items import Item, PictureItem, PointsItem, PoseItem, StatusItem
 from companion.streaming.live_viewer import LiveViewer
@@ -178,27 +177,6 @@ def test_view_refuses_what_is_no_host_and_what_is_no_viewer() -> None:
         )  # fmt: skip
         assert run.returncode == 2
         assert said in run.stderr and run.stderr.count("\n") == 1
-
-
-def test_inbox_is_bounded_by_bytes_and_reserves_capacity_for_small_messages() -> None:
-    inbox = Inbox(20 * size_bytes(image(0)))
-    taken = [inbox.offer(image(seq)) for seq in range(40)]
-    assert sum(taken) == 10
-    assert all(inbox.offer(flown.position(seq)) for seq in range(1000))
-    inbox.close()
-    seqs = []
-    while (message := inbox.get()) is not None:
-        if isinstance(message, Frame):
-            seqs.append(message.seq)
-    assert seqs == list(range(10))
-
-
-def test_inbox_lets_in_a_message_larger_than_its_capacity() -> None:
-    inbox = Inbox(10)
-    inbox.put(image(0))
-    assert not inbox.offer(flown.position(0))
-    assert inbox.get() is not None
-    assert inbox.offer(flown.position(0))
 
 
 def test_inbox_blocks_until_there_is_capacity_or_it_is_closed() -> None:

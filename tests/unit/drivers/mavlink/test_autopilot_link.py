@@ -280,7 +280,7 @@ def test_a_reboot_is_named_and_everything_taken_up_again(firmware: str) -> None:
                 # of a reboot that is over everything is back within two seconds
                 await heard.until(lambda: heard.kinds()["attitude"] > 10, 2.0)
                 await heard.until(lambda: set(intervals(autopilot)) >= {31, 32, 33, 29}, 1.0)
-                assert heard.link.n_reboots == 1 and heard.link.health.n_dropped < 40
+                assert heard.link.clock_filter.n_reboots == 1 and heard.link.health.n_dropped < 40
                 assert heard.named().count("autopilot rebooted") == 1
                 assert "telemetry stamped wildly" not in heard.named()
                 now_ns = time.monotonic_ns()
@@ -303,7 +303,7 @@ def test_silence_is_named_and_its_end() -> None:
                 autopilot.silent = False
                 await heard.until(lambda: heard.link.alive and heard.samples, 1.0)
                 assert "autopilot heard again" in heard.named()
-                assert heard.link.n_reboots == 0
+                assert heard.link.clock_filter.n_reboots == 0
 
     run(test())
 
@@ -466,7 +466,7 @@ def test_another_vehicle_is_ignored_and_named_once() -> None:
             assert heard.named().count("another vehicle on the link") == 1
             assert heard.kinds() == {"armed": 1}
             assert heard.link.vehicle is not None and heard.link.vehicle.system_id == 1
-            assert port.identity == (1, 197) and heard.link.n_reboots == 0
+            assert port.identity == (1, 197) and heard.link.clock_filter.n_reboots == 0
 
     run(test())
 
@@ -567,7 +567,7 @@ def test_replayed_and_wild_stamps_are_dropped_counted_and_named() -> None:
             assert heard.link.health.n_dropped == 89 + 78 + 39
             for what in dropped:
                 assert heard.named().count(what) == 1
-            assert heard.link.n_reboots == 0
+            assert heard.link.clock_filter.n_reboots == 0
 
     run(test())
 

@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.health import ComputerLoad
-from drivers.mavlink.computer_status import LinkLoad, computer_status
+from drivers.mavlink.computer_status import computer_status
 from drivers.system.system_load import SystemLoad
 
 
@@ -131,8 +131,7 @@ FULL = ComputerLoad(
 
 
 def test_every_field_is_in_its_unit() -> None:
-    links = [LinkLoad("serial", 12.4, 30.6, 90.0), LinkLoad("network", 0.0, 1.0)]
-    message = sent(computer_status(1_790_000_000_123_456_789, FULL, links))
+    message = sent(computer_status(1_790_000_000_123_456_789, FULL))
     assert message.get_type() == "ONBOARD_COMPUTER_STATUS"
     assert message.time_usec == 1_790_000_000_123_456
     assert message.uptime == 3_661_500
@@ -149,11 +148,6 @@ def test_every_field_is_in_its_unit() -> None:
     assert message.storage_type == [2, unknown, unknown, unknown]
     assert message.storage_usage == [10_000, unknown, unknown, unknown]
     assert message.storage_total == [30_000, unknown, unknown, unknown]
-    assert message.link_type == [0, 10] + [unknown] * 4
-    assert message.link_tx_rate == [12, 0] + [unknown] * 4
-    assert message.link_rx_rate == [31, 1] + [unknown] * 4
-    assert message.link_tx_max == [90] + [unknown] * 5
-    assert message.link_rx_max == [90] + [unknown] * 5
     assert message.status_flags == 0
 
 
@@ -177,11 +171,10 @@ def test_more_than_fits_is_cut() -> None:
         uptime_s=60 * 86400, core_shares=(0.5,) * 64, fans_rpm=(1,) * 9,
         temperatures_c={f"cpu{i}": 50.0 for i in range(20)},
     )  # fmt: skip
-    message = sent(computer_status(0, many, [LinkLoad("serial", 1, 1)] * 9))
+    message = sent(computer_status(0, many))
     assert message.cpu_cores == [50] * 8
     assert message.temperature_core == [50] * 8
     assert message.fan_speed == [1] * 4
-    assert message.link_type == [0] * 6
     assert message.uptime == 60 * 86_400_000 - 2**32
 
 

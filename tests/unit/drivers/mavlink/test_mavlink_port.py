@@ -13,7 +13,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import ConfigError
 from companion.timing.clock import FlightClock
-from drivers.mavlink.wire.message_port import MavlinkPort
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_wire import PtyWire
 from tests.support.autopilot.mavlink_link import (
@@ -36,7 +35,7 @@ def test_an_autopilot_on_any_wire(tmp_path: Path, kind: str) -> None:
     async def play() -> None:
         place = f"{tmp_path}/autopilot" if kind == "pty" else f"{HOST}:0"
         with FakeAutopilot("px4", f"{kind}:{place}") as autopilot:
-            port: MavlinkPort = port_at(autopilot.url.replace(":auto", ":57600"))
+            port = port_at(autopilot.url.replace(":auto", ":57600"))
             heard = Heard()
             async with running(port.run(heard)):
                 await until(lambda: port.connected)
