@@ -72,7 +72,7 @@ class MountConfig:
     """
 
     known: bool = False
-    """Whether the mounting is given; without it the autopilot's attitude cannot be used."""
+    """The angles below are those of the camera; else the autopilot's attitude cannot be used."""
     roll_deg: Annotated[float, Meta(ge=-180, le=180)] = 0.0
     """Roll of the camera, degrees."""
     pitch_deg: Annotated[float, Meta(ge=-180, le=180)] = 0.0
@@ -160,7 +160,7 @@ class ControlConfig:
     """Commands and parameters of ground stations over MAVLink; see docs/control.md."""
 
     enabled: bool = True
-    """Whether ground stations may give commands and set parameters."""
+    """Let ground stations give commands and set parameters."""
     keep: str = ""
     """TOML file that keeps settings from the ground, read after all else; "" keeps nothing."""
 
@@ -192,14 +192,14 @@ class RecorderConfig:
     """The recording of a live flight: flight.mcap, and flight.tlog for ground stations."""
 
     enabled: bool = True
-    """Whether live flights are recorded."""
+    """Record live flights."""
     codec: Literal["mjpeg", "h264", "png", "raw"] = "mjpeg"
     """Image codec; h264 is smaller and more work, png and raw are lossless."""
     least_free_mb: Annotated[int, Meta(ge=0, le=1000000)] = 1000
     """Least free disk space, megabytes; below it the oldest flights are deleted, but those with a
     file named keep."""
     when_full: Expert[Literal["prune", "stop"]] = "prune"
-    """What happens below least_free_mb: delete the oldest flights, or stop recording."""
+    """Action below least_free_mb: delete the oldest flights, or stop recording."""
     jpeg_quality: Expert[Annotated[int, Meta(ge=30, le=100)]] = 90
     """Quality of mjpeg."""
     h264_encoder: Expert[str] = "auto"
@@ -221,11 +221,11 @@ class TelemetryConfig:
     log: Expert[str] = ""
     """The log to read; "" takes the one beside the images."""
     align: Expert[Literal["auto", "never"]] = "auto"
-    """Whether a log is aligned with a video without frames.csv by the rotation of both."""
+    """Align a log with a video without frames.csv by the rotation of both."""
     offset_s: Expert[Annotated[float, Meta(ge=-1e10, le=1e10)]] = 0.0
     """Added to all times of the log, for a log or a video whose clock was set wrong, seconds."""
     starts_with_video: Expert[bool] = False
-    """Whether a log without absolute time begins with the video; else it is not used."""
+    """A log without absolute time begins with the video; else it is not used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +275,7 @@ class DepthConfig:
     """The dense map."""
 
     enabled: bool = True
-    """Whether it is made; without it there are a trajectory and sparse points only."""
+    """Make the dense map; without it there are a trajectory and sparse points only."""
     stride: Annotated[int, Meta(ge=1, le=8)] = 2
     """Pixel step of depth estimation; images are matched at full size."""
     reference_step: Expert[Annotated[float, Meta(ge=0, le=10)]] = 0.15

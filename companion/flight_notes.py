@@ -1,6 +1,6 @@
-"""Notes of a flight beside its measurements: what came over the link, what was decided, health.
+"""Notes of a flight beside its measurements: bytes of the link, steps of the pose gate, health.
 
-They go to the recording, from which the flight can be done again.
+They go to the recording, for a replay as flown.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ class LinkBytes:
 
 @dataclass(frozen=True, slots=True)
 class GateStep:
-    """One call of the pose gate, by which its poses can be made again; see `gate_journal`.
+    """One call of the pose gate, with its inputs; see `estimation.gate_journal`.
 
-    `t_ns` is the time of the call, `n_attitudes` of the autopilot's had come since the flight
-    began; `counter` is that of resets afterwards, and whether this boot was sent a pose. `sent`
-    tells whether the autopilot was heard, so that a pose was sent.
+    `t_ns` is the time of the call, `n_attitudes` the number of attitudes since the begin of the
+    flight. `counter` is the reset counter afterwards; `counter_sent` is True once this boot of the
+    autopilot was sent a pose, `sent` if the autopilot was heard, so that a pose of this call went
+    out.
     """
 
     t_ns: int

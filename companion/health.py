@@ -22,7 +22,7 @@ MIN_BETWEEN_LINES_S = 1.0
 """Least interval of lines about changes."""
 
 SourceState = Literal["missing", "opening", "running", "silent", "frozen", "ended", "driver fault"]
-"""`driver fault` is a bug of ours, not of the device; its traceback is in the journal."""
+"""State of a source; `driver fault` is a bug of this program, whose traceback is in the journal."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,7 +93,7 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True)
 class FrameTracked:
-    """What the pose of a frame hung on beside its image: told after it.
+    """Inputs beside the image that the pose of a frame depended on; given after it.
 
     `n_samples` of telemetry had been taken since the beginning. `mapping_point` is where mapping
     stood, see `companion.slam.mapping.mapping_worker.MapLock`; `feature_ratio` the load level.
@@ -146,7 +146,7 @@ class Georeference:
 
     world_from_map: Similarity
     sigma_scale: float
-    """relative: 0.01 is one percent"""
+    """Standard deviation relative to the scale: 0.01 is one percent."""
     sigma_yaw_rad: float
     method: str
     n_positions: int
@@ -227,7 +227,7 @@ class MapUpdate:
         return 1.0
 
     def _with(self, place: Similarity, other_id: int) -> bool:
-        """Whether a keyframe exists, and has the same scale."""
+        """True if a keyframe exists, and has the same scale."""
         unit = self.scale_of.get(other_id, 1.0)
         return other_id in self.map_from_camera and abs(unit / place.scale - 1.0) < 1e-9
 

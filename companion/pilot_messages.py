@@ -1,8 +1,8 @@
-"""All that is ever said to the pilot: one table, whose rows docs/pilot_messages.md explains.
+"""Texts for the pilot: one table, explained row by row in docs/pilot_messages.md.
 
 A STATUSTEXT holds 50 bytes, and longer ones are cut or come in pieces, of which one may be lost. So
-each text fits into one message, in words of aviation that cannot be taken for anything else. What
-is warned of within the program becomes one of these texts, or stays in the journal.
+each text fits into one message, in unambiguous words of aviation. A `Warned` becomes one of these
+texts, or stays in the journal.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 PREFIX = "Companion: "
 WARNING, NOTICE, INFO = 4, 5, 6
-"""Of MAV_SEVERITY."""
+"""Values of MAV_SEVERITY."""
 OTHER_VALUE = "?"
 LONGEST_NAME, LONGEST_NUMBER, LONGEST_REASON = 16, 10, 17
 """Characters of a parameter's name, of a number, and of a reason."""
@@ -28,14 +28,14 @@ class PilotText:
 
 @dataclass(frozen=True, slots=True)
 class PilotMessage:
-    """A row: what is said, with the names of what is filled in, and how long each may be."""
+    """A row: a text with named gaps, and the longest value of each, characters."""
 
     severity: int
     text: str
     longest: Mapping[str, int] = field(default_factory=dict)
 
     def __call__(self, **values: str) -> PilotText:
-        """What is sent; a value that is too long is cut, and of what is not ASCII a ? is left."""
+        """The text with its values; too long ones are cut, and a ? replaces what is not ASCII."""
         fitting = {
             name: values.get(name, OTHER_VALUE).encode("ascii", "replace").decode("ascii")[:most]
             for name, most in self.longest.items()
@@ -126,7 +126,7 @@ GROUND_TOO_OFTEN = PilotMessage(NOTICE, "too many ground requests")
 
 LEFT_OUT = PilotMessage(NOTICE, "{n} messages left out, see its log", {"n": 3})
 OTHER = PilotMessage(NOTICE, "warning, see its log")
-"""For what is warned of and has no row of its own."""
+"""Text of a warning without a row of its own."""
 
 REASONS: Mapping[str, str] = {
     "no pose yet": "no position yet",
@@ -148,10 +148,10 @@ REASONS: Mapping[str, str] = {
     "disk is slow": "disk slow",
     "autopilot rebooted": "autopilot reboot",
 }
-"""Why no pose is sent, as `estimation.pose_gate` and `daemon.pose.pose_sender` have it."""
+"""Texts by the reason for which no pose is sent, see `estimation.pose_gate`, `daemon.pose`."""
 OTHER_REASON = "see its log"
 SWITCHED_OFF = ("off", "switched off")
-"""Reasons that are the pilot's own, or the ground's."""
+"""Reasons for which the pilot or the ground has switched poses off: not reported as a loss."""
 PARTS: Mapping[str, str] = {
     "depth": "dense map", "recorder": "recording", "results": "results",
     "topics": "remote map link",
@@ -209,13 +209,13 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "points were given up, as the disk does not take them": MAP_INCOMPLETE,
     "no node elsewhere makes depth any more": REMOTE_MAP_LOST,
 }
-"""By what a `Warned` is of."""
+"""Message for the pilot by the kind (`what`) of a `Warned`."""
 JOURNAL_ONLY = frozenset({
     "a node elsewhere makes the depth", "questions came over the network that cannot be read",
     "the flight can be seen", "the viewer cannot be shown", "the viewer has gone",
     "the viewer does not keep up", "viewers cannot connect",
 })  # fmt: skip
-"""What a `Warned` may be of that no pilot has to do with."""
+"""Kinds of `Warned` that do not concern a pilot."""
 
 
 def of_warning(what: str, detail: str = "", good: bool = False) -> PilotText | None:
@@ -231,7 +231,7 @@ def of_warning(what: str, detail: str = "", good: bool = False) -> PilotText | N
 
 
 def position_lost(why_not: str) -> PilotText:
-    """No poses are sent any more, for a reason of `companion.estimation.pose_gate`."""
+    """Text for the end of poses, by a reason of `companion.estimation.pose_gate`."""
     if why_not in SWITCHED_OFF:
         return POSITION_OFF()
     return POSITION_LOST(reason=REASONS.get(why_not, OTHER_REASON))

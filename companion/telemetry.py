@@ -83,7 +83,7 @@ class HeightSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmedSample:
-    """Whether the motors are armed."""
+    """State of the motors: True in `armed` while they may turn."""
 
     schema: ClassVar[Schema] = Schema("armed", "Whether the motors are armed")
     t_ns: int

@@ -18,7 +18,7 @@ QUATERNION, VECTOR = {"size": 4}, {"size": 3}
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """What a message is called, and what users of recordings are told of it."""
+    """Name of a message, with its description for users of recordings."""
 
     name: str
     says: str

@@ -51,7 +51,7 @@ FOLDERS = (
     Format("geotagged photographs", is_geotagged, open_geotagged),
     Format("video or images", has_pictures, open_flight_folder),
 )
-"""In the order of detection."""
+"""Formats of folders, in the order of detection."""
 
 
 def open_flight(

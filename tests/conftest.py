@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import companion.__main__  # noqa: F401 - limits numeric libraries to one thread, before they load
+
+import numpy as np  # isort: skip
 import pytest
 
 from tests.support.left_behind import left_since, running, watch_tasks

@@ -32,7 +32,7 @@ class Wanted(Protocol):
     """Condition on a value."""
 
     def accepts(self, value: float) -> bool:
-        """Whether a value is acceptable."""
+        """True if a value of the parameter is acceptable."""
 
     def corrected(self, value: float) -> float:
         """The nearest acceptable value."""

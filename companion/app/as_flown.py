@@ -1,8 +1,8 @@
-"""Replay of a recording as it was flown: the poses that the autopilot was sent, made again.
+"""Replay of a recording as flown: the poses sent to the autopilot are computed again and compared.
 
-Where images were recorded as they were, all of it is done again: telemetry, frames and mapping take
-turns as they did, with the load levels of then. Else the pose gate alone is, with the recorded
-odometry, since other pixels give other poses.
+Of images recorded without loss all stages up to the pose gate are replayed: telemetry, frames and
+mapping in their recorded order, at the recorded load levels. Else other pixels would give other
+poses: then only the pose gate is replayed, on the recorded odometry.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ AS_FLOWN = "as_flown.json"
 def replay_as_flown(
     path: Path, out: Path, config: Config, progress: Progress, notify: Callable[[str], None]
 ) -> None:
-    """Compare the poses with those sent, and write what came of it to `out`/as_flown.json.
+    """Compare the poses with those sent; the result goes to `out`/as_flown.json.
 
     The settings are those of the flight. FlightError where its decisions are not recorded,
     StageError where a pose differs.

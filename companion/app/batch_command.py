@@ -18,28 +18,17 @@ from typing import Any
 
 from companion import __version__
 from companion.app.progress import NoProgress, Progress
-from companion.app.replay_command import replay
+from companion.app.replay_command import RecordedInput, replay
 from companion.app.thumbnail import thumbnail
 from companion.config import Config
 from companion.config_file import shown
 from companion.errors import CompanionError, InputError
 from companion.products.atomic_file import write_atomically
-from companion.products.report.batch_page import batch_page
+from companion.products.report.batch_page import BatchResult, batch_page
 
 DONE, INDEX, THUMBNAIL = "batch.json", "index.html", "thumbnail.jpg"
 MOST_FILES = 1000
 """Files of a flight's folder checked for changes; a flight of images has its list besides."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class BatchResult:
-    """Outcome of one flight: `error`, or "" and the numbers of its `report`."""
-
-    name: str
-    flight: Path
-    error: str
-    report: dict[str, Any]
-    done_before: bool = False
 
 
 def batch(
@@ -86,10 +75,8 @@ def replay_one(name: str, flight: Path, out: Path, config: Config, mark: str) ->
     """One Dask task. An error of the flight ends that flight only."""
     folder = out / name
     try:
-        replay(
-            flight, folder, config, start_s=None, stop_s=None, viewer="none",
-            progress=NoProgress(),
-        )  # fmt: skip
+        given = RecordedInput(flight, config)
+        replay(given, folder, config, "none", NoProgress(), lambda remark: None)
         write_atomically(folder / THUMBNAIL, thumbnail(flight, config.camera))
     except (CompanionError, OSError) as error:
         return BatchResult(name, flight, str(error), {})

@@ -23,23 +23,13 @@ TICK_S = 0.05
 
 
 def replay_paced(
-    flight_path: Path,
-    out: Path,
-    config: Config,
-    *,
-    start_s: float | None,
-    stop_s: float | None,
-    viewer: str,
-    progress: Progress,
+    given: RecordedInput, out: Path, config: Config, viewer: str, progress: Progress,
     notify: Callable[[str], None],
-) -> None:
+) -> None:  # fmt: skip
     """Replay a flight into the folder `out`; InputError when it cannot begin.
 
     `notify` takes remarks. StageError where localisation ends on the way.
     """
-    given = RecordedInput(flight_path, config, start_s, stop_s)
-    for remark in given.log.remarks:
-        notify(f"telemetry: {remark}")
     live = replace(
         config, recorder=replace(config.recorder, enabled=False),
         stream=replace(config.stream, listen=""), daemon=replace(config.daemon, viewer=viewer),
@@ -58,9 +48,6 @@ def replay_paced(
 
     def odometry(message: Odometry) -> None:
         watched.state = message.state
-
-    def update(n_done: int) -> None:
-        progress.update(n_done, watched.state.value, watched.n_points)
 
     flight = LiveFlight(
         live, given.flight.camera, FlightClock(),

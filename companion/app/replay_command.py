@@ -38,13 +38,13 @@ NO_DEPTH = "none (depth.enabled = false)"
 
 
 class Watched:
-    """What the progress line and the report need of the messages."""
+    """State and counts of the map, taken from its messages for the progress line and the report."""
 
     def __init__(self) -> None:
         self.state = TrackState.INITIALISING
         self.n_points = self.n_depth_maps = 0
         self.has_origin = False
-        """Whether the map is georeferenced to the log's origin."""
+        """True once the map is georeferenced to the log's origin."""
 
     def take(self, message: Message) -> None:
         """Take a message of any kind."""
@@ -60,10 +60,10 @@ class Watched:
 
 
 class RecordedInput:
-    """What is replayed of a flight; InputError where it cannot be."""
+    """Frames and telemetry of a recorded flight between two times; InputError where invalid."""
 
     def __init__(
-        self, path: Path, config: Config, start_s: float | None, stop_s: float | None
+        self, path: Path, config: Config, start_s: float | None = None, stop_s: float | None = None
     ) -> None:
         self.flight = open_flight(path, config.camera, config.telemetry)
         self._start_ns, self._stop_ns = _span(self.flight, start_s, stop_s)
@@ -81,28 +81,17 @@ class RecordedInput:
 
 
 def replay(
-    flight_path: Path,
-    out: Path,
-    config: Config,
-    *,
-    start_s: float | None,
-    stop_s: float | None,
-    viewer: str,
-    progress: Progress,
-    notify: Callable[[str], None] = lambda remark: None,
-) -> None:
+    given: RecordedInput, out: Path, config: Config, viewer: str, progress: Progress,
+    notify: Callable[[str], None],
+) -> None:  # fmt: skip
     """Replay a flight into the folder `out`; InputError when it cannot begin.
 
-    `notify` takes remarks: how the telemetry was read, OpenCL devices refused, address of the
-    viewer.
+    `notify` takes remarks: OpenCL devices refused, address of the viewer.
 
     Results so far are written also when it is interrupted or fails on the way. Where only the dense
     map fails, all frames are tracked and written with the cloud so far; then StageError.
     """
-    given = RecordedInput(flight_path, config, start_s, stop_s)
     camera, log = given.flight.camera, given.log
-    for remark in log.remarks:
-        notify(f"telemetry: {remark}")
     watched = Watched()
     live: LiveViewer | None = None
     names = ("localisation", "depth", "results") if config.depth.enabled else LEAST

@@ -28,7 +28,7 @@ class LensModel:
     distortion: Distortion
     n_free: int
     curved: bool = True
-    """Whether the curvature of the board is estimated."""
+    """True if the curvature of the board is estimated."""
 
     @property
     def n_lens(self) -> int:

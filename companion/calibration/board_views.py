@@ -58,13 +58,13 @@ class View:
 
     @property
     def blurred(self) -> bool:
-        """Whether edges are too wide for accurate corners."""
+        """True if edges are too wide for accurate corners."""
         limit_px = max(MAX_EDGE_PX, MAX_EDGE_RATIO * self.diagonal_px)
         return self.detection.edge_px > limit_px
 
     @property
     def small(self) -> bool:
-        """Whether the board is too far away."""
+        """True if the board fills too small a part of the image."""
         return self.area < MIN_AREA
 
 

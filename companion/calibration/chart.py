@@ -43,9 +43,9 @@ class Detection:
     ids: NDArray[np.int64]
     """Corner numbers, row by row."""
     image_px: Array
-    """(N, 2)"""
+    """Corners (N, 2), pixels."""
     board_m: Array
-    """(N, 3)"""
+    """The same corners (N, 3) on the board, metres."""
     edge_px: float
     """Width of black-white edges, in the direction where they are widest."""
 
@@ -64,7 +64,7 @@ class Chart(Protocol):
         """Detect the board in an image; None if not found."""
 
     def explain(self, greys: Sequence[Bytes]) -> str | None:
-        """What images without the board show instead, perhaps another one."""
+        """Contents of grey images without the board, as a clause; None if unknown."""
 
     def black_m(self) -> Array:
         """Black rectangles (N, 4) x, y, width, height in metres."""
@@ -133,7 +133,7 @@ class CharucoChart:
         return _detection(self, grey, numbers[order], image_px)
 
     def explain(self, greys: Sequence[Bytes]) -> str | None:
-        """What the images show instead of the board."""
+        """Contents of grey images without the board, as a clause; None if unknown."""
         tried = _spread(greys, MAX_TRIED)
         seen = _markers_seen(tried, self._dictionary)
         if not seen:
@@ -216,7 +216,7 @@ class ChessboardChart:
         return _detection(self, grey, np.arange(self.columns * self.rows), image_px)
 
     def explain(self, greys: Sequence[Bytes]) -> str | None:
-        """What the images show instead of the board."""
+        """Contents of grey images without the board, as a clause; None if unknown."""
         tried = _spread(greys, MAX_TRIED)
         return _other_dictionary(tried) or _chessboard_seen(tried, None)
 

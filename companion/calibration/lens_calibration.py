@@ -127,7 +127,7 @@ def calibrate_lens(views: Sequence[View], lit: Mask, wanted: str) -> Calibration
 
 
 def folds(camera: Camera) -> bool:
-    """Whether the distortion is not invertible within the image.
+    """True if the distortion is not invertible within the image.
 
     The image circle of a fisheye may end before the corners, so only radtan lenses are checked.
     """

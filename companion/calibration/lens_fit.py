@@ -52,9 +52,9 @@ class LensFit:
     width: int
     height: int
     parameters: Array
-    """fx fy cx cy k..., then a b c of the board depth a x^2 + b x y + c y^2, in metres"""
+    """Lens fx fy cx cy k..., then a b c of the board depth a x^2 + b x y + c y^2, in metres."""
     poses: tuple[Array, ...]
-    """camera_from_board of each view: rotation vector and translation, (6,)."""
+    """Poses camera_from_board of the views: rotation vector and translation, (6,) each."""
     residuals_px: tuple[Array, ...]
     """Observed minus projected corners, (N, 2) of each view."""
     numbers: tuple[int, ...]

@@ -26,7 +26,7 @@ LIST_PATIENCE_S = 30.0
 MAX_PLATFORMS = 32
 MAX_LINE_CHARS = 160
 PR_SET_PDEATHSIG = 1
-"""prctl(2)"""
+"""Option of prctl(2): the signal at the death of the parent."""
 
 
 def listed_devices(

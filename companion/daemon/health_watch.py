@@ -34,9 +34,9 @@ from drivers.system.system_load import SystemLoad
 
 GOVERN_NS = 1_000_000_000
 STUCK_NS = 3_000_000_000
-"""Time with frames but no track after which the pose loop counts as hanging,"""
+"""Time with frames but no track after which the pose loop counts as hanging."""
 BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
-"""unless it uses the processor: then the computer is overloaded, and it gets more time."""
+"""The same where it uses the processor, by so many cores at least: the computer is overloaded."""
 START_S = 120.0
 """Longest start of localisation; the first of all compiles its loops."""
 PATIENCE_NS = 20_000_000_000
@@ -93,7 +93,7 @@ class HealthWatch:
 
     @property
     def too_hot(self) -> bool:
-        """Whether the load level is reduced because of the temperature."""
+        """True while the load level is reduced because of the temperature."""
         return "hot" in self._governor.degraded
 
     def reconfigure(self, config: Config) -> None:
@@ -137,7 +137,7 @@ class HealthWatch:
 
     @property
     def up(self) -> bool:
-        """Whether the stages are ready for frames, and the link is open."""
+        """True if the stages are ready for frames, and the link is open."""
         link_open = self._link is None or self._link.health.state != "missing"
         return link_open and self._flights.stages_up
 

@@ -40,7 +40,7 @@ CONTRADICTION_SIGMAS = 3.0
 MIN_SUPPORT = 2
 """Maps that must support a depth, this one included if measured."""
 MIN_CONTRADICTIONS = 2
-"""Of two contradicting maps either may be wrong; two outvote one."""
+"""Least number of contradicting maps: of two either may be wrong, two outvote one."""
 POSE_SIGMA = 0.01
 """Lower bound of the relative depth error due to relative poses, which is measured in the overlap
 of maps. At most `AGREEMENT`: a map with larger errors is wrong."""

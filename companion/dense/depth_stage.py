@@ -44,6 +44,7 @@ N_UPDATES = MAX_VIEWS + 1
 class _BufferedFrame:
     grey: Bytes
     rgb: Bytes | None
+    """None once it is known that it is no keyframe."""
     track: Track | None = None
 
 
@@ -94,6 +95,7 @@ class DepthStage:
                 buffered.track = message
         elif isinstance(message, KeyframeAdded):
             self._waiting.append(message)
+            self._drop_colours()
         elif isinstance(message, MapUpdate):
             self._update = message
             out: list[Message] = []
@@ -130,6 +132,8 @@ class DepthStage:
         place = None if update is None else update.place_of(keyframe.keyframe_id)
         if update is None or buffered is None or place is None or len(keyframe.points_camera) < 20:
             return []
+        if buffered.rgb is None:
+            return []  # a keyframe that was told after later ones were done
         z = keyframe.points_camera[:, 2]
         z = z[z > 0]
         if not self._sees_new_area(keyframe, place, float(np.median(z))):
@@ -139,7 +143,6 @@ class DepthStage:
         if len(chosen) < 3 or not self._scheduled():
             return []
         self._last_reference = keyframe.keyframe_id
-        assert buffered.rgb is not None
         rgb = self._undistortion.image(buffered.rgb)
 
         def depth(engine: DepthEngine) -> DepthMap:
@@ -157,7 +160,7 @@ class DepthStage:
         return [depth_map, *chunks]
 
     def _scheduled(self) -> bool:
-        """Whether this keyframe is due, under a reduced load ratio."""
+        """Count a keyframe; True if it is due at the present load ratio."""
         self._credit = min(self._credit + self._load_ratio, 1.0)
         if self._credit < 1.0 - 1e-9:
             return False
@@ -167,7 +170,7 @@ class DepthStage:
     def _sees_new_area(
         self, keyframe: KeyframeAdded, place: Similarity, median_depth: float
     ) -> bool:
-        """Whether a keyframe sees enough that the last reference did not."""
+        """True if a keyframe sees enough that the last reference did not."""
         last = self._last_reference
         update = self._update
         before = None if last is None or update is None else update.place_of(last)
@@ -224,6 +227,16 @@ class DepthStage:
             chosen.append((seq, pose))
         baselines = {seq: b for b, seq, _ in candidates}
         return sorted(chosen, key=lambda c: (baselines[c[0]], c[0]))
+
+    def _drop_colours(self) -> None:
+        """Drop the colours of frames before the oldest pending keyframe, which are none.
+
+        They are the larger part of a frame, and only those of keyframes are used.
+        """
+        oldest = min(k.seq for k in self._waiting)
+        for seq, buffered in self._frames.items():
+            if seq < oldest:
+                buffered.rgb = None
 
     def _drop_frames(self, keyframe: KeyframeAdded) -> None:
         """Drop frames older than pending keyframes can use."""

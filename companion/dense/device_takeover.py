@@ -117,7 +117,7 @@ class TestedEngine:
 
     @property
     def off(self) -> bool:
-        """Whether no device is left."""
+        """True once no device is left."""
         return self._engine is None
 
     def run(self, t_ns: int, job: Callable[[DepthEngine], DepthMap]) -> DepthMap | None:

@@ -28,7 +28,7 @@ class _RecentMap:
     map: DepthMap
     normals: Floats
     spans: Mapping[int, float]
-    """of its keyframe at measurement"""
+    """Spans of its keyframe at measurement, see `MapUpdate.spans_of`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

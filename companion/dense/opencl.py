@@ -61,7 +61,7 @@ class ComputeDevice:
     def __init__(self, device: cl.Device) -> None:
         self.device = device
         self.why = ""
-        """Why it was chosen, where among others."""
+        """Reason why it was chosen among several devices; "" where it is the only one."""
         self.name = f"{device.name.strip()} ({device.platform.name.strip()})"
         self.context = cl.Context([device])
         self.queue = cl.CommandQueue(

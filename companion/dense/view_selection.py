@@ -44,7 +44,7 @@ class View:
     slot: int
     current_from_reference: Pose
     centre: Array
-    """(3,) in the frame of the reference."""
+    """Position (3,) in the frame of the reference."""
 
 
 class Views:

@@ -64,13 +64,13 @@ class RotationAgreement:
 
     @property
     def stabilised(self) -> bool:
-        """Whether the camera is stabilised about an axis about which the body rotates."""
+        """True if the camera is stabilised about an axis about which the body rotates."""
         with np.errstate(invalid="ignore"):
             return bool((self.gain + SIGMAS * self.sigma_gain < STABILISED_GAIN).any())
 
     @property
     def body_fixed(self) -> bool:
-        """Whether the camera rotates with the body in roll and pitch, and by nothing else."""
+        """True if the camera rotates with the body in roll and pitch, and by nothing else."""
         known = np.isfinite(self.gain)
         if not known[:2].all():
             return False
@@ -80,7 +80,7 @@ class RotationAgreement:
 
     @property
     def rotates_independently(self) -> bool:
-        """Whether the camera rotates by more than body and clock errors explain."""
+        """True if the camera rotates by more than the body's rotation and clock errors explain."""
         body_rad = float(np.linalg.norm(self.body_rad))
         return self.residual_rad > max(float(MAX_RESIDUAL_RAD), MAX_RESIDUAL_RATIO * body_rad)
 

@@ -62,7 +62,7 @@ class AttitudeVerdict:
 
     def __init__(self, history: AttitudeHistory) -> None:
         self.used = True
-        """Whether the attitude is that of the camera."""
+        """True while the attitude is taken for that of the camera."""
         self.n_reinitialised = 0
         """Maps reinitialised since the last consistent one."""
         self._history = history
@@ -74,11 +74,11 @@ class AttitudeVerdict:
         """Time at which the attitude was last known to be that of the camera."""
         self._tilted_since_ns: int | None = None
         self._consistent = False
-        """Whether the active map has been consistent for long."""
+        """True once the active map has been consistent with the attitude for long enough."""
         self._retry_ns = RETRY_NS
         self._not_before_ns = 0
         self._mount = False
-        """Whether the attitude is ignored because of the mount."""
+        """True while the attitude is ignored because of the mount."""
 
     def add(self, sample: AttitudeSample) -> None:
         """Add an attitude of the autopilot, which is in the history too."""
@@ -106,7 +106,7 @@ class AttitudeVerdict:
         self._consistent, self._tilted_since_ns = False, None
 
     def due(self, t_ns: int) -> bool:
-        """Whether a check is due."""
+        """True if a check is due at flight time `t_ns`."""
         return t_ns >= self._rotations_due_ns or (self.used and t_ns >= self._check_due_ns)
 
     def check(

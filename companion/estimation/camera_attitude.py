@@ -63,7 +63,7 @@ class CameraAttitude:
 
     @property
     def used(self) -> bool:
-        """Whether it applies to the camera."""
+        """True while the autopilot's attitude is used for that of the camera."""
         return self._mounted and self._verdict.used
 
     def add(self, sample: AttitudeSample) -> None:
@@ -142,7 +142,7 @@ class CameraAttitude:
         self._verdict.reset()
 
     def due(self, t_ns: int) -> bool:
-        """Whether a check is due."""
+        """True if a check is due at flight time `t_ns`."""
         mount_due = self.used and t_ns >= self._due_ns
         return self._mounted and (mount_due or self._verdict.due(t_ns))
 

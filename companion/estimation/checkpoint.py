@@ -30,7 +30,7 @@ MAGIC = b"COMPMAP\x01"
 """The last byte is the format version."""
 CHECK_BYTES = 4
 MAX_BYTES = 4_000_000
-"""Of keyframes and points: the surroundings of some 20 keyframes, and 4 ms to copy."""
+"""Largest size of keyframes and points: some 20 keyframes around, and 4 ms to copy."""
 _FEATURES: dict[str, Any] = {
     "pixels": np.float32, "octaves": np.uint8, "angles_deg": np.float32, "descriptors": np.uint8,
 }  # fmt: skip

@@ -1,8 +1,8 @@
-"""Journal of the pose gate: what it was asked and when, so that its poses can be made again.
+"""Journal of the pose gate: its inputs, from which its poses can be computed again.
 
-The gate decides by the time of each call, by the height that the autopilot has just then, by what
-is known of its boot. The journal has these, and in which order they came with attitudes and frames;
-polls without effect are left out.
+The gate decides by the time of each call, the autopilot's height at that time, and the boot of the
+autopilot. The journal has these, in their order among attitudes and frames; polls without effect
+are left out.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BOOTED, RESTARTED, WITHHELD, LIMITS = "booted", "restarted", "withheld", "limits
 
 
 class JournaledGate(PoseGate):
-    """A gate that tells each step and whether the autopilot is heard; `begin` with each flight."""
+    """A pose gate that passes each step to `tell`; call `begin` with each flight."""
 
     def __init__(
         self, config: FeedbackConfig, counter: ResetCounter,
@@ -46,7 +46,7 @@ class JournaledGate(PoseGate):
         super().__init__(config, counter, asked_down_m, asked_may_start)
 
     def begin(self) -> None:
-        """A flight and its recording begin."""
+        """Begin the journal of a flight, with its recording."""
         self._n_attitudes = 0
         self._say(BEGIN, self._now_ns())
 
@@ -110,7 +110,7 @@ def poses_as_sent(
     config: FeedbackConfig, steps: Iterable[GateStep], attitudes: Iterable[AttitudeSample],
     odometry_of: Callable[[int], Odometry],
 ) -> Iterator[tuple[GateStep, PoseToSend]]:  # fmt: skip
-    """Poses that a gate gave, by its journal; from the beginning of a flight.
+    """Poses of a gate by its journal, from the beginning of a flight.
 
     `odometry_of` gives that of a frame, and raises where there is none.
     """

@@ -100,7 +100,7 @@ class Georeferencer:
 
     @property
     def has_ranges(self) -> bool:
-        """Whether there are enough ranges to compare with a map."""
+        """True if there are enough ranges to compare with a map."""
         return len(self._range) >= MIN_RANGES
 
     def _integrate(self, series: SampleSeries, t_ns: int, velocity: Array) -> None:

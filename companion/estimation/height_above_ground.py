@@ -33,7 +33,7 @@ class HeightAboveGround:
         step = max(1, -(-len(points_map) // MOST_POINTS))
         self._points, self._down = points_map[::step], down_map
         self._plan = np.linalg.svd(down_map[None])[2][1:].T
-        """(3, 2): two directions perpendicular to the vertical"""
+        """Two directions (3, 2) perpendicular to the vertical."""
         self._tree = cKDTree(self._points @ self._plan) if len(self._points) else None
 
     def distance(self, origin_map: Array, beam_map: Array) -> float | None:

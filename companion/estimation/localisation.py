@@ -39,7 +39,7 @@ from companion.telemetry import AttitudeSample, ImuSample, Telemetry
 from companion.timing.clock import Timer
 
 FINAL_ITERATIONS = 8
-"""Of the global adjustment at the end: 4 and 16 end the sample flight within 0.1 mm of this."""
+"""Iterations of the final global adjustment; 4 and 16 give the sample flight within 0.1 mm."""
 MIN_DEAD_RECKONING_NS = 150_000_000
 MAX_DEAD_RECKONING_NS, MAX_DEAD_RECKONING_NO_ATTITUDE_NS = 4_000_000_000, 400_000_000
 """Longest dead reckoning without tracking, with and without attitude."""

@@ -27,7 +27,7 @@ SPACING_NS = 95_000_000
 """A little under the period of 10 frames/s: every frame of such a camera."""
 RATE_STEP_NS = 40_000_000
 SIGMA_RAD = np.radians(0.5)
-"""Of the vertical of an autopilot against that of images, over some seconds."""
+"""Standard deviation of an autopilot's vertical against that of images, over some seconds."""
 SIGMA_MOUNT_RAD, SIGMA_DELAY_S = np.radians(4.0), 0.06
 MAX_MOUNT_RAD = np.radians(8.0)
 """While a body yaws, larger mount errors cannot be separated from a bending map."""

@@ -26,7 +26,7 @@ without attitude."""
 
 
 VARIANCE_ALIGNMENT_RAD2 = 1e-4
-"""Of `map_from_ned` after one image: 0.6 degrees."""
+"""Variance of `map_from_ned` after one image: 0.6 degrees."""
 
 
 class MotionFilter:
@@ -45,7 +45,7 @@ class MotionFilter:
         self._filter: KalmanFilter | None = None
         self._map_from_ned = np.eye(3)
         self._aligned = False
-        """Whether `map_from_ned` is known."""
+        """True once `map_from_ned` is known."""
 
     def reset(self) -> None:
         """Reset all but the attitude alignment itself."""
@@ -54,7 +54,7 @@ class MotionFilter:
 
     @property
     def aligned(self) -> bool:
-        """Whether `map_from_ned` is known."""
+        """True once `map_from_ned` is known."""
         return self._aligned
 
     @property

@@ -48,7 +48,7 @@ class MountEstimate:
 
     @property
     def certain(self) -> bool:
-        """Whether the body rotated enough for the estimate."""
+        """True if the body rotated enough for the estimate."""
         return (
             self.rotation_rad > float(MIN_ROTATION_RAD)
             and float(self.sigma_turn_rad.max()) < float(CERTAIN_RAD)

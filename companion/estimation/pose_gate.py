@@ -217,7 +217,7 @@ class PoseGate:
         return int(np.median(self._periods_ns))
 
     def _rejection_reason(self, odometry: Odometry, now_ns: int) -> str:
-        """Why a pose is rejected; "" if accepted."""
+        """Reason why a pose is rejected; "" if accepted."""
         pose, velocity = odometry.world_from_body, odometry.velocity_world_m_s
         if odometry.state is TrackState.INITIALISING:
             return INITIALISING

@@ -38,7 +38,7 @@ class BootIdentity:
 
 
 def same_boot(before: BootIdentity, now: BootIdentity) -> bool:
-    """Whether an autopilot has not rebooted since `before`.
+    """True if an autopilot has not rebooted since `before`.
 
     False where unknown: counting on is safe, restarting at 0 may hide a discontinuity.
     """
@@ -57,9 +57,9 @@ class ResetCounter:
 
     def __init__(self) -> None:
         self.value = 0
-        """Of the next pose; its lowest eight bits are sent."""
+        """Counter of the next pose; its lowest eight bits are sent."""
         self.sent = False
-        """Whether this boot was sent a pose, or may have been."""
+        """True once a pose was sent in this boot, or may have been."""
 
     def discontinuity(self) -> None:
         """Count a discontinuity."""

@@ -20,11 +20,11 @@ from companion.slam.loop.relocalizer import MIN_FOUND
 MAX_ABSENT_NS = 60_000_000_000
 """An older map is of another flight, or too far away by now."""
 TIMEOUT_NS = 5_000_000_000
-"""After which another map may be initialised; its scale would take as long."""
+"""Time after which another map may be initialised; its scale would take as long."""
 MIN_FRAMES, MIN_SPAN_NS = 5, 300_000_000
-"""Successive agreeing frames, and their span, required;"""
+"""Successive agreeing frames required, and their least span."""
 NO_ATTITUDE_FACTOR = 3
-"""times this without attitude."""
+"""Factor on both without attitude."""
 MAX_ATTITUDE_ERROR_RAD = np.radians(8.0)
 """Heading drift of the autopilot meanwhile, and error of its vertical."""
 MAX_POSITION_ERROR_M = 2.0

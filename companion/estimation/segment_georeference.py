@@ -276,7 +276,7 @@ class SegmentGeoreferences:
     def loop_allowed(
         self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: LoopClosure
     ) -> bool:
-        """Whether measured positions are consistent with a loop closure.
+        """True if measured positions are consistent with a loop closure.
 
         `keyframe` is in `segment`, if that is active.
         """

@@ -24,7 +24,7 @@ long: longer than any gap bridged (feedback.max_gap_ms is at most 300), at any f
 with fewer frames."""
 DRIFT_WINDOW_NS = 10_000_000_000
 SIGMA_DEAD_RECKONING_M_S = 0.3
-"""Of the velocity used in dead reckoning."""
+"""Standard deviation of the velocity used in dead reckoning."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
 SIGMA_DRIFT = 0.005
 """Ratio of path length: drift of a map before adjustment."""
@@ -63,9 +63,9 @@ class OdometryState(NamedTuple):
     odometry_from_world: Pose
     anchored: bool
     position_m: Array
-    """(3,) of the body in the odometry frame, when last tracked,"""
+    """Position (3,) of the body in the odometry frame when last tracked."""
     velocity_m_s: Array
-    """and its velocity (3,)."""
+    """Velocity (3,) of the body in the odometry frame at that time."""
 
 
 class SmoothOdometry:
@@ -80,7 +80,7 @@ class SmoothOdometry:
         self._georeference: Georeference | None = None
         self._odometry_from_world = Pose.identity()
         self._last: tuple[int, Pose, Pose] | None = None
-        """time, `map_from_camera`, `odometry_from_body` of the last accepted frame"""
+        """Time, `map_from_camera` and `odometry_from_body` of the last accepted frame."""
         self._anchored = False
         self._velocity = np.zeros(3)
         self._rejected: _RejectedPoses | None = None
@@ -316,7 +316,7 @@ class SmoothOdometry:
         )
 
     def _reachable(self, before: Array, after: Array, dt_ns: int) -> bool:
-        """Whether the body can have moved between two positions (3,) in a time."""
+        """True if the body can have moved between two positions (3,), world, metres, in `dt_ns`."""
         dt_s = dt_ns * 1e-9
         expected = before + self._velocity * min(dt_s, 1.0)
         away_m = float(np.linalg.norm(after - expected))

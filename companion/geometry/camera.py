@@ -17,7 +17,7 @@ from companion.geometry.transforms import Array, Pose
 MAX_OFF_AXIS_RAD = np.radians(80.0)
 """Larger angles from the optical axis have no usable normalised coordinates."""
 CONVERGED = 1e-12
-"""In normalised coordinates."""
+"""Convergence threshold, in normalised coordinates."""
 
 
 class Distortion(Enum):
@@ -48,7 +48,7 @@ class Camera:
     coefficients: tuple[float, ...] = ()
     body_from_camera: Pose | None = None
     assumed: bool = field(default=False)
-    """Whether the intrinsics are a guess, without calibration."""
+    """True if the intrinsics are a guess, without calibration."""
 
     @property
     def focal_px(self) -> float:

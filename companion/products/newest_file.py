@@ -10,9 +10,10 @@ from companion.products.atomic_file import sync, write_atomically
 
 
 class NewestFile:
-    """Writes in a thread of its own: a disk that hangs delays nothing and costs no more memory.
+    """A file of which only the newest content counts, written in a thread of its own.
 
-    `failed` is called in that thread with the error.
+    A disk that hangs delays nothing and costs no more memory. `failed` is called in that thread
+    with the error.
     """
 
     def __init__(self, path: Path, failed: Callable[[str], None]) -> None:
@@ -59,8 +60,8 @@ class NewestFile:
             self.path.unlink(missing_ok=True)
         else:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            # there for who comes after a crash at once, for who comes after a power cut a little
-            # later: a disk may take its time
+            # the rename makes it survive a crash of the process at once, the synchronisation, which
+            # may take long, a loss of power
             write_atomically(self.path, data)
             sync(self.path)
         sync(self.path.parent)

@@ -167,10 +167,10 @@ class _Apart:
             is_open = False
             for out in self._work.finish(Finish(hurry=False)):
                 self._outbox.put(out)
-        except BaseException as fault:  # handed to the caller's thread, which tells of it
+        except BaseException as fault:  # raised or reported in the caller's thread
             self.fault = fault
         while is_open and self._take() is not None:
-            pass  # whoever puts must not wait for ever
+            pass  # so that `put` does not wait for ever
 
     def _take(self) -> Message | None:
         message = self._inbox.get()

@@ -24,7 +24,7 @@ header fits into a socket's buffer, of 208 KiB in Linux, several times."""
 APART_BYTES = 4 << 10
 """Smaller arrays are pickled with the rest: the mappings of a map hold thousands."""
 ALIGNMENT = 64
-"""Of arrays, for vector instructions."""
+"""Alignment of arrays, for vector instructions."""
 MOST_BYTES = 2 * INLINE_BYTES
 """Largest packet."""
 _HEADER = struct.Struct("<qQB")
@@ -81,7 +81,7 @@ class Parcel:
 
     @property
     def is_shared(self) -> bool:
-        """Whether it lies in memory of its own, of which only a descriptor travels."""
+        """True if it lies in memory of its own, of which only a descriptor travels."""
         return self._memory is not None
 
     def open(self) -> Any:

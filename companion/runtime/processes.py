@@ -78,12 +78,12 @@ class Processes:
 
     @property
     def over(self) -> bool:
-        """Whether the flight is over, and messages go to its results only."""
+        """True once the flight is over, and messages go to its results only."""
         return self._over.is_set()
 
     @property
     def up(self) -> bool:
-        """Whether every stage that can run is up, or has failed to start and is retried."""
+        """True if every stage that can run is up, or has failed to start and is retried."""
         return all(
             process.progress is not None or self.n_restarted[name]
             for name, process in list(self.by_name.items())
@@ -142,7 +142,7 @@ class Processes:
 
     @property
     def hurried(self) -> bool:
-        """Whether it must end soon."""
+        """True if the end has only a short time."""
         return self._hurry_s is not None
 
     def finish(self, finish: Callable[[Stage], Finish]) -> dict[str, str]:

@@ -58,7 +58,7 @@ class StageProcess:
         """Time of the first message since it last reported that it waits."""
         self._deliver, self._ended = deliver, ended
         self.asked_to_end = False
-        """Whether it was asked to finish or killed."""
+        """True once it was asked to finish, or killed."""
         self._driver = DriverAtWork()
         self._n_sent = self._n_taken = 0
         """Bytes of shared memory, so far."""
@@ -86,7 +86,7 @@ class StageProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
+        """True while the process runs."""
         return self._child.poll() is None
 
     @property
@@ -145,7 +145,7 @@ class StageProcess:
 
     @property
     def was_interrupted(self) -> bool:
-        """Whether it was ended by `interrupt`."""
+        """True if it was ended by `interrupt`."""
         return self._interrupted is not None
 
     def interrupt(self, why: str = "") -> None:

@@ -16,7 +16,7 @@ class Work(ABC):
     """Base class of stages; `step` and `finish` are theirs."""
 
     outlives_daemon = False
-    """Whether it finishes by itself when the daemon is gone; else it ends at once."""
+    """True if it finishes by itself when the daemon is gone; else it ends at once."""
     device = ""
 
     def __init__(self) -> None:

@@ -44,7 +44,7 @@ class Frames(Enum):
 
 
 class Death(Enum):
-    """What follows when a stage ends by itself, or is ended for not answering."""
+    """Consequence of a stage that ends by itself, or is ended for not answering."""
 
     ENDS_FLIGHT = "the flight ends, and another begins"
     RESTARTED = "it is started again within the flight"
@@ -63,16 +63,16 @@ class Stage:
     """Longest step before it counts as hanging: room for a slow disk or network, and for depth a
     driver that compiles. Localisation is judged by its poses, and sooner."""
     finish_s: float = 60.0
-    """Time for its last results,"""
+    """Time for its last results, seconds."""
     hurried_s: float = 0.2
-    """and where the daemon is to end: three seconds for all."""
+    """The same where the daemon is to end, which has three seconds for all stages."""
     death: Death = Death.RESTARTED
     with_flight: bool = False
-    """Whether it begins with the flight, whose name or folder it needs; else it stands by."""
+    """It begins with the flight, whose name or folder it needs; else it stands by."""
     in_folder: bool = False
-    """Whether it writes into the flight's folder; each restart into one of its own."""
+    """It writes into the flight's folder; each restart into one of its own."""
     is_source: bool = False
-    """Whether other stages wait for its last results."""
+    """Other stages wait for its last results."""
 
 
 STAGES = (
@@ -127,11 +127,11 @@ DROPPED = {
     "Setup": DropPolicy.ALWAYS, "Finish": DropPolicy.ALWAYS, "SetLoadLevel": DropPolicy.ALWAYS,
     "TakeSnapshot": DropPolicy.ALWAYS, "SetBudget": DropPolicy.ALWAYS, "KeepMap": DropPolicy.ALWAYS,
 }  # fmt: skip
-"""What happens to messages where a queue is full, by kind; all others are LOSSLESS."""
+"""Policy of messages where a queue is full, by kind; all others are LOSSLESS."""
 
 
 def drop_policy(stage: Stage, kind: str, in_daemon: bool) -> DropPolicy:
-    """What happens to a message that waits for a stage, in the daemon or in its own process."""
+    """Policy of a message in the queue of a stage, in the daemon or in the stage's process."""
     replaced = stage.frames is Frames.NEWEST or (in_daemon and stage.frames is Frames.RECENT)
     if kind == Frame.__name__ and replaced:
         return DropPolicy.LATEST_WINS

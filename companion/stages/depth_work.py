@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,6 +14,8 @@ from companion.dense.opencl import ListedDevice
 from companion.messages import DepthMap, Message
 from companion.runtime.stage_protocol import DriverAtWork, Finish, Remark, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
+from drivers.system.heap import give_back_heap
+from drivers.system.library_pages import give_back_library_pages
 
 FIRST_PATIENCE_S = 120.0
 """Drivers may compile kernels when they first run: on a small processor that takes most of a
@@ -47,7 +48,7 @@ class _Depth(Work):
             setup.config.depth, setup.config.cloud, setup.camera, self._devices, self.times
         )
         self.device = self._devices.described
-        give_back_memory()
+        self._give_back()
 
     def details(self) -> Mapping[str, Any]:
         return {"failures": list(self._devices.failures) if self._devices is not None else []}
@@ -58,14 +59,21 @@ class _Depth(Work):
             self._stage.set_share(message.level)
             return []
         out = self._stage.step(message)
-        if any(isinstance(each, DepthMap) for each in out):
+        if self._used not in self._proven and any(isinstance(each, DepthMap) for each in out):
             self._proven.add(self._used)
+            self._give_back()  # drivers compile kernels when these first run
         self.device = self._devices.described
         return out
 
     def finish(self, finish: Finish) -> Iterable[Message]:
         assert self._stage is not None
         return [] if finish.hurry else self._stage.flush()
+
+    def _give_back(self) -> None:
+        """Return to the system what compiling kernels has left unused, and the compiler itself."""
+        give_back_heap()
+        if self._setup.is_live:  # in a process of its own
+            give_back_library_pages()
 
     @contextmanager
     def _watched(self, device: ListedDevice) -> Iterator[None]:
@@ -82,13 +90,6 @@ class _Depth(Work):
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             self._tell(DriverAtWork())
-
-
-def give_back_memory() -> None:
-    """Return to the system what compiling kernels has left unused, some 50 MB; glibc only."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 def work(setup: Setup) -> Work:

@@ -18,6 +18,7 @@ from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import cache_errors
 from companion.stages.map_keeper import Kept, MapKeeper
 from companion.timing.clock import since_boot_ns
+from drivers.system.library_pages import give_back_library_pages
 
 KEEP_EVERY_NS = 1_000_000_000
 NO_COLOUR = np.zeros((0, 0, 3), np.uint8)
@@ -38,6 +39,8 @@ class _Localisation(Work):
         self._stage = LocalisationStage(
             setup.config, setup.camera, self.times, background=setup.is_live
         )
+        if setup.is_live:  # in a process of its own; of the compiler of loops nothing is needed now
+            give_back_library_pages()
         self._keeper: MapKeeper | None = None
         self._to_take_up: Kept | None = None
         self._reported_fault = ""

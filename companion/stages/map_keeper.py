@@ -60,7 +60,7 @@ class MapKeeper:
 
     @property
     def busy(self) -> bool:
-        """Whether the last one is still being written."""
+        """True while the last one is still being written."""
         return self._waiting is not None
 
     def put(self, checkpoint: Checkpoint) -> None:

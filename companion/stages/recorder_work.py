@@ -11,6 +11,7 @@ from companion.products.surroundings import versions
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
 from drivers.recording.recorder import Recorder
+from drivers.system.library_pages import give_back_library_pages
 
 
 class _Recorder(Work):
@@ -22,6 +23,8 @@ class _Recorder(Work):
             raise StageError("a recorder needs a folder")
         setup.folder.mkdir(parents=True, exist_ok=True)
         self._recorder = Recorder(setup.folder, setup.config, setup.camera, versions())
+        if setup.is_live:  # in a process of its own
+            give_back_library_pages()
 
     @property
     def n_rejected(self) -> int:

@@ -14,6 +14,7 @@ from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapsh
 from companion.runtime.stage_work import Work
 from companion.stages.cloud_snapshots import CloudSnapshots
 from companion.streaming.viewer import FileViewer
+from drivers.system.library_pages import give_back_library_pages
 
 
 class _Results(Work):
@@ -35,6 +36,8 @@ class _Results(Work):
                 indexed=not setup.is_live,
             )
         )
+        if setup.is_live:  # in a process of its own
+            give_back_library_pages()
 
     def step(self, message: Any) -> Iterable[Message | Snapshot]:
         if isinstance(message, TakeSnapshot):

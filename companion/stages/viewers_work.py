@@ -39,7 +39,7 @@ class _Viewers(Work):
         self._port = own.getsockname()[1]
         self._exporter.listen(own)
         self._closed = ""
-        """Why nobody can connect from elsewhere; "" where they can."""
+        """Reason why nobody can connect from elsewhere; "" where they can."""
         name = setup.folder.name if setup.folder is not None else ""
         flight = FlightItem(name or os.urandom(8).hex(), name, camera.pinhole(), setup.origin)
         self._encoder = SceneEncoder(flight, PATH_STEP_NS)

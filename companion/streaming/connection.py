@@ -81,7 +81,7 @@ class Connection:
         return n
 
     def is_writable(self) -> bool:
-        """Whether the kernel takes more now."""
+        """True if the kernel takes more now."""
         return bool(select.select([], [self.socket], [], 0)[1])
 
     def wire_bytes(self, n_given: int) -> int:

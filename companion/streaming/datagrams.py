@@ -53,7 +53,7 @@ class Datagrams:
         self._peers = {viewer: peer for viewer, peer in self._peers.items() if viewer in peers}
 
     def get_through(self, viewer: bytes, now_s: float) -> bool:
-        """Whether datagrams reach a viewer."""
+        """True while datagrams of a viewer arrive; `now_s` is monotonic time."""
         peer = self._peers.get(viewer)
         return (
             peer is not None
@@ -62,7 +62,7 @@ class Datagrams:
         )
 
     def has_peer(self, viewer: bytes) -> bool:
-        """Whether a viewer's address is known."""
+        """True if a viewer's address is known."""
         return viewer in self._peers
 
     def send(self, viewer: bytes, data: bytes) -> int:

@@ -73,7 +73,7 @@ class Exporter:
         self._wake_up()
 
     def is_drained(self, n_least: int = 0) -> bool:
-        """Whether all connected viewers, at least `n_least`, have received everything."""
+        """True if all connected viewers, at least `n_least`, have received everything."""
         with self._lock:
             sessions = [c.session for c in self._connections]
             done = [session is not None and session.is_complete for session in sessions]

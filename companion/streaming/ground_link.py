@@ -35,9 +35,10 @@ HELLO_EVERY_S = 1.0
 
 
 class GroundLink:
-    """`items` gives them until `stop` is set; `notify` takes the state of the link in words.
+    """Link to the drone of a viewer; `items` gives what comes until `stop` is set.
 
-    Without `again` the end of the first connection is the end.
+    `notify` takes the state of the link in words. Without `again` the end of
+    the first connection is the end.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ class KeyframePlacement:
 
     def __init__(self) -> None:
         self.world: Similarity | None = None
-        """world_from_map, once known."""
+        """Transform `world_from_map`; None while unknown."""
         self._update: MapUpdate | None = None
         self._mapped: dict[int, Similarity] = {}
         """Places in the newest map."""

@@ -14,7 +14,6 @@ import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from companion.config import Config, StreamConfig, ViewerConfig
@@ -129,7 +128,7 @@ class LiveViewer:
 
     @property
     def alive(self) -> bool:
-        """Whether the exporter runs."""
+        """True while the exporter runs."""
         return self._stage.alive
 
     def stalled_s(self, now_s: float) -> float:
@@ -142,18 +141,13 @@ class LiveViewer:
 
     @property
     def is_shown(self) -> bool:
-        """Whether the process of the viewer here runs."""
+        """True while the viewer that was started here runs."""
         return self._ground is not None and self._ground.poll() is None
 
     def __enter__(self) -> LiveViewer:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close(PATIENCE_S)
 
     def close(self, patience_s: float) -> None:

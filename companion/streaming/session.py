@@ -63,11 +63,11 @@ class Session:
         self._pictures = AdaptiveJpeg()
         self._credit = 0.0
         self.is_connected = True
-        """Whether skipped items are counted."""
+        """True while the viewer is connected: skipped items are counted."""
         self._pose_is_new = False
         self._datagram_s = -1e9
         self.datagrams_work = False
-        """Whether poses get through by datagram."""
+        """True while poses get through by datagram."""
         self.limit_bytes_s = 0.0
         """Rate limit of this viewer; 0 for none."""
         self.n_skipped: Counter[str] = Counter()
@@ -118,7 +118,7 @@ class Session:
 
     @property
     def is_complete(self) -> bool:
-        """Whether everything has been received."""
+        """True if everything has been received."""
         return not self._in_flight and not self._partial and not any(self._waiting.values())
 
     def next_datagram(self, now_s: float) -> bytes | None:
@@ -177,7 +177,7 @@ class Session:
         return None
 
     def _can_send(self, kind: Kind, now_s: float, rate: float, share: float) -> bool:
-        """Whether an item of a kind is partly sent, or one can begin."""
+        """True if an item of a kind is partly sent, or one can begin."""
         if kind in self._partial:
             return True
         if now_s - self._sent_s[kind] < self._every_s(kind, rate):

@@ -22,7 +22,7 @@ MOST_WARNINGS = 3
 
 
 class StatusFacts:
-    """Collects the values."""
+    """Newest values of the status, collected from messages."""
 
     def __init__(self) -> None:
         self.shown = Shown.WAITING

@@ -187,7 +187,7 @@ class ClockFilter:
         return expected_ns <= receive_ns + REBOOT_NS
 
     def _other_clock_proven(self, remote_ns: int, receive_ns: int) -> bool:
-        """Whether inconsistent stamps have indicated another clock for long enough."""
+        """True if inconsistent stamps have indicated another clock for long enough."""
         offset_ns = receive_ns - remote_ns
         seen = self._other_clock
         if seen is None or abs(offset_ns - seen.offset_ns) > REBOOT_NS:

@@ -62,7 +62,7 @@ class TimeAlignment:
 
     @property
     def why_not(self) -> str | None:
-        """Why it is not reliable, in words; None if it is."""
+        """Reason why it is not reliable; None if it is."""
         if self.rms_rate_rad_s < MIN_RATE_RAD_S:
             return "the camera hardly turns"
         if self.score < MIN_SCORE:

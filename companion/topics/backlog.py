@@ -27,7 +27,7 @@ class _Held:
 
 
 class Backlog:
-    """To be used by several threads. A budget of 0 is no limit."""
+    """Bundles of one flight for nodes that fetch them; thread-safe. A budget of 0 is no limit."""
 
     def __init__(self, run: str, capacity_bytes: int, budget_bytes_s: float) -> None:
         self._run, self._capacity_bytes, self._budget_bytes_s = run, capacity_bytes, budget_bytes_s

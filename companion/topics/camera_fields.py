@@ -39,20 +39,11 @@ def camera_of(part: Envelope) -> Camera:
         distortion = Distortion(part.text("distortion"))
     except ValueError as error:
         raise StreamError(f"{part.kind}: {error}") from error
-    coefficients = _numbers(part, "coefficients", N_COEFFICIENTS[distortion])
+    coefficients = part.numbers("coefficients", N_COEFFICIENTS[distortion], MOST_FOCAL_PX)
     body = None
     if part.known("body_from_camera"):
-        body = pose_of(_numbers(part, "body_from_camera", POSE_NUMBERS))
+        body = pose_of(part.numbers("body_from_camera", POSE_NUMBERS, MOST_FOCAL_PX))
     return Camera(
         width, height, focal[0], focal[1], centre[0], centre[1], distortion,
         tuple(coefficients), body, part.flag("assumed"),
     )  # fmt: skip
-
-
-def _numbers(part: Envelope, name: str, n: int) -> list[float]:
-    values = part.fields.get(name)
-    if not isinstance(values, list) or len(values) != n:
-        raise StreamError(f"{part.kind}: {name} is not a list of {n} numbers")
-    if not all(type(v) in (int, float) and abs(v) < MOST_FOCAL_PX for v in values):
-        raise StreamError(f"{part.kind}: {name} has what is no number")
-    return [float(v) for v in values]

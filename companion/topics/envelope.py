@@ -61,7 +61,7 @@ class Envelope:
         return float(value)
 
     def known(self, name: str) -> bool:
-        """Whether a field is there and not null."""
+        """True if a field is there and not null."""
         return self.fields.get(name) is not None
 
     def text(self, name: str, most: int = 200) -> str:
@@ -84,6 +84,15 @@ class Envelope:
         if not isinstance(value, dict):
             raise StreamError(f"{self.kind}: {name} is not an object")
         return Envelope(f"{self.kind}.{name}", value, {})
+
+    def numbers(self, name: str, n: int, below: float) -> list[float]:
+        """List of n numbers of magnitude less than `below`."""
+        values = self.fields.get(name)
+        if not isinstance(values, list) or len(values) != n:
+            raise StreamError(f"{self.kind}: {name} is not a list of {n} numbers")
+        if not all(type(v) in (int, float) and abs(v) < below for v in values):
+            raise StreamError(f"{self.kind}: {name} has what is no number")
+        return [float(v) for v in values]
 
     def array(self, name: str, dtype: str, *shape: int, finite: bool = True) -> NDArray[Any]:
         """Array of a type and shape, -1 being any length; finite unless stated otherwise."""

@@ -164,7 +164,7 @@ def georeference_of(envelope: Envelope) -> Georeference | None:
         for name in ("sigma_scale", "sigma_yaw_rad", "residual_m")
     ]
     return Georeference(
-        place_of(_row(part, "world_from_map", PLACE_NUMBERS)), numbers[0], numbers[1],
+        place_of(part.numbers("world_from_map", PLACE_NUMBERS, FAR_AWAY)), numbers[0], numbers[1],
         part.text("method"), part.integer("n_positions"), numbers[2], part.flag("has_origin"),
     )  # fmt: skip
 
@@ -187,12 +187,3 @@ def _placed(keyframe_id: int, update: MapUpdate | None) -> dict[str, Any]:
         "map_from_camera": place_row(place) if place is not None else None,
         "world_from_camera": place_row(world) if world is not None else None,
     }
-
-
-def _row(envelope: Envelope, name: str, n: int) -> list[float]:
-    values = envelope.fields.get(name)
-    if not isinstance(values, list) or len(values) != n:
-        raise StreamError(f"{envelope.kind}: {name} is not a list of {n} numbers")
-    if not all(type(v) in (int, float) and abs(v) < FAR_AWAY for v in values):
-        raise StreamError(f"{envelope.kind}: {name} has what is no number")
-    return [float(v) for v in values]

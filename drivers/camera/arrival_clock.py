@@ -26,7 +26,7 @@ class ArrivalClock:
 
     @property
     def settled(self) -> bool:
-        """Whether times are valid: images buffered before the connection arrive all at once."""
+        """True once times are valid: images buffered before the connection arrive all at once."""
         return self._n_steady >= SETTLED_AFTER
 
     def monotonic_ns(self, sent_ns: int, arrived_ns: int) -> int:

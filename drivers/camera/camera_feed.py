@@ -41,9 +41,9 @@ FROZEN_S = 1.0
 MIN_CONTRAST = 12
 """Least contrast of images that are compared; darker ones, as under a lens cap, may be equal."""
 INVALID_S = 1.5
-"""A camera with invalid images for this long is reopened,"""
+"""Time of invalid images only, after which a camera is reopened."""
 BETWEEN_CURES_S = 5.0
-"""but not more often than this."""
+"""Least interval of such reopenings."""
 MAX_AHEAD_NS, MAX_BEHIND_NS = 50_000_000, 10_000_000_000
 """Largest difference of a stamp from now."""
 REPEAT_WARNING_S = 10.0

@@ -36,7 +36,7 @@ class CameraSource(Protocol):
     name: str
     """For people: a path, a URL without its password."""
     live: bool
-    """Whether reopening can help where it gives nothing, or the same image for ever."""
+    """True if reopening can help where it gives nothing, or the same image again and again."""
     start_s: float
     """Longest time from opening to the first image."""
     silent_s: float

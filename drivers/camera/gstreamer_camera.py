@@ -33,7 +33,7 @@ INSTALL = (
 )
 
 Answer = tuple[bytes, int, int, int, int, bytes]
-"""kind, width, height, stride, t_ns, data"""
+"""Kind, width, height, stride in bytes, time (ns, CLOCK_MONOTONIC), data."""
 
 
 class GstreamerCamera:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from companion.messages import Bytes
 
 Arrays = tuple[Bytes, Bytes]
-"""grey (H, W), rgb (H, W, 3)"""
+"""Images grey (H, W) and rgb (H, W, 3)."""
 
 
 def to_grey_and_rgb(

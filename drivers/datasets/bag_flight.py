@@ -43,12 +43,12 @@ MODELS = {
 
 
 def is_ros2_folder(path: Path) -> bool:
-    """Whether a folder has the metadata file of a ROS 2 bag."""
+    """True if a folder has the metadata file of a ROS 2 bag."""
     return (path / "metadata.yaml").is_file()
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a file is a bag by its name, or a folder holds ROS 1 bags."""
+    """True if a file is a bag by its name, or a folder holds ROS 1 bags."""
     if path.is_dir():
         return any(path.glob("*.bag"))
     return path.suffix.lower() in (".bag", ".db3", ".mcap")

@@ -32,7 +32,7 @@ MAX_YAML_BYTES = 100_000
 
 
 def is_euroc(path: Path) -> bool:
-    """Whether a folder is such a sequence."""
+    """True if a folder is an EuRoC sequence."""
     return (_mav(path) / "cam0" / "data.csv").is_file()
 
 

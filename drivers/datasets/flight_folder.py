@@ -26,12 +26,12 @@ from drivers.telemetry.video_alignment import read_unaligned
 
 
 def is_flight_folder(path: Path) -> bool:
-    """Whether a folder has the frame times of a flight folder."""
+    """True if a folder has the frame times of a flight folder."""
     return (path / "frames.csv").is_file()
 
 
 def has_pictures(path: Path) -> bool:
-    """Whether a folder has a video or images, which is enough for a fallback."""
+    """True if a folder has a video or images, the least that can be replayed."""
     wanted = VIDEO_SUFFIXES | IMAGE_SUFFIXES
     inside = [path, *(p for p in (path / "images",) if p.is_dir())]
     return any(p.suffix.lower() in wanted for folder in inside for p in folder.iterdir())

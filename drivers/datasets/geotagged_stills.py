@@ -34,7 +34,7 @@ SUSPECT_SHARE = 0.9
 
 
 def is_geotagged(path: Path) -> bool:
-    """Whether a folder holds stills, without a video, and one of the first is geotagged."""
+    """True if a folder holds stills, without a video, and one of the first is geotagged."""
     if any(p.suffix.lower() in VIDEO_SUFFIXES for p in path.iterdir()):
         return False
     files = _files(path)
@@ -74,7 +74,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _in_order(photos: Sequence[Photo]) -> tuple[list[Photo], list[int]]:
-    """In order of time and name; those of one second are spread over it."""
+    """Stills in order of time and name; those of one second are spread over it."""
     offset_ns = _zone_ns(photos)
     whole = [
         (p.local_ns - offset_ns if p.local_ns is not None else p.utc_ns or 0, p) for p in photos

@@ -25,7 +25,7 @@ CAMERAS = ("image_2", "image_0", "image_3", "image_1")
 
 
 def is_kitti(path: Path) -> bool:
-    """Whether a folder is such a sequence."""
+    """True if a folder is a sequence of KITTI odometry."""
     return (path / "times.txt").is_file() and (path / "calib.txt").is_file()
 
 

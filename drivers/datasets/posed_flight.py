@@ -20,7 +20,7 @@ STEP_NS = 100_000_000
 
 
 def is_posed_folder(path: Path) -> bool:
-    """Whether a folder has one of these layouts."""
+    """True if a folder has one of the layouts of images with poses."""
     posed_video = (path / "K.txt").is_file() and (path / "poses.txt").is_file()
     return posed_video or any(path.glob("*input_sequence*.txt"))
 

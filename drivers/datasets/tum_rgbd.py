@@ -19,7 +19,7 @@ from drivers.telemetry.telemetry_log import no_telemetry
 
 
 def is_tum_rgbd(path: Path) -> bool:
-    """Whether a folder is such a sequence."""
+    """True if a folder is a TUM RGB-D sequence."""
     return (path / "rgb.txt").is_file()
 
 

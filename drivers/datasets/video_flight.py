@@ -14,7 +14,7 @@ from drivers.telemetry.video_alignment import read_unaligned
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file is a video by its name."""
+    """True if a file is a video by its name."""
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 

@@ -144,7 +144,7 @@ def _number(value: Any) -> float | None:
 
 
 def _time(text: Any) -> int | None:
-    """`2014:10:19 13:20:51`, as if it were UTC."""
+    """Time of text such as `2014:10:19 13:20:51`, as if it were UTC, ns."""
     words = str(text).strip("\0 ").split()
     if len(words) != 2:
         return None

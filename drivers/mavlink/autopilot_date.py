@@ -13,7 +13,7 @@ N_ALIKE, ALIKE_NS = 3, 1_000_000_000
 
 
 class AutopilotDate:
-    """Used in the event loop."""
+    """Date of an autopilot against the flight's clock. Used in the event loop."""
 
     def __init__(self, link: AutopilotLink) -> None:
         self.ahead_ns: int | None = None

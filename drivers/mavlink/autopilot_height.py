@@ -34,7 +34,7 @@ class _Height(NamedTuple):
 
 
 class AutopilotHeight:
-    """Listens on a link. To be used in the event loop."""
+    """Height of the vehicle in its local frame, from messages of a link, in the event loop."""
 
     def __init__(self, link: AutopilotLink) -> None:
         self._link = link

@@ -69,7 +69,7 @@ class AutopilotLink:
         self.vehicle: Vehicle | None = None
         """None until its first HEARTBEAT; kept while it is silent."""
         self.alive = False
-        """Whether the autopilot has been heard recently."""
+        """True while the autopilot is heard."""
         self.clock_filter = ClockFilter()
         self.samples = LiveSamples(self.clock_filter, deliver, warn)
         self._meter = SourceMeter("autopilot")

@@ -35,9 +35,10 @@ INTERVAL = mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL
 
 
 class MessageRequests:
-    """`now` makes messages of this moment; `rates_hz` are the rates of all streamed messages.
+    """Handlers of the commands that request messages and set or ask for their rates.
 
-    `set_rate` changes the rate of one that is adjustable, None for its default.
+    `now` makes messages of this moment; `rates_hz` gives the rates of all streamed messages;
+    `set_rate` changes the rate of an adjustable one, None for its default.
     """
 
     def __init__(

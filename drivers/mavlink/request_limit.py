@@ -12,7 +12,7 @@ MOST_ASKERS = 32
 
 
 class RequestLimit:
-    """Asks no clock; `now_ns` is any monotonic time."""
+    """Rate limit of requests, without a clock; `now_ns` is any monotonic time."""
 
     def __init__(self) -> None:
         self.n_refused = 0
@@ -20,7 +20,7 @@ class RequestLimit:
         self._askers: OrderedDict[tuple[int, int], RateLimit] = OrderedDict()
 
     def allows(self, asker: tuple[int, int], now_ns: int) -> bool:
-        """Whether a request is accepted; rejected ones are counted."""
+        """True if a request is accepted; rejected ones are counted."""
         own = self._askers.get(asker)
         if own is None:
             own = self._askers[asker] = RateLimit(EACH_HZ, EACH_BURST)

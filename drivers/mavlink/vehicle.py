@@ -46,7 +46,7 @@ class Vehicle:
 
 
 def is_autopilot(heartbeat: Any) -> bool:
-    """Whether a HEARTBEAT is of an autopilot, not of a ground station or a camera."""
+    """True if a HEARTBEAT is of an autopilot, not of a ground station or a camera."""
     return bool(
         heartbeat.get_srcComponent() == mavlink.MAV_COMP_ID_AUTOPILOT1
         and heartbeat.autopilot != mavlink.MAV_AUTOPILOT_INVALID

@@ -1,4 +1,4 @@
-"""What was decided in a recorded flight, and in which order it came: for a replay as flown."""
+"""Decisions of a recorded flight, in the order in which they came, for a replay as flown."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ LOSSLESS = {"png", "raw"}
 
 @dataclass(slots=True)
 class Decisions:
-    """In the order in which each came."""
+    """Inputs and decisions of one flight, each list in its recorded order."""
 
     config: Config
     lossless: bool
-    """Whether images are recorded as they were."""
+    """True if images are recorded without loss."""
     samples: list[Telemetry] = field(default_factory=list)
     frames: list[FrameTracked] = field(default_factory=list)
     gate: list[GateStep] = field(default_factory=list)
     odometry: dict[int, Odometry] = field(default_factory=dict)
-    """By the number of the frame."""
+    """Odometry by the number of the frame."""
     events: list[str] = field(default_factory=list)
     """Warnings and good news, in words."""
     sent: list[tuple[int, bytes]] = field(default_factory=list)
@@ -105,7 +105,7 @@ def _of(kind: type[Any], t_ns: int, data: bytes) -> Any:
 
 
 def _poses(stream: MavlinkStream, data: bytes, config: Config) -> Iterator[tuple[int, bytes]]:
-    """Ours, not those of a client of the router."""
+    """Id and payload of the packets with poses of this program, not of a client of the router."""
     taken = MavlinkBytes.FromString(data)
     for packet in stream.feed(taken.data, taken.monotonic_ns):
         if packet.message_id in POSES and packet.component == config.link.component_id:

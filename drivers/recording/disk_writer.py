@@ -77,7 +77,7 @@ class DiskWriter:
 
     @property
     def recording(self) -> bool:
-        """Whether new messages are still written."""
+        """True while new messages are still written."""
         return not self._ended
 
     def put(self, entry: Entry, kind: str, is_picture: bool = False) -> bool:

@@ -36,7 +36,7 @@ class FlightPlace(NamedTuple):
     n_bytes: int
     kept: bool
     growing: bool
-    """Whether it is still being recorded."""
+    """True while it is being recorded."""
     not_before_s: float | None = None
     """Lower bound of its begin, Unix time, by its name and those before it in order; None where no
     clock was ever right."""
@@ -127,7 +127,7 @@ def delete(flight: FlightPlace) -> None:
 
 
 def is_recorded_now(flight: Path) -> bool:
-    """Whether a recording in a flight's folder is still being written."""
+    """True while a recording in a flight's folder is being written."""
     return any(map(_is_growing, recordings_in(flight)))
 
 

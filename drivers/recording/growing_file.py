@@ -58,7 +58,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def is_growing(fd: int) -> bool:
-    """Whether another process still writes to the file that is open as `fd`."""
+    """True while another process writes to the file that is open as `fd`."""
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:

@@ -51,7 +51,7 @@ class ChunkPlace(NamedTuple):
     compression: str
     data_at: int
     after_loss: bool = False
-    """Whether data before it could not be read."""
+    """True if data before it could not be read."""
 
 
 class McapFile:

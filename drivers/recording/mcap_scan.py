@@ -53,7 +53,7 @@ class Scan:
 
     profile: str = ""
     whole: bool = False
-    """Whether it has a valid end."""
+    """True if the file has a valid end."""
     contents: Contents = field(default_factory=Contents)
     chunks: list[ChunkPlace] = field(default_factory=list)
     attachments: dict[str, bytes] = field(default_factory=dict)

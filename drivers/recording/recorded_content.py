@@ -52,7 +52,7 @@ def decision_bytes(decision: FrameTracked | GateStep) -> bytes:
 
 
 def is_sample_topic(topic: str) -> bool:
-    """Whether a topic holds telemetry."""
+    """True if a topic holds telemetry."""
     return topic in _KINDS
 
 

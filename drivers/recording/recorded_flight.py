@@ -18,10 +18,11 @@ from drivers.images.calibration_file import assumed_camera
 from drivers.recording.camera_document import camera_of
 from drivers.recording.flights_folder import RECORDING
 from drivers.recording.mcap_file import McapFile
-from drivers.recording.picture_codec import VideoDecoder, grey_of, still
+from drivers.recording.picture_codec import grey_of, still
 from drivers.recording.recorder import CAMERA_JSON
 from drivers.recording.recording import PicturePlace, Recording
 from drivers.recording.recording_topics import PROFILE, VIDEO
+from drivers.recording.video_codec import VideoDecoder
 from drivers.telemetry.telemetry_log import TelemetryLog, rates_hz
 
 NO_TELEMETRY = "no telemetry"
@@ -108,7 +109,7 @@ class RecordedFlight(Flight):
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is an MCAP of ours, whole or not."""
+    """True if a file is a recording of this program, whole or not."""
     try:
         with McapFile(path) as file:
             return file.profile() == PROFILE
@@ -128,7 +129,7 @@ def open_recording(path: Path, config: CameraConfig, telemetry: TelemetryConfig)
 
 
 def is_recorded_folder(path: Path) -> bool:
-    """Whether a folder is that of a recorded live flight."""
+    """True if a folder is that of a recorded live flight."""
     return (path / RECORDING).is_file()
 
 

@@ -11,10 +11,11 @@ from companion.errors import FlightError
 from companion.messages import Bytes, Warned
 from companion.telemetry import Telemetry
 from drivers.recording.mcap_file import DAMAGED, ChunkPlace, McapMessage
-from drivers.recording.picture_codec import is_intra, still
+from drivers.recording.picture_codec import still
 from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recording_topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
 from drivers.recording.repair import n_cut_bytes, opened, was_cut
+from drivers.recording.video_codec import is_intra
 
 CUT, DAMAGE = "the recording was cut short", "the recording is damaged"
 
@@ -132,7 +133,7 @@ class Recording:
                 self.health = document
 
     def lost_before(self, number: int) -> bool:
-        """Whether data is missing just before a chunk."""
+        """True if data is missing just before a chunk."""
         return self.found.chunks[number].after_loss or number - 1 in self._bad
 
 

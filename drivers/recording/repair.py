@@ -45,7 +45,7 @@ def repair(path: Path, found: Scan) -> bool:
 
 
 def unfinished(path: Path) -> bool:
-    """Whether its writer has gone without ending it; reads its end only.
+    """True if its writer is gone and has not ended it; reads the end of the file only.
 
     FlightError where it is no MCAP file.
     """
@@ -70,7 +70,7 @@ def n_cut_bytes(found: Scan) -> int:
 
 
 def was_cut(found: Scan) -> bool:
-    """Whether its writer did not end it, repaired since or not."""
+    """True if its writer did not end it, repaired since or not."""
     return not found.whole or NOTE in found.metadata
 
 

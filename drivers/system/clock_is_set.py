@@ -1,4 +1,4 @@
-"""Whether the computer's clock is synchronised."""
+"""State of the computer's clock: synchronised by the network or not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 
 
 def clock_is_set() -> bool:
-    """Whether the clock is synchronised by the network; False too where unknown.
+    """True if the clock is synchronised by the network; False too where unknown.
 
     In a service that may not set the clock the kernel does not tell (ProtectClock=).
     """

@@ -13,7 +13,7 @@ from companion.messages import Warned
 ERROR, WARNING, INFO = 3, 4, 6
 MAX_SAME_IN_A_ROW = 5
 EVERY = 100
-"""Of a repeated warning only every so many are written."""
+"""Interval, in warnings, at which a repeated one is written."""
 
 
 class Journal:

@@ -18,14 +18,17 @@ NVGETTY = "nvgetty.service"
 
 @dataclass(frozen=True, slots=True)
 class LoginConsole:
-    """`port` is as in /dev; on a Jetson it is ttyTHS* for nvgetty, which takes any of them."""
+    """A login console on a serial port.
+
+    `port` is as in /dev; on a Jetson it is ttyTHS* for nvgetty, which takes any of them.
+    """
 
     port: str
     remedy: str
 
     @property
     def what(self) -> str:
-        """Description."""
+        """Port and remedy, as a clause."""
         return f"a login console sits on /dev/{self.port}: {self.remedy}"
 
 

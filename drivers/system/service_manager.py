@@ -37,7 +37,7 @@ class ServiceManager:
 
     @property
     def present(self) -> bool:
-        """Whether there is one."""
+        """True if the process was started by a service manager that listens."""
         return self._socket is not None
 
     def ready(self, status: str = "") -> None:

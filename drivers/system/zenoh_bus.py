@@ -51,7 +51,7 @@ class ZenohBus:
         )
 
     def has_subscribers(self, topic: str) -> bool:
-        """Whether a declared topic has subscribers."""
+        """True if a declared topic has subscribers."""
         return bool(self._publishers[topic].matching_status.matching)
 
     def publish(self, topic: str, data: bytes) -> None:

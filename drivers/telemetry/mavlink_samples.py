@@ -54,7 +54,7 @@ class Wanted:
     ids: tuple[int, ...]
     rate_hz: float
     always: bool = True
-    """Whether it is always sent; a position or a range may be unknown."""
+    """True if it is always sent; a position or a range may be unknown."""
 
 
 def wanted(config: LinkConfig) -> list[Wanted]:

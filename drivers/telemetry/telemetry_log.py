@@ -155,7 +155,7 @@ def kind_of(sample: Telemetry) -> str:
 
 
 def is_finite(content: Telemetry | GeodeticFix) -> bool:
-    """Whether all its numbers are finite."""
+    """True if all its numbers are finite."""
     # written out, since this runs for every sample of a flight
     if isinstance(content, AttitudeSample):
         return bool(np.isfinite(content.ned_from_body).all())

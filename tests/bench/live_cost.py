@@ -5,8 +5,9 @@
 The test pattern at 640x480 and 30 frames/s, dense map, recorder, exporter for viewers, an autopilot
 to which poses are sent. CLONE is another working tree, of an earlier version say: both are measured
 in turn. What is left out where there is too much to do is not left out here. Memory is the sum of
-proportional set sizes (PSS). "Pickled" is what the daemon's own process turns into bytes and back.
-The camera's thread, in the daemon, draws the pattern, and closes each frame for the stages.
+proportional set sizes (PSS), without pandas, which an installed program does not have. "Pickled" is
+what the daemon's own process turns into bytes and back. The camera's thread, in the daemon, draws
+the pattern, and closes each frame for the stages.
 """
 
 from __future__ import annotations
@@ -65,6 +66,8 @@ Governor.step = lambda self, t_ns, pressure: False
 from companion.__main__ import main
 sys.exit(main())
 """
+NO_PANDAS = "raise ModuleNotFoundError(name='pandas')"
+"""A test's library wants pandas, and where it is installed Rerun's arrays import it: 45 MB."""
 SETTLE_S, UP_S = 15.0, 180.0
 NAMES = {"companion.streaming.export_process": "viewers"}
 
@@ -102,6 +105,8 @@ def measured(tree: Path, seconds: float) -> dict[str, float]:
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        (folder / "pandas.py").write_text(NO_PANDAS)
+        os.environ["PYTHONPATH"] = f"{tree}:{folder}"
         pickled = folder / "pickled"
         settings = (
             "camera.source=pattern", "camera.rate_hz=30", "camera.width=640", "camera.height=480",

@@ -123,8 +123,13 @@ class Flown:
             raise AssertionError("localisation has died")
 
         return Listener(
-            self._odometry, self.watch.take_georeference, self._warned, died, lambda why: None,
-            points_made=self.watch.points_made, mapped=self._mapped,
+            self._odometry,
+            self.watch.take_georeference,
+            self._warned,
+            died,
+            lambda why: None,
+            points_made=self.watch.points_made,
+            mapped=self._mapped,
         )
 
     def _facts(self, flight: LiveFlight) -> RunFacts:

@@ -149,9 +149,11 @@ def begin(camera: Camera, seen: list[Seen], fault: Fault) -> dict[str, Any]:
 def row(flight: str, fault: str, starts: list[dict[str, Any]]) -> str:
     begun = [s for s in starts if s["frames"] is not None]
     right = [s for s in begun if s["way_rad"] < WRONG_RAD]
+
     def parts(key: str) -> str:
         values = np.degrees([s[key] for s in begun]) if begun else np.array([np.nan])
         return f"{np.nanmedian(values):.3f} / {np.nanpercentile(values, 90):.3f}"
+
     return (
         f"| {flight} | {fault} | {len(right)} / {len(begun)} / {len(starts)} "
         f"| {np.mean([s['frames'] for s in begun]) if begun else np.nan:.1f} "

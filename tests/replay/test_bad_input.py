@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.support.flights.sample_faults import make_flight
-from tests.support.processes.program import refused, replay
+from tests.support.processes.program import refused, replay, replay_here
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 
@@ -41,17 +41,17 @@ def test_no_such_folder(tmp_path: Path) -> None:
 
 def test_folder_without_frames(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    assert "empty" in refused(replay(tmp_path / "empty", tmp_path / "out"))
+    assert "empty" in refused(replay_here(tmp_path / "empty", tmp_path / "out"))
 
 
 def test_video_that_is_none(flight: Path, tmp_path: Path) -> None:
     (flight / "camera.mp4").write_bytes(b"not a video")
-    assert "camera.mp4" in refused(replay(flight, tmp_path / "out"))
+    assert "camera.mp4" in refused(replay_here(flight, tmp_path / "out"))
 
 
 def test_list_of_frames_that_is_none(flight: Path, tmp_path: Path) -> None:
     (flight / "frames.csv").write_text("index,unix_ns\n0,soon\n")
-    assert "frames.csv" in refused(replay(flight, tmp_path / "out"))
+    assert "frames.csv" in refused(replay_here(flight, tmp_path / "out"))
 
 
 @pytest.mark.parametrize(
@@ -67,14 +67,14 @@ def test_list_of_frames_that_is_none(flight: Path, tmp_path: Path) -> None:
 )
 def test_calibration(flight: Path, tmp_path: Path, changes: dict[str, Any], named: str) -> None:
     change_camera(flight, **changes)
-    line = refused(replay(flight, tmp_path / "out"))
+    line = refused(replay_here(flight, tmp_path / "out"))
     assert "camera.json" in line
     assert named in line
 
 
 def test_calibration_that_is_not_json(flight: Path, tmp_path: Path) -> None:
     (flight / "camera.json").write_text("{")
-    assert "camera.json" in refused(replay(flight, tmp_path / "out"))
+    assert "camera.json" in refused(replay_here(flight, tmp_path / "out"))
 
 
 def test_telemetry_of_another_flight(flight: Path, tmp_path: Path) -> None:
@@ -82,18 +82,18 @@ def test_telemetry_of_another_flight(flight: Path, tmp_path: Path) -> None:
     day_ns = 86_400 * 10**9
     later = [f"{row.split(',')[0]},{int(row.split(',')[1]) + day_ns}" for row in rows[1:]]
     (flight / "frames.csv").write_text("\n".join([rows[0], *later]) + "\n")
-    assert "telemetry.tlog" in refused(replay(flight, tmp_path / "out"))
+    assert "telemetry.tlog" in refused(replay_here(flight, tmp_path / "out"))
 
 
 def test_no_such_device(flight: Path, tmp_path: Path) -> None:
-    line = refused(replay(flight, tmp_path / "out", "--set", "opencl.device=no-such-device"))
+    line = refused(replay_here(flight, tmp_path / "out", "--set", "opencl.device=no-such-device"))
     assert "no-such-device" in line
 
 
 def test_part_after_the_end(flight: Path, tmp_path: Path) -> None:
-    assert "--start" in refused(replay(flight, tmp_path / "out", "--start", "100"))
+    assert "--start" in refused(replay_here(flight, tmp_path / "out", "--start", "100"))
 
 
 def test_unknown_key(flight: Path, tmp_path: Path) -> None:
-    line = refused(replay(flight, tmp_path / "out", "--set", "depth.enable=true"))
+    line = refused(replay_here(flight, tmp_path / "out", "--set", "depth.enable=true"))
     assert "depth.enabled" in line

@@ -17,9 +17,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     An autopilot that is told of a smaller error than there is will trust a wrong pose: not above
     1.5. Below 0.1 the pose would be worth less to it than it is.
     """
-    (row,) = bench_slam(
-        [SAMPLE], Config(), None, faults=False, above_m=None, progress=NoProgress()
-    )
+    (row,) = bench_slam([SAMPLE], Config(), None, faults=False, above_m=None, progress=NoProgress())
     assert row.nees is not None
     assert 0.1 < row.nees < 1.5
     # the heading's error hardly changes in a flight: within two standard deviations, and not said

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.support.flights.sample_faults import TIMESYNC, Image, Record, make_flight
-from tests.support.processes.program import Run, replay
+from tests.support.processes.program import Run, replay_here
 from tests.support.reference.scoring import Score, Trajectory, read_tum, score
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
@@ -22,7 +22,7 @@ SPARSE = ["--set", "depth.enabled=false"]
 
 def fly(folder: Path, **faults: Any) -> Run:
     flight = make_flight(folder / "flight", SAMPLE, frames=FRAMES, **faults)
-    run = replay(flight, folder / "out", *SPARSE)
+    run = replay_here(flight, folder / "out", *SPARSE)
     assert run.status == 0, run.stderr
     return run
 
@@ -116,7 +116,7 @@ def test_no_telemetry_means_no_scale(tmp_path: Path) -> None:
 
 
 def test_part_of_a_flight(tmp_path: Path) -> None:
-    run = replay(SAMPLE, tmp_path / "out", *SPARSE, "--start", "5", "--stop", "9")
+    run = replay_here(SAMPLE, tmp_path / "out", *SPARSE, "--start", "5", "--stop", "9")
     assert run.status == 0, run.stderr
     assert run.report["frames"] == 40
     found = read_tum(tmp_path / "out" / "trajectory.tum")

@@ -18,7 +18,7 @@ from tests.support.flights.sequences import (
     write_posed_video,
     write_tum_rgbd,
 )
-from tests.support.processes.program import Run, replay
+from tests.support.processes.program import Run, replay_here
 
 FAST = ["--set", "depth.enabled=false"]
 
@@ -47,7 +47,7 @@ def grey(flown: Piece, tmp_path_factory: pytest.TempPathFactory) -> list[list[st
     """The path by our own layout."""
     place = tmp_path_factory.mktemp("grey")
     write_flight_folder(place / "flight", flown, grey=True)
-    return path_of(replay(place / "flight", place / "out", *FAST))
+    return path_of(replay_here(place / "flight", place / "out", *FAST))
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +55,13 @@ def ideal(flown: Piece, tmp_path_factory: pytest.TempPathFactory) -> list[list[s
     """The path by our own layout, of pictures of an ideal lens."""
     place = tmp_path_factory.mktemp("ideal")
     write_flight_folder(place / "flight", flown.without_lens())
-    return path_of(replay(place / "flight", place / "out", *FAST))
+    return path_of(replay_here(place / "flight", place / "out", *FAST))
 
 
 def test_euroc(grey: list[list[str]], flown: Piece, tmp_path: Path) -> None:
     write_euroc(tmp_path / "flight", flown)
     assert len(grey) >= 30
-    assert path_of(replay(tmp_path / "flight", tmp_path / "out", *FAST)) == grey
+    assert path_of(replay_here(tmp_path / "flight", tmp_path / "out", *FAST)) == grey
 
 
 def test_tum_rgbd(ideal: list[list[str]], flown: Piece, tmp_path: Path) -> None:
@@ -69,20 +69,20 @@ def test_tum_rgbd(ideal: list[list[str]], flown: Piece, tmp_path: Path) -> None:
     own = tmp_path / "flight" / "camera.json"
     write_flight_folder(tmp_path / "other", flown.without_lens().part(1))
     own.write_bytes((tmp_path / "other" / "camera.json").read_bytes())
-    assert_near(path_of(replay(tmp_path / "flight", tmp_path / "out", *FAST)), ideal)
+    assert_near(path_of(replay_here(tmp_path / "flight", tmp_path / "out", *FAST)), ideal)
 
 
 def test_kitti(ideal: list[list[str]], flown: Piece, tmp_path: Path) -> None:
     folder = write_kitti(tmp_path / "flight", flown.without_lens())
     assert len(ideal) >= 30
-    assert_near(path_of(replay(folder, tmp_path / "out", *FAST)), ideal)
+    assert_near(path_of(replay_here(folder, tmp_path / "out", *FAST)), ideal)
 
 
 def test_bag_with_odometry(flown: Piece, tmp_path: Path) -> None:
     """Metric and in its place, as the flight itself is with its own telemetry."""
     longer = piece(n_frames=60)
     write_bag(tmp_path / "flight", "mcap", longer)
-    run = replay(tmp_path / "flight", tmp_path / "out", *FAST)
+    run = replay_here(tmp_path / "flight", tmp_path / "out", *FAST)
     path = np.array(path_of(run), np.float64)[:, :3]
     assert run.report["unit"] == "m"
     assert len(path) >= 55
@@ -96,7 +96,7 @@ def test_imported_flight_gives_the_same_bytes(flown: Piece, tmp_path: Path) -> N
     for name in ("folder", "flight.mcap"):
         assert main(["import", str(tmp_path / "flown.bag"), "--out", str(tmp_path / name)]) == 0
     runs = [
-        replay(tmp_path / name, tmp_path / f"out of {name}", *FAST)
+        replay_here(tmp_path / name, tmp_path / f"out of {name}", *FAST)
         for name in ("flown.bag", "folder", "flight.mcap")
     ]
     assert len(path_of(runs[0])) >= 30
@@ -107,4 +107,4 @@ def test_imported_flight_gives_the_same_bytes(flown: Piece, tmp_path: Path) -> N
 def test_images_without_times(flown: Piece, tmp_path: Path) -> None:
     """Not the very same path: what moves between frames is told by time as well."""
     write_posed_video(tmp_path / "flight", flown.without_lens())
-    assert len(path_of(replay(tmp_path / "flight", tmp_path / "out", *FAST))) >= 30
+    assert len(path_of(replay_here(tmp_path / "flight", tmp_path / "out", *FAST))) >= 30

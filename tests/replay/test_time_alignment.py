@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.processes.program import refused, replay
+from tests.support.processes.program import refused, replay_here
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
-FAST = ["--stop", "14", "--set", "depth.enabled=false"]
+SPARSE = ["--set", "depth.enabled=false"]
+FAST, FASTER = ["--stop", "14", *SPARSE], ["--stop", "5", *SPARSE]
 
 
 @pytest.fixture
@@ -28,7 +29,7 @@ def true_offset_s() -> float:
 
 
 def test_aligned_by_rotation_and_said(folder: Path) -> None:
-    run = replay(folder, folder / "out", *FAST)
+    run = replay_here(folder, folder / "out", *FAST)
     assert run.status == 0, run.stderr
     said = re.search(r"by rotation of the pictures: ([-+][\d.]+) s, within (\d+) ms", run.stdout)
     assert said is not None
@@ -36,7 +37,7 @@ def test_aligned_by_rotation_and_said(folder: Path) -> None:
     assert run.report["unit"] == "m"
     assert run.report["clock"]["method"] == "rotation of the pictures"
     # the path is that of the flight itself, by its own clocks
-    with_times = replay(SAMPLE, folder / "own", *FAST)
+    with_times = replay_here(SAMPLE, folder / "own", *FAST)
     a, b = (np.loadtxt(folder / name / "trajectory.tum") for name in ("out", "own"))
     assert len(a) == len(b)
     assert with_times.status == 0
@@ -44,7 +45,7 @@ def test_aligned_by_rotation_and_said(folder: Path) -> None:
 
 
 def test_offset_that_is_given(folder: Path) -> None:
-    run = replay(folder, folder / "out", *FAST, f"--offset={true_offset_s():.3f}")
+    run = replay_here(folder, folder / "out", *FASTER, f"--offset={true_offset_s():.3f}")
     assert run.status == 0, run.stderr
     assert "rotation" not in run.stdout
     assert run.report["unit"] == "m"
@@ -54,7 +55,7 @@ def test_log_of_another_flight_is_refused(folder: Path) -> None:
     """The first ten seconds of the log say too little of the last thirty of the video."""
     log = (folder / "telemetry.tlog").read_bytes()
     (folder / "telemetry.tlog").write_bytes(log[: len(log) // 5])
-    line = refused(replay(folder, folder / "out", *FAST))
+    line = refused(replay_here(folder, folder / "out", *FAST))
     assert "--offset" in line
     assert "telemetry.tlog" in line
 
@@ -65,9 +66,11 @@ def test_log_elsewhere(folder: Path) -> None:
     (folder / "camera.mp4").rename(folder / "flown.mp4")
     (folder / "camera.json").rename(folder / "flown.json")
     log = folder / "elsewhere" / "a.tlog"
-    run = replay(folder / "flown.mp4", folder / "out", *FAST, "--log", str(log))
+    run = replay_here(folder / "flown.mp4", folder / "out", *FASTER, "--log", str(log))
     assert run.status == 0, run.stderr
     assert "a.tlog put on the time of flown.mp4" in run.stdout
     assert "no telemetry log" in refused(
-        replay(folder / "flown.mp4", folder / "out", *FAST, "--log", str(folder / "flown.json"))
+        replay_here(
+            folder / "flown.mp4", folder / "out", *FAST, "--log", str(folder / "flown.json")
+        )
     )

@@ -135,9 +135,7 @@ def test_key_outside_a_section(tmp_path: Path) -> None:
         ("router.clients=[1]", "`str`", "[1]"),
     ],
 )
-def test_wrong_value_says_what_was_wanted_and_given(
-    override: str, wanted: str, given: str
-) -> None:
+def test_wrong_value_says_what_was_wanted_and_given(override: str, wanted: str, given: str) -> None:
     message = refusal(None, override)
     assert override.split("=")[0] in message
     assert wanted in message.split(": ", 2)[2]

@@ -14,6 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from companion.app.bench.depth_accuracy import Accuracy, accuracy
+from companion.app.bench.depth_results import (
+    AfterFrames,
+    AsUsed,
+    AtThreshold,
+    DepthBench,
+    ReferenceAsUsed,
+    Timed,
+)
 from companion.app.bench.depth_tables import write_bench
 from companion.app.bench.remode_serial import RemodeSerial
 from companion.app.depth_command import Wanted, reconstruct
@@ -32,93 +40,6 @@ from drivers.datasets.posed_layouts import open_posed_images
 
 CHECKPOINTS = (1, 5, 10, 15, 20, 25, 30, 40, 50, 75, 100, 150, 200, 300, 400)
 THRESHOLDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-
-
-@dataclass(frozen=True, slots=True)
-class AfterFrames:
-    """State after some frames; `ms_per_frame` is wall time of updates and result."""
-
-    frames: int
-    still_updated: float
-    """share of the pixels"""
-    ms_per_frame: float
-    converged: Accuracy
-    all_pixels: Accuracy
-
-
-@dataclass(frozen=True, slots=True)
-class AtThreshold:
-    """Result for one least correlation of a matching image."""
-
-    min_zncc: float
-    converged: Accuracy
-
-
-@dataclass(frozen=True, slots=True)
-class Timed:
-    """One run over all frames: `update_s` for them, `finish_s` for the regularised result."""
-
-    name: str
-    update_s: float
-    finish_s: float
-    cpu_s: float
-    converged: Accuracy
-    all_pixels: Accuracy
-
-    @property
-    def wall_s(self) -> float:
-        """Seconds for updates and result."""
-        return self.update_s + self.finish_s
-
-
-@dataclass(frozen=True, slots=True)
-class ReferenceAsUsed:
-    """One reference with its own depth range, before and after the consensus with others."""
-
-    reference: int
-    alone_converged: Accuracy
-    alone_all: Accuracy
-    converged: Accuracy
-    all_pixels: Accuracy
-
-
-@dataclass(frozen=True, slots=True)
-class AsUsed:
-    """Result of `companion depth`: own depth ranges, all references.
-
-    `rows` are the references that have truth, `n_references` is the number of all. Times are per
-    reference, over all, with reading of images and search for ranges. `refused` is the reason where
-    there is no result, else empty.
-    """
-
-    n_references: int
-    wall_s: float
-    cpu_s: float
-    rows: tuple[ReferenceAsUsed, ...]
-    refused: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class DepthBench:
-    """All measurements; `searched` of `frames` images were searched for one reference."""
-
-    dataset: str
-    device: str
-    width: int
-    height: int
-    frames: int
-    searched: int
-    runs: tuple[Timed, ...]
-    kernel_ms: dict[str, float]
-    after_frames: tuple[AfterFrames, ...]
-    serial_after_frames: tuple[AfterFrames, ...]
-    thresholds: tuple[AtThreshold, ...]
-    as_used: AsUsed
-
-    @property
-    def speed_up(self) -> float | None:
-        """Wall time of the serial reference over ours; None where it was left out."""
-        return self.runs[1].wall_s / self.runs[0].wall_s if len(self.runs) > 1 else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,14 +7,14 @@ that errors are the same in each run; times are not.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.app.bench.injected_faults import FAULTS, NO_FAULT, Fault, Span
-from companion.app.bench.slam_tables import write_bench
+from companion.app.bench.slam_tables import BenchRow, write_bench
 from companion.app.progress import Progress
 from companion.config import Config
 from companion.errors import FlightError
@@ -23,7 +23,7 @@ from companion.geometry.transforms import Array, rotation_from_quaternion
 from companion.messages import Frame, Odometry, Track, TrackState
 from companion.products.flight_result import FlightResult
 from companion.products.surroundings import peak_memory_mb
-from companion.products.trajectory_error import Path, PathErrors, path_errors
+from companion.products.trajectory_error import Path, path_errors
 from companion.runtime.in_order import in_order_of_time
 from companion.timing.clock import StageTimes
 from drivers.open_flight import open_flight
@@ -34,45 +34,6 @@ FRAME_PARTS = ("features", "tracking", "initialising")
 NEES_NS = 10_000_000_000
 STEP_NS = 500_000_000
 """Longest interval between consecutive odometry poses."""
-
-
-@dataclass(frozen=True, slots=True)
-class BenchRow:
-    """Measurements of one flight under one fault; lengths in metres, times in milliseconds.
-
-    `tracked_share` is the share of frames tracked, of those that show something above the given
-    height. `live_ate_m` is the ATE of poses as first published, aligned by similarity.
-    `worst_step_m` is the largest error of the motion between consecutive poses of smooth odometry.
-    `nees` is the normalised estimation error squared of its position since its last reset, 1 where
-    its covariance is true; `nees_yaw` likewise of its heading against north, which errs slowly, so
-    that one flight gives few independent samples. `longest_gap_s` is the longest time without a
-    pose beyond image dropouts; `cost_growth` is the ratio of the median work per frame in the last
-    fifth of the flight to the second fifth.
-    """
-
-    flight: str
-    fault: str
-    frames: int
-    tracked_share: float
-    errors: PathErrors | None
-    live_ate_m: float | None
-    worst_step_m: float | None
-    nees: float | None
-    nees_yaw: float | None
-    resets: int
-    longest_gap_s: float
-    coasted: int
-    keyframes: int
-    segments: int
-    loops: int
-    scale_method: str
-    frame_ms_median: float
-    frame_ms_p95: float
-    mapping_ms_median: float
-    cost_growth: float
-    peak_memory_mb: float
-    warnings: tuple[str, ...] = ()
-    paths: tuple[Path, Path] | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

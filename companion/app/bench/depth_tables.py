@@ -8,171 +8,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from companion.app.bench.depth_accuracy import Accuracy
+from companion.app.bench.depth_results import AsUsed, DepthBench
 from companion.products.atomic_file import write_atomically
 
 
-class Run(Protocol):
-    """One timed run."""
-
-    @property
-    def name(self) -> str:
-        """Name of the implementation."""
-
-    @property
-    def wall_s(self) -> float:
-        """Wall time, seconds."""
-
-    @property
-    def cpu_s(self) -> float:
-        """Processor time over all cores, seconds."""
-
-    @property
-    def converged(self) -> Accuracy:
-        """Accuracy of converged pixels."""
-
-    @property
-    def all_pixels(self) -> Accuracy:
-        """Accuracy of the regularised result."""
-
-
-class Stand(Protocol):
-    """Result after some frames."""
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-
-    @property
-    def still_updated(self) -> float:
-        """Share of the pixels."""
-
-    @property
-    def ms_per_frame(self) -> float:
-        """Wall time."""
-
-    @property
-    def converged(self) -> Accuracy:
-        """Accuracy of converged pixels."""
-
-    @property
-    def all_pixels(self) -> Accuracy:
-        """Accuracy of all pixels."""
-
-
-class Threshold(Protocol):
-    """Result at one threshold."""
-
-    @property
-    def min_zncc(self) -> float:
-        """Least normalised correlation."""
-
-    @property
-    def converged(self) -> Accuracy:
-        """Accuracy of converged pixels."""
-
-
-class Reference(Protocol):
-    """One reference with its own depth range."""
-
-    @property
-    def reference(self) -> int:
-        """Number of its frame."""
-
-    @property
-    def alone_converged(self) -> Accuracy:
-        """Accuracy of converged pixels before the consensus with other references."""
-
-    @property
-    def alone_all(self) -> Accuracy:
-        """Accuracy of all pixels before it."""
-
-    @property
-    def converged(self) -> Accuracy:
-        """Accuracy of converged pixels in the end."""
-
-    @property
-    def all_pixels(self) -> Accuracy:
-        """Accuracy of all pixels in the end."""
-
-
-class Used(Protocol):
-    """All references, as `companion depth` computes them."""
-
-    @property
-    def n_references(self) -> int:
-        """With truth or without."""
-
-    @property
-    def wall_s(self) -> float:
-        """Seconds per reference."""
-
-    @property
-    def cpu_s(self) -> float:
-        """Processor seconds per reference, over all cores."""
-
-    @property
-    def rows(self) -> Sequence[Reference]:
-        """References with truth."""
-
-    @property
-    def refused(self) -> str:
-        """Reason why there is no result, or ""."""
-
-
-class Bench(Protocol):
-    """All measurements; any dataclass with these."""
-
-    @property
-    def dataset(self) -> str:
-        """Path of the data set."""
-
-    @property
-    def device(self) -> str:
-        """OpenCL device."""
-
-    @property
-    def frames(self) -> int:
-        """Number of images without the reference."""
-
-    @property
-    def searched(self) -> int:
-        """Number of images searched."""
-
-    @property
-    def runs(self) -> Sequence[Run]:
-        """Ours, then the serial reference."""
-
-    @property
-    def speed_up(self) -> float | None:
-        """Ratio of wall times."""
-
-    @property
-    def kernel_ms(self) -> dict[str, float]:
-        """Milliseconds of each kernel on the device."""
-
-    @property
-    def after_frames(self) -> Sequence[Stand]:
-        """Ours."""
-
-    @property
-    def serial_after_frames(self) -> Sequence[Stand]:
-        """The serial reference's."""
-
-    @property
-    def thresholds(self) -> Sequence[Threshold]:
-        """Ours."""
-
-    @property
-    def as_used(self) -> Used:
-        """Result of `companion depth`."""
-
-
-def tables(bench: Bench) -> str:
+def tables(bench: DepthBench) -> str:
     """Text tables; shares in percent of the pixels whose truth is known."""
     parts = [
         f"{bench.dataset}: {bench.frames} images taken, {bench.searched} of them searched\n"
@@ -209,7 +54,7 @@ def tables(bench: Bench) -> str:
     return "\n\n".join(parts)
 
 
-def _as_used(used: Used) -> str:
+def _as_used(used: AsUsed) -> str:
     title = "as a user runs it: ranges of depth found by itself, all references"
     if used.refused:
         return f"{title}\nnot measured: {used.refused}"
@@ -233,13 +78,13 @@ def _as_used(used: Used) -> str:
     return title + "\n" + _aligned(rows)
 
 
-def as_json(bench: Bench) -> str:
+def as_json(bench: DepthBench) -> str:
     """JSON of all results; null for unknown values."""
-    content = asdict(bench)  # type: ignore[call-overload]
+    content = asdict(bench)
     return json.dumps({**_finite(content), "speed_up": bench.speed_up}, indent=1, allow_nan=False)
 
 
-def write_bench(out: Path, bench: Bench) -> None:
+def write_bench(out: Path, bench: DepthBench) -> None:
     """Write depth_bench.json and depth_bench.png into folder `out`."""
     write_atomically(out / "depth_bench.json", as_json(bench).encode())
     figure = Figure(figsize=(11, 3.4), layout="constrained")

@@ -6,13 +6,14 @@ import io
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path as FilePath
-from typing import Any, Protocol
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from companion.products.atomic_file import write_atomically
+from companion.products.report.comparison_page import shown
 from companion.products.trajectory_error import Path, PathErrors, align, paired
 
 COLUMNS = (
@@ -28,41 +29,60 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class Row(Protocol):
-    """Fields of a row; any dataclass with the fields that `COLUMNS` names."""
+@dataclass(frozen=True, slots=True)
+class BenchRow:
+    """Measurements of one flight under one fault; lengths in metres, times in milliseconds.
 
-    @property
-    def flight(self) -> str:
-        """Name of the flight."""
+    `tracked_share` is the share of frames tracked, of those that show something above the given
+    height. `live_ate_m` is the ATE of poses as first published, aligned by similarity.
+    `worst_step_m` is the largest error of the motion between consecutive poses of smooth odometry.
+    `nees` is the normalised estimation error squared of its position since its last reset, 1 where
+    its covariance is true; `nees_yaw` likewise of its heading against north, which errs slowly, so
+    that one flight gives few independent samples. `longest_gap_s` is the longest time without a
+    pose beyond image dropouts; `cost_growth` is the ratio of the median work per frame in the last
+    fifth of the flight to the second fifth.
+    """
 
-    @property
-    def fault(self) -> str:
-        """Name of the fault."""
+    flight: str
+    fault: str
+    frames: int
+    tracked_share: float
+    errors: PathErrors | None
+    live_ate_m: float | None
+    worst_step_m: float | None
+    nees: float | None
+    nees_yaw: float | None
+    resets: int
+    longest_gap_s: float
+    coasted: int
+    keyframes: int
+    segments: int
+    loops: int
+    scale_method: str
+    frame_ms_median: float
+    frame_ms_p95: float
+    mapping_ms_median: float
+    cost_growth: float
+    peak_memory_mb: float
+    warnings: tuple[str, ...] = ()
+    paths: tuple[Path, Path] | None = field(default=None, repr=False, compare=False)
 
-    @property
-    def errors(self) -> PathErrors | None:
-        """Errors of the path."""
 
-    @property
-    def paths(self) -> tuple[Path, Path] | None:
-        """Estimated and true."""
-
-
-def numbers(row: Row) -> dict[str, Any]:
+def numbers(row: BenchRow) -> dict[str, Any]:
     """Fields of one row for JSON: errors inlined, no paths, null for unknown values."""
-    out = {f.name: getattr(row, f.name) for f in fields(row)}  # type: ignore[arg-type]
+    out = {f.name: getattr(row, f.name) for f in fields(row)}
     out.pop("paths"), out.pop("errors")
     errors = asdict(row.errors) if row.errors is not None else {}
     rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in errors.items()}
     return {k: _finite(v) for k, v in {**out, **rounded}.items()}
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[BenchRow]) -> str:
     """Text table of all rows; lengths in metres, times in milliseconds."""
     cells = [[title for title, _ in COLUMNS]]
     for row in rows:
         values = numbers(row)
-        cells.append([_shown(values.get(key)) for _, key in COLUMNS])
+        cells.append([shown(values.get(key)) for _, key in COLUMNS])
     widths = [max(len(line[i]) for line in cells) for i in range(len(COLUMNS))]
     return "\n".join(_line(line, widths) for line in cells)
 
@@ -73,12 +93,12 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
     return "  ".join(padded).rstrip()
 
 
-def as_json(rows: Sequence[Row]) -> str:
+def as_json(rows: Sequence[BenchRow]) -> str:
     """JSON of all rows; ValueError on nan, which JSON has not."""
     return json.dumps([numbers(row) for row in rows], indent=2, allow_nan=False)
 
 
-def write_bench(out: FilePath, rows: Sequence[Row]) -> None:
+def write_bench(out: FilePath, rows: Sequence[BenchRow]) -> None:
     """Write slam.json and a picture of each path against the truth into folder `out`."""
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / "slam.json", (as_json(rows) + "\n").encode())
@@ -88,7 +108,7 @@ def write_bench(out: FilePath, rows: Sequence[Row]) -> None:
             write_atomically(out / f"{name}.svg", picture(row))
 
 
-def picture(row: Row) -> bytes:
+def picture(row: BenchRow) -> bytes:
     """SVG: plan view of both paths and the error over time, after alignment by similarity."""
     assert row.paths is not None
     found, wanted = paired(*row.paths)
@@ -110,12 +130,6 @@ def picture(row: Row) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
-
-
-def _shown(value: object) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _finite(value: Any) -> Any:

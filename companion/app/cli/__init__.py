@@ -65,7 +65,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _readers_gone() -> bool:
-    """Whether standard output or error is a pipe without a reader; such a one leads nowhere then.
+    """Redirect standard output and error to the null device where their reader is gone; True if so.
 
     What is still buffered for it would fail once more when the interpreter ends.
     """

@@ -15,6 +15,9 @@ from companion.errors import InputError
 
 
 def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from drivers.system.heap import bound_heap
+
+    bound_heap()
     from companion.daemon.nodes.node_config import with_stages
 
     def load() -> Config:

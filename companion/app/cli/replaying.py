@@ -40,29 +40,23 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         from companion.products.export.exports import check_formats
 
         check_formats(config.export)
+    progress = signals.between_frames(progress_on(sys.stderr))
     if arguments.as_flown:
         if arguments.paced or (arguments.start, arguments.stop) != (None, None):
             raise InputError("--as-flown replays a whole flight, in the order in which it came")
         from companion.app.as_flown import replay_as_flown
 
-        progress = signals.between_frames(progress_on(sys.stderr))
         replay_as_flown(arguments.flight, arguments.out, config, progress, print)
         signals.take()
         return 0
+    from companion.app.replay_command import RecordedInput, replay
+
     if arguments.paced:
         from companion.app.paced_replay import replay_paced as replay
-    else:
-        from companion.app.replay_command import replay
-    replay(
-        arguments.flight,
-        arguments.out,
-        config,
-        start_s=arguments.start,
-        stop_s=arguments.stop,
-        viewer=arguments.viewer,
-        progress=signals.between_frames(progress_on(sys.stderr)),
-        notify=print,
-    )
+    given = RecordedInput(arguments.flight, config, arguments.start, arguments.stop)
+    for remark in given.log.remarks:
+        print(f"telemetry: {remark}")
+    replay(given, arguments.out, config, arguments.viewer, progress, print)
     if config.export.formats:
         _export_into(arguments.out, arguments.out, config.export)
     print(f"report: {arguments.out / 'report.html'}")

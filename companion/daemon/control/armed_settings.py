@@ -19,7 +19,7 @@ from companion.daemon.control.tightening import WHILE_ARMED, tightened
 from companion.errors import ConfigError
 
 FILE = ".armed.json"
-"""In the folder of flights, the one place that the daemon can certainly write to."""
+"""Name in the folder of flights, the one place that the daemon can certainly write to."""
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """Random id of each boot of the computer (random(4))."""
 ANOTHER_BOOT = "unknown"

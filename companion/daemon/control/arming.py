@@ -30,9 +30,10 @@ SAME_BOOT_S, SAME_BOOT_SHARE = 5.0, 0.02
 
 
 class Arming:
-    """Used in the event loop. `boot_s` is the boot time of the autopilot (CLOCK_MONOTONIC).
+    """State of the motors, and the changes held until disarming. Used in the event loop.
 
-    `before` is left by a daemon that ended while armed. `heard` is whether the autopilot is heard.
+    `before` is left by a daemon that ended while armed. `boot_s` is the boot time of the autopilot
+    (CLOCK_MONOTONIC), None while unknown; `heard` is True while the autopilot is heard.
     """
 
     def __init__(
@@ -47,12 +48,12 @@ class Arming:
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are armed; before the first report, whether they last were."""
+        """True while the motors are armed; before the first report, as of the previous process."""
         return self._held is not None if self._said is None else self._said
 
     @property
     def holds(self) -> bool:
-        """Whether a change is held until disarming."""
+        """True while changes are held back until disarming."""
         return self._held is not None
 
     def resume(self, read: Config) -> Resumed:
@@ -85,7 +86,7 @@ class Arming:
             self._put(replace(held, autopilot_boot_s=self._boot_s(), written_s=now_s))
         if self._disarmed_s is None or now_s - self._disarmed_s < CERTAIN_S or not self._heard():
             return False
-        # with another start of the computer all was without power, which nobody survives in the air
+        # after a reboot of the computer: the power was off, so that the vehicle was on the ground
         return held.computer_boot != computer_boot() or self._is_same_boot(now_s)
 
     def hold(self, config: Config, by_ground: Mapping[str, Any], now_s: float) -> None:
@@ -107,7 +108,7 @@ class Arming:
         self._file.put(encoded(settings))
 
     def _is_same_boot(self, now_s: float) -> bool:
-        """Whether the autopilot still runs in the boot in which it was armed."""
+        """True if the autopilot has not rebooted since it was armed; False where unknown."""
         held, boot_s = self._held, self._boot_s()
         if held is None or held.autopilot_boot_s is None or boot_s is None:
             return False

@@ -24,7 +24,7 @@ class FlightParameter:
     name: str
     full_key: str
     at_once: bool = False
-    """Whether it takes effect at once; else with the next map."""
+    """True if a change takes effect at once; else it does with the next map."""
 
 
 def _table() -> dict[str, FlightParameter]:

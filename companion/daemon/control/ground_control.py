@@ -77,7 +77,7 @@ class Controlled(Protocol):
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are armed; the last known state where nothing is heard."""
+        """True while the motors are armed; the last known state while the autopilot is silent."""
 
     def take_over(self, config: Config) -> None:
         """Continue with another configuration."""

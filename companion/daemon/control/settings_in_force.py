@@ -26,11 +26,11 @@ from drivers.system.journal import ERROR, INFO, WARNING, Journal
 
 
 class SettingsInForce:
-    """Used in the event loop. While armed settings only tighten; the rest waits for disarming.
+    """Configuration in force. While armed it only tightens; the rest waits for disarming.
 
-    `load` reads the configuration; CompanionError where it cannot be. `boot_s` is the boot time of
-    the autopilot (CLOCK_MONOTONIC), `heard` whether it is heard. `not_kept` hears, in any thread,
-    why the settings could not be written; `applied` the old and the new configuration.
+    Used in the event loop. `load` reads the configuration; CompanionError where it cannot be.
+    `boot_s` and `heard` as in `Arming`. `not_kept` takes, in any thread, the reason why the
+    settings could not be written; `applied` the old and the new configuration.
     """
 
     def __init__(
@@ -50,13 +50,13 @@ class SettingsInForce:
         self.by_ground |= resumed.by_ground
         """Values set from the ground, by key; changed in place."""
         self._stays_off = resumed.by_ground.get("feedback.mode") == "off"
-        """Whether the pilot is still to be told so, once the link is up."""
+        """True until the pilot was told, over the open link, that poses stay off."""
         if before is not None:
             self._say_resumed(resumed.by_ground, resumed.waiting, unreadable)
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are armed; the last known state where nothing is heard."""
+        """True while the motors are armed; the last known state while the autopilot is silent."""
         return self._arming.armed
 
     def set_armed(self, armed: bool) -> None:
@@ -84,7 +84,7 @@ class SettingsInForce:
         if self._arming.holds:
             for name in list(self._arming.waiting):
                 if value_of_key(config, name) != value_of_key(old, name):
-                    del self._arming.waiting[name]  # whoever has set it since has the last word
+                    del self._arming.waiting[name]  # set since: the later value counts
             if config.feedback.mode == "off" != old.feedback.mode and not config.control.keep:
                 self._arming.waiting["feedback.mode"] = old.feedback.mode
             self._hold()

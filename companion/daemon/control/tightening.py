@@ -14,7 +14,7 @@ from companion.config import Config
 from companion.config_file import value_of_key, with_values
 
 MayChange = Callable[[Any, Any], bool]
-"""Whether a value may be replaced by another while armed."""
+"""Rule of a key: (present value, wanted value) -> True if it may change while armed."""
 
 
 def _to_less(now: float, wanted: float) -> bool:
@@ -63,7 +63,7 @@ WHILE_ARMED: Mapping[str, MayChange] = {
 
 
 def may_change(name: str, now: Any, wanted: Any) -> bool:
-    """Whether a key may change to a value while armed; always for keys without influence."""
+    """True if a key may change to a value while armed; always so for keys without a rule."""
     return WHILE_ARMED.get(name, _freely)(now, wanted)
 
 

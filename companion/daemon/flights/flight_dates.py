@@ -33,10 +33,11 @@ class _Flight:
 
 
 class FlightDates:
-    """`ahead_ns` is the autopilot's date minus the flight's clock, None without one.
+    """Dates of the flights of this run of the daemon, and their correction.
 
-    `is_set` is whether the system's clock is synchronised. For the event loop, except `ended` and
-    `write`, which wait for the disk.
+    `ahead_ns` is the autopilot's date minus the flight's clock, None without one; `is_set` is True
+    if the system's clock is synchronised. For the event loop, except `ended` and `write`, which
+    wait for the disk.
     """
 
     def __init__(
@@ -127,7 +128,7 @@ class FlightDates:
             found = _plausible(now_ns, autopilot_ns, "the autopilot")
             if found is not None:
                 return found
-        if abs(set_ns) >= WRONG_NS:  # whoever sets a clock knows better than who started it
+        if abs(set_ns) >= WRONG_NS:  # set since the start
             return _plausible(now_ns, set_ns, "the system's clock, which was set")
         return None
 

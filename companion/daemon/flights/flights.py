@@ -44,7 +44,7 @@ class Flights:
 
     @property
     def stages_up(self) -> bool:
-        """Whether the current flight, or else the one on standby, can take frames."""
+        """True if the current flight, or else the one on standby, can take frames."""
         flight = self.current or self._standby
         return flight is not None and flight.stages_up
 
@@ -83,7 +83,7 @@ class Flights:
         thread.start()
 
     def is_standby(self, flight: LiveFlight) -> bool:
-        """Whether a flight is the one on standby."""
+        """True if a flight is the one on standby."""
         return self._standby is flight
 
     def discard_standby(self) -> None:

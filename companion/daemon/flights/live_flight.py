@@ -73,15 +73,15 @@ class LiveFlight:
         self.folder: Path | None = None
         """Folder of the results; None before the begin."""
         self.keep_map = False
-        """Whether the vehicle flies on without it, and the next process may continue its map."""
+        """True at the end of a process in the air: the next process may continue the map."""
         self.n_frames = 0
         self._flies = False
-        """Whether all stages take what comes: none gets anything before the recorder does."""
+        """True once the stages take messages: none gets any before the recorder does."""
         self._viewing: Viewing | None = None
         self._health_ns = 0
         self._origin: GeoOrigin | None = None
         self.has_origin = False
-        """Whether the map is georeferenced to the autopilot's origin."""
+        """True once the map is georeferenced to the autopilot's origin."""
         self._dense = makes_depth(config)
         self._dense_share = 1.0
         self._processes = Processes(
@@ -103,12 +103,12 @@ class LiveFlight:
 
     @property
     def ready(self) -> bool:
-        """Whether frames are processed as they come."""
+        """True while frames are processed as they come."""
         return self.folder is not None and self.stages["localisation"].progress is not None
 
     @property
     def stages_up(self) -> bool:
-        """Whether every stage that can run is up, or has failed to start and is retried."""
+        """True if every stage that can run is up, or has failed to start and is retried."""
         return self._processes.up
 
     def begin(self, folder: Path, keep: KeepMap | None = None) -> None:
@@ -157,7 +157,7 @@ class LiveFlight:
 
     @property
     def dense(self) -> bool:
-        """Whether the dense map is made."""
+        """True while the dense map is made."""
         return self._dense
 
     def set_dense(self, dense: bool) -> None:
@@ -287,10 +287,10 @@ def stages_of(config: Config) -> list[Stage]:
 
 
 def depth_elsewhere(config: Config) -> bool:
-    """Whether another machine makes the dense map, if any does."""
+    """True if another machine makes the dense map."""
     return config.distributed.enabled and "depth" not in config.distributed.stages
 
 
 def makes_depth(config: Config) -> bool:
-    """Whether the dense map is made here."""
+    """True if the dense map is made on this machine."""
     return config.depth.enabled and not depth_elsewhere(config)

@@ -13,7 +13,7 @@ READY_PERCENT = 90
 
 
 class NewMap:
-    """To be used in the event loop; `prepare` starts the stages, `begin` begins a flight."""
+    """Change to a new map. Used in the event loop; `prepare` and `begin` are of the next flight."""
 
     def __init__(
         self, flights: Flights, prepare: Callable[[], None], begin: Callable[[], None]

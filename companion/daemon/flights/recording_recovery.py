@@ -23,7 +23,7 @@ CUT_SHORT = "an earlier recording was cut short"
 
 
 class RecordingRecovery:
-    """Used in the event loop. `warn` takes a warning for each recording."""
+    """Repairs recordings in a process. Used in the event loop; `warn` takes a warning for each."""
 
     def __init__(
         self, flights: Path, clock: FlightClock, warn: Callable[[Warned], None],

@@ -16,7 +16,7 @@ RESULTS_GONE = "the results stage has died"
 
 
 class Snapshots:
-    """One at a time; to be used in the event loop.
+    """Cloud snapshots, one at a time. Used in the event loop.
 
     `tell` takes the pilot's text, the journal's text, and whether it is good news.
     """

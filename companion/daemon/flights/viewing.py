@@ -48,7 +48,7 @@ class Viewing:
         self._config, self._camera, self._name, self._warn = config, camera, name, warn
         self._stream = config.stream
         self.pictures = True
-        """Whether images are sent to viewers."""
+        """True while images are sent to viewers."""
         self._n_dropped = self._n_seen = self._n_restarted = 0
         self._where = config.daemon.viewer
         self._last_warning = ""

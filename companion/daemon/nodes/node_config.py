@@ -10,7 +10,7 @@ from companion.errors import InputError
 
 TRACKING, DEPTH, CLOUD = "tracking", "depth", "cloud"
 SETS = (frozenset({TRACKING}), frozenset({DEPTH, CLOUD}), frozenset({TRACKING, DEPTH, CLOUD}))
-"""What a node can run: depth and cloud share their depth maps, which are too large for a link."""
+"""Sets of stages that a node can run: depth maps are too large for a link to the cloud."""
 
 
 def with_stages(config: Config, stages: Sequence[str] | None, join: Sequence[str]) -> Config:

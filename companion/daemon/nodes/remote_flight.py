@@ -54,7 +54,7 @@ class RemoteFlight:
         self._mirror = MapMirror()
         self._update: MapUpdate | None = None
         self._is_new = False
-        """Whether points are made here; those before were found."""
+        """True while new points are made; those found in the folder come first."""
         self._numbers: OrderedDict[int, tuple[str, int]] = OrderedDict()
         self._viewing: Viewing | None = None
         if config.stream.listen or config.daemon.viewer != "none":

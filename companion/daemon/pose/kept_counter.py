@@ -79,7 +79,7 @@ class CounterFile:
         threading.Thread(target=self._write, name="reset counter", daemon=True).start()
 
     def has(self, kept: KeptCounter) -> bool:
-        """Whether it is on disk."""
+        """True if this counter is on disk."""
         with self._lock:
             return self._written == kept
 

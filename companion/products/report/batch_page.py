@@ -4,50 +4,35 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
-
-class Row(Protocol):
-    """One flight."""
-
-    @property
-    def name(self) -> str:
-        """Name of its folder beside the page."""
-
-    @property
-    def flight(self) -> Path:
-        """Path of its source."""
-
-    @property
-    def error(self) -> str:
-        """Error message; "" without one."""
-
-    @property
-    def report(self) -> dict[str, Any]:
-        """Numbers of its report."""
+from companion.products.report.templates import rendered
 
 
-def batch_page(rows: Sequence[Row], pictures: Mapping[str, bytes]) -> bytes:
+@dataclass(frozen=True, slots=True)
+class BatchResult:
+    """Outcome of one flight: `error`, or "" and the numbers of its `report`."""
+
+    name: str
+    flight: Path
+    error: str
+    report: dict[str, Any]
+    done_before: bool = False
+
+
+def batch_page(rows: Sequence[BatchResult], pictures: Mapping[str, bytes]) -> bytes:
     """HTML with the pictures, JPEG by name, embedded; links to the reports."""
-    environment = Environment(
-        loader=PackageLoader("companion.products.report", ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template("batch.html.j2").render(
+    return rendered(
+        "batch.html.j2",
         rows=[_shown(row, pictures.get(row.name, b"")) for row in rows],
         n_failed=sum(bool(row.error) for row in rows),
     )
-    return page.encode("utf-8")
 
 
-def _shown(row: Row, picture: bytes) -> dict[str, Any]:
+def _shown(row: BatchResult, picture: bytes) -> dict[str, Any]:
     report = row.report
     unit = report.get("unit") or ""
     duration_s, length = report.get("duration_s"), report.get("path_length")

@@ -71,7 +71,7 @@ class Comparison:
 
     @property
     def identical(self) -> bool:
-        """Whether poses and cloud are equal to the last bit."""
+        """True if poses and cloud are equal to the last bit."""
         return all(self.same_files.values())
 
 
@@ -161,7 +161,7 @@ def _side_by_side(
 
 
 def _settings(report: Mapping[str, Any]) -> dict[str, Any]:
-    """By the keys of this version; what is a constant now only where it was another."""
+    """Settings by the keys of this version; a constant of now only where it was another value."""
     values = _flat(report.get("config")).items()
     return {current_key(k) or k: v for k, v in values if CONSTANTS.get(k) != v}
 

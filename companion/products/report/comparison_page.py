@@ -7,12 +7,12 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from companion.geometry.transforms import Array
 from companion.products.report.comparison import Comparison, numbers
+from companion.products.report.templates import rendered
 
 A, B, DIFFERENCE = "#9aa0a6", "#0b6bcb", "#d64545"
 STYLE: Any = {
@@ -26,20 +26,12 @@ MAX_POINTS = 3000
 
 def comparison_page(found: Comparison, name_a: str, name_b: str) -> bytes:
     """HTML with all styles and plots embedded."""
-    environment = Environment(
-        loader=PackageLoader("companion.products.report", ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(shown=shown)
     with matplotlib.rc_context(STYLE):
-        page = environment.get_template("comparison.html.j2").render(
+        return rendered(
+            "comparison.html.j2", shown,
             n=numbers(found), a=name_a, b=name_b, stages=found.stages,
             path=_path(found), cloud=_cloud(found),
         )  # fmt: skip
-    return page.encode("utf-8")
 
 
 def shown(value: Any) -> str:

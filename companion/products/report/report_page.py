@@ -9,7 +9,6 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from companion.geometry.transforms import Array
@@ -17,6 +16,7 @@ from companion.products.cloud import Cloud
 from companion.products.flight_result import FlightResult, RunFacts, WorldPose
 from companion.products.report import plots
 from companion.products.report.cloud_views import CloudView, cloud_views
+from companion.products.report.templates import rendered
 
 N_DEPTH_PICTURES = 6
 LAST_CENTURY_NS = 946_684_800 * 10**9
@@ -31,16 +31,12 @@ def report_page(
     numbers: dict[str, Any],
 ) -> bytes:
     """HTML with all styles and pictures embedded; `numbers` are those of report.json."""
-    environment = Environment(
-        loader=PackageLoader("companion.products.report", ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(distance=distance, thousands=thousands, number=number)
     segments = path_segments(poses)
-    page = environment.get_template("report.html.j2").render(
+    return rendered(
+        "report.html.j2",
+        distance,
+        thousands,
+        number,
         n=numbers,
         when=when(result.first_t_ns),
         plots=_plots(result, facts, segments, numbers["duration_s"]),
@@ -50,7 +46,6 @@ def report_page(
         stages={**numbers["stages"], **kernel_stages(result)},
         config=json.dumps(numbers["config"], indent=2, ensure_ascii=False),
     )
-    return page.encode("utf-8")
 
 
 def kernel_stages(result: FlightResult) -> dict[str, dict[str, float]]:

@@ -31,7 +31,7 @@ images, patches = given(types.uint8, 2), given(types.uint8, 3)
 
 
 cache_errors: list[str] = []
-"""Why kernels could not be cached or loaded, in words; each start then compiles them."""
+"""Reasons why kernels could not be cached or loaded; each start then compiles them."""
 
 
 def compiled(*arguments: Any) -> Callable[[Loop], Loop]:

@@ -154,7 +154,7 @@ def align(
     grey: Bytes, centre: Array, stored_level: Ints, image_from_patch: Array, image: Bytes,
     half_image: Bytes, quarter_image: Bytes, pixels: Array, max_move_px: Array,
 ) -> tuple[Array, Bools]:  # fmt: skip
-    """As `companion.slam.features.patches.align`."""
+    """Alignment of patches, see `companion.slam.features.patches.align`."""
     found, sure = pixels.copy(), np.zeros(len(pixels), np.bool_)
     back, position, work = np.empty((2, 2)), np.empty(2), np.empty((4, _SIDE, _SIDE))
     for i in range(len(pixels)):

@@ -24,13 +24,13 @@ class View:
     point_ids: Ints
     n_matches: int = 0
     map_from_camera_rotation: Array | None = None
-    """by the autopilot, in the axes of the current map"""
+    """Rotation (3, 3) by the autopilot, in the axes of the current map."""
     normalised: Array | None = None
     whitening: Array | None = None
     refined_for: Ints | None = None
-    """as of a keyframe, once the frame was tracked"""
+    """(N,) as of a keyframe; None until the frame is tracked."""
     information: Array | None = None
-    """(6, 6) of the pose: rotation, translation in the camera frame"""
+    """Information (6, 6) of the pose: rotation, translation in the camera frame."""
 
     @property
     def centre(self) -> Array:

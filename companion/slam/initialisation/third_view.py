@@ -27,7 +27,7 @@ def middle_view(views: Iterable[View], first: View, second: View) -> View | None
 def third_view_rejects(
     third: View, first: View, second: View, points_map: Array, features_first: Ints
 ) -> bool:
-    """Whether a view between two fits their points (N, 3) from no pose.
+    """True if no pose of a view between two fits their points (N, 3).
 
     `first` and `second` have poses; `features_first` (N,) observe the points.
     """

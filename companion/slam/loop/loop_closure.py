@@ -42,7 +42,7 @@ class LoopClosure:
 
 
 LoopCheck = Callable[[LoopClosure, bool], bool]
-"""Whether other information allows a loop closure, and whether it is within one map."""
+"""Test of a loop closure by other measurements; its second argument is True within one map."""
 
 
 class LoopDetector:

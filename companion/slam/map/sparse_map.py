@@ -43,13 +43,13 @@ class Keyframe:
     point_ids: Ints
     normalised: Array
     whitening: Array
-    """(N, 2), (N, 2, 2) as those of the features, refined where patch alignment succeeded"""
+    """(N, 2), (N, 2, 2) as those of the features, refined where patch alignment succeeded."""
     refined_for: Ints
-    """(N,) the point whose patch refined each feature, -1 where none did"""
+    """Point (N,) whose patch refined each feature, -1 where none did."""
     grey: Bytes | None = None
-    """the image, while patch alignment may still use it"""
+    """Image (H, W), while patch alignment may still use it."""
     ned_from_camera: Array | None = None
-    """(3, 3) attitude by the autopilot, where measured"""
+    """Attitude (3, 3) by the autopilot, where measured."""
 
     @property
     def centre(self) -> Array:
@@ -97,7 +97,7 @@ class SlamMap:
     first_keyframe_id: int = -1
     """Identifies the map among others; -1 before initialisation."""
     level: bool = False
-    """Whether the z axis is gravity-aligned (down)."""
+    """True if the z axis is gravity-aligned (down)."""
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     """Ordered by id."""
     retired: dict[int, Retired] = field(default_factory=dict)
@@ -109,31 +109,31 @@ class SlamMap:
     alive: Bools = field(default_factory=lambda: np.zeros(0, bool))
     descriptors: Bytes = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
     normals: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    """mean viewing direction, from point to camera"""
+    """Mean viewing direction (P, 3), from point to camera."""
     base_distance: Array = field(default_factory=lambda: np.zeros(0))
-    """distance at which the point would be detected at pyramid level 0"""
+    """Distance (P,) at which the point would be detected at pyramid level 0, map units."""
     n_visible: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     n_found: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     n_observers: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     observers: Ints = field(default_factory=lambda: np.zeros((0, N_OBSERVERS_KEPT), np.int64))
-    """ids of the latest keyframes to observe the point, unordered, -1 padded; may be outdated"""
+    """Ids of the latest keyframes to observe the point, unordered, -1 padded; may be outdated."""
     born: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """keyframe id at which the point was created"""
+    """Id (P,) of the keyframe at which the point was created."""
     first_seen: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """keyframe id of the reference view of the patch"""
+    """Id (P,) of the keyframe with the reference view of the patch."""
     _centres: Array | None = None
     _ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     first_unproject: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     """Jacobian of the reference view's normalised coordinates by its pixels"""
     patch_at: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """row of a point's patch in `patch_grey`, while the point is alive"""
+    """Row (P,) of a point's patch in `patch_grey`, while the point is alive."""
     patch_centre: Array = field(default_factory=lambda: np.zeros((0, 2)))
     patch_level: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     patch_grey: Bytes = field(default_factory=lambda: np.zeros((0, STORED, STORED), np.uint8))
     _free: list[int] = field(default_factory=list)
-    """rows of patches of removed points"""
+    """Rows of patches of removed points."""
     _free_ids: list[int] = field(default_factory=list)
-    """point ids to recycle, the lowest last"""
+    """Point ids to recycle, the lowest last."""
     _quarantined_ids: list[int] = field(default_factory=list)
     _quarantine_age: int = 0
 

@@ -226,7 +226,7 @@ def _needs_pose_graph(found: LoopClosure) -> bool:
 
 
 def _within_drift(found: LoopClosure) -> bool:
-    """Whether drift along the path between the two keyframes explains the loop error."""
+    """True if drift along the path between the two keyframes explains the loop error."""
     first, last = sorted((found.keyframe.keyframe_id, found.relocalised.keyframe.keyframe_id))
     centres = np.stack(
         [k.centre for key, k in found.there.keyframes.items() if first <= key <= last]

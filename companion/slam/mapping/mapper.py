@@ -34,7 +34,8 @@ WINDOW, N_FIXED = 10, 10
 """Keyframes adjusted together, and older ones with the same points that are held fixed. Half or
 twice as many of either change the error of the sample flight, 53 mm, by 4 mm at most."""
 ITERATIONS = 6
-"""Of a local adjustment: the next keyframe repeats most of it. 3 and 12 end within 5 mm of it."""
+"""Iterations of a local adjustment, most of which the next keyframe repeats. 3 and 12 end within
+5 mm of it."""
 KEYFRAME_SPACING_DEG = 1.0
 """Keyframes closer than this are culled if redundant: a third of what tracking inserts one for."""
 N_IMAGES_KEPT = 100

@@ -18,11 +18,11 @@ IdleWork = Callable[[Callable[[], None]], None]
 """Work for idle time; it calls its argument every few milliseconds."""
 MAX_QUEUED = 2
 LONGEST_TURN_S = 60.0
-"""Of mapping, before a frame's turn comes, where their order is given."""
+"""Longest wait of a frame for its place in a given order of mapping and frames."""
 
 
 class OrderError(CompanionError):
-    """Mapping does not come to the point at which a frame was tracked."""
+    """The given order cannot be kept: mapping never reaches the point of a frame."""
 
     def __init__(self, point: int, wanted: int) -> None:
         super().__init__(f"mapping stands at point {point}, and a frame was tracked at {wanted}")
@@ -146,7 +146,7 @@ class MappingWorker(Protocol):
 
     @property
     def busy(self) -> bool:
-        """Whether the queue is so long that another keyframe would be mapped too late."""
+        """True if the queue is so long that another keyframe would be mapped too late."""
 
     def submit(self, job: Job) -> None:
         """Queue a job."""
@@ -197,7 +197,7 @@ class BackgroundMapping:
 
     @property
     def busy(self) -> bool:
-        """Whether the queue is so long that another keyframe would be mapped too late."""
+        """True if the queue is so long that another keyframe would be mapped too late."""
         return self._waiting >= MAX_QUEUED
 
     def submit(self, job: Job) -> None:

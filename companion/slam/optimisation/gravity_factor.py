@@ -14,9 +14,9 @@ import numpy as np
 from companion.geometry.transforms import Array, skew
 
 MIN_SIGMA_RAD, MAX_SIGMA_RAD = np.radians(0.3), np.radians(1.0)
-"""Larger disagreement is due to the map, not the attitude,"""
+"""Bounds of the standard deviation: larger disagreement is due to the map, not the attitude."""
 MAX_DISAGREEMENT_RAD = np.radians(4.0)
-"""or the attitude is not that of the camera."""
+"""Disagreement beyond which the attitude is not that of the camera."""
 CORRELATION_INFLATION = 2.0
 """Inflation of sigma, as consecutive attitude errors are correlated."""
 HUBER = 2.0

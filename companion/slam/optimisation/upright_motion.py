@@ -11,6 +11,7 @@ import numpy as np
 
 from companion.geometry.transforms import Array, Pose, rotation_from_vector, skew
 from companion.slam.features.orb_features import Bools, Ints
+from companion.slam.optimisation.upright_pose import rotations_about_z
 
 N_SAMPLES = 120
 N_FIRST, N_KEPT = 100, 8
@@ -101,11 +102,7 @@ def three_point_motions(rays_a: Array, rays_b: Array) -> tuple[Array, Array]:
     each = np.arange(len(which))
     translations, size = across[each, longest], size[each, longest]
     good = size > EPSILON
-    rotations = np.zeros((len(which), 3, 3))
-    rotations[:, 0, 0] = rotations[:, 1, 1] = cosine
-    rotations[:, 0, 1], rotations[:, 1, 0] = -sine, sine
-    rotations[:, 2, 2] = 1.0
-    return rotations[good], translations[good] / size[good, None]
+    return rotations_about_z(cosine, sine)[good], translations[good] / size[good, None]
 
 
 def _normals(rays_a: Array, rays_b: Array, cosine: Array, sine: Array) -> Array:

@@ -41,6 +41,15 @@ def upright_pose(
     return Pose(rotations[best], shifts[best]), agree[best]
 
 
+def rotations_about_z(cosine: Array, sine: Array) -> Array:
+    """Rotations (N, 3, 3) about the z axis by angles of these cosines and sines (N,)."""
+    rotations = np.zeros((len(cosine), 3, 3))
+    rotations[:, 0, 0] = rotations[:, 1, 1] = cosine
+    rotations[:, 0, 1], rotations[:, 1, 0] = -sine, sine
+    rotations[:, 2, 2] = 1.0
+    return rotations
+
+
 def _from_pairs(rays: Array, points: Array) -> tuple[Array, Array]:
     """Rotations (M, 3, 3) about z and translations (M, 3) that put pairs of points on their rays.
 
@@ -69,11 +78,7 @@ def _from_pairs(rays: Array, points: Array) -> tuple[Array, Array]:
     good = enough[:, None] & (depths > 0).all(2)
     before = np.arctan2(difference[:, 1], difference[:, 0])
     heading = (np.arctan2(rotated[..., 1], rotated[..., 0]) - before[:, None])[good]
-    cos, sin = np.cos(heading), np.sin(heading)
-    rotations = np.zeros((len(cos), 3, 3))
-    rotations[:, 0, 0] = rotations[:, 1, 1] = cos
-    rotations[:, 0, 1], rotations[:, 1, 0] = -sin, sin
-    rotations[:, 2, 2] = 1.0
+    rotations = rotations_about_z(np.cos(heading), np.sin(heading))
     which = np.nonzero(good)[0]
     on_ray = depths[good][:, :1] * first[which]
     return rotations, on_ray - np.einsum("nij,nj->ni", rotations, points[which, 0])

@@ -44,7 +44,7 @@ class FrameTracker:
         self.local = np.zeros(0, np.int64)
 
     def too_few_features(self, view: View) -> bool:
-        """Whether a view has too few features to be tracked."""
+        """True if a view has too few features to be tracked."""
         return len(view.features) < self._config.min_inliers
 
     def match(

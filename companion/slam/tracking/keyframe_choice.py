@@ -21,7 +21,7 @@ MIN_SHARED, MAX_PARALLAX_RATIO = 0.5, 0.75
 
 
 def needs_keyframe(slam_map: SlamMap, reference: Keyframe, view: View, since_ns: int) -> bool:
-    """Whether a view shows enough that `reference`, in use since `since_ns`, does not."""
+    """True if a view shows enough that `reference`, in use since `since_ns`, does not."""
     share = view.n_inliers / max(len(_well_observed(slam_map, reference)), 1)
     parallax_deg = _parallax_deg(slam_map, reference, view)
     late = view.t_ns - since_ns > MAX_S * 1e9 and parallax_deg > 0.5

@@ -286,7 +286,7 @@ class Tracker:
         return self._frame_tracker.verify(view, relocalised)
 
     def _may_restart(self, t_ns: int, has_attitude: bool) -> bool:
-        """Whether tracking has been lost for long enough to initialise another map."""
+        """True if tracking has been lost for long enough to initialise another map."""
         since = self._lost_since_ns
         if since is not None and t_ns < since:
             return False  # relocalisation in a stored map is still being tried
@@ -311,7 +311,7 @@ class Tracker:
     # -- keyframes ------------------------------------------------------------------------------
 
     def _needs_keyframe(self, view: View) -> bool:
-        """Whether no keyframe makes a view redundant; an equivalent one becomes the reference."""
+        """True if no keyframe makes a view redundant; an equivalent one becomes the reference."""
         reference = self._reference
         if reference is not None and reference.keyframe_id not in self.map.retired:
             since_ns = (
@@ -351,7 +351,7 @@ class Tracker:
 
 
 def _rotation_plausible(view: View, prior: Prior) -> bool:
-    """Whether the rotation of a pose agrees with the prediction by attitude."""
+    """True if the rotation of a pose agrees with the prediction by attitude, or there is none."""
     if prior.map_from_camera is None or prior.ned_from_camera is None:
         return True
     off_rad = angle_between(prior.map_from_camera.rotation, view.camera_from_map.rotation.T)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from types import TracebackType
 
 from companion.config import ViewerConfig
 from companion.geometry.camera import Camera
@@ -21,7 +20,7 @@ CAPACITY_BYTES = 64 << 20
 
 
 class FileViewer:
-    """All messages into a .rrd file: the caller waits when the file cannot keep up.
+    """Writer of all messages into a .rrd file; the caller waits where it cannot keep up.
 
     At most `rrd_mb` of the newest are kept, in several files. An error of the thread is raised when
     the file is closed, and not before. `indexed` is not for long flights, see RrdFiles.
@@ -46,12 +45,7 @@ class FileViewer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._inbox.close()
         self._thread.join()
         self._files.close()

@@ -19,7 +19,7 @@ RANGES = {"Quality": (0.0, 105.0), "Poses": (0.0, 120.0)}
 PLOTTED_S = 120.0
 BACKGROUND = [20, 22, 26]
 ZOOM = 17.0
-"""About a metre per point of the screen."""
+"""Zoom of the map of the earth: about a metre per pixel of the screen."""
 
 
 def layout(*, live: bool) -> rrb.Blueprint:

@@ -20,10 +20,11 @@ LOOK_EVERY = 16
 
 
 class RrdFiles:
-    """`path` and its successors: flight.rrd, flight-2.rrd, …; `most_bytes` is 0 for no limit.
+    """Files of one flight: `path` (flight.rrd), then flight-2.rrd and so on.
 
-    With `indexed` each ends with an index of its chunks, for programs that seek in it. Until then
-    the index is in memory, and grows by some kilobytes with each frame: not for flights of hours.
+    `most_bytes` is 0 for no limit. With `indexed` each ends with an index of its chunks, for
+    programs that seek in it. Until then the index is in memory, and grows by some kilobytes with
+    each frame: not for flights of hours.
     """
 
     def __init__(self, path: Path, most_bytes: int, indexed: bool) -> None:
@@ -36,7 +37,7 @@ class RrdFiles:
         self.recording = self._begin()
 
     def is_full(self) -> bool:
-        """Whether the next file is due; checks the disk only now and then.
+        """True if the next file is due; the disk is checked on every LOOK_EVERY-th call only.
 
         OSError where the recording cannot be written.
         """

@@ -35,7 +35,7 @@ class Screen:
         self.address = f"rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy"
         self.process: subprocess.Popen[bytes] | None = None
         self.is_ours = False
-        """Whether it ends with the flight: a page does, a window stays."""
+        """True if the viewer ends with the flight: a page does, a window stays."""
         self.page = ""
         """Address for a browser."""
         self.proxy: WebProxy | None = None
@@ -77,7 +77,7 @@ class Screen:
 
     @property
     def is_gone(self) -> bool:
-        """Whether a viewer that was started here has ended."""
+        """True once a viewer that was started here has ended."""
         return self.process is not None and self.process.poll() is not None
 
     def close(self) -> None:
@@ -96,7 +96,7 @@ def page_of(host: str) -> str:
 
 
 def listens(host: str, port: int) -> bool:
-    """Whether a server accepts connections there."""
+    """True if a server accepts connections at an address."""
     try:
         with socket.create_connection((host, port), timeout=3.0):
             return True

@@ -65,7 +65,7 @@ class WebProxy:
 
     @property
     def is_lagging(self) -> bool:
-        """Whether a browser does not take what it is sent."""
+        """True while a browser does not take its data."""
         now_s = monotonic_s()
         since = [
             direction.since_s for pair in list(self._directions.values()) for direction in pair

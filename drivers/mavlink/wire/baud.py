@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 BAUDS = (921600, 57600, 115200, 460800, 230400, 1500000, 500000, 38400, 19200, 9600)
-"""In order of the search: the most common first."""
+"""Rates in the order of the search: the most common first."""
 SURE_PACKETS = 2
 SILENT_NS = 1_200_000_000
 """An autopilot sends at least a heartbeat every second."""
@@ -23,7 +23,7 @@ class BaudSearch:
     def __init__(self, bauds: tuple[int, ...] = BAUDS) -> None:
         self.found = False
         self.garbled = False
-        """Whether bytes come, but no packets."""
+        """True if bytes come, but no packets."""
         self._bauds = list(bauds)
         self._at = 0
         self._since_ns = 0
@@ -59,7 +59,7 @@ class BaudSearch:
             self.found = False
 
     def look(self, t_ns: int) -> bool:
-        """Whether another rate is due; `baud` is then that."""
+        """True if another rate is due, which is then in `baud`."""
         if self.found or len(self._bauds) == 1:
             return False
         patience_ns = HOPEFUL_NS if self._n_packets else SILENT_NS

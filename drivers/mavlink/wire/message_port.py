@@ -22,7 +22,7 @@ class MavlinkPort(Protocol):
 
     @property
     def connected(self) -> bool:
-        """Whether the wire is open; says nothing about an autopilot at its other end."""
+        """True while the wire is open; says nothing about an autopilot at its other end."""
 
     @property
     def trouble(self) -> str:

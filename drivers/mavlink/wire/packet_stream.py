@@ -46,11 +46,11 @@ class Packet(NamedTuple):
     message_id: int
     seq: int
     known: bool
-    """Whether our dialect knows the message."""
+    """True if the message is in this program's dialect."""
 
     @property
     def signed(self) -> bool:
-        """Whether it has a signature, valid or not."""
+        """True if it has a signature, valid or not."""
         return self.raw[0] == V2 and bool(self.raw[2] & SIGNED)
 
     @property

@@ -62,7 +62,7 @@ class PymavlinkPort:
 
     @property
     def connected(self) -> bool:
-        """Whether the wire is open."""
+        """True while the wire is open."""
         return self._wire.connected
 
     @property
@@ -147,7 +147,7 @@ class PymavlinkPort:
         return sum(packet.known for packet in packets)
 
     def _is_signed(self, packet: Packet, monotonic_ns: int) -> bool:
-        """Whether it is signed as required."""
+        """True if a packet is signed with the key, or no key is required."""
         if self._signing is None:
             return True
         return self._signing.accepts(packet, self._clock.from_monotonic_ns(monotonic_ns))

@@ -268,7 +268,7 @@ class Router:
 
 
 def _answers_timesync(packet: Packet) -> bool:
-    """Whether an autopilot would set its estimate of our clock by this.
+    """True if an autopilot would set its estimate of this computer's clock by a packet.
 
     It asks all at once and takes any answer for ours, whose time is in the poses that it gets.
     """

@@ -52,7 +52,7 @@ class MavlinkSigning:
         return self._newest
 
     def accepts(self, packet: Packet, unix_ns: int) -> bool:
-        """Whether a packet is signed with the key, and newer than all of its stream before."""
+        """True if a packet is signed with the key, and newer than all of its stream before."""
         if not packet.signed:
             return False
         raw = packet.raw

@@ -614,9 +614,7 @@ class FakeAutopilot:
             if result == ACCEPTED:
                 self._take_origin(*values[4:])
         self.send(
-            mavlink.MAVLink_command_ack_message(
-                command, result, 0, 0, got.system, got.component
-            )
+            mavlink.MAVLink_command_ack_message(command, result, 0, 0, got.system, got.component)
         )
         if after is not None:
             after()

@@ -88,9 +88,7 @@ class Parameters:
         if self._bytewise and kind == INT32:
             (value,) = struct.unpack("<f", struct.pack("<i", int(value)))
         index = names.index(name) if name in names else 65535
-        return mavlink.MAVLink_param_value_message(
-            name.encode(), value, kind, len(names), index
-        )
+        return mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(names), index)
 
     def set(self, name: str, value: float, kind: int) -> None:
         """Take a PARAM_SET as the firmware would."""

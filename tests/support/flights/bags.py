@@ -155,9 +155,7 @@ def _picture(bag: BagWriter, t_ns: int, rgb: Any, compressed: bool) -> None:
         height, width = rgb.shape[:2]
         padded = np.zeros((height, width * 3 + 16), np.uint8)  # rows may be longer than pictures
         padded[:, : width * 3] = bgr.reshape(height, -1)
-        message = bag.make(
-            kind, header, height, width, "bgr8", 0, padded.shape[1], padded.ravel()
-        )
+        message = bag.make(kind, header, height, width, "bgr8", 0, padded.shape[1], padded.ravel())
     bag.write(topic, kind, t_ns, message)
 
 

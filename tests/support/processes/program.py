@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from companion.app.cli import main
 
 
 @dataclass(frozen=True)
@@ -27,11 +31,23 @@ class Run:
 
 
 def replay(flight: Path, out: Path, *options: str, timeout_s: float = 280) -> Run:
+    """`companion replay`, in a process of its own."""
     command = [sys.executable, "-m", "companion", "replay", str(flight), "--out", str(out)]
     done = subprocess.run(
         [*command, *options], capture_output=True, text=True, timeout=timeout_s, check=False
     )
     return Run(done.returncode, done.stdout, done.stderr, out)
+
+
+def replay_here(flight: Path, out: Path, *options: str) -> Run:
+    """The same command in this process: for tests of what comes of a flight.
+
+    A process of its own takes several seconds to load its libraries and compiled loops.
+    """
+    stdout, stderr = io.StringIO(), io.StringIO()
+    with redirect_stdout(stdout), redirect_stderr(stderr):
+        status = main(["replay", str(flight), "--out", str(out), *options])
+    return Run(status, stdout.getvalue(), stderr.getvalue(), out)
 
 
 def refused(run: Run) -> str:

@@ -99,9 +99,7 @@ class TwoNamespaces:
         return self
 
     def _make(self) -> None:
-        for (_, name), address in zip(
-            self._names.items(), (self.DRONE, self.GROUND), strict=True
-        ):
+        for (_, name), address in zip(self._names.items(), (self.DRONE, self.GROUND), strict=True):
             _run("ip", "netns", "add", name)
             self._tuns.append(_tun_in(name))
             _run("ip", "-n", name, "link", "set", "lo", "up")

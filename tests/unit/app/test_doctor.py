@@ -54,9 +54,7 @@ def never(question: str) -> bool:
         ("px4", ["EKF2_EV_CTRL", "EKF2_HGT_REF"]),
     ],
 )
-def test_names_sets_and_finds_nothing_more(
-    config: Config, firmware: str, names: list[str]
-) -> None:
+def test_names_sets_and_finds_nothing_more(config: Config, firmware: str, names: list[str]) -> None:
     with quick_autopilot(firmware, "udpin:127.0.0.1:0") as autopilot:
         status, text = examine(config, autopilot.url, ask=never)
         assert status == 1

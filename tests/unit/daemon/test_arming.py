@@ -203,9 +203,7 @@ def test_what_is_written_is_read_back_and_a_full_disk_is_reported(
 ) -> None:
     in_flight(autopilot, tmp_path, OFF)
     assert read_settings(tmp_path, READ)[1] == ""
-    assert set(json.loads((tmp_path / FILE).read_bytes())["values"]) == set(
-        WHILE_ARMED
-    )
+    assert set(json.loads((tmp_path / FILE).read_bytes())["values"]) == set(WHILE_ARMED)
     (tmp_path / "file").write_text("")
     failed: list[str] = []
     file = NewestFile(tmp_path / "file" / "below" / FILE, failed.append)

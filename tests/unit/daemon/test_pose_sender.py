@@ -64,7 +64,11 @@ class Vehicle:
             LinkConfig(), self.port, self.clock, self._deliver, self.warned.append
         )
         self.sender = PoseSender(
-            FeedbackConfig(mode=self.mode), self.link, self.clock, self.path, self.warned.append,
+            FeedbackConfig(mode=self.mode),
+            self.link,
+            self.clock,
+            self.path,
+            self.warned.append,
             lambda step: None,
         )
         task = asyncio.create_task(self.link.run())

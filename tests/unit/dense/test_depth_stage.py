@@ -101,6 +101,17 @@ def test_frame_buffer_is_bounded_while_hovering() -> None:
     assert len(it._frames) <= MAX_FRAMES + 1
 
 
+def test_colours_are_kept_only_where_a_keyframe_may_be() -> None:
+    it, n_maps, most, n_frames = stage(RADTAN), 0, 0, 0
+    for _, message in told(RADTAN, 34):
+        n_maps += sum(isinstance(each, DepthMap) for each in it.step(message))
+        most = max(most, sum(each.rgb is not None for each in it._frames.values()))
+        n_frames = max(n_frames, len(it._frames))
+    assert n_maps > 2
+    # from the oldest of two that wait to the frame after the next keyframe, every fourth
+    assert most <= 13 < n_frames
+
+
 # -- devices that fail in flight -----------------------------------------------------------------
 
 

@@ -36,9 +36,7 @@ POSE_EVERY_S, IMAGE_EVERY_S, CHUNK_EVERY_S = 1 / 30, 0.1, 1.0
 
 def points(keyframe_id: int, n: int = 5000) -> PointsItem:
     chunk: PointChunk = flown.chunk(keyframe_id % 12, n)
-    return PointsItem(
-        chunk.t_ns, keyframe_id, "", chunk.points_camera, chunk.rgb, chunk.confidence
-    )
+    return PointsItem(chunk.t_ns, keyframe_id, "", chunk.points_camera, chunk.rgb, chunk.confidence)
 
 
 CHUNKS = [points(k) for k in range(12)]

@@ -131,9 +131,7 @@ def test_satellite_fixes(tmp_path: Path, flown: Piece) -> None:
     assert fixes[0].sigma_vertical_m == 3.0
     true = local_positions(flown)
     way = true[fixes[-1].t_ns].position_ned_m - true[fixes[0].t_ns].position_ned_m
-    np.testing.assert_allclose(
-        fixes[-1].position_ned_m - fixes[0].position_ned_m, way, atol=1e-3
-    )
+    np.testing.assert_allclose(fixes[-1].position_ned_m - fixes[0].position_ned_m, way, atol=1e-3)
     assert attitudes_agree(log.samples, flown, 1e-6)
     assert log.origin is not None
     assert log.origin.latitude_deg == pytest.approx(HOME.latitude_deg, abs=0.01)

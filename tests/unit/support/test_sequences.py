@@ -50,15 +50,11 @@ def pictures(flight: Flight) -> list[Frame]:
 def same_grey(flight: Flight, flown: Piece) -> bool:
     found = pictures(flight)
     assert len(found) == len(flown.frames)
-    return all(
-        (a.grey == b.grey).all() for a, b in zip(found, flown.frames, strict=True)
-    )
+    return all((a.grey == b.grey).all() for a, b in zip(found, flown.frames, strict=True))
 
 
 def same_rgb(flight: Flight, flown: Piece) -> bool:
-    return all(
-        (a.rgb == b.rgb).all() for a, b in zip(pictures(flight), flown.frames, strict=True)
-    )
+    return all((a.rgb == b.rgb).all() for a, b in zip(pictures(flight), flown.frames, strict=True))
 
 
 def steps(poses: Sequence[Pose]) -> list[Array]:
@@ -199,4 +195,3 @@ def test_kitti_that_is_damaged(tmp_path: Path, flown: Piece) -> None:
     (folder / "calib.txt").write_text("P0: 1 2 3\n")
     with pytest.raises(FlightError, match="P2"):
         opened(folder)
-

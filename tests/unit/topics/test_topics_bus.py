@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -87,13 +88,17 @@ def test_what_is_malformed_is_refused_by_both_sides(
         *bundles[:2],
         bundles[2].replace(b"\xff\xd8", b"\0\0"),
     ]
-    bad_drone.serve("depth_input", lambda data: replies.pop(0) if replies else b"")
+    asked_on = threading.Event()
+
+    def reply(data: bytes) -> bytes:
+        if not replies:
+            asked_on.set()  # whoever asks again has dealt with the last reply
+        return replies.pop(0) if replies else b""
+
+    bad_drone.serve("depth_input", reply)
     ground = Ground(ground_config(other, tmp_path))
     closing.callback(ground.stop)
-    until_s = time.monotonic() + 30
-    while replies and time.monotonic() < until_s:
-        time.sleep(0.05)
-    time.sleep(0.3)
+    assert asked_on.wait(30)
     ground.stop()  # raises what brought it down
     assert not replies and "malformed" in capfd.readouterr().err
     assert [p.name for p in (tmp_path / "ground").iterdir()] == ["drone-a-flight"]

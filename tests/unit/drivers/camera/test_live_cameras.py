@@ -109,9 +109,7 @@ def test_it_begins_again_and_time_goes_on(tmp_path: Path) -> None:
 
 def test_it_can_begin_at_a_set_time(tmp_path: Path) -> None:
     at_s = time.time() + 0.2
-    config = CameraConfig(
-        source="file", path=str(flight(tmp_path, [0, 20])), starts_at_unix_s=at_s
-    )
+    config = CameraConfig(source="file", path=str(flight(tmp_path, [0, 20])), starts_at_unix_s=at_s)
     camera = camera_source(config)
     camera.open()
     (first,) = taken(camera, 1)

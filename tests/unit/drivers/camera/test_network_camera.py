@@ -129,7 +129,9 @@ def test_power_lost_and_back(film: Path) -> None:
         came.set()
 
     with server.rtsp_server(film) as port:
-        config = CameraConfig(source="network", url=f"rtsp://pilot:{PASSWORD}@127.0.0.1:{port}/film")
+        config = CameraConfig(
+            source="network", url=f"rtsp://pilot:{PASSWORD}@127.0.0.1:{port}/film"
+        )
         feed = CameraFeed(NetworkCamera(config), FlightClock(), config, deliver, warned.append)
         feed.start()
         assert came.wait(3)
@@ -153,9 +155,7 @@ def test_power_lost_and_back(film: Path) -> None:
     assert np.all(np.diff([frame.t_ns for frame in frames]) > 0)
 
 
-def test_passwords_are_used_and_never_told(
-    film: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_passwords_are_used_and_never_told(film: Path, capfd: pytest.CaptureFixture[str]) -> None:
     missing = server.missing()
     if missing:
         pytest.skip(missing)
@@ -195,9 +195,7 @@ def test_nobody_there_and_nobody_answering(monkeypatch: pytest.MonkeyPatch) -> N
         b"HTTP/1.1 500 no\r\n\r\n",
     ],
 )
-def test_whatever_answers_is_one_line(
-    answer: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_whatever_answers_is_one_line(answer: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network_camera, "OPEN_S", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as odd:
 

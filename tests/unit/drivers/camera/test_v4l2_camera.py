@@ -152,9 +152,7 @@ def test_a_rate_other_than_requested_is_reported(webcam: FakeV4l2) -> None:
     camera = V4l2Camera(CameraConfig(rate_hz=60))
     camera.open()
     camera.close()
-    assert camera.remarks == [
-        f"{webcam.stable_path}: it gives 30 pictures/s, 60 were asked"
-    ]
+    assert camera.remarks == [f"{webcam.stable_path}: it gives 30 pictures/s, 60 were asked"]
 
 
 def test_two_cameras_are_ambiguous(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

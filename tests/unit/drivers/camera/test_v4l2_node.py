@@ -122,9 +122,7 @@ def test_a_busy_camera_is_let_go_and_tried_again(webcam: FakeV4l2, at: int) -> N
     camera.close()
 
 
-def test_memory_for_some_buffers_only(
-    webcam: FakeV4l2, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_for_some_buffers_only(webcam: FakeV4l2, monkeypatch: pytest.MonkeyPatch) -> None:
     given = webcam._querybuf
 
     def querybuf(fd: int, about: v4l2.Buffer) -> None:

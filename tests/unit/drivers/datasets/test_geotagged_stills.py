@@ -129,8 +129,7 @@ def test_gimbal_and_barometer(tmp_path: Path) -> None:
     attitude = next(s for s in flight.telemetry().samples if isinstance(s, AttitudeSample))
     assert flight.camera.body_from_camera is not None
     ned_from_camera = (
-        rotation_from_quaternion(attitude.ned_from_body)
-        @ flight.camera.body_from_camera.rotation
+        rotation_from_quaternion(attitude.ned_from_body) @ flight.camera.body_from_camera.rotation
     )
     np.testing.assert_allclose(ned_from_camera[:, 2], [0, -0.5, math.sqrt(0.75)], atol=1e-6)
     np.testing.assert_allclose(ned_from_camera[:, 0], [1, 0, 0], atol=1e-6)

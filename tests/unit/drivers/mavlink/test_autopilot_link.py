@@ -240,9 +240,7 @@ def test_a_recorded_flight_gives_the_samples_that_its_log_gives() -> None:
         if not isinstance(sample, AttitudeSample | PositionSample | HeightSample):
             continue
         same = [
-            each
-            for each in in_log
-            if abs(each.t_ns - t_ns) < 100_000_000 and _same(each, sample)
+            each for each in in_log if abs(each.t_ns - t_ns) < 100_000_000 and _same(each, sample)
         ]
         assert same, sample
         if isinstance(sample, AttitudeSample):

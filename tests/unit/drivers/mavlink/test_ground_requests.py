@@ -26,7 +26,7 @@ from drivers.mavlink.request_limit import EACH_BURST, MOST_ASKERS, RequestLimit
 from drivers.mavlink.status_text import TEXTS_AT_ONCE, WARNINGS_ONLY, TextLimit
 from drivers.mavlink.wire.packet_stream import MavlinkStream, decode
 from tests.support.autopilot.ground_station import asked
-from tests.support.autopilot.mavlink_link import Speaker
+from tests.support.autopilot.mavlink_link import Speaker, until
 from tests.support.autopilot.memory_port import MemoryPort
 
 SECOND = 1_000_000_000
@@ -145,7 +145,7 @@ def test_the_link_hands_on_what_others_than_the_autopilot_ask() -> None:
         port.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), clock.now_ns())
         message = mavlink.MAVLink_param_set_message(1, 197, b"ONE", 2.0, 9)
         port.hear(message, clock.now_ns(), 255, 190)
-        await asyncio.sleep(0.2)
+        await until(lambda: bool(port.of("PARAM_VALUE")))
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)

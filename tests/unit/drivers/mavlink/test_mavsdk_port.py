@@ -134,14 +134,14 @@ def test_every_bit_of_a_message_comes_and_goes() -> None:
     async def fly() -> None:
         async with linked() as (peer, port, heard):
             peer.send(mavlink.MAVLink_param_value_message(b"SYS_X", minus_one, 6, 900, 3))
-            peer.send(mavlink.MAVLink_statustext_message(4, b"\xff\xfe \"quoted\""))
+            peer.send(mavlink.MAVLink_statustext_message(4, b'\xff\xfe "quoted"'))
             peer.send(mavlink.MAVLink_command_ack_message(512, 0, 0, 0, 1, 197))
             peer.codec.srcSystem, peer.codec.srcComponent = 42, 1  # never said that it is there
             peer.send(mavlink.MAVLink_attitude_quaternion_message(7, 1, 0, 0, 0, 0, math.nan, 0))
             await until(lambda: len(heard) == 4)
             value, text, answer, other = (message for message, _ in heard)
             assert struct.pack("<f", value.param_value) == b"\xff" * 4
-            assert text.text.endswith("\"quoted\"")
+            assert text.text.endswith('"quoted"')
             assert (answer.get_type(), answer.target_component) == ("COMMAND_ACK", 197)
             assert other.get_srcSystem() == 42
             assert math.isnan(other.pitchspeed)
@@ -297,8 +297,7 @@ def test_end_does_not_wait_for_a_line_that_takes_nothing(tmp_path: Path) -> None
                 autopilot._wire.receive = list  # type: ignore[method-assign] # reads no more
                 for number in range(5000):
                     port.send(mavlink.MAVLink_timesync_message(0, number))
-                await asyncio.sleep(0.3)
-                assert port.n_dropped > 1000
+                await until(lambda: port.n_dropped > 1000)
 
     asyncio.run(fly())
 
@@ -330,9 +329,7 @@ def test_clients_share_the_link() -> None:
                 async with running(port):
                     await until(lambda: port.connected)
                     port.send(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
-                    await until(
-                        lambda: client.listen() and client.got[-1].get_srcComponent() == 1
-                    )
+                    await until(lambda: client.listen() and client.got[-1].get_srcComponent() == 1)
                     client.codec.srcSystem, client.codec.srcComponent = 255, 190
                     client.send(mavlink.MAVLink_param_request_read_message(1, 1, b"EKF2_EN", -1))
                     await until(

@@ -118,9 +118,7 @@ def test_every_metric_is_described_and_every_described_one_exists() -> None:
         for row in re.findall(r"^\| (`.*?) \|", metrics.__doc__, re.MULTILINE)
         for name in re.findall(r"`([a-z_]+)`", row)
     } - {"companion_"}
-    load = dataclasses.replace(
-        HEALTH.load, gpu_share=0.1, memory_total_mib=200, disk_free_mib=1.0
-    )
+    load = dataclasses.replace(HEALTH.load, gpu_share=0.1, memory_total_mib=200, disk_free_mib=1.0)
     feedback = dataclasses.replace(HEALTH.feedback, latency_p50_ms=20.0)
     found = {name for name, _ in scrape(dataclasses.replace(HEALTH, load=load, feedback=feedback))}
     assert found == {f"companion_{name}" for name in described}

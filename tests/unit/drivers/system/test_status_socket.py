@@ -299,7 +299,9 @@ def test_watching_ends_when_the_daemon_does(path: Path, monkeypatch: pytest.Monk
                     show_status, path, out, as_json=True, watch=True, stop=threading.Event()
                 )
             )
-            await asyncio.sleep(0.2)
+            while len(out.getvalue().splitlines()) <= 2:
+                assert not watching.done()
+                await asyncio.sleep(0.005)
         with pytest.raises(SourceError):
             await watching
 

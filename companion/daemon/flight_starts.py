@@ -1,0 +1,143 @@
+"""Begin and end of flights: by arming or at once, by the ground, and after failures."""
+
+from __future__ import annotations
+
+import asyncio
+
+from companion.config import Config
+from companion.daemon.control.settings_in_force import SettingsInForce
+from companion.daemon.flights.flights import Flights
+from companion.daemon.flights.live_flight import LiveFlight, makes_depth
+from companion.daemon.health_watch import HealthWatch
+from companion.daemon.pose.pose_sender import PoseSender
+from companion.daemon.stop_request import BAD_INPUT, StopRequest
+from companion.daemon.vehicle_reports import VehicleReports
+from companion.errors import CompanionError
+from companion.geometry.camera import Camera
+from drivers.camera.camera_feed import CameraFeed
+from drivers.camera.live_calibration import live_camera
+from drivers.system.journal import WARNING, Journal
+
+STANDBY_RETRY_S = 1.0
+
+
+class FlightStarts:
+    """Begins and ends flights, and prepares the standby one. Used in the event loop.
+
+    It is the daemon as `control.ground_control` sees it.
+    """
+
+    def __init__(
+        self, settings: SettingsInForce, feed: CameraFeed, flights: Flights,
+        sender: PoseSender | None, reports: VehicleReports | None, watch: HealthWatch,
+        journal: Journal, stop: StopRequest,
+    ) -> None:  # fmt: skip
+        self._loop = asyncio.get_running_loop()
+        self._settings, self._feed, self._flights = settings, feed, flights
+        self._sender, self._reports, self._watch = sender, reports, watch
+        self._journal, self._stop = journal, stop
+        self.camera: Camera | None = None
+        """Calibrated camera; None before its first frame."""
+        self.reported_armed = False
+        """Last state of the motors that this process has heard."""
+        self._standby_later: asyncio.TimerHandle | None = None
+
+    @property
+    def config(self) -> Config:
+        """Configuration in force."""
+        return self._settings.config
+
+    @property
+    def armed(self) -> bool:
+        """True while the motors are armed; the last known state while the autopilot is silent."""
+        return self._settings.armed
+
+    def take_over(self, config: Config) -> None:
+        """Continue with another configuration: at once where possible, else with the next map."""
+        self._settings.take_over(config)
+
+    def prepare(self) -> None:
+        """Start the processes of a standby flight."""
+        if self.camera is not None:
+            self._flights.prepare(self.config, self.camera)
+
+    def begin_flight(self) -> None:
+        """Begin a flight with a map of its own, where one is due."""
+        self._begin_if_due(take_up=False)
+
+    def camera_known(self) -> None:
+        """Calibrate the camera by the size of its first frame, and begin a flight where one is due.
+
+        Called again it does nothing.
+        """
+        size = self._feed.size
+        if self.camera is not None or size is None:
+            return
+        try:
+            self.camera, remarks = live_camera(self.config.camera, self.config.mount, *size)
+        except CompanionError as error:
+            self._stop.fail(str(error), BAD_INPUT)
+            return
+        for remark in remarks:
+            self._journal.say(remark, WARNING)
+        self._begin_if_due()
+
+    def set_armed(self, armed: bool) -> None:
+        """Take the state of the motors from the autopilot."""
+        self._settings.set_armed(armed)
+        if armed == self.reported_armed:
+            return
+        self.reported_armed = armed
+        self._journal.say("armed" if armed else "disarmed")
+        if not armed and not self._always:
+            self._flights.end()
+        self._begin_if_due()
+
+    def reconfigure(self, old: Config, config: Config) -> None:
+        """Apply a changed configuration to the current flight, or to the one on standby."""
+        flight = self._flights.current
+        if flight is not None and old.feedback.mode == "off" != config.feedback.mode:
+            self._flights.end()  # a map whose scale is the autopilot's own is none to fly on
+            self._begin_if_due(take_up=False)
+            return
+        if flight is not None:
+            flight.set_dense(makes_depth(config))
+            flight.set_budget(config.stream.budget_kbit_s)
+            return
+        self._flights.discard_standby()
+        if self._standby_later is not None:
+            self._standby_later.cancel()
+        self._standby_later = self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
+
+    def localisation_died(self, flight: LiveFlight) -> None:
+        """Begin another flight, or prepare another standby one, in place of `flight`."""
+        if self._flights.current is flight:
+            self._flights.end()
+            self._begin_if_due()
+        elif self._flights.is_standby(flight):
+            self._flights.discard_standby()
+            self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
+
+    def stage_unusable(self, why: str) -> None:
+        """On the ground exit with the error; in the air the pose goes on without the stage."""
+        if not self.reported_armed:
+            self._stop.fail(why, BAD_INPUT)
+
+    @property
+    def _always(self) -> bool:
+        return self.config.daemon.flight == "always" or self._sender is None
+
+    def _begin_if_due(self, take_up: bool = True) -> None:
+        if self.camera is None or self._flights.current is not None or self._stop.made:
+            return
+        if self._always or self.reported_armed:
+            if self._sender is not None:
+                self._sender.restart()
+            if self._reports is not None:
+                self._reports.restart(self.camera)
+            self._watch.restart()
+            self._flights.begin(self.config, self.camera, take_up)
+            if self._sender is not None:
+                self._sender.begin_flight()
+        else:
+            self._flights.prepare(self.config, self.camera)

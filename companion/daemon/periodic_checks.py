@@ -1,0 +1,117 @@
+"""Checks every 0.2 s: health, hanging stages, the service manager, missing devices."""
+
+from __future__ import annotations
+
+import asyncio
+
+from companion.config import Config
+from companion.daemon.component_state import component_state
+from companion.daemon.control.settings_in_force import SettingsInForce
+from companion.daemon.flight_starts import FlightStarts
+from companion.daemon.flights.flight_dates import FlightDates
+from companion.daemon.flights.flights import Flights
+from companion.daemon.health_watch import HealthWatch
+from companion.daemon.link_watch import LinkWatch
+from companion.daemon.missing_devices import MissingDevices
+from companion.daemon.stop_request import BAD_INPUT, StopRequest
+from companion.health import Health
+from companion.timing.clock import FlightClock
+from drivers.camera.camera_feed import CameraFeed
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.system.journal import ERROR, Journal
+from drivers.system.service_manager import ServiceManager
+
+EVERY_S = 0.2
+START_S = 180.0
+"""Time for stages to start once no device is missing; the first time they compile."""
+NOT_THERE = ("missing", "driver fault")
+"""States of sources that are retried."""
+NO_PROGRESS = "frames come and no pose, whatever is tried: left to the service manager's watchdog"
+
+
+class PeriodicChecks:
+    """Reads the health and acts on it. Used in the event loop."""
+
+    def __init__(
+        self, settings: SettingsInForce, clock: FlightClock, journal: Journal,
+        service: ServiceManager, feed: CameraFeed, link: AutopilotLink | None,
+        link_watch: LinkWatch | None, flights: Flights, dates: FlightDates, watch: HealthWatch,
+        starts: FlightStarts, stop: StopRequest,
+    ) -> None:  # fmt: skip
+        self._settings, self._clock, self._journal = settings, clock, journal
+        self._service = service
+        self._feed, self._link, self._link_watch = feed, link, link_watch
+        self._flights, self._dates, self._watch = flights, dates, watch
+        self._starts, self._stop = starts, stop
+        self._missing = MissingDevices(settings.config.daemon.missing_device_s)
+        self._is_ready = False
+        self._progress = True
+
+    async def run(self) -> None:
+        """Check until cancelled."""
+        began_ns = self._clock.now_ns()
+        while True:
+            await asyncio.sleep(EVERY_S)
+            now_ns = self._clock.now_ns()
+            if self._link_watch is not None:
+                self._link_watch.step(now_ns)
+            health = self._watch.health()
+            self._publish(health)
+            self._check_start(health)
+            self._check_stages()
+            self._report()
+            if self._feed.fault is not None:
+                self._stop.fail(str(self._feed.fault), BAD_INPUT)
+            if self._dates.step():
+                asyncio.get_running_loop().run_in_executor(None, self._dates.write)
+            self._settings.step()
+            gone = self._missing.step(
+                health, (now_ns - began_ns) * 1e-9, self._starts.reported_armed
+            )
+            if gone:
+                self._stop.fail(gone)
+
+    def reconfigure(self, old: Config, config: Config) -> None:
+        """Apply a changed configuration."""
+        if config.daemon != old.daemon:
+            self._missing = MissingDevices(config.daemon.missing_device_s)
+
+    def reload(self) -> None:
+        """Read the configuration again: SIGHUP."""
+        if self._is_ready:
+            self._service.reloading()
+        self._settings.reload()
+        if self._is_ready:
+            self._service.ready()
+
+    def _publish(self, health: Health) -> None:
+        if self._link is not None:
+            self._link.system_status = component_state(health)
+        if self._flights.current is not None:
+            origin = self._link.origin if self._link is not None else None
+            self._flights.current.publish_health(health, origin)
+
+    def _check_start(self, health: Health) -> None:
+        if not self._is_ready and self._watch.up:
+            self._is_ready = True
+            self._service.ready(health.tracker)
+        elif not self._is_ready and any(each.state in NOT_THERE for each in health.sources):
+            self._service.extend_timeout(START_S)
+
+    def _check_stages(self) -> None:
+        """End stages that hang; the service manager is told of life while poses come."""
+        if not self._watch.pose_loop_alive:
+            self._watch.kill_stuck()
+        self._watch.end_stalled()
+        progress = self._watch.progress
+        if self._progress and not progress:
+            self._journal.say(NO_PROGRESS, ERROR)
+        self._progress = progress
+        if progress:
+            self._service.alive()
+
+    def _report(self) -> None:
+        line = self._watch.line_due()
+        if line:
+            self._journal.say(line)
+            self._service.status(line)

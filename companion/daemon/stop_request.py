@@ -1,0 +1,39 @@
+"""End of the daemon: asked for by a signal, or due to a failure."""
+
+from __future__ import annotations
+
+import asyncio
+
+from drivers.system.journal import ERROR, Journal
+
+FAULT, BAD_INPUT = 1, 2
+"""Exit statuses."""
+
+
+class StopRequest:
+    """Event that ends the daemon, with its exit status. Used in the event loop."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._event = asyncio.Event()
+        self.status = 0
+
+    @property
+    def made(self) -> bool:
+        """True once the daemon is to end."""
+        return self._event.is_set()
+
+    def stop(self) -> None:
+        """End the daemon."""
+        self._event.set()
+
+    def fail(self, why: str, status: int = FAULT) -> None:
+        """End the daemon with an error; the first one is reported."""
+        if self.status == 0:
+            self._journal.say(f"error: {why}", ERROR)
+            self.status = status
+        self._event.set()
+
+    async def wait(self) -> None:
+        """Wait for the request."""
+        await self._event.wait()

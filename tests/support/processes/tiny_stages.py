@@ -1,0 +1,101 @@
+"""Stages that do what they are told to, and nothing else: for tests of how stages are run.
+
+`tiny_stage_child` is the process that runs one of them. What a test tells a stage is a `Do`, and
+what that answers a `Said`; a frame is answered with its number.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from companion.errors import CompanionError, InputError
+from companion.messages import Frame, MapUpdate
+from companion.runtime.stage_protocol import DriverAtWork, Finish, Setup
+from companion.runtime.stage_work import Work
+from companion.runtime.stages import Death, Frames, Stage
+
+UNUSABLE = "unusable"
+"""Name of a folder of which no stage can make anything."""
+GIVEN_UP = "no room on the disk"
+
+
+@dataclass(frozen=True, slots=True)
+class Do:
+    """What a stage is to do: `say`, `hang`, `exit`, `crash`, `give up`, `drive`, or at its end
+    `be slow to finish`, `fail to finish`."""
+
+    t_ns: int
+    what: str
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """Words of a stage."""
+
+    t_ns: int
+    who: str
+    text: str
+
+
+SOURCE = Stage(
+    "source", (Frame, Do), nice=1, frames=Frames.NEWEST, death=Death.ENDS_FLIGHT, is_source=True,
+)  # fmt: skip
+READER = Stage("reader", (Frame, Do, MapUpdate), nice=1, frames=Frames.EVERY)
+WRITER = Stage("writer", (Said, MapUpdate), nice=1, with_flight=True, in_folder=True)
+STAGES = SOURCE, READER, WRITER
+
+
+class TinyWork(Work):
+    """See above."""
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__()
+        if setup.folder is not None and setup.folder.name == UNUSABLE:
+            raise InputError(f"{setup.folder}: cannot be used")
+        self._tell: Callable[[Any], None] = print
+        self._at_the_end = ""
+
+    def begin(self, tell: Callable[[Any], None]) -> None:
+        self._tell = tell
+
+    def step(self, message: Any) -> Iterator[Any]:
+        if isinstance(message, Do):
+            yield from self._do(message)
+        elif isinstance(message, Frame):
+            yield Said(message.t_ns, "frame", str(message.seq))
+        elif isinstance(message, MapUpdate):
+            yield Said(message.t_ns, "map", str(message.revision))
+        else:
+            yield Said(message.t_ns, "heard", f"{message.who} {message.text}")
+
+    def _do(self, what: Do) -> Iterator[Any]:
+        if what.what == "say":
+            yield Said(what.t_ns, "told", what.detail)
+        elif what.what == "hang":
+            threading.Event().wait()
+        elif what.what == "exit":
+            os._exit(int(what.detail))
+        elif what.what == "crash":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        elif what.what == "give up":
+            raise CompanionError(GIVEN_UP)
+        elif what.what == "drive":
+            self._tell(DriverAtWork(what.detail, f"the {what.detail}"))
+        else:
+            self._at_the_end = what.what
+
+    def finish(self, finish: Finish) -> Iterator[Any]:
+        if self._at_the_end == "be slow to finish":
+            threading.Event().wait()
+        if self._at_the_end == "fail to finish":
+            raise CompanionError(GIVEN_UP)
+        yield Said(0, "last words", "in a hurry" if finish.hurry else "at leisure")
+
+
+work = TinyWork

@@ -1,0 +1,299 @@
+"""The executor of a live flight: who gets what, who begins again, and how it all ends."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from companion.config import Config
+from companion.messages import MapUpdate
+from companion.runtime import stage_process
+from companion.runtime.parcel import Parcel
+from companion.runtime.processes import Processes, Supervisor
+from companion.runtime.stage_process import StageProcess
+from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stages import Stage
+from tests.support.flights.topic_flight import CAMERA
+from tests.support.processes.stage_heard import SOON_S, Heard
+from tests.support.processes.tiny_stages import (
+    GIVEN_UP,
+    READER,
+    SOURCE,
+    STAGES,
+    UNUSABLE,
+    WRITER,
+    Do,
+    Said,
+)
+
+TINY_CHILD = "tests.support.processes.tiny_stage_child"
+
+
+@dataclass(frozen=True)
+class Began:
+    """A setup was asked for."""
+
+    stage: str
+    n_restarted: int
+    failed_devices: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A stage has ended: `restarted`, `over` or `unusable`."""
+
+    how: str
+    why: str
+
+
+class Flight:
+    """Tiny stages in a flight: what one of them says goes to all that listen, as in the daemon."""
+
+    def __init__(self, *rows: Stage, folder: Path | None = None) -> None:
+        self.heard, self._folder = Heard(), folder
+        note = self.heard.note
+        self.processes = Processes(
+            rows or STAGES,
+            Supervisor(
+                self._setup, self._hear,
+                lambda stage, why: note(Ended("restarted", f"{stage.name}: {why}")),
+                lambda why: note(Ended("over", why)),
+                lambda why: note(Ended("unusable", why)),
+            ),
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """End what is left of it."""
+        self.processes.hurry()
+        self.processes.finish(lambda stage: Finish(hurry=True))
+
+    def do(self, name: str, what: str, detail: str = "") -> None:
+        """Tell one stage to do something."""
+        self.processes.order(name, Do(1, what, detail))
+
+    def until_up(self, *names: str) -> None:
+        """Wait until the work of stages has begun."""
+        for name in names:
+            self.processes.order(name, Do(1, "say", f"{name} up"))
+        for name in names:
+            self.heard.until_said("told", f"{name} up")
+
+    def process(self, name: str) -> StageProcess:
+        """Process of a stage."""
+        return self.processes.by_name[name]
+
+    def pids(self) -> list[int]:
+        """Of all processes."""
+        return [self.process(name).pid for name in self.processes.by_name]
+
+    def until_ended(self, how: str, why: str) -> None:
+        self.heard.until(lambda: Ended(how, why) in self.heard.all)
+
+    def began(self, name: str) -> list[Began]:
+        return [each for each in self.heard.all if isinstance(each, Began) and each.stage == name]
+
+    def _setup(self, stage: Stage, n_restarted: int, failed_devices: dict[str, str]) -> Setup:
+        self.heard.note(Began(stage.name, n_restarted, tuple(failed_devices.values())))
+        return Setup(Config(), CAMERA, self._folder)
+
+    def _hear(self, parcel: Parcel) -> None:
+        self.heard.parcel(parcel)
+        self.processes.publish(parcel)
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_process, "CHILD", TINY_CHILD)
+
+
+Fly = Callable[..., Flight]
+
+
+@pytest.fixture
+def fly() -> Iterator[Fly]:
+    """Begins a flight, which is ended."""
+    begun: list[Flight] = []
+
+    def begin(*rows: Stage, folder: Path | None = None) -> Flight:
+        begun.append(Flight(*rows, folder=folder))
+        begun[-1].processes.fly()
+        return begun[-1]
+
+    yield begin
+    for flight in begun:
+        flight.close()
+
+
+def endings(flight: Flight) -> list[Ended]:
+    return [each for each in flight.heard.all if isinstance(each, Ended)]
+
+
+def map_update(revision: int) -> Parcel:
+    return Parcel.of(MapUpdate(revision, 1, {}, np.zeros((0, 3)), None))
+
+
+@pytest.fixture(scope="module")
+def flying() -> Iterator[Flight]:
+    """One flight for the tests of what goes on during one."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(stage_process, "CHILD", TINY_CHILD)
+        flight = Flight(SOURCE, READER, replace(WRITER, answer_s=0.2))
+        with closing(flight):
+            assert {each.stage for each in flight.heard.all} == {"source", "reader"}, "stand by"
+            flight.processes.publish(map_update(1))
+            flight.heard.until_said("map", "1")
+            assert not flight.began("writer"), "it begins with the flight"
+            flight.processes.fly()
+            flight.until_up("source", "reader", "writer")
+            yield flight
+
+
+@pytest.mark.continues
+def test_messages_go_to_who_listens(flying: Flight) -> None:
+    flying.processes.publish(Parcel.of(Do(1, "say", "both")))
+    flying.heard.until(lambda: flying.heard.texts("told").count("both") == 2)
+    # the writer listens to what these say, and hears it once each
+    flying.heard.until(lambda: flying.heard.texts("heard").count("told both") == 2)
+    assert flying.processes.up
+    flying.processes.muted.add("reader")
+    flying.processes.publish(map_update(10))
+    flying.do("reader", "say", "muted")  # what is for it alone it gets still
+    flying.processes.order("nobody", Do(1, "say", "to nobody"))
+    flying.heard.until_said("told", "muted")
+    flying.heard.until_said("map", "10")
+    assert flying.heard.texts("map").count("10") == 1, "the writer got it, the reader did not"
+    flying.processes.muted.discard("reader")
+    flying.processes.bring_up_to_date("reader")
+    flying.heard.until(lambda: flying.heard.texts("map").count("10") == 2)
+    assert "to nobody" not in flying.heard.texts("told")
+
+
+@pytest.mark.continues
+def test_a_stage_that_dies_begins_again_with_the_newest_map(flying: Flight) -> None:
+    flying.processes.publish(map_update(20))
+    flying.processes.publish(map_update(21))
+    flying.heard.until(lambda: flying.heard.texts("map").count("21") == 2)
+    source = flying.process("source")
+    flying.do("reader", "drive", "gpu")
+    flying.do("reader", "crash")
+    flying.until_ended("restarted", "reader: killed by SIGSEGV")
+    flying.heard.until(lambda: flying.heard.texts("map").count("21") == 3)
+    # without the device whose driver was at work
+    assert flying.began("reader")[1:] == [Began("reader", 1, ("the gpu: killed by SIGSEGV",))]
+    assert flying.heard.texts("map").count("20") == 2, "the newest only"
+    assert flying.processes.n_restarted["reader"] == 1
+    assert flying.process("source") is source and source.alive
+    assert not flying.processes.over and flying.processes.up
+
+
+@pytest.mark.continues
+def test_a_stage_that_hangs_is_ended_and_begins_again(flying: Flight) -> None:
+    flying.do("writer", "drive", "disk")
+    flying.do("writer", "hang")
+    until_s = time.monotonic() + SOON_S
+    while not flying.began("writer")[1:]:
+        assert time.monotonic() < until_s
+        flying.processes.end_stalled()
+        threading.Event().wait(0.01)
+    why = endings(flying)[-1].why
+    assert why.startswith("writer: it hung for ")
+    again = flying.began("writer")[1]
+    assert again.n_restarted == 1
+    # the first time others may be to blame for it
+    assert not any("disk" in device for device in again.failed_devices)
+    flying.until_up("writer")
+    assert flying.processes.n_restarted["source"] == 0, "what has nothing to do is left alone"
+
+
+def test_without_its_source_the_flight_is_over(fly: Fly) -> None:
+    flight = fly(SOURCE, READER)
+    flight.until_up("source", "reader")
+    flight.do("source", "exit", "9")
+    flight.until_ended("over", "ended with status 9")
+    assert flight.processes.over
+    flight.processes.add(WRITER)
+    assert "writer" not in flight.processes.by_name
+    reader = flight.processes.by_name["reader"]
+    flight.do("reader", "exit", "8")
+    assert reader.wait(SOON_S)
+    # what had something to give gives it; nothing begins again
+    assert flight.processes.finish(lambda stage: Finish(hurry=False)) == {}
+    assert [each.how for each in flight.heard.all if isinstance(each, Ended)] == ["over"]
+    assert flight.processes.n_restarted == {"source": 0, "reader": 0}
+
+
+def test_what_cannot_start_because_of_the_user_is_told(fly: Fly, tmp_path: Path) -> None:
+    flight = fly(READER, folder=tmp_path / UNUSABLE)
+    flight.heard.until(lambda: any(e.how == "unusable" for e in endings(flight)))
+    unusable = next(each for each in endings(flight) if each.how == "unusable")
+    assert str(tmp_path / UNUSABLE) in unusable.why
+    flight.heard.until(lambda: len(endings(flight)) == 3)
+    # it is tried again, and then it is not said again
+    assert [each.how for each in endings(flight)] == ["restarted", "unusable", "restarted"]
+    begun_s = time.monotonic()
+    flight.close()  # does not wait for the pause before the next
+    assert time.monotonic() - begun_s < 0.9
+    assert len(flight.began("reader")) == 2
+
+
+def test_last_words_of_sources_reach_the_others_before_these_end() -> None:
+    flight = Flight()
+    with closing(flight):
+        flight.processes.fly()
+        flight.until_up("source", "reader")
+        asked: list[str] = []
+        pids = flight.pids()
+
+        def finish_of(stage: Stage) -> Finish:
+            asked.append(stage.name)
+            return Finish(flight.processes.hurried)
+
+        assert flight.processes.finish(finish_of) == {}
+        assert asked == ["source", "reader", "writer"]
+        assert flight.heard.texts("last words") == ["at leisure"] * 3
+        assert flight.heard.texts("heard").count("last words at leisure") >= 1
+        spoken = [e for e in flight.heard.all if isinstance(e, Said)]
+        assert spoken.index(Said(0, "last words", "at leisure")) < spoken.index(
+            Said(0, "heard", "last words at leisure")
+        )
+        assert not any(psutil.pid_exists(pid) for pid in pids)
+
+
+@pytest.mark.parametrize("hurried", [False, True])
+def test_stages_that_are_late_are_named_and_ended(hurried: bool) -> None:
+    """By the time of the table, and where the daemon is to end by the shorter one."""
+    flight = Flight(
+        replace(SOURCE, hurried_s=SOON_S),
+        replace(READER, finish_s=300.0 if hurried else 0.3, hurried_s=0.3),
+    )
+    with closing(flight):
+        flight.processes.fly()
+        flight.until_up("source", "reader")
+        flight.do("source", "fail to finish")
+        flight.do("reader", "be slow to finish")
+        if hurried:
+            flight.processes.hurry()
+        pids = flight.pids()
+        begun_s = time.monotonic()
+        late = flight.processes.finish(lambda stage: Finish(flight.processes.hurried))
+        assert late == {"source": GIVEN_UP, "reader": ""}
+        assert 0.3 <= time.monotonic() - begun_s < 100.0
+        assert flight.heard.texts("last words") == []
+        assert not any(psutil.pid_exists(pid) for pid in pids)
+
+
+def test_without_a_flight_nothing_is_finished() -> None:
+    flight = Flight(SOURCE)
+    flight.until_up("source")
+    pids = flight.pids()
+    assert flight.processes.finish(lambda stage: Finish(hurry=False)) == {}
+    assert flight.heard.texts("last words") == []
+    assert not any(psutil.pid_exists(pid) for pid in pids)

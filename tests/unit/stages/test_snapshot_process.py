@@ -1,0 +1,61 @@
+"""The results stage writes the cloud in mid-flight, and goes on."""
+
+from __future__ import annotations
+
+import queue
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.config import Config
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose
+from companion.messages import MapUpdate, PointChunk
+from companion.runtime.parcel import Parcel
+from companion.runtime.stage_process import StageProcess
+from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from companion.runtime.stages import stage_named
+from tests.support.reference.scoring import read_ply
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
+N_CHUNKS, N_POINTS = 200, 2000
+PATIENCE_S = 60.0
+
+
+def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> None:
+    told: queue.Queue[Any] = queue.Queue()
+    stage = StageProcess(
+        stage_named("results"), lambda parcel: told.put(parcel.open()), lambda why: told.put(why)
+    )
+    stage.order(TakeSnapshot(0))  # before it knows what to do: passed over
+    stage.begin(Setup(Config(), CAMERA, tmp_path))
+    try:
+        poses = {n: Pose(np.eye(3), np.array([3.0 * n, 0, 0])) for n in range(N_CHUNKS)}
+        update = MapUpdate(1, 1, poses, np.zeros((0, 3)), None)
+        stage.offer(Parcel.of(update))
+        for n in range(N_CHUNKS):
+            points = rng.uniform((-5, -5, 5), (5, 5, 9), (N_POINTS, 3)).astype(np.float32)
+            ones = np.ones(N_POINTS, np.float32)
+            colours = np.zeros((N_POINTS, 3), np.uint8)
+            chunk = PointChunk(n, n, points, colours, ones, 0 * points, ones)
+            stage.offer(Parcel.of(chunk))
+        for number in (1, 2):
+            stage.order(TakeSnapshot(number))
+            last = Snapshot(number)
+            percents = []
+            while not last.path:
+                stage.offer(Parcel.of(update))  # the flight goes on: it is between its messages
+                try:
+                    last = told.get(timeout=0.02)
+                except queue.Empty:
+                    continue
+                assert isinstance(last, Snapshot) and last.number == number and not last.why_not
+                percents.append(last.percent)
+            assert percents == sorted(percents) and len(percents) > 2
+            assert len(read_ply(tmp_path / f"snapshot-{number:03d}.ply")) == last.n_points > 1000
+        stage.ask_to_finish(Finish(hurry=True))
+        assert stage.wait(PATIENCE_S)
+        assert stage.finished is not None
+    finally:
+        stage.kill()
