@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+from companion.app.poses_sent import PosesSent
 from companion.app.progress import Progress
 from companion.config import Config
 from companion.config_file import command_shown, shown
@@ -92,13 +93,14 @@ def replay(
     map fails, all frames are tracked and written with the cloud so far; then StageError.
     """
     camera, log = given.flight.camera, given.log
-    watched = Watched()
+    watched, sent = Watched(), PosesSent(config.feedback)
     live: LiveViewer | None = None
     names = ("localisation", "depth", "results") if config.depth.enabled else LEAST
     setup = Setup(config, camera, out, origin=log.origin, is_live=False)
 
     def watch(message: Message) -> None:
         watched.take(message)
+        sent.take(message)
         if live is not None:
             live.take(message)
 
@@ -140,7 +142,10 @@ def replay(
             completed = True
         finally:
             progress.finish()
-            stages.finish(finish)
+            try:
+                stages.finish(finish)
+            finally:
+                sent.write(out)
     if depth is not None and depth.details()["failures"]:
         notify(f"dense map: {depth.device}")
     if stages.depth_fault is not None:

@@ -7,7 +7,9 @@ does; without positions a rangefinder or barometer gives the scale.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -159,26 +161,30 @@ class Georeferencer:
                 return np.asarray(np.nan_to_num(travelled_m), np.float64)
         return None
 
-    def solve(self, samples: list[AlignmentSample]) -> Georeference | None:
-        """Georeference of the map; None until certain enough. Samples may be unordered."""
+    def solve(
+        self, samples: list[AlignmentSample], inertial: Scale | None = None
+    ) -> Georeference | None:
+        """Georeference of the map; None until certain enough. Samples may be unordered.
+
+        `inertial` is the scale by accelerometers, where there are any.
+        """
         samples = sorted(
             samples, key=lambda sample: sample.t_ns
         )  # keyframes of a merged map come after ours
         if len(samples) > MAX_SAMPLES:
             chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_SAMPLES).astype(int))
             samples = [samples[int(i)] for i in chosen]
-        level = _mean_rotation(samples)
+        level = mean_rotation(samples)
         for source in self._sources:
             if len(self._positions[source]) >= 4:
-                found = self._from_positions(samples, level, source)
+                found = self._from_positions(samples, level, source, inertial)
                 if found is not None:
                     return found
         if level is None:
             return None
-        by_range, by_height = self._range_scale(samples), self._height_scale(samples, level)
-        if by_range is None or by_height is None:
-            return self._from_scale(samples, level, by_range or by_height)
-        return self._from_scale(samples, level, reconciled(by_range, by_height))
+        scales = [self._range_scale(samples), self._height_scale(samples, level), inertial]
+        known = [scale for scale in scales if scale is not None]
+        return self._from_scale(samples, level, reduce(reconciled, known) if known else None)
 
     def place_new_map(
         self, samples: list[AlignmentSample], start_ned_m: Array
@@ -189,7 +195,7 @@ class Georeferencer:
         """
         first, last = samples[0], samples[-1]
         level, displacement_m = (
-            _mean_rotation(samples),
+            mean_rotation(samples),
             self.displacement_by_velocity(first.t_ns, last.t_ns),
         )
         if level is None or displacement_m is None:
@@ -208,8 +214,9 @@ class Georeferencer:
         )  # fmt: skip
 
     def _from_positions(
-        self, samples: list[AlignmentSample], level: Array | None, source: PositionSource
-    ) -> Georeference | None:
+        self, samples: list[AlignmentSample], level: Array | None, source: PositionSource,
+        inertial: Scale | None,
+    ) -> Georeference | None:  # fmt: skip
         t_ns = np.array([p.t_ns for p in samples])
         measured, ok = self._positions[source].at(t_ns)
         travelled_m = np.full((len(samples), 3), np.nan)
@@ -224,7 +231,7 @@ class Georeferencer:
         extent = target - target.mean(0)
         if float(np.linalg.norm(extent, axis=1).max()) < 0.5 * self._config.min_travel_m:
             return None
-        scales = [self._range_scale(samples)]
+        scales = [self._range_scale(samples), inertial]
         if level is not None:
             scales.append(self._height_scale(samples, level))
         prior = min((s for s in scales if s is not None), key=lambda s: s.sigma, default=None)
@@ -315,7 +322,7 @@ class Georeferencer:
         )
 
 
-def _mean_rotation(samples: list[AlignmentSample]) -> Array | None:
+def mean_rotation(samples: Sequence[AlignmentSample]) -> Array | None:
     """Chordal mean of world_from_map rotations by attitude; None without."""
     rotations = [
         p.ned_from_camera @ p.map_from_camera.rotation.T

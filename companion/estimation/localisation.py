@@ -35,7 +35,7 @@ from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.map_part import map_of, part_around
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
-from companion.telemetry import AttitudeSample, Telemetry
+from companion.telemetry import AttitudeSample, ImuSample, Telemetry
 from companion.timing.clock import Timer
 
 FINAL_ITERATIONS = 8
@@ -122,6 +122,8 @@ class LocalisationStage:
 
     def _take_samples(self) -> None:
         for sample in self._samples:
+            if isinstance(sample, AttitudeSample | ImuSample):
+                self._georeferences.take(sample)
             if isinstance(sample, AttitudeSample):
                 self._attitude.add(sample)
             else:
@@ -252,6 +254,7 @@ class LocalisationStage:
         self._attitude.prune(living.keys())
         when_ns: Array = np.array(sorted(living.values()))
         self._georeferencer.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
+        self._georeferences.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
 
     def _check_resumption(self, resumption: Resumption, t_ns: int) -> Iterator[MapUpdate | Warned]:
         """Verify the stored map; resume or drop it."""

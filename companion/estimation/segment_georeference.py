@@ -7,20 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 
+from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.georeference import AlignmentSample, Georeferencer
 from companion.estimation.height_above_ground import HeightAboveGround
+from companion.estimation.inertial_scale import InertialScale, settled
 from companion.estimation.trajectory_alignment import (
     DISAGREE,
     MAX_STEP_S,
     SIGMA_VELOCITY_M_S,
     VELOCITY_TAU_S,
+    Scale,
 )
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Georeference, MapUpdate
 from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.optimisation.displacement_factor import DisplacementFactor, typical_error
+from companion.telemetry import AttitudeSample, ImuSample
 
 MAX_LOOP_ERROR_M = 6.0
 """Error of measured positions between two times."""
@@ -29,6 +33,10 @@ CORRELATION_INFLATION = 3.0
 MAX_SIGMA_SCALE_DISPLACEMENT = 0.05
 """Displacement factors require a scale at least this certain."""
 MAX_SAMPLES, MAX_SAMPLES_FINAL = 120, 400
+INERTIAL_EVERY_NS = 400_000_000
+"""Between keyframes for the inertial scale: with closer ones it is no more certain."""
+SETTLED_AFTER = 2
+"""Keyframes after which one has been adjusted."""
 
 
 class SegmentGeoreferences:
@@ -50,6 +58,19 @@ class SegmentGeoreferences:
         """A resumed segment and its stored georeference."""
         self._main: int | None = None
         self._revision = 0
+        self._acceleration = AccelerationIntegral()
+        self._inertial: dict[int, InertialScale] = {}
+        """By first keyframe of a segment, as is:"""
+        self._spaced: dict[int, list[tuple[int, int]]] = {}
+        """Ids and times of the keyframes that the inertial scale takes."""
+
+    def take(self, sample: AttitudeSample | ImuSample) -> None:
+        """Add a sample for the inertial scale."""
+        self._acceleration.take(sample)
+
+    def prune(self, before_ns: int, keyframes_ns: Array) -> None:
+        """Drop measurements before a time, except at the times of keyframes (N,), sorted."""
+        self._acceleration.prune(before_ns, keyframes_ns)
 
     def of(self, segment: SlamMap) -> Georeference | None:
         """Georeference of a segment; None until known."""
@@ -91,7 +112,8 @@ class SegmentGeoreferences:
         for segment in segments:
             if final or (segment is segments[-1] and _due(segment)):
                 found = self._georeferencer.solve(
-                    self._samples(segment, _subsample(segment, final))
+                    self._samples(segment, _subsample(segment, final)),
+                    self._inertial_scale(segment, final),
                 )
                 if found is not None:
                     self._known[segment.first_keyframe_id] = self._more_certain(segment, found)
@@ -125,6 +147,36 @@ class SegmentGeoreferences:
         return MapUpdate(
             self._revision, t_ns, poses, np.concatenate(points), anchor, scales, n_retired
         )
+
+    def _inertial_scale(self, segment: SlamMap, final: bool) -> Scale | None:
+        """Scale of a segment by accelerometers; None while it is unknown."""
+        mount = self._body_from_camera
+        if mount is None or not self._attitude.used or not self._acceleration.has_samples:
+            return None
+        key = segment.first_keyframe_id
+        spaced = self._spaced.setdefault(key, [])
+        newest_ns = spaced[-1][1] if spaced else -INERTIAL_EVERY_NS
+        in_time = sorted(
+            (k.t_ns, k.keyframe_id) for k in segment.keyframes.values() if k.t_ns > newest_ns
+        )
+        for t_ns, keyframe_id in in_time[: len(in_time) - SETTLED_AFTER * (not final)]:
+            if t_ns >= newest_ns + INERTIAL_EVERY_NS:
+                spaced.append((keyframe_id, t_ns))
+                newest_ns = t_ns
+
+        def sample_at(index: int) -> AlignmentSample | None:
+            keyframe_id, t_ns = spaced[index]
+            pose = segment.pose_of(keyframe_id)
+            attitude = self._attitude.of_keyframe(keyframe_id, t_ns)
+            if pose is None or attitude is None:
+                return None
+            return AlignmentSample(t_ns, pose.inverse(), attitude)
+
+        lever_m, delay_ns = mount.rotation.T @ mount.translation, self._attitude.correction[1]
+        if final:
+            return settled(len(spaced), sample_at, self._acceleration, lever_m, delay_ns)
+        estimate = self._inertial.setdefault(key, InertialScale(lever_m))
+        return estimate.update(len(spaced), sample_at, self._acceleration, delay_ns)
 
     def displacements_of(
         self, segment: SlamMap, keyframes: list[Keyframe]

@@ -1,11 +1,11 @@
-"""Camera path as a TUM file."""
+"""Camera path, and poses as given out, as TUM files."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from companion.geometry.geodesy import GeoOrigin
-from companion.geometry.transforms import quaternion_from_rotation
+from companion.geometry.transforms import Pose, quaternion_from_rotation
 from companion.products.flight_result import WorldPose
 
 
@@ -16,12 +16,27 @@ def trajectory_tum(poses: Sequence[WorldPose], unit: str, origin: GeoOrigin | No
         "# pose of the camera (right, down, forward) in the world, world_from_camera",
         *("# " + line for line in frame_lines(unit, origin)),
     ]
-    for _, t_ns, pose in poses:
-        w, x, y, z = quaternion_from_rotation(pose.rotation)
-        place = " ".join(f"{v + 0.0:.6f}" for v in pose.translation)
-        turn = " ".join(f"{v + 0.0:.9f}" for v in (x, y, z, w))
-        lines.append(f"{exact_seconds(t_ns)} {place} {turn}")
+    lines += [tum_line(t_ns, pose) for _, t_ns, pose in poses]
     return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def sent_poses_tum(poses: Iterable[tuple[int, Pose]]) -> bytes:
+    """Lines likewise, `world_from_body`, of poses as they were given out."""
+    lines = [
+        "# unix_s x y z qx qy qz qw",
+        "# pose of the body (forward, right, down) as given out in flight, world_from_body",
+        "# world: level, metres, and north as the autopilot's attitude has it; its origin is free",
+    ]
+    lines += [tum_line(t_ns, pose) for t_ns, pose in poses]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def tum_line(t_ns: int, pose: Pose) -> str:
+    """A pose at a time in the format of TUM's benchmark (Sturm et al. 2012)."""
+    w, x, y, z = quaternion_from_rotation(pose.rotation)
+    place = " ".join(f"{v + 0.0:.6f}" for v in pose.translation)
+    turn = " ".join(f"{v + 0.0:.9f}" for v in (x, y, z, w))
+    return f"{exact_seconds(t_ns)} {place} {turn}"
 
 
 def frame_lines(unit: str, origin: GeoOrigin | None) -> list[str]:

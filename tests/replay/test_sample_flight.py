@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from companion.app.cli import main
+from tests.support.autopilot.received_poses import TrueFlight
 from tests.support.processes.program import Run, replay
 from tests.support.reference.scoring import Score, depth_errors, read_ply, read_tum, score
 
@@ -58,6 +59,21 @@ def test_path_is_in_order_of_time_and_of_known_frames(run: Run) -> None:
     assert all(np.abs(listed - t_s).min() < 1e-4 for t_s in path.t_s)
 
 
+def test_poses_given_out_in_flight_are_true_when_they_are_given(run: Run) -> None:
+    """By the gate of a live flight; they are never corrected afterwards, unlike the path."""
+    sent, truth = read_tum(run.out / "poses_sent.tum"), TrueFlight(SAMPLE)
+    assert sent.t_s[0] - truth.begin_s < 12.0
+    steps_s = np.diff(sent.t_s)
+    assert steps_s.min() > 0.0
+    assert np.median(steps_s) < 0.04, "thirty a second, of a camera that gives ten"
+    error_m = np.linalg.norm(sent.centres - truth.place(sent.t_s), axis=1)
+    cosine = (np.einsum("nij,nij->n", sent.rotations, truth.rotations(sent.t_s)) - 1) / 2
+    error_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    print(f"{len(sent.t_s)} poses, {np.percentile(error_m, 95):.2f} m, {error_deg.max():.1f} degrees")
+    assert np.percentile(error_m, 95) < 1.0
+    assert np.percentile(error_deg, 95) < 4.0
+
+
 def test_cloud_lies_on_the_true_surface(run: Run, scored: Score) -> None:
     cloud = read_ply(run.out / "cloud.ply")
     assert cloud.dtype.names is not None
@@ -102,7 +118,7 @@ def test_recording_is_a_recording(run: Run) -> None:
 def test_two_runs_are_identical(tmp_path: Path) -> None:
     for name in ("one", "two"):
         assert replay(SAMPLE, tmp_path / name, *SHORT).status == 0
-    for result in ("trajectory.tum", "cloud.ply"):
+    for result in ("trajectory.tum", "cloud.ply", "poses_sent.tum"):
         one, two = ((tmp_path / name / result).read_bytes() for name in ("one", "two"))
         assert one == two
         assert len(one) > 1000

@@ -1,0 +1,135 @@
+"""Integrals of the measured acceleration in NED, by accelerometers and the autopilot's attitude.
+
+Between two times they give the change of velocity and the displacement that an unbiased
+accelerometer measured, and how a bias in body axes changes both: preintegration (Forster et al.,
+"On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", 2017) with given rotations.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.estimation.sample_series import SampleSeries
+from companion.geometry.transforms import Array, rotation_from_quaternion
+from companion.telemetry import AttitudeSample, ImuSample
+
+GRAVITY_NED_M_S2 = np.array([0.0, 0.0, 9.80665])
+"""Standard gravity (CGPM 1901); what it differs by on earth, 0.3 %, counts as bias."""
+MAX_GAP_NS = 100_000_000
+"""Longer without a sample, nothing is integrated across."""
+NOISE_TAU = 500
+"""Samples over which the white noise is averaged."""
+LEAST_NOISE_M_S2 = 0.00980665 / np.sqrt(12.0)
+"""Rounding to 1 mg, as RAW_IMU states it."""
+
+
+class Change(NamedTuple):
+    """Velocity and displacement (3,) gained from rest, and their derivatives (3, 3) by the bias."""
+
+    dt_s: float
+    velocity_m_s: Array
+    displacement_m: Array
+    velocity_by_bias: Array
+    displacement_by_bias: Array
+
+
+class AccelerationIntegral:
+    """Integrates what arrives; attitude and IMU may come in any order up to a few samples."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[ImuSample] = deque(maxlen=1000)
+        self._attitudes: tuple[AttitudeSample, ...] = ()
+        self._series = SampleSeries()
+        self._last: tuple[int, Array, Array] | None = None
+        """Time, acceleration (3,) and rotation (3, 3) of the last sample."""
+        self._sums = np.zeros((9, 3))
+        """Rows: velocity, displacement, their derivatives by bias, and the number of gaps."""
+        self._raw: deque[Array] = deque(maxlen=3)
+        self._noise_variance = 0.0
+        self._n = 0
+        self._interval_s = 0.01
+
+    def take(self, sample: AttitudeSample | ImuSample) -> None:
+        """Add a sample; samples of a kind come in order of time."""
+        if isinstance(sample, ImuSample):
+            self._see_noise(sample)
+            self._waiting.append(sample)
+        elif not self._attitudes or sample.t_ns > self._attitudes[-1].t_ns:
+            self._attitudes = (*self._attitudes[-1:], sample)
+        self._integrate()
+
+    def prune(self, before_ns: int, keyframes_ns: Array) -> None:
+        """Drop integrals before a time, except at the times of keyframes (N,), sorted."""
+        self._series.prune(before_ns, keyframes_ns)
+
+    @property
+    def has_samples(self) -> bool:
+        """Whether accelerations came."""
+        return len(self._series) > 1
+
+    @property
+    def density_m_s2(self) -> float:
+        """Noise density of the accelerometers, m/s2 per root of Hz, from their own differences."""
+        sigma = max(float(np.sqrt(self._noise_variance)), float(LEAST_NOISE_M_S2))
+        return float(sigma * np.sqrt(self._interval_s))
+
+    def between(self, from_ns: int, to_ns: int) -> Change | None:
+        """Integrals between two times; None where measurements are missing."""
+        if not self.has_samples:
+            return None
+        (start, end), ok = self._series.at(np.array([from_ns, to_ns]))
+        if not ok.all() or start[8, 0] != end[8, 0]:
+            return None
+        dt_s = (to_ns - from_ns) * 1e-9
+        change = end - start
+        return Change(
+            dt_s, change[0], change[1] - dt_s * start[0],
+            change[2:5], change[5:8] - dt_s * start[2:5],
+        )  # fmt: skip
+
+    def _see_noise(self, sample: ImuSample) -> None:
+        """White noise by second differences, in which motion hardly shows at 100 Hz."""
+        self._raw.append(sample.accel_m_s2)
+        if len(self._raw) < 3:
+            return
+        first, middle, last = self._raw
+        variance = float(((first - 2.0 * middle + last) ** 2).mean()) / 6.0
+        self._n = min(self._n + 1, NOISE_TAU)
+        self._noise_variance += (variance - self._noise_variance) / self._n
+
+    def _integrate(self) -> None:
+        if len(self._attitudes) < 2:
+            return
+        before, after = self._attitudes
+        span_ns = after.t_ns - before.t_ns
+        # straight between the two, which at 5 rad/s and 50 Hz turns wrongly by 0.00004 rad at most
+        first, second = before.ned_from_body, after.ned_from_body
+        second = second if first @ second >= 0.0 else -second
+        while self._waiting and self._waiting[0].t_ns <= after.t_ns:
+            sample = self._waiting.popleft()
+            if sample.t_ns < before.t_ns or span_ns > MAX_GAP_NS:
+                self._last = None
+                continue
+            share = (sample.t_ns - before.t_ns) / span_ns
+            rotation = rotation_from_quaternion(first + share * (second - first))
+            self._add(sample.t_ns, rotation @ sample.accel_m_s2 + GRAVITY_NED_M_S2, rotation)
+
+    def _add(self, t_ns: int, acceleration_m_s2: Array, rotation: Array) -> None:
+        """Trapezoidal rule; displacement with acceleration linear between samples."""
+        last, self._last = self._last, (t_ns, acceleration_m_s2, rotation)
+        if last is None or not 0 < t_ns - last[0] <= MAX_GAP_NS:
+            self._sums[8] += 1.0
+        else:
+            dt_s = (t_ns - last[0]) * 1e-9
+            self._interval_s += (dt_s - self._interval_s) / NOISE_TAU
+            was = np.vstack([last[1], -last[2]])
+            now = np.vstack([acceleration_m_s2, -rotation])
+            rates = self._sums[[0, 2, 3, 4]]
+            moved = rates * dt_s + (2.0 * was + now) * (dt_s * dt_s / 6.0)
+            changed = (was + now) * (dt_s / 2.0)
+            self._sums[[0, 2, 3, 4]] += changed
+            self._sums[[1, 5, 6, 7]] += moved
+        self._series.add(t_ns, self._sums.copy())

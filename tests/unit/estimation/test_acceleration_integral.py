@@ -1,0 +1,87 @@
+"""Integrals of accelerometers are those of the motion, and of a bias in body axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.estimation.acceleration_integral import GRAVITY_NED_M_S2, AccelerationIntegral
+from companion.geometry.transforms import (
+    Array,
+    quaternion_from_rotation,
+    rotation_from_vector,
+)
+from companion.telemetry import AttitudeSample, ImuSample
+
+RATE_HZ = 200
+
+
+def turning(t_s: float) -> Array:
+    """`ned_from_body` (3, 3) of a body that rolls and yaws."""
+    yaw, roll = (
+        rotation_from_vector(np.array([0, 0, 0.8 * t_s])),
+        np.array([0.3 * np.sin(t_s), 0, 0]),
+    )
+    return yaw @ rotation_from_vector(roll)
+
+
+def acceleration(t_s: float) -> Array:
+    """Of the body in NED, m/s2."""
+    return np.array([1.5 * np.cos(t_s), -0.7 * np.sin(2 * t_s), 0.4])
+
+
+def flown(
+    seconds: float, bias: Array | None = None, without: tuple[float, float] = (0.0, 0.0)
+) -> AccelerationIntegral:
+    """What an accelerometer makes of that flight; without samples in a span of time."""
+    integral = AccelerationIntegral()
+    for i in range(int(seconds * RATE_HZ) + 1):
+        t_s = i / RATE_HZ
+        t_ns = round(t_s * 1e9)
+        if i % 4 == 0:
+            integral.take(AttitudeSample(t_ns, quaternion_from_rotation(turning(t_s))))
+        force = turning(t_s).T @ (acceleration(t_s) - GRAVITY_NED_M_S2)
+        if not without[0] <= t_s < without[1]:
+            integral.take(ImuSample(t_ns, np.zeros(3), force + (0.0 if bias is None else bias)))
+    return integral
+
+
+def test_it_gives_velocity_and_displacement() -> None:
+    change = flown(6.0).between(round(1e9), round(5e9))
+    assert change is not None
+    t_s = np.linspace(1.0, 5.0, 40_001)
+    a = np.stack([acceleration(each) for each in t_s])
+    dt = t_s[1] - t_s[0]
+    velocity = np.vstack([np.zeros(3), np.cumsum(0.5 * (a[1:] + a[:-1]) * dt, axis=0)])
+    displacement = (0.5 * (velocity[1:] + velocity[:-1]) * dt).sum(axis=0)
+    assert change.dt_s == pytest.approx(4.0)
+    assert change.velocity_m_s == pytest.approx(velocity[-1], abs=2e-3)
+    assert change.displacement_m == pytest.approx(displacement, abs=5e-3)
+
+
+def test_a_bias_changes_them_as_its_derivatives_say() -> None:
+    bias = np.array([0.11, -0.23, 0.05])
+    span = round(1e9), round(4e9)
+    true, wrong = flown(5.0).between(*span), flown(5.0, bias).between(*span)
+    assert true is not None and wrong is not None
+    back_m_s = wrong.velocity_m_s + wrong.velocity_by_bias @ bias
+    back_m = wrong.displacement_m + wrong.displacement_by_bias @ bias
+    assert back_m_s == pytest.approx(true.velocity_m_s, abs=1e-4)
+    assert back_m == pytest.approx(true.displacement_m, abs=1e-4)
+
+
+def test_nothing_is_integrated_over_a_gap() -> None:
+    integral = flown(6.0, without=(2.0, 2.2))
+    assert integral.between(round(1e9), round(4e9)) is None
+    assert integral.between(round(0.5e9), round(1.5e9)) is not None
+    assert integral.between(round(3e9), round(5e9)) is not None
+    assert integral.between(round(5e9), round(9e9)) is None, "nothing has come yet"
+
+
+def test_white_noise_is_measured_by_itself(rng: np.random.Generator) -> None:
+    integral = AccelerationIntegral()
+    for i in range(2000):
+        t_ns = i * 10_000_000
+        integral.take(AttitudeSample(t_ns, np.array([1.0, 0, 0, 0])))
+        integral.take(ImuSample(t_ns, np.zeros(3), rng.normal(scale=0.08, size=3)))
+    assert integral.density_m_s2 == pytest.approx(0.08 * np.sqrt(0.01), rel=0.1)
