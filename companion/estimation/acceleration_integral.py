@@ -67,7 +67,7 @@ class AccelerationIntegral:
 
     @property
     def has_samples(self) -> bool:
-        """Whether accelerations came."""
+        """True once accelerations came."""
         return len(self._series) > 1
 
     @property

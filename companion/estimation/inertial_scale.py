@@ -134,7 +134,7 @@ class ScaleBank:
         return float(np.linalg.norm(self._gained_m_s)) / max(self._lasted_s, 1e-9)
 
     def moved(self, sample: AlignmentSample) -> float:
-        """How far the last sample's place has moved since it was taken, map units."""
+        """Distance by which the last place has moved since it was taken, map units."""
         if self._last is None:
             return 0.0
         levelled = self._level @ sample.map_from_camera.translation
@@ -263,7 +263,7 @@ class InertialScale:
         return end
 
     def _is_coarse(self, bank: ScaleBank) -> bool:
-        """Whether the scale is narrow within the bank, or near its edge."""
+        """True if the scale is narrow within the bank, or near its edge."""
         if bank.n < LEAST_PLACES:
             return False
         mean, sigma = bank.posterior

@@ -69,7 +69,7 @@ def test_poses_given_out_in_flight_are_true_when_they_are_given(run: Run) -> Non
     error_m = np.linalg.norm(sent.centres - truth.place(sent.t_s), axis=1)
     cosine = (np.einsum("nij,nij->n", sent.rotations, truth.rotations(sent.t_s)) - 1) / 2
     error_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    print(f"{len(sent.t_s)} poses, {np.percentile(error_m, 95):.2f} m, {error_deg.max():.1f} degrees")
+    print(f"{len(sent.t_s)} poses, {np.percentile(error_m, 95):.2f} m, {error_deg.max():.1f} deg")
     assert np.percentile(error_m, 95) < 1.0
     assert np.percentile(error_deg, 95) < 4.0
 
