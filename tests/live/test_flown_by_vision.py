@@ -20,6 +20,9 @@ HEIGHT_OF = {"ardupilot": "GLOBAL_POSITION_INT", "px4": "LOCAL_POSITION_NED"}
 """What tells its height before it has a position."""
 CORNERS = ((SIDE_M, 0.0), (SIDE_M, SIDE_M), (0.0, SIDE_M), (0.0, 0.0))
 
+BACK_S, THERE_M = 5.0, 0.2
+"""So long it may take to go back to where it believes itself to be, within so much."""
+
 
 @dataclass
 class Flown:
@@ -38,6 +41,11 @@ class Flown:
     """From the cable's return to the next pose."""
     n_refused: int = 0
     texts: list[str] = field(default_factory=list)
+
+
+def is_there(moment: Moment) -> bool:
+    """Whether it believes to be where it is to be."""
+    return bool(np.linalg.norm((moment.believed - moment.wanted)[:2]) < THERE_M)
 
 
 @pytest.fixture(scope="module", params=["ardupilot", "px4"])
@@ -92,7 +100,9 @@ def flown(
             time.sleep(0.02)
         out.again_s = time.monotonic() - plugged_s
         out.without_pose_s = time.monotonic() - pulled_s
-        during(5.0)
+        until_s = time.monotonic() + BACK_S
+        while not is_there(drone.moments[-1]) and time.monotonic() < until_s:
+            time.sleep(0.05)
         out.back_again = during(2.0)
         out.n_refused, out.texts = drone.n_refused, drone.texts()
         daemon.stop()

@@ -1,18 +1,18 @@
-"""A stage that hangs in flight is ended and restarted, and what it wrote is kept."""
+"""Stages that hang in flight are ended and restarted, and what they wrote is kept."""
 
 from __future__ import annotations
 
 import signal
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 from drivers.recording.recording import Recording
 from tests.support.processes.daemon_process import Daemon
 
 ANSWER_S, UP_S = 4.0, 120.0
+KINDS = ("results", "recorder")
 IMPATIENT = f"""
 import sys
 from dataclasses import replace
@@ -40,27 +40,29 @@ def is_up(health: dict[str, Any], kind: str, n_restarted: int) -> bool:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["results", "recorder"])
-def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path, kind: str) -> None:
+def works(health: dict[str, Any], kind: str) -> bool:
+    return bool(stage_of(health, kind)["n"] > 5)
+
+
+def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path) -> None:
     settings = "camera.source=pattern", "camera.rate_hz=10", "depth.enabled=false", "link.url="
     with Daemon(tmp_path, *settings, program=("-c", IMPATIENT)) as daemon:
-        daemon.until(lambda health: is_up(health, kind, 0), UP_S)
-        daemon.until(lambda health: is_up(health, "localisation", 0), UP_S)
-        stopped_ns = daemon.signal_stage(kind, signal.SIGSTOP)
+        for kind in (*KINDS, "localisation"):
+            daemon.until(partial(is_up, kind=kind, n_restarted=0), UP_S)
+        stopped_ns = {kind: daemon.signal_stage(kind, signal.SIGSTOP) for kind in KINDS}
         n_poses = stage_of(daemon.status(), "localisation")["n"]
-        ended = daemon.line(f"started again: {kind}: it hung for", UP_S, stopped_ns)
-        assert ended.monotonic_ns - stopped_ns > (ANSWER_S - 2.0) * 1e9
-        daemon.until(lambda health: is_up(health, kind, 1), UP_S)
-        health = daemon.until(lambda health: stage_of(health, kind)["n"] > 5, UP_S)
-        assert stage_of(health, "localisation")["n"] > n_poses, "poses went on"
+        for kind in KINDS:
+            ended = daemon.line(f"started again: {kind}: it hung for", UP_S, stopped_ns[kind])
+            assert ended.monotonic_ns - stopped_ns[kind] > (ANSWER_S - 2.0) * 1e9
+        for kind in KINDS:
+            daemon.until(partial(is_up, kind=kind, n_restarted=1), UP_S)
+            daemon.until(partial(works, kind=kind), UP_S)
+        assert stage_of(daemon.status(), "localisation")["n"] > n_poses, "poses went on"
         daemon.stop(60.0)
         assert not daemon.said("Traceback")
         (folder,) = daemon.flown()
-    first, second = folder, folder / "part-2"
-    if kind == "results":
-        for part in (first, second):
-            assert (part / "flight.rrd").stat().st_size > 10_000
-        return
-    for part in (first, second):  # the first is mended, which it was not closed for
+    for part in (folder, folder / "part-2"):
+        assert (part / "flight.rrd").stat().st_size > 10_000
+        # the first is mended, which it was not closed for
         with closing(Recording(part / "flight.mcap")) as recording:
             assert recording.pictures

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -18,11 +15,9 @@ import pytest
 
 from companion.daemon.nodes.kept_chunks import NAME
 from companion.errors import SourceError
-from companion.runtime.stage_protocol import Finish
 from drivers.system.status_socket import ask_status
-from tests.support.flights import topic_flight
 from tests.support.processes.two_namespaces import TwoNamespaces, why_not
-from tests.support.processes.zenoh_nodes import Ground, free_endpoint, ground_config, topics_of
+from tests.support.processes.zenoh_nodes import points_in, until
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
 SLOWER = 3
@@ -30,86 +25,6 @@ SLOWER = 3
 KBIT_S, DELAY_MS = 20_000, 10
 PORT = 7447
 RUN = (sys.executable, "-m", "companion", "run")
-
-
-def points_in(folder: Path) -> int:
-    """Points of a finished run."""
-    head = (folder / "cloud.ply").read_bytes()[:600].decode("ascii", "ignore")
-    found = re.search(r"element vertex (\d+)", head)
-    assert found is not None
-    return int(found[1])
-
-
-def until(such: Callable[[], bool], timeout_s: float, what: str) -> float:
-    """Wait for something; how long it took."""
-    began_s = time.monotonic()
-    while not such():
-        assert time.monotonic() - began_s < timeout_s, f"not within {timeout_s:g} s: {what}"
-        time.sleep(0.2)
-    return time.monotonic() - began_s
-
-
-@pytest.fixture
-def closing() -> Iterator[ExitStack]:
-    """Closes what a test has opened, however it ends."""
-    with ExitStack() as stack:
-        yield stack
-
-
-def test_a_node_goes_on_with_its_map_after_a_restart(tmp_path: Path, closing: ExitStack) -> None:
-    endpoint = free_endpoint()
-    messages = list(topic_flight.messages(130))
-    first = Ground(ground_config(endpoint, tmp_path))  # before the drone is there
-    closing.callback(first.stop)
-    drone = closing.enter_context(topics_of(endpoint, tmp_path))
-    for message in messages[: len(messages) // 2]:
-        drone.step(message)
-    folder = tmp_path / "ground" / "drone-a-flight"
-    kept = folder / NAME
-    until(lambda: kept.exists() and kept.stat().st_size > 2000, 60, "a cloud")
-    first.stop()
-    n_first, n_kept = points_in(folder), kept.stat().st_size
-    assert n_first > 50
-    for message in messages[len(messages) // 2 :]:
-        drone.step(message)  # nobody is there, and it takes no notice
-    second = Ground(ground_config(endpoint, tmp_path))
-    closing.callback(second.stop)
-    second.stop()  # before it has heard of the drone: what is there stays
-    assert points_in(folder) == n_first
-    third = Ground(ground_config(endpoint, tmp_path))
-    closing.callback(third.stop)
-    until(lambda: kept.stat().st_size > n_kept, 60, "more cloud")
-    drone.finish(Finish(hurry=False))  # waits for who fetches
-    third.stop()
-    assert points_in(folder) > 1.3 * n_first
-    assert kept.stat().st_size > n_kept
-
-
-def test_the_drone_begins_anew_and_so_does_its_map(tmp_path: Path, closing: ExitStack) -> None:
-    endpoint = free_endpoint()
-    messages = list(topic_flight.messages(130))
-    folders = [tmp_path / "ground" / f"drone-{name}" for name in ("a-flight", "b-flight")]
-
-    def kept_bytes(folder: Path) -> int:
-        return (folder / NAME).stat().st_size if (folder / NAME).exists() else 0
-
-    ground = Ground(ground_config(endpoint, tmp_path))
-    closing.callback(ground.stop)
-    with topics_of(endpoint, tmp_path) as topics:
-        for message in messages[:180]:
-            topics.step(message)
-        until(lambda: kept_bytes(folders[0]) > 2000, 60, "a cloud")
-    before = kept_bytes(folders[0])
-    with topics_of(endpoint, tmp_path) as topics:  # the same flight, another process
-        for message in messages[180:]:
-            topics.step(message)
-        until(lambda: kept_bytes(folders[0]) > before, 60, "more of this cloud")
-    with topics_of(endpoint, tmp_path, "b-flight") as topics:
-        for message in messages:
-            topics.step(message)
-        until(lambda: kept_bytes(folders[1]) > 2000, 60, "a cloud of the next flight")
-    ground.stop()
-    assert all(points_in(folder) > 50 for folder in folders)
 
 
 def slow_flight(folder: Path) -> Path:

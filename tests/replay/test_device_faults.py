@@ -11,7 +11,7 @@ from tests.support.processes.program import Run, replay
 from tests.support.reference.failing_driver import fail, two_devices
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
-STOP_S = "6"
+SHORT = "--stop", "6", "--set", "depth.stride=4"
 KERNELS = 900
 """The test at the start runs some hundred, each depth map some ten: it fails in mid-flight."""
 
@@ -26,7 +26,7 @@ def test_the_next_device_takes_over_and_each_run_is_the_same(
 ) -> None:
     first, second = two_devices(monkeypatch, tmp_path)
     fail(monkeypatch, tmp_path, "lost", first, after=KERNELS)
-    runs = [replay(FLIGHT, tmp_path / name, "--stop", STOP_S) for name in ("a", "b")]
+    runs = [replay(FLIGHT, tmp_path / name, *SHORT) for name in ("a", "b")]
     for run in runs:
         assert run.status == 0, run.stderr
         assert told(run)[FAILED_OVER].startswith(f"{second.named}; {first.named}: fails")
@@ -44,7 +44,7 @@ def test_without_another_device_path_and_report_are_whole(
     first, _ = two_devices(monkeypatch, tmp_path)
     fail(monkeypatch, tmp_path, "lost", first, after=KERNELS)
     asked_for = f"opencl.device={first.number}"  # so that no other may take over
-    run = replay(FLIGHT, tmp_path / "a", "--stop", STOP_S, "--set", asked_for)
+    run = replay(FLIGHT, tmp_path / "a", *SHORT, "--set", asked_for)
     assert run.status == 0, run.stderr
     assert told(run)[NO_DEVICE_LEFT].startswith(f"{first.named}: fails while it computes")
     assert run.report["device"].startswith("none is left; failed: ")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import companion.streaming.viewer  # noqa: F401 - Rerun keeps a runtime from its import on
 from companion.app.cli import main
 
 

@@ -71,7 +71,7 @@ class TinyWork(Work):
             yield Said(message.t_ns, "frame", str(message.seq))
         elif isinstance(message, MapUpdate):
             yield Said(message.t_ns, "map", str(message.revision))
-        else:
+        elif message.who != "heard":  # by itself
             yield Said(message.t_ns, "heard", f"{message.who} {message.text}")
 
     def _do(self, what: Do) -> Iterator[Any]:

@@ -165,7 +165,6 @@ def test_how_long_it_has_hung_and_its_end_by_interruption(start: Start) -> None:
     assert tiny.why() == "it hung"
     assert tiny.process.was_interrupted
     assert tiny.process.driver is not None, "which may be to blame"
-    assert tiny.stage.stalled_s(offered_s + 100.0) == 0.0
 
 
 def test_a_stage_that_is_asked_to_end_does_not_hang(start: Start) -> None:
