@@ -7,6 +7,9 @@ BIN := $(VENV)/bin
 FLIGHT ?= sample/survey
 OUT ?= out/demo
 
+# With it each process of the tests, seven a flight, compiles the whole program anew: a second each.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test lint opencl clean reference regression settings deb system-test docs
 
 demo: opencl
