@@ -115,6 +115,7 @@ class MapLock:
         with self._changed:
             self._changed.wait_for(self._may_map)
             self.point += 1
+            self._changed.notify_all()  # a frame may have waited for this point
             return look()
 
     def end_order(self) -> None:

@@ -125,3 +125,19 @@ def test_mapping_ends_where_the_frame_that_is_due_never_comes() -> None:
     closing.join(5.0)
     assert not closing.is_alive()
     assert lock.point == 2
+
+
+def test_a_frame_goes_as_soon_as_idle_work_comes_to_its_point() -> None:
+    lock = MapLock([1])
+    tracked = threading.Event()
+
+    def track() -> None:
+        with lock.tracking():
+            tracked.set()
+
+    frame = threading.Thread(target=track)
+    frame.start()
+    assert not tracked.wait(0.05), "it is not its turn"
+    lock.pass_point(lambda: True)
+    assert tracked.wait(5.0)
+    frame.join()
