@@ -14,8 +14,8 @@ from companion.dense.opencl import ListedDevice
 from companion.messages import DepthMap, Message
 from companion.runtime.stage_protocol import DriverAtWork, Finish, Remark, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
+from drivers.system.file_pages import give_back_library_pages
 from drivers.system.heap import give_back_heap
-from drivers.system.library_pages import give_back_library_pages
 
 FIRST_PATIENCE_S = 120.0
 """Drivers may compile kernels when they first run: on a small processor that takes most of a

@@ -18,8 +18,8 @@ from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import cache_errors
 from companion.stages.map_keeper import Kept, MapKeeper
 from companion.timing.clock import since_boot_ns
+from drivers.system.file_pages import give_back_library_pages
 from drivers.system.heap import give_back_heap
-from drivers.system.library_pages import give_back_library_pages
 
 KEEP_EVERY_NS = 1_000_000_000
 NO_COLOUR = np.zeros((0, 0, 3), np.uint8)

@@ -11,7 +11,7 @@ from companion.products.surroundings import versions
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
 from drivers.recording.recorder import Recorder
-from drivers.system.library_pages import give_back_library_pages
+from drivers.system.file_pages import give_back_library_pages
 
 
 class _Recorder(Work):

@@ -14,7 +14,7 @@ from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapsh
 from companion.runtime.stage_work import Work
 from companion.stages.cloud_snapshots import CloudSnapshots
 from companion.streaming.viewer import FileViewer
-from drivers.system.library_pages import give_back_library_pages
+from drivers.system.file_pages import give_back_library_pages
 
 
 class _Results(Work):

@@ -17,7 +17,7 @@ import pytest
 from tests.support.processes.flying import Flying
 from tests.support.processes.program import Run, replay
 
-FLY_S, LOADED_S = 4.0, 4.0
+FLY_S, LOADED_S = 8.0, 4.0
 ENOUGH = 150
 """Messages with poses, however long they take on a busy machine."""
 BUSY = "while True: pass"
@@ -35,15 +35,14 @@ def load() -> Iterator[None]:
             process.wait()
 
 
-def flown(folder: Path, codec: str, *, loaded: bool) -> Path:
-    """A flight without pictures for a while, and where `loaded` with a stage killed; its folder."""
+def flown(folder: Path, codec: str) -> Path:
+    """A flight with load, and with a stage killed; its folder."""
     with Flying(folder, f"recorder.codec={codec}", "recorder.jpeg_quality=90") as flying:
         flying.take_off()
         time.sleep(FLY_S)
-        if loaded:
-            flying.daemon.signal_stage("results", signal.SIGKILL)
-            with load():
-                time.sleep(LOADED_S)
+        flying.daemon.signal_stage("results", signal.SIGKILL)
+        with load():
+            time.sleep(LOADED_S)
         flying.camera.on = False
         time.sleep(1.0)
         flying.camera.on = True
@@ -65,7 +64,7 @@ def again(path: Path, out: Path) -> tuple[Run, dict[str, Any]]:
 
 @pytest.mark.alone
 def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> None:
-    path = flown(tmp_path, "png", loaded=True)
+    path = flown(tmp_path, "png")
     done, found = again(path, tmp_path / "again")
     assert found["tracked_again"]
     assert found["frames_same"] == found["frames"] > 100
@@ -75,7 +74,7 @@ def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> No
 
 @pytest.mark.alone
 def test_compressed_images_give_the_decisions_of_the_gate_again(tmp_path: Path) -> None:
-    path = flown(tmp_path, "mjpeg", loaded=False)
+    path = flown(tmp_path, "mjpeg")
     _, found = again(path, tmp_path / "again")
     assert not found["tracked_again"]
     assert found["same"] == found["sent"] == found["made_again"] > 100

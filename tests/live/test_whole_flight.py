@@ -28,7 +28,7 @@ from tests.support.reference.scoring import Trajectory, read_ply, read_tum, scor
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 TRUTH = read_tum(SAMPLE / "truth" / "world_from_camera.tum")
-ARMS_S, SEEN_S, DISARMS_S = 1.0, 25.0, 35.0
+ARMS_S, DISARMS_S = 1.0, 45.0
 """After the first picture."""
 
 
@@ -87,7 +87,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
             out.folders_before_arming = daemon.flown()
             autopilot.arm()
             out.armed_ns = time.monotonic_ns()
-            wait_until(SEEN_S)
+            wait_until(30)
             out.health = daemon.status()
             out.table = subprocess.run(
                 [sys.executable, "-m", "companion", "status",
@@ -205,8 +205,7 @@ def test_results_are_left(flown: Flown) -> None:
     on_truth_clock = found.t_s - flown.begins_unix_s + TRUTH.t_s[0]
     result = score(Trajectory(on_truth_clock, found.centres, found.rotations), TRUTH)
     print(f"{result.n_common} frames, {result.ate_sim3_m:.2f} m, scale {result.scale_error:.1%}")
-    n_flown = np.count_nonzero(TRUTH.t_s < TRUTH.t_s[0] + DISARMS_S)
-    assert result.n_common > 0.7 * n_flown
+    assert result.n_common > 0.7 * len(TRUTH.t_s)
     assert result.ate_sim3_m < 0.5
     assert result.scale_error < 0.03
     assert len(read_ply(flown.folder / "cloud.ply")) > 1000

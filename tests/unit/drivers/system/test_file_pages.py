@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from drivers.system.library_pages import _unchanged
+from drivers.system.file_pages import _unchanged
 
 SMAPS = """\
 7f0000000000-7f0000010000 r-xp 00001000 fe:00 11      /usr/lib/libcode.so.1.2
@@ -50,7 +50,7 @@ PROGRAM = """
 import re, sys
 import cv2, numpy as np
 from pathlib import Path
-from drivers.system.library_pages import give_back_library_pages
+from drivers.system.file_pages import give_back_library_pages
 
 def file_kib():
     text = Path("/proc/self/smaps_rollup").read_text()
