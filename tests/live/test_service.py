@@ -14,8 +14,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from companion.daemon.daemon import NO_PROGRESS
 from companion.daemon.health_watch import PATIENCE_NS
+from companion.daemon.periodic_checks import NO_PROGRESS
 from tests.support.processes.daemon_process import Daemon
 
 PATTERN = ("camera.source=pattern", "daemon.flight=always", "recorder.enabled=false")
