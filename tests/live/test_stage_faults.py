@@ -56,6 +56,9 @@ def test_what_is_killed_begins_again(
     flying.until_told(" restarted", killed_ns)
     flying.assert_went_on(killed_ns)
     flying.assert_true_poses()
+    if kind == "results":  # what begins anew writes beside what was written before
+        for part in (".", "part-2"):
+            assert (flying.daemon.flown()[-1] / part / "flight.rrd").exists()
 
 
 def test_what_hangs_is_named_and_goes_on_when_it_can(flying: Flying) -> None:
@@ -146,10 +149,3 @@ def test_it_still_ends_in_time_and_leaves_nothing_behind(flying: Flying) -> None
     psutil.wait_procs(children, timeout=10)
     assert not [child for child in children if child.is_running()]
     assert not flying.daemon.said("Traceback")
-
-
-def test_every_part_of_the_flights_was_recorded(flying: Flying) -> None:
-    """A results stage that began anew writes beside what it wrote before."""
-    first = flying.daemon.flown()[0]
-    assert (first / "flight.rrd").exists()
-    assert (first / "part-2" / "flight.rrd").exists()

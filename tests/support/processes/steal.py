@@ -1,8 +1,9 @@
 """Processor time that the host gives to others while this machine wants it: /proc/stat's `steal`.
 
 A flight in real time is a measurement, and none of a machine that was away. What fails by a flight
-in which the processors were taken is flown again, three times at most; then it has no verdict.
-It says so, and is skipped. On a machine that is not shared nothing is ever flown again.
+in which the processors were taken is flown again with all that its module flew before it, three
+times at most and not for longer than MOST_AGAIN_S in all; then it has no verdict. It says so, and
+is skipped. On a machine that is not shared nothing is ever flown again.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from itertools import pairwise
 
 import pytest
 from _pytest.runner import runtestprotocol
@@ -18,6 +20,7 @@ EVERY_S = 0.5
 SPAN_S, SHARE = 2.0, 0.2
 """A fifth of all processors taken for two seconds: poses are late, the dense map is shed."""
 FLIGHTS = 3
+MOST_AGAIN_S = 1200.0
 
 
 class Steal:
@@ -66,7 +69,10 @@ class FlownAgain:
         self._module: object = None
         self._begun_s = 0.0
         """When that which the module's tests share was begun."""
+        self._before: list[pytest.Item] = []
+        """The module's tests so far."""
         self._again: list[str] = []
+        self._again_s = 0.0
 
     def pytest_unconfigure(self) -> None:
         if self._steal is not None:
@@ -84,7 +90,7 @@ class FlownAgain:
         steal = self._steal = self._steal or Steal()
         module = item.getparent(pytest.Module)
         if module is not self._module:
-            self._module, self._begun_s = module, time.monotonic()
+            self._module, self._begun_s, self._before = module, time.monotonic(), []
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         reports = runtestprotocol(item, nextitem=nextitem, log=False)
         shares: list[float] = []
@@ -92,14 +98,18 @@ class FlownAgain:
             shares.append(steal.worst(self._begun_s))
             if shares[-1] < SHARE:
                 break
-            if len(shares) == FLIGHTS:
+            if len(shares) == FLIGHTS or self._again_s > MOST_AGAIN_S:
                 no_verdict(item, reports, shares)
                 break
             taken = f"the host took {100 * shares[-1]:.0f} % of the processors"
             self._again.append(f"FLOWN AGAIN {item.nodeid} - {taken}")
             item.session._setupstate.teardown_exact(None)  # what the module shares is flown again
             self._begun_s = time.monotonic()
+            for flown, following in pairwise([*self._before, item]):
+                runtestprotocol(flown, nextitem=following, log=False)
             reports = runtestprotocol(item, nextitem=nextitem, log=False)
+            self._again_s += time.monotonic() - self._begun_s
+        self._before.append(item)
         for each in reports:
             item.ihook.pytest_runtest_logreport(report=each)
         item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)

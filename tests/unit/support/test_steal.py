@@ -26,20 +26,25 @@ def pytest_configure(config):
 """
 FLIGHTS = """
 import pytest
-flights = []
+flights, done = [], []
 
 @pytest.fixture(scope="module")
 def flown():
     flights.append(1)
+    done.clear()
     return len(flights)
 
 @pytest.mark.alone
-def test_first(flown):
-    print("flight", flown)
+def test_take_off(flown):
+    done.append("take off")
+
+@pytest.mark.alone
+def test_cruise(flown):
+    assert done == ["take off"]
     assert flown >= {needed}
 
 @pytest.mark.alone
-def test_second(flown):
+def test_land(flown):
     assert flown == len(flights)
 """
 
@@ -56,12 +61,12 @@ def fly(folder: Path, needed: int, *shares: float) -> str:
 @pytest.mark.parametrize(
     ("needed", "shares", "verdict"),
     [
-        (1, (), "2 passed"),
-        (2, (0.1,), "1 failed, 1 passed"),
-        (2, (0.5,), "2 passed"),
-        (3, (0.5, 0.3), "2 passed"),
-        (3, (0.5, 0.1), "1 failed, 1 passed"),
-        (9, (0.5, 0.4, 0.3), "1 passed, 1 skipped"),
+        (1, (), "3 passed"),
+        (2, (0.1,), "1 failed, 2 passed"),
+        (2, (0.5,), "3 passed"),
+        (3, (0.5, 0.3), "3 passed"),
+        (3, (0.5, 0.1), "1 failed, 2 passed"),
+        (9, (0.5, 0.4, 0.3), "2 passed, 1 skipped"),
     ],
 )
 def test_it_is_flown_again(
