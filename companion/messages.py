@@ -89,6 +89,8 @@ class Odometry:
     sigma_velocity_m_s: float = float("inf")
     sigma_attitude_rad: float = float("inf")
     sigma_yaw_rad: float = float("inf")
+    inertial: bool = False
+    """Dead reckoning goes by accelerometers."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,6 +71,12 @@ class AccelerationIntegral:
         return len(self._series) > 1
 
     @property
+    def newest_ns(self) -> int:
+        """Time up to which there are integrals; before there are any, before all times."""
+        newest = self._series.newest
+        return -(2**62) if newest is None else newest[0]
+
+    @property
     def density_m_s2(self) -> float:
         """Noise density of the accelerometers, m/s2 per root of Hz, from their own differences."""
         sigma = max(float(np.sqrt(self._noise_variance)), float(LEAST_NOISE_M_S2))

@@ -11,13 +11,19 @@ from dataclasses import replace
 import numpy as np
 
 from companion.config import Config
+from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.checkpoint import MAX_BYTES, Checkpoint
 from companion.estimation.georeference import Georeferencer
+from companion.estimation.inertial_navigation import InertialNavigation
 from companion.estimation.motion_filter import MotionFilter
 from companion.estimation.resumption import Resumption, Verdict
 from companion.estimation.segment_georeference import SegmentGeoreferences
-from companion.estimation.smooth_odometry import SIGMA_DEAD_RECKONING_M_S, SmoothOdometry
+from companion.estimation.smooth_odometry import (
+    SIGMA_DEAD_RECKONING_M_S,
+    BodyAttitude,
+    SmoothOdometry,
+)
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
@@ -72,9 +78,11 @@ class LocalisationStage:
         self._georeferencer = Georeferencer(
             config.georeference, camera.body_from_camera, sensors_only=config.feedback.mode != "off"
         )
-        self._odometry = SmoothOdometry(camera, config.feedback.max_jump_m)
+        self._acceleration = AccelerationIntegral()
+        self._navigation = InertialNavigation(self._acceleration)
+        self._odometry = SmoothOdometry(camera, config.feedback.max_jump_m, self._navigation)
         self._georeferences = SegmentGeoreferences(
-            self._georeferencer, self._attitude, camera.body_from_camera
+            self._georeferencer, self._attitude, self._acceleration, camera.body_from_camera
         )
         self._last: Track | None = None
         """The last frame with a pose, in the frame of the active segment."""
@@ -123,7 +131,7 @@ class LocalisationStage:
     def _take_samples(self) -> None:
         for sample in self._samples:
             if isinstance(sample, AttitudeSample | ImuSample):
-                self._georeferences.take(sample)
+                self._acceleration.take(sample)
             if isinstance(sample, AttitudeSample):
                 self._attitude.add(sample)
             else:
@@ -254,7 +262,7 @@ class LocalisationStage:
         self._attitude.prune(living.keys())
         when_ns: Array = np.array(sorted(living.values()))
         self._georeferencer.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
-        self._georeferences.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
+        self._acceleration.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
 
     def _check_resumption(self, resumption: Resumption, t_ns: int) -> Iterator[MapUpdate | Warned]:
         """Verify the stored map; resume or drop it."""
@@ -313,7 +321,8 @@ class LocalisationStage:
     def _predicted(self, t_ns: int, attitude: Array | None) -> Pose | None:
         """Predicted pose in the active segment; None when unknown.
 
-        Constant velocity between frames; over longer spans the velocity of the autopilot.
+        Constant velocity between frames; over longer spans inertial navigation, else the velocity
+        of the autopilot.
         """
         predicted, last = self._motion.predict(t_ns, attitude), self._last
         if predicted is None or last is None or last.map_from_camera is None:
@@ -321,6 +330,11 @@ class LocalisationStage:
         placed = self._georeferences.of(self._tracker.map)
         if placed is None or t_ns - last.t_ns < MIN_DEAD_RECKONING_NS:
             return predicted
+        body = self._body_attitude(t_ns)
+        reckoned = None if body is None else self._odometry.reckoned(body.t_ns)
+        if reckoned is not None:
+            place = self._odometry.place_in_map(reckoned.place_m, predicted.rotation)
+            return predicted if place is None else Pose(predicted.rotation, place)
         moved_m = self._georeferencer.displacement_by_velocity(last.t_ns, t_ns)
         if moved_m is None:
             return predicted
@@ -352,8 +366,17 @@ class LocalisationStage:
         """Odometry of a track of the active segment, in its own frame."""
         segment = self._tracker.map
         return self._odometry.step(
-            track, segment.first_keyframe_id, self._georeferences.of(segment), self._motion.velocity
-        )
+            track, segment.first_keyframe_id, self._georeferences.of(segment),
+            self._motion.velocity, self._body_attitude(track.t_ns),
+        )  # fmt: skip
+
+    def _body_attitude(self, t_ns: int) -> BodyAttitude | None:
+        """Attitude of the body at a frame, where the autopilot's is that of the camera."""
+        ned_from_camera = self._attitude.at(t_ns)
+        if ned_from_camera is None:
+            return None
+        mount, delay_ns = self._attitude.correction
+        return BodyAttitude(t_ns + delay_ns, ned_from_camera @ mount.T)
 
     def _check_attitude(self, t_ns: int) -> list[Warned]:
         if not self._attitude.due(t_ns):
@@ -378,6 +401,7 @@ class LocalisationStage:
             self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)
             self._motion.reset()
             self._attitude.reset()
+            self._navigation.reset()
             self._last = None
         return checked.warnings
 

@@ -3,7 +3,8 @@
 A pose must be metric, tracked, certain, of sufficient quality, level by the autopilot's own
 attitude, and recent. What cannot be checked is not sent. All conditions must hold for a while
 before the first pose is sent; gaps shorter than an autopilot's timeout are bridged by prediction,
-after longer ones and after every discontinuity the conditions must hold again.
+and longer ones by inertial dead reckoning for as long as its standard deviation is within the
+limit. After others, and after every discontinuity, the conditions must hold again.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -47,6 +49,16 @@ RESET = "position reset"
 REBOOTED = "autopilot rebooted"
 NO_HEIGHT = "no autopilot height"
 PROVING = "belief must hold first"
+
+
+class Sending(Enum):
+    """State of the pose output; docs/autopilots.md has its changes as a table."""
+
+    OFF = "off"
+    PROVING = "proving"
+    SENDING = "sending"
+    BRIDGING = "bridging"
+    """Sent by inertial dead reckoning: nothing is tracked."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,8 +110,13 @@ class PoseGate:
         self._periods_ns: deque[int] = deque(maxlen=N_PERIODS)
         self._newest_ns = 0
         self._last_rejection = ""
-        self.sending = False
+        self.state = Sending.OFF
         self.why_not = NOT_YET
+
+    @property
+    def sending(self) -> bool:
+        """True while poses are sent."""
+        return self.state in (Sending.SENDING, Sending.BRIDGING)
 
     @property
     def n_resets(self) -> int:
@@ -157,7 +174,8 @@ class PoseGate:
         why_not = self._rejection_reason(odometry, now_ns)
         if why_not:
             self._accepted_since_ns = None
-            self.why_not = why_not if not self.sending else ""
+            if not self.sending:
+                self.state, self.why_not = Sending.OFF, why_not
             self._last_rejection = why_not
             return None
         self._accepted, self._accepted_at_ns, self._n_predicted = odometry, now_ns, 0
@@ -166,9 +184,11 @@ class PoseGate:
             if self._accepted_since_ns is None:
                 self._accepted_since_ns = now_ns
             proven = now_ns - self._accepted_since_ns >= self._config.resume_after_s * 1e9
+            self.state = Sending.PROVING
             self.why_not = self._start_sending(odometry, now_ns) if proven else PROVING
             if self.why_not:
                 return None
+        self.state = Sending.BRIDGING if odometry.inertial else Sending.SENDING
         return self._stamped(self._pose_of(odometry))
 
     def due(self, now_ns: int) -> PoseToSend | None:
@@ -221,7 +241,8 @@ class PoseGate:
         pose, velocity = odometry.world_from_body, odometry.velocity_world_m_s
         if odometry.state is TrackState.INITIALISING:
             return INITIALISING
-        if odometry.state is not TrackState.TRACKING:
+        bridging = odometry.inertial and self.sending
+        if odometry.state is not TrackState.TRACKING and not bridging:
             return LOST
         if pose is None or velocity is None:
             return NO_SCALE if self._accepted is None else LOST
@@ -231,7 +252,7 @@ class PoseGate:
         hysteresis = 1.0 if self.sending else HYSTERESIS
         if not odometry.sigma_position_m <= hysteresis * self._config.max_sigma_m:
             return UNCERTAIN
-        if odometry.quality * hysteresis < self._config.min_quality:
+        if odometry.quality * hysteresis < self._config.min_quality and not bridging:
             return POOR
         if now_ns - odometry.t_ns > MAX_AGE_NS:
             return LATE
@@ -255,7 +276,7 @@ class PoseGate:
         why_not = self._may_start(now_ns)
         if not why_not:
             self._down_shift_m = shift_m or 0.0
-            self.sending = self._counter.sent = True
+            self._counter.sent = True
         return why_not
 
     def _discontinuity(self) -> None:
@@ -269,7 +290,7 @@ class PoseGate:
         self._accepted_since_ns = None
 
     def _stop(self, why_not: str) -> None:
-        self.sending, self.why_not = False, why_not
+        self.state, self.why_not = Sending.OFF, why_not
         self._accepted_since_ns = None
 
     def _pose_of(self, odometry: Odometry) -> PoseToSend:

@@ -24,7 +24,6 @@ from companion.messages import Georeference, MapUpdate
 from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.optimisation.displacement_factor import DisplacementFactor, typical_error
-from companion.telemetry import AttitudeSample, ImuSample
 
 MAX_LOOP_ERROR_M = 6.0
 """Error of measured positions between two times."""
@@ -47,8 +46,9 @@ class SegmentGeoreferences:
     """
 
     def __init__(
-        self, georeferencer: Georeferencer, attitude: CameraAttitude, body_from_camera: Pose | None
-    ) -> None:
+        self, georeferencer: Georeferencer, attitude: CameraAttitude,
+        acceleration: AccelerationIntegral, body_from_camera: Pose | None,
+    ) -> None:  # fmt: skip
         self.main_from_newest = Similarity.identity()
         self._georeferencer = georeferencer
         self._attitude = attitude
@@ -58,19 +58,11 @@ class SegmentGeoreferences:
         """A resumed segment and its stored georeference."""
         self._main: int | None = None
         self._revision = 0
-        self._acceleration = AccelerationIntegral()
+        self._acceleration = acceleration
         self._inertial: dict[int, InertialScale] = {}
         """By first keyframe of a segment, as is:"""
         self._spaced: dict[int, list[tuple[int, int]]] = {}
         """Ids and times of the keyframes that the inertial scale takes."""
-
-    def take(self, sample: AttitudeSample | ImuSample) -> None:
-        """Add a sample for the inertial scale."""
-        self._acceleration.take(sample)
-
-    def prune(self, before_ns: int, keyframes_ns: Array) -> None:
-        """Drop measurements before a time, except at the times of keyframes (N,), sorted."""
-        self._acceleration.prune(before_ns, keyframes_ns)
 
     def of(self, segment: SlamMap) -> Georeference | None:
         """Georeference of a segment; None until known."""

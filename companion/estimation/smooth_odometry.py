@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.estimation.inertial_navigation import AidedPlace, InertialNavigation, Reckoned
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
@@ -25,6 +26,10 @@ with fewer frames."""
 DRIFT_WINDOW_NS = 10_000_000_000
 SIGMA_DEAD_RECKONING_M_S = 0.3
 """Standard deviation of the velocity used in dead reckoning."""
+MAX_SIGMA_RECKONED_M = 5.0
+"""By inertial navigation; beyond, it is of no use even to find the map again."""
+SIGMA_RECKONED_RAD = np.radians(1.0)
+"""Of the autopilot's attitude over some seconds."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
 SIGMA_DRIFT = 0.005
 """Ratio of path length: drift of a map before adjustment."""
@@ -57,6 +62,13 @@ class _RejectedPoses(NamedTuple):
     n: int
 
 
+class BodyAttitude(NamedTuple):
+    """Attitude `ned_from_body` (3, 3) of a frame, at its time by the autopilot's stamps."""
+
+    t_ns: int
+    ned_from_body: Array
+
+
 class OdometryState(NamedTuple):
     """State to continue in the same frame: see `SmoothOdometry.resume`."""
 
@@ -69,13 +81,19 @@ class OdometryState(NamedTuple):
 
 
 class SmoothOdometry:
-    """Tracks of the active map and its georeference in, Odometry out; one per frame."""
+    """Tracks of the active map and its georeference in, Odometry out; one per frame.
 
-    def __init__(self, camera: Camera, max_jump_m: float) -> None:
+    Tracked places aid the inertial navigation, which carries the pose on where nothing is tracked.
+    """
+
+    def __init__(self, camera: Camera, max_jump_m: float, navigation: InertialNavigation) -> None:
         mount = camera.body_from_camera
         self._camera_from_body = mount.inverse() if mount is not None else Pose.identity()
         self._size = np.array([camera.width, camera.height], np.float64)
         self._max_jump_m = max_jump_m
+        self._navigation = navigation
+        self._owed_m = np.zeros(3)
+        """Of the last reacquisition, not slewed yet."""
         self._segment: int | None = None
         self._georeference: Georeference | None = None
         self._odometry_from_world = Pose.identity()
@@ -95,36 +113,42 @@ class SmoothOdometry:
         segment: int,
         georeference: Georeference | None,
         velocity_map: tuple[Array, float] | None,
+        attitude: BodyAttitude | None = None,
     ) -> Odometry:
         """Odometry of a frame.
 
         `segment` identifies the map of the track, `georeference` is that of this map, and
         `velocity_map` the camera velocity in it with its standard deviation.
         """
+        reckoned = None if attitude is None else self.reckoned(attitude.t_ns)
         pose = track.map_from_camera
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None or georeference is None:
-            return self._unknown(track)
+            return self._unknown(track, attitude, reckoned)
         if segment != self._segment or self._georeference is None:
             self._start_map(segment, georeference, pose)
         elif georeference is not self._georeference:
             self._update_georeference(georeference)
         raw = self._raw(georeference, pose)
         if track.state is TrackState.DEAD_RECKONING:
+            if reckoned is not None:
+                return self._unknown(track, attitude, reckoned)
             return self._dead_reckon(track, raw)
         if self._dead_reckoning:
-            self._reacquire(raw, track.t_ns)
+            self._reacquire(raw, track.t_ns, reckoned)
         before = self._odometry_from_world, self._slewed
+        here = self._odometry_from_world @ raw
         self._slew(raw, track.t_ns)
         placed = self._odometry_from_world @ raw
         within_gate = self._within_gate(placed, track.t_ns)
         if not within_gate and not self._consistent(placed, track.t_ns):
             self._odometry_from_world, self._slewed = before
-            return self._unknown(track)
+            return self._unknown(track, attitude, reckoned)
         rejected_ns = track.t_ns - self._rejected.since_ns if self._rejected is not None else 0
         if not within_gate or rejected_ns >= MIN_CONSISTENT_NS:
             self.reset_counter += 1
             self._path.clear()
+            self._navigation.reset()
         self._rejected = None
         sigma_velocity = float("inf")
         if velocity_map is not None:
@@ -138,6 +162,12 @@ class SmoothOdometry:
             sigma_velocity = velocity_map[1] * to_world.scale
         self._last = (track.t_ns, pose, placed)
         noise_m = NOISE_INFLATION * track.sigma_position * georeference.world_from_map.scale
+        self._navigation.move(
+            placed.rotation @ here.rotation.T, here.translation, placed.translation, 1.0
+        )
+        if attitude is not None:
+            turned = placed.rotation @ attitude.ned_from_body.T
+            self._navigation.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
         drift_sigma_m = self._drift_sigma_m(
             track.t_ns, placed.translation, georeference.sigma_scale
         )
@@ -178,6 +208,16 @@ class SmoothOdometry:
             float(np.linalg.norm(self._slewed - since.slewed)) / np.sqrt(3.0),
         ]))  # fmt: skip
 
+    def reckoned(self, t_ns: int) -> Reckoned | None:
+        """Where inertial navigation has the body, at a time by autopilot stamps.
+
+        None where unknown, or too uncertain to be of use.
+        """
+        found = self._navigation.at(t_ns)
+        if found is None or found.sigma_place_m > MAX_SIGMA_RECKONED_M:
+            return None
+        return found
+
     def _dead_reckon(self, track: Track, raw: Pose) -> Odometry:
         """Odometry by dead reckoning: of lowest quality and growing uncertainty."""
         assert track.map_from_camera is not None
@@ -196,19 +236,56 @@ class SmoothOdometry:
             self._sigma_yaw_rad(self._georeference, track.sigma_rotation_rad),
         )  # fmt: skip
 
-    def _reacquire(self, raw: Pose, t_ns: int) -> None:
-        """Reacquisition after dead reckoning: continue from its pose, if close enough."""
+    def _reacquire(self, raw: Pose, t_ns: int, reckoned: Reckoned | None) -> None:
+        """Reacquisition after dead reckoning: continue from its pose, if close enough.
+
+        What the pose is then off by is slewed away.
+        """
         self._dead_reckoning = False
         if self._last is None:
             return
         expected = self._last[2].translation + self._velocity * ((t_ns - self._last[0]) * 1e-9)
+        if reckoned is not None:
+            expected = reckoned.place_m
         correction = expected - (self._odometry_from_world @ raw).translation
         if float(np.linalg.norm(correction)) < self._max_jump_m:
             before = self._odometry_from_world
             self._odometry_from_world = Pose(before.rotation, before.translation + correction)
+            self._owed_m = self._owed_m - correction
 
-    def _unknown(self, track: Track) -> Odometry:
-        return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
+    def place_in_map(self, place_m: Array, map_from_camera: Array) -> Array | None:
+        """Where in the active map the camera is (3,), for a place (3,) of the body.
+
+        The place is in the frame of the odometry, metres; the rotation (3, 3) is the camera's in
+        the map. None without a georeference.
+        """
+        if self._georeference is None:
+            return None
+        to_world = self._georeference.world_from_map
+        world_m = self._odometry_from_world.inverse().apply(place_m)
+        lever_m = to_world.rotation @ map_from_camera @ self._camera_from_body.translation
+        return np.asarray(to_world.inverse().apply(world_m - lever_m))
+
+    def _unknown(
+        self, track: Track, attitude: BodyAttitude | None, reckoned: Reckoned | None
+    ) -> Odometry:
+        """Odometry without a pose by the map: by inertial navigation, as far as that knows it."""
+        if attitude is None or reckoned is None or self._georeference is None:
+            return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
+        rotation = self._navigation.world_from_attitude @ attitude.ned_from_body
+        placed, self._velocity = Pose(rotation, reckoned.place_m), reckoned.velocity_m_s
+        self._dead_reckoning = True
+        if self._last is not None:
+            self._last = (track.t_ns, self._last[1], placed)
+        georeference = self._georeference
+        drift_m = self._drift_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
+        return Odometry(
+            track.seq, track.t_ns, TrackState.DEAD_RECKONING, self.reset_counter, 1, placed,
+            reckoned.velocity_m_s,
+            float(np.linalg.norm([FLOOR_M, reckoned.sigma_place_m, drift_m])),
+            reckoned.sigma_velocity_m_s, float(SIGMA_RECKONED_RAD),
+            self._sigma_yaw_rad(georeference, float(SIGMA_RECKONED_RAD)), inertial=True,
+        )  # fmt: skip
 
     def _raw(self, georeference: Georeference, map_from_camera: Pose) -> Pose:
         """`world_from_body` by the map at present."""
@@ -221,6 +298,9 @@ class SmoothOdometry:
             self.reset_counter += 1
             if not georeference.has_origin:  # continue from the last known position
                 offset = self._last[2].translation - self._raw(georeference, pose).translation
+            else:
+                self._navigation.reset()
+        self._owed_m = np.zeros(3)
         self._odometry_from_world = Pose(np.eye(3), offset)
         self._anchored = georeference.has_origin
         self._segment, self._georeference = segment, georeference
@@ -238,6 +318,8 @@ class SmoothOdometry:
             self._odometry_from_world = Pose(
                 yaw_offset, placed.translation - yaw_offset @ raw.translation
             )
+            ratio = georeference.world_from_map.scale / self._georeference.world_from_map.scale
+            self._navigation.move(np.eye(3), placed.translation, placed.translation, ratio)
         self._georeference = georeference
 
     @property
@@ -259,6 +341,8 @@ class SmoothOdometry:
         self._odometry_from_world, self._anchored = state.odometry_from_world, state.anchored
         self._last, self._rejected, self._dead_reckoning = None, None, False
         self._path.clear()
+        self._owed_m = np.zeros(3)
+        self._navigation.reset()
 
     def correct_map(self, map_from_camera: Pose) -> None:
         """Apply a correction of the map: `map_from_camera` of the last accepted frame now.
@@ -274,12 +358,19 @@ class SmoothOdometry:
     def _slew(self, raw: Pose, t_ns: int) -> None:
         """Slew towards the pose by the map, where that started with a world position.
 
-        A map that started without one stays in its frame: the correction may be large, and an
-        autopilot would fly it.
+        A map that started without one stays in its frame, but for what a reacquisition owes: the
+        correction may be large, and an autopilot would fly it.
         """
-        if self._last is None or not self._anchored:
+        if self._last is None:
             return
         dt_s = min((t_ns - self._last[0]) * 1e-9, 1.0)
+        if not self._anchored:
+            owed_m = float(np.linalg.norm(self._owed_m))
+            step = self._owed_m * min(1.0, MAX_SLEW_M_S * dt_s / max(owed_m, 1e-12))
+            before = self._odometry_from_world
+            self._odometry_from_world = Pose(before.rotation, before.translation + step)
+            self._owed_m, self._slewed = self._owed_m - step, self._slewed + step
+            return
         here = self._odometry_from_world @ raw
         yaw = _yaw(self._odometry_from_world.rotation)
         most = float(MAX_SLEW_RAD_S) * dt_s

@@ -126,5 +126,5 @@ def _odometry(t_ns: int, given: Mapping[str, Any]) -> Odometry:
         int(given["seq"]), t_ns, TrackState(given["state"]), int(given["reset_counter"]),
         int(given["quality"]), pose, None if velocity is None else np.array(velocity, float),
         number("sigma_position_m"), number("sigma_velocity_m_s"), number("sigma_attitude_rad"),
-        number("sigma_yaw_rad"),
+        number("sigma_yaw_rad"), bool(given.get("inertial", False)),
     )  # fmt: skip

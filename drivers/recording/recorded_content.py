@@ -90,6 +90,7 @@ def odometry_bytes(odometry: Odometry) -> bytes:
             "sigma_velocity_m_s": odometry.sigma_velocity_m_s,
             "sigma_attitude_rad": odometry.sigma_attitude_rad,
             "sigma_yaw_rad": odometry.sigma_yaw_rad,
+            "inertial": odometry.inertial,
         }
     )
 
