@@ -186,32 +186,22 @@ class Georeferencer:
         known = [scale for scale in scales if scale is not None]
         return self._from_scale(samples, level, reduce(reconciled, known) if known else None)
 
-    def place_new_map(
-        self, samples: list[AlignmentSample], start_ned_m: Array
-    ) -> Georeference | None:
-        """Georeference of a new map whose first keyframe is at `start_ned_m` (3,).
+    def travelled(self, samples: list[AlignmentSample]) -> tuple[Array, float, str] | None:
+        """Displacement (3,) by velocity from the first to the last sample, NED metres.
 
-        Its scale is roughly that of the velocity since; None where that is too uncertain.
+        With its standard deviation, and the name of the method; None where unknown.
         """
-        first, last = samples[0], samples[-1]
-        level, displacement_m = (
-            mean_rotation(samples),
-            self.displacement_by_velocity(first.t_ns, last.t_ns),
-        )
-        if level is None or displacement_m is None:
+        first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
+        displacement_m = self.displacement_by_velocity(first_ns, last_ns)
+        if displacement_m is None:
             return None
-        mapped = level @ (last.map_from_camera.translation - first.map_from_camera.translation)
-        scale = float(mapped @ displacement_m) / max(float(mapped @ mapped), 1e-12)
-        way_s = (last.t_ns - first.t_ns) * 1e-9
+        way_s = (last_ns - first_ns) * 1e-9
         sigma_m = SIGMA_VELOCITY_M_S * float(np.sqrt(way_s * max(way_s, VELOCITY_TAU_S)))
-        sigma = sigma_m / max(float(np.linalg.norm(displacement_m)), 1e-9)
-        if scale <= 0 or sigma > MAX_SIGMA_SCALE_NEW_MAP:
-            return None
-        origin = start_ned_m - scale * level @ first.map_from_camera.translation
-        return Georeference(
-            Similarity(scale, level, origin), sigma, float(SIGMA_YAW_RAD), "velocity",
-            len(samples), 0.0,
-        )  # fmt: skip
+        return displacement_m, sigma_m, "velocity"
+
+    def lever_of(self, sample: AlignmentSample) -> Array:
+        """Lever arm (3,) from body to camera, NED metres; zero where the attitude is unknown."""
+        return np.asarray(self._lever_ned([sample])[0])
 
     def _from_positions(
         self, samples: list[AlignmentSample], level: Array | None, source: PositionSource,
@@ -320,6 +310,29 @@ class Georeferencer:
         return Georeference(
             similarity, sigma, float(SIGMA_YAW_RAD), method, n, 0.0, has_origin=False
         )
+
+
+def place_new_map(
+    samples: list[AlignmentSample], start_ned_m: Array, displacement_m: Array, sigma_m: float,
+    method: str,
+) -> Georeference | None:  # fmt: skip
+    """Georeference of a new map whose first keyframe is at `start_ned_m` (3,).
+
+    Its scale is roughly that of a displacement (3,) from the first to the last sample, NED metres;
+    None where that is too uncertain.
+    """
+    first, last, level = samples[0], samples[-1], mean_rotation(samples)
+    if level is None:
+        return None
+    mapped = level @ (last.map_from_camera.translation - first.map_from_camera.translation)
+    scale = float(mapped @ displacement_m) / max(float(mapped @ mapped), 1e-12)
+    sigma = sigma_m / max(float(np.linalg.norm(displacement_m)), 1e-9)
+    if scale <= 0 or sigma > MAX_SIGMA_SCALE_NEW_MAP:
+        return None
+    origin = start_ned_m - scale * level @ first.map_from_camera.translation
+    return Georeference(
+        Similarity(scale, level, origin), sigma, float(SIGMA_YAW_RAD), method, len(samples), 0.0
+    )
 
 
 def mean_rotation(samples: Sequence[AlignmentSample]) -> Array | None:

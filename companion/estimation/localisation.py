@@ -15,7 +15,7 @@ from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.checkpoint import MAX_BYTES, Checkpoint
 from companion.estimation.georeference import Georeferencer
-from companion.estimation.inertial_navigation import InertialNavigation
+from companion.estimation.inertial_navigation import InertialNavigation, Reckoned
 from companion.estimation.motion_filter import MotionFilter
 from companion.estimation.resumption import Resumption, Verdict
 from companion.estimation.segment_georeference import SegmentGeoreferences
@@ -94,6 +94,7 @@ class LocalisationStage:
         self._resumption: Resumption | None = None
         """While a stored map is being verified."""
         self._tracker.atlas.loop_allowed = self._loop_allowed
+        self._georeferences.reckoned_world = self._odometry.reckoned_world
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
 
     @property
@@ -211,7 +212,8 @@ class LocalisationStage:
         self._take_samples()
         attitude = self._attitude.at(frame.t_ns)
         self._apply_map_correction()
-        predicted = self._predicted(frame.t_ns, attitude)
+        reckoned = self._odometry.begin(frame.t_ns, self._body_attitude(frame.t_ns))
+        predicted = self._predicted(frame.t_ns, attitude, reckoned)
         before = self._tracker.map
         aligned = predicted is not None and attitude is not None and self._motion.aligned
         rotation_in_map = predicted.rotation if predicted is not None and aligned else None
@@ -318,7 +320,9 @@ class LocalisationStage:
         self._odometry.correct_map(now)
         self._last = replace(last, map_from_camera=now)
 
-    def _predicted(self, t_ns: int, attitude: Array | None) -> Pose | None:
+    def _predicted(
+        self, t_ns: int, attitude: Array | None, reckoned: Reckoned | None
+    ) -> Pose | None:
         """Predicted pose in the active segment; None when unknown.
 
         Constant velocity between frames; over longer spans inertial navigation, else the velocity
@@ -330,8 +334,6 @@ class LocalisationStage:
         placed = self._georeferences.of(self._tracker.map)
         if placed is None or t_ns - last.t_ns < MIN_DEAD_RECKONING_NS:
             return predicted
-        body = self._body_attitude(t_ns)
-        reckoned = None if body is None else self._odometry.reckoned(body.t_ns)
         if reckoned is not None:
             place = self._odometry.place_in_map(reckoned.place_m, predicted.rotation)
             return predicted if place is None else Pose(predicted.rotation, place)
@@ -366,9 +368,8 @@ class LocalisationStage:
         """Odometry of a track of the active segment, in its own frame."""
         segment = self._tracker.map
         return self._odometry.step(
-            track, segment.first_keyframe_id, self._georeferences.of(segment),
-            self._motion.velocity, self._body_attitude(track.t_ns),
-        )  # fmt: skip
+            track, segment.first_keyframe_id, self._georeferences.of(segment), self._motion.velocity
+        )
 
     def _body_attitude(self, t_ns: int) -> BodyAttitude | None:
         """Attitude of the body at a frame, where the autopilot's is that of the camera."""

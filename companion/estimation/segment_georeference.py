@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
-from companion.estimation.georeference import AlignmentSample, Georeferencer
+from companion.estimation.georeference import AlignmentSample, Georeferencer, place_new_map
 from companion.estimation.height_above_ground import HeightAboveGround
 from companion.estimation.inertial_scale import InertialScale, settled
+from companion.estimation.smooth_odometry import BodyPlace
 from companion.estimation.trajectory_alignment import (
     DISAGREE,
     MAX_STEP_S,
@@ -63,6 +64,10 @@ class SegmentGeoreferences:
         """By first keyframe of a segment, as is:"""
         self._spaced: dict[int, list[tuple[int, int]]] = {}
         """Ids and times of the keyframes that the inertial scale takes."""
+        self.reckoned_world: Callable[[int], BodyPlace | None] = lambda _t_ns: None
+        """Where inertial navigation had the body at a recent frame."""
+        self._reckoned: dict[int, tuple[BodyPlace, Georeference | None]] = {}
+        """Where a segment began by it, and how that placed the segment, by first keyframe."""
 
     def of(self, segment: SlamMap) -> Georeference | None:
         """Georeference of a segment; None until known."""
@@ -244,6 +249,15 @@ class SegmentGeoreferences:
         `own` gives its scale without an origin, or None.
         """
         first = next(iter(segment.keyframes.values()))
+        begun = self._begun_by_navigation(segment, first)
+        if begun is not None:
+            body, placed = begun
+            own = own or placed
+            if own is None:
+                return None
+            (sample,) = self._samples(segment, [first])
+            start_ned_m = body.place_world_m + self._georeferencer.lever_of(sample)
+            return _beginning_at(own, first, start_ned_m)
         before = [
             (k.t_ns, placed.world_from_map.apply(k.centre))
             for s in segments
@@ -260,10 +274,31 @@ class SegmentGeoreferences:
         start_ned_m = from_ned_m + displacement_m
         if own is None:
             samples = self._samples(segment, list(segment.keyframes.values()))
-            return self._georeferencer.place_new_map(samples, start_ned_m)
-        to_world = own.world_from_map
-        origin = start_ned_m - to_world.scale * to_world.rotation @ first.centre
-        return replace(own, world_from_map=replace(to_world, translation=origin))
+            travelled = self._georeferencer.travelled(samples)
+            return None if travelled is None else place_new_map(samples, start_ned_m, *travelled)
+        return _beginning_at(own, first, start_ned_m)
+
+    def _begun_by_navigation(
+        self, segment: SlamMap, first: Keyframe
+    ) -> tuple[BodyPlace, Georeference | None] | None:
+        """Where inertial navigation had the body as a segment began, and the segment placed so.
+
+        Found once, while the navigation does not go by this segment.
+        """
+        key = segment.first_keyframe_id
+        if key not in self._reckoned:
+            last = max(segment.keyframes.values(), key=lambda k: k.t_ns)
+            start, end = self.reckoned_world(first.t_ns), self.reckoned_world(last.t_ns)
+            if start is None or end is None or last is first:
+                return None
+            samples = self._samples(segment, [first, last])
+            levers = [self._georeferencer.lever_of(sample) for sample in samples]
+            moved_m = end.place_world_m + levers[1] - start.place_world_m - levers[0]
+            sigma_m = end.sigma_velocity_m_s * (last.t_ns - first.t_ns) * 1e-9
+            from_m = start.place_world_m + levers[0]
+            placed = place_new_map(samples, from_m, moved_m, sigma_m, "accelerometers")
+            self._reckoned[key] = start, placed
+        return self._reckoned[key]
 
     def loop_allowed(
         self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: LoopClosure
@@ -309,6 +344,13 @@ class SegmentGeoreferences:
         return [
             ground.distance(pose.translation, beam) for pose, beam in zip(poses, beams, strict=True)
         ]
+
+
+def _beginning_at(own: Georeference, first: Keyframe, start_ned_m: Array) -> Georeference:
+    """A georeference with the origin at which its first keyframe is where that began."""
+    to_world = own.world_from_map
+    origin = start_ned_m - to_world.scale * to_world.rotation @ first.centre
+    return replace(own, world_from_map=replace(to_world, translation=origin))
 
 
 def _poses(keyframes: list[Keyframe]) -> tuple[Array, Array]:

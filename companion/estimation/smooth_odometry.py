@@ -28,6 +28,10 @@ SIGMA_DEAD_RECKONING_M_S = 0.3
 """Standard deviation of the velocity used in dead reckoning."""
 MAX_SIGMA_RECKONED_M = 5.0
 """By inertial navigation; beyond, it is of no use even to find the map again."""
+MAX_RECKONED_PLACES = 900
+"""By inertial navigation in a row, one a frame: half a minute at 30 a second."""
+MAX_SIGMA_SCALE_AIDING = 0.05
+"""Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
 SIGMA_RECKONED_RAD = np.radians(1.0)
 """Of the autopilot's attitude over some seconds."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
@@ -69,6 +73,14 @@ class BodyAttitude(NamedTuple):
     ned_from_body: Array
 
 
+class BodyPlace(NamedTuple):
+    """Place (3,) of the body by inertial navigation, world NED, metres; sigma of its velocity."""
+
+    t_ns: int
+    place_world_m: Array
+    sigma_velocity_m_s: float
+
+
 class OdometryState(NamedTuple):
     """State to continue in the same frame: see `SmoothOdometry.resume`."""
 
@@ -94,6 +106,10 @@ class SmoothOdometry:
         self._navigation = navigation
         self._owed_m = np.zeros(3)
         """Of the last reacquisition, not slewed yet."""
+        self._attitude: BodyAttitude | None = None
+        self._reckoned: Reckoned | None = None
+        """Attitude of the frame that has begun, and where inertial navigation has the body."""
+        self._reckoned_world: deque[BodyPlace] = deque(maxlen=MAX_RECKONED_PLACES)
         self._segment: int | None = None
         self._georeference: Georeference | None = None
         self._odometry_from_world = Pose.identity()
@@ -113,29 +129,27 @@ class SmoothOdometry:
         segment: int,
         georeference: Georeference | None,
         velocity_map: tuple[Array, float] | None,
-        attitude: BodyAttitude | None = None,
     ) -> Odometry:
-        """Odometry of a frame.
+        """Odometry of the frame that has begun.
 
         `segment` identifies the map of the track, `georeference` is that of this map, and
         `velocity_map` the camera velocity in it with its standard deviation.
         """
-        reckoned = None if attitude is None else self.reckoned(attitude.t_ns)
         pose = track.map_from_camera
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None or georeference is None:
-            return self._unknown(track, attitude, reckoned)
+            return self._unknown(track)
         if segment != self._segment or self._georeference is None:
             self._start_map(segment, georeference, pose)
         elif georeference is not self._georeference:
             self._update_georeference(georeference)
         raw = self._raw(georeference, pose)
         if track.state is TrackState.DEAD_RECKONING:
-            if reckoned is not None:
-                return self._unknown(track, attitude, reckoned)
+            if self._reckoned is not None:
+                return self._unknown(track)
             return self._dead_reckon(track, raw)
         if self._dead_reckoning:
-            self._reacquire(raw, track.t_ns, reckoned)
+            self._reacquire(raw, track.t_ns)
         before = self._odometry_from_world, self._slewed
         here = self._odometry_from_world @ raw
         self._slew(raw, track.t_ns)
@@ -143,7 +157,7 @@ class SmoothOdometry:
         within_gate = self._within_gate(placed, track.t_ns)
         if not within_gate and not self._consistent(placed, track.t_ns):
             self._odometry_from_world, self._slewed = before
-            return self._unknown(track, attitude, reckoned)
+            return self._unknown(track)
         rejected_ns = track.t_ns - self._rejected.since_ns if self._rejected is not None else 0
         if not within_gate or rejected_ns >= MIN_CONSISTENT_NS:
             self.reset_counter += 1
@@ -165,7 +179,8 @@ class SmoothOdometry:
         self._navigation.move(
             placed.rotation @ here.rotation.T, here.translation, placed.translation, 1.0
         )
-        if attitude is not None:
+        attitude = self._attitude
+        if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
             turned = placed.rotation @ attitude.ned_from_body.T
             self._navigation.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
         drift_sigma_m = self._drift_sigma_m(
@@ -208,15 +223,27 @@ class SmoothOdometry:
             float(np.linalg.norm(self._slewed - since.slewed)) / np.sqrt(3.0),
         ]))  # fmt: skip
 
-    def reckoned(self, t_ns: int) -> Reckoned | None:
-        """Where inertial navigation has the body, at a time by autopilot stamps.
+    def begin(self, t_ns: int, attitude: BodyAttitude | None) -> Reckoned | None:
+        """Go on by inertial navigation to the next frame, with its attitude where that is known.
 
-        None where unknown, or too uncertain to be of use.
+        Where the body should be then, in the frame of the odometry; None where unknown, or too
+        uncertain to be of use.
         """
-        found = self._navigation.at(t_ns)
-        if found is None or found.sigma_place_m > MAX_SIGMA_RECKONED_M:
-            return None
+        found = None if attitude is None else self._navigation.at(attitude.t_ns)
+        if found is not None and found.sigma_place_m > MAX_SIGMA_RECKONED_M:
+            found = None
+        self._attitude, self._reckoned = attitude, found
+        if found is None:
+            self._reckoned_world.clear()
+        else:
+            world_m = self._odometry_from_world.inverse().apply(found.place_m)
+            place = BodyPlace(t_ns, np.asarray(world_m), found.sigma_velocity_m_s)
+            self._reckoned_world.append(place)
         return found
+
+    def reckoned_world(self, t_ns: int) -> BodyPlace | None:
+        """Where inertial navigation had the body at one of the latest frames; None if nowhere."""
+        return next((each for each in self._reckoned_world if each.t_ns == t_ns), None)
 
     def _dead_reckon(self, track: Track, raw: Pose) -> Odometry:
         """Odometry by dead reckoning: of lowest quality and growing uncertainty."""
@@ -236,7 +263,7 @@ class SmoothOdometry:
             self._sigma_yaw_rad(self._georeference, track.sigma_rotation_rad),
         )  # fmt: skip
 
-    def _reacquire(self, raw: Pose, t_ns: int, reckoned: Reckoned | None) -> None:
+    def _reacquire(self, raw: Pose, t_ns: int) -> None:
         """Reacquisition after dead reckoning: continue from its pose, if close enough.
 
         What the pose is then off by is slewed away.
@@ -245,8 +272,8 @@ class SmoothOdometry:
         if self._last is None:
             return
         expected = self._last[2].translation + self._velocity * ((t_ns - self._last[0]) * 1e-9)
-        if reckoned is not None:
-            expected = reckoned.place_m
+        if self._reckoned is not None:
+            expected = self._reckoned.place_m
         correction = expected - (self._odometry_from_world @ raw).translation
         if float(np.linalg.norm(correction)) < self._max_jump_m:
             before = self._odometry_from_world
@@ -266,10 +293,9 @@ class SmoothOdometry:
         lever_m = to_world.rotation @ map_from_camera @ self._camera_from_body.translation
         return np.asarray(to_world.inverse().apply(world_m - lever_m))
 
-    def _unknown(
-        self, track: Track, attitude: BodyAttitude | None, reckoned: Reckoned | None
-    ) -> Odometry:
+    def _unknown(self, track: Track) -> Odometry:
         """Odometry without a pose by the map: by inertial navigation, as far as that knows it."""
+        attitude, reckoned = self._attitude, self._reckoned
         if attitude is None or reckoned is None or self._georeference is None:
             return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
         rotation = self._navigation.world_from_attitude @ attitude.ned_from_body

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.config import GeoreferenceConfig
-from companion.estimation.georeference import AlignmentSample, Georeferencer
+from companion.estimation.georeference import AlignmentSample, Georeferencer, place_new_map
 from companion.geometry.transforms import Pose, Similarity, rotation_from_vector, yaw_rotation
 from companion.telemetry import HeightSample, PositionSample, PositionSource, RangeSample
 
@@ -153,7 +153,9 @@ def test_new_map_is_placed_by_velocity() -> None:
     kept, ned = places(4)
     velocity_noise = np.array([[0.1, -0.1, 0.05], [-0.1, 0.1, -0.05]])
     georeferencer = reference(ned, np.zeros_like(ned), velocity_noise)
-    found = georeferencer.place_new_map(kept[:3], ned[0])
+    travelled = georeferencer.travelled(kept[:3])
+    assert travelled is not None
+    found = place_new_map(kept[:3], ned[0], *travelled)
     assert found is not None
     np.testing.assert_allclose(found.world_from_map.scale, TRUTH.scale, rtol=0.15)
     np.testing.assert_allclose(
@@ -166,4 +168,4 @@ def test_new_map_is_placed_by_velocity() -> None:
 
 def test_new_map_is_not_placed_without_velocity() -> None:
     kept, ned = places(4)
-    assert reference(ned, np.zeros_like(ned), None).place_new_map(kept[:3], ned[0]) is None
+    assert reference(ned, np.zeros_like(ned), None).travelled(kept[:3]) is None

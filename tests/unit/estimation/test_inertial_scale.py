@@ -2,47 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from companion.estimation.acceleration_integral import GRAVITY_NED_M_S2, AccelerationIntegral
+from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.georeference import AlignmentSample
 from companion.estimation.inertial_scale import InertialScale, settled
 from companion.estimation.trajectory_alignment import Scale
-from companion.geometry.transforms import (
-    Array,
-    Pose,
-    quaternion_from_rotation,
-    rotation_from_vector,
+from companion.geometry.transforms import Array, Pose, rotation_from_vector
+from tests.support.flights.measured_motion import (
+    MeasuredMotion,
+    Path,
+    hovering,
+    straight,
+    turned,
+    weaving,
 )
-from companion.telemetry import AttitudeSample, ImuSample
 
 METRES_PER_UNIT = 13.7
 LEVER_M = np.array([0.11, -0.04, 0.07])
 """From body to camera, in axes of the camera, which are those of the body here."""
 MAP_FROM_NED = rotation_from_vector(np.array([0.9, -0.4, 1.3]))
 SECONDS = 24.0
-Path = Callable[[float], Array]
-
-
-def weaving(t_s: float) -> Array:
-    """Place in NED, metres: 3 m to either side, 1.5 m up and down, on its way north."""
-    return np.array([2.0 * t_s, 3.0 * np.sin(0.9 * t_s), -20.0 + 1.5 * np.sin(0.6 * t_s)])
-
-
-def straight(t_s: float) -> Array:
-    return np.array([4.0 * t_s, 1.0 * t_s, -20.0])
-
-
-def hovering(t_s: float) -> Array:
-    return np.array([0.0, 0.0, -20.0 + 0.0 * t_s])
-
-
-def turned(t_s: float) -> Array:
-    """`ned_from_body` (3, 3)."""
-    return rotation_from_vector(np.array([0.1 * np.sin(t_s), 0.05, 0.2 * t_s]))
 
 
 class Flight:
@@ -51,27 +32,17 @@ class Flight:
     def __init__(self, path: Path, seed: int = 0, axes: Array | None = None) -> None:
         rng = np.random.default_rng(seed)
         self.integral = AccelerationIntegral()
-        bias = rng.normal(scale=0.08, size=3)
-        tilt = rotation_from_vector(rng.normal(scale=0.005, size=3))
-        h = 0.01
-        for i in range(int((SECONDS + 1.0) / h)):
-            t_s = i * h
-            t_ns = round(t_s * 1e9)
-            turn = turned(t_s)
-            if i % 2 == 0:
-                self.integral.take(AttitudeSample(t_ns, quaternion_from_rotation(tilt @ turn)))
-            a = (path(t_s + h) - 2 * path(t_s) + path(t_s - h)) / h**2
-            force = turn.T @ (a - GRAVITY_NED_M_S2) + bias + rng.normal(scale=0.08, size=3)
-            if axes is not None:
-                force = axes @ force
-            self.integral.take(ImuSample(t_ns, np.zeros(3), force))
+        motion = MeasuredMotion(path, rng, SECONDS + 1.0, axes)
+        for sample in motion.samples():
+            self.integral.take(sample)
         self.samples: list[AlignmentSample] = []
         for t_s in np.arange(0.5, SECONDS, 0.4):
             turn = turned(t_s)
             place = (path(t_s) + turn @ LEVER_M) / METRES_PER_UNIT
             noisy = MAP_FROM_NED @ place + rng.normal(scale=4e-4, size=3)
             pose = Pose(MAP_FROM_NED @ turn, noisy)
-            self.samples.append(AlignmentSample(round(t_s * 1e9), pose, tilt @ turn))
+            attitude = motion.tilt @ turn
+            self.samples.append(AlignmentSample(round(t_s * 1e9), pose, attitude))
 
     def scale(self) -> Scale | None:
         return settled(len(self.samples), self.samples.__getitem__, self.integral, LEVER_M)

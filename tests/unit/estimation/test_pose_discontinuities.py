@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from companion.config import FeedbackConfig
+from companion.estimation.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial_navigation import InertialNavigation
 from companion.estimation.pose_gate import PoseGate, PoseToSend
 from companion.estimation.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera
@@ -24,7 +26,8 @@ class Flight:
     """Northward at constant speed; poses may be off by metres."""
 
     def __init__(self, rate_hz: float) -> None:
-        self.odometry = SmoothOdometry(CAMERA, FeedbackConfig().max_jump_m)
+        navigation = InertialNavigation(AccelerationIntegral())
+        self.odometry = SmoothOdometry(CAMERA, FeedbackConfig().max_jump_m, navigation)
         self.gate = PoseGate(FeedbackConfig(mode="odometry"))
         self.sent: list[tuple[int, PoseToSend]] = []
         self.interrupted = False

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from companion.config import FeedbackConfig
-from companion.estimation.pose_gate import PoseGate, PoseToSend
+from companion.estimation.pose_gate import PoseGate, PoseToSend, Sending
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import Odometry, TrackState
 from companion.telemetry import AttitudeSample
@@ -371,3 +371,54 @@ def test_odometry_message() -> None:
     assert np.allclose(position.covariance, message.pose_covariance)
     assert np.allclose([position.roll, position.pitch, position.yaw], [0.1, -0.2, 0.7])
     assert (speed.x, speed.y, speed.z) == (1.0, 0.5, -0.2)
+
+
+BLIND = {"state": TrackState.DEAD_RECKONING, "quality": 1, "inertial": True}
+
+
+def test_inertial_dead_reckoning_bridges_what_is_not_tracked() -> None:
+    flight = Flight()
+    flight.run(2)
+    assert flight.gate.state is Sending.SENDING
+    poses = flight.run(3, **BLIND)
+    assert flight.gate.state is Sending.BRIDGING
+    assert len(poses) > 3 * 29
+    assert min(pose.quality for pose in poses) == 1
+    # tracked again: no proof is needed, as nothing has jumped
+    assert len(flight.run(1)) > 29
+    assert flight.gate.state is Sending.SENDING
+
+
+def test_a_bridge_ends_where_its_uncertainty_does() -> None:
+    flight = Flight(max_sigma_m=1.0)
+    flight.run(2)
+    assert flight.run(0.5, **BLIND, sigma_position_m=0.99)
+    assert len(flight.run(1, **BLIND, sigma_position_m=1.01)) <= 8  # max_gap_ms predicted
+    assert (flight.gate.state, flight.gate.why_not) == (Sending.OFF, "lost")
+    assert not flight.run(2, **BLIND)  # nothing begins on a bridge
+    assert not flight.run(0.9)
+    assert flight.gate.state is Sending.PROVING
+    assert flight.run(0.3)
+
+
+def test_dead_reckoning_by_a_held_velocity_is_not_sent() -> None:
+    flight = Flight()
+    flight.run(2)
+    flight.run(1, **(BLIND | {"inertial": False}))
+    assert (flight.gate.state, flight.gate.why_not) == (Sending.OFF, "lost")
+
+
+def test_a_bridge_is_level_by_the_autopilot_too() -> None:
+    flight = Flight()
+    flight.run(2)
+    tilted = Pose(rotation_from_quaternion(quaternion_from_euler(0.4, -0.2, 0.7)), np.zeros(3))
+    flight.run(1, **BLIND, world_from_body=tilted)
+    assert flight.gate.state is Sending.OFF
+
+
+def test_a_reset_while_bridging_needs_proof() -> None:
+    flight = Flight()
+    flight.run(2)
+    flight.run(1, **BLIND)
+    assert not [pose for pose in flight.run(0.9, reset_counter=1) if pose.reset_counter]
+    assert flight.gate.state is Sending.PROVING

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from companion.config import GeoreferenceConfig
+from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.georeference import Georeferencer
 from companion.estimation.segment_georeference import SegmentGeoreferences
@@ -36,7 +37,7 @@ def known(scale: float, sigma: float, n: int, has_origin: bool) -> Georeference:
 def placed(slam_map: SlamMap, kept: Georeference | None, measured: Array) -> Georeference:
     """Georeference of the map given these ranges."""
     georeferencer, attitude = Georeferencer(GeoreferenceConfig(), MOUNT), CameraAttitude(MOUNT)
-    places = SegmentGeoreferences(georeferencer, attitude, MOUNT)
+    places = SegmentGeoreferences(georeferencer, attitude, AccelerationIntegral(), MOUNT)
     if kept is not None:
         places.resume(slam_map, kept)
     end_ns = max(k.t_ns for k in slam_map.keyframes.values())

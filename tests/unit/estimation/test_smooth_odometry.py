@@ -7,15 +7,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.estimation.smooth_odometry import SmoothOdometry
+from companion.estimation.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial_navigation import InertialNavigation
+from companion.estimation.smooth_odometry import BodyAttitude, SmoothOdometry
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
+from companion.telemetry import AttitudeSample, ImuSample
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 PLACED = Georeference(Similarity(2.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "GPS", 50, 0.3)
 SPEED = 1.0
 """Map units a second, northward; the world's are twice as many metres."""
+
+
+def unaided() -> SmoothOdometry:
+    """Odometry of a flight without accelerometers."""
+    return SmoothOdometry(CAMERA, 1.0, InertialNavigation(AccelerationIntegral()))
 
 
 def track(k: int, off: float = 0.0, state: TrackState = TrackState.TRACKING) -> Track:
@@ -38,7 +46,7 @@ def north(odometry: Odometry) -> float:
 
 
 def test_map_correction_is_slew_limited() -> None:
-    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    odometry = unaided()
     for k in range(10):
         before = give(odometry, track(k))
     last = track(9, off=1.5).map_from_camera
@@ -52,7 +60,7 @@ def test_map_correction_is_slew_limited() -> None:
 
 
 def test_slew_correction_adds_to_the_drift_sigma() -> None:
-    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    odometry = unaided()
     before = [give(odometry, track(k)) for k in range(200)][-1].sigma_position_m
     last = track(199, off=1.5).map_from_camera
     assert last is not None
@@ -66,7 +74,7 @@ def test_slew_correction_adds_to_the_drift_sigma() -> None:
 
 def test_heading_sigma_includes_the_pending_correction() -> None:
     """Heading corrections are slewed; until then the pose is off by the rest."""
-    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    odometry = unaided()
     for k in range(10):
         before = give(odometry, track(k))
     noise_rad = 3 * 0.001
@@ -89,7 +97,7 @@ def test_heading_sigma_includes_the_pending_correction() -> None:
 
 
 def test_unexplained_jump_is_a_reset() -> None:
-    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    odometry = unaided()
     for k in range(10):
         give(odometry, track(k))
     after = [give(odometry, track(k, off=5.0)) for k in range(10, 20)]
@@ -98,7 +106,7 @@ def test_unexplained_jump_is_a_reset() -> None:
 
 
 def test_dead_reckoning_grows_uncertain_and_reacquires_without_a_jump() -> None:
-    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    odometry = unaided()
     for k in range(10):
         give(odometry, track(k))
     dead_reckoned = []
@@ -117,8 +125,48 @@ def test_dead_reckoning_grows_uncertain_and_reacquires_without_a_jump() -> None:
 
 
 def test_lost_camera_has_no_pose() -> None:
-    odometry = SmoothOdometry(CAMERA, max_jump_m=1.0)
+    odometry = unaided()
     give(odometry, track(0))
     lost = give(odometry, Track(1, 100_000_000, TrackState.LOST))
     assert lost.world_from_body is None
     assert lost.quality == -1
+
+
+def test_what_a_reacquisition_was_off_by_is_slewed_away() -> None:
+    odometry = unaided()
+    for k in range(10):
+        give(odometry, track(k))
+    for k in range(10, 20):
+        give(odometry, replace(track(k, state=TrackState.DEAD_RECKONING), sigma_position=0.1))
+    seen = [give(odometry, track(k, off=0.3)) for k in range(20, 100)]
+    truth = np.array([SPEED * 2.0 * k / 10 + 0.6 for k in range(20, 100)])
+    away_m = truth - [north(o) for o in seen]
+    assert away_m[0] == pytest.approx(0.6, abs=0.05)
+    assert away_m[-1] == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(np.diff(away_m)).max() < 0.02
+
+
+def test_accelerometers_carry_the_pose_on() -> None:
+    """Where nothing is tracked, no map is known, and the pose by the map cannot be."""
+    integral = AccelerationIntegral()
+    odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    found = []
+    for k in range(200):
+        for step in range(10):
+            t_ns = (k * 10 + step - 9) * 10_000_000
+            force = np.array([0.0, 0.0, -9.80665])
+            integral.take(ImuSample(t_ns, np.zeros(3), force))
+            integral.take(AttitudeSample(t_ns, level))
+        odometry.begin(k * 100_000_000, BodyAttitude(k * 100_000_000, np.eye(3)))
+        velocity = np.array([SPEED, 0.0, 0.0]), 0.1
+        blind = 100 <= k < 120
+        seen = Track(k, k * 100_000_000, TrackState.LOST) if blind else track(k)
+        found.append(odometry.step(seen, 0, PLACED, velocity))
+    places = np.array([north(each) for each in found])
+    assert np.abs(np.diff(places) - 0.2).max() < 0.02
+    assert {each.state for each in found[100:120]} == {TrackState.DEAD_RECKONING}
+    assert all(each.inertial == (100 <= k < 120) for k, each in enumerate(found))
+    sigmas = [each.sigma_position_m for each in found[100:120]]
+    assert sigmas[-1] > sigmas[0]
+    assert {each.reset_counter for each in found} == {0}

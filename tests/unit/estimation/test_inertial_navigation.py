@@ -1,0 +1,136 @@
+"""Inertial navigation: where the body is after seconds without a tracked place, as it states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from companion.estimation.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial_navigation import AidedPlace, InertialNavigation
+from companion.geometry.transforms import Array, yaw_rotation
+from tests.support.flights.measured_motion import (
+    STEP_S,
+    MeasuredMotion,
+    hovering,
+    turned,
+    velocity,
+    weaving,
+)
+
+WORLD_FROM_NED = yaw_rotation(0.3)
+"""The frame of the places is turned against the autopilot's north."""
+SIGMA_M = 0.02
+AIDED_S = 12.0
+Place = Callable[[float], Array]
+
+
+class Flown:
+    """Aided 15 times a second up to AIDED_S, then by accelerations alone."""
+
+    def __init__(self, path: Place, seed: int, seconds: float) -> None:
+        self.path, rng = path, np.random.default_rng(seed)
+        self.integral = AccelerationIntegral()
+        self.navigation = InertialNavigation(self.integral)
+        motion = MeasuredMotion(path, rng, AIDED_S + seconds + STEP_S)
+        next_s = 0.0
+        for sample in motion.samples():
+            self.integral.take(sample)
+            t_s = sample.t_ns * 1e-9
+            if next_s <= t_s < AIDED_S:
+                next_s += 1.0 / 15.0
+                noisy = WORLD_FROM_NED @ path(t_s) + rng.normal(scale=SIGMA_M, size=3)
+                turn = WORLD_FROM_NED @ turned(t_s) @ (motion.tilt @ turned(t_s)).T
+                self.navigation.aid(AidedPlace(sample.t_ns, noisy, turn, SIGMA_M))
+
+    def error(self, t_s: float) -> tuple[Array, Array, float, float]:
+        """Errors of place and velocity (3,), and what is stated of both."""
+        found = self.navigation.at(round(t_s * 1e9))
+        assert found is not None
+        return (
+            found.place_m - WORLD_FROM_NED @ self.path(t_s),
+            found.velocity_m_s - WORLD_FROM_NED @ velocity(self.path, t_s),
+            found.sigma_place_m,
+            found.sigma_velocity_m_s,
+        )
+
+
+@pytest.mark.parametrize(("seconds", "most_m"), [(2.0, 0.25), (5.0, 1.5)])
+def test_place_after_seconds_without_one(seconds: float, most_m: float) -> None:
+    errors = [Flown(weaving, seed, seconds).error(AIDED_S + seconds - 0.05) for seed in range(4)]
+    away_m = np.array([np.linalg.norm(place) for place, *_ in errors])
+    assert away_m.max() < most_m
+    assert away_m.max() > 0.0
+
+
+def test_what_it_states_is_what_it_is_off_by() -> None:
+    """Normalised squared errors: one per degree of freedom, over ten flights."""
+    places, velocities = [], []
+    for seed in range(10):
+        place, speed, sigma_m, sigma_m_s = Flown(weaving, seed, 3.0).error(AIDED_S + 2.95)
+        places.append(float(place @ place) / sigma_m**2 / 3.0)
+        velocities.append(float(speed @ speed) / sigma_m_s**2 / 3.0)
+    # the stated one is the largest of three axes
+    assert 0.1 < float(np.mean(places)) < 1.5
+    assert 0.1 < float(np.mean(velocities)) < 1.5
+
+
+def test_velocity_is_known_while_it_is_aided() -> None:
+    _, speed, _, sigma_m_s = Flown(weaving, 3, 0.0).error(AIDED_S - 0.02)
+    assert float(np.linalg.norm(speed)) < 0.1
+    assert sigma_m_s < 0.1
+
+
+def test_places_may_come_before_the_accelerations_up_to_them() -> None:
+    flown = Flown(hovering, 2, 0.0)
+    place, *_ = flown.error(AIDED_S + 0.3)
+    assert float(np.linalg.norm(place)) < 0.1
+    assert flown.navigation.at(round((AIDED_S + 0.6) * 1e9)) is None
+
+
+def test_a_frame_that_moves_takes_the_body_with_it() -> None:
+    flown = Flown(weaving, 4, 1.0)
+    before = flown.navigation.at(round((AIDED_S + 0.9) * 1e9))
+    turn, about, to = yaw_rotation(-0.4), np.array([20.0, 5.0, -3.0]), np.array([1.0, 2.0, 3.0])
+    flown.navigation.move(turn, about, to, 1.02)
+    after = flown.navigation.at(round((AIDED_S + 0.9) * 1e9))
+    assert before is not None and after is not None
+    # but for what was measured since the last place, whose unit is the metre
+    expected = to + 1.02 * turn @ (before.place_m - about)
+    assert np.linalg.norm(after.place_m - expected) < 0.1
+    assert np.linalg.norm(after.velocity_m_s - 1.02 * turn @ before.velocity_m_s) < 0.1
+
+
+def test_a_place_that_cannot_be_is_refused_and_counted() -> None:
+    flown = Flown(weaving, 5, 1.0)
+    t_ns = round((AIDED_S + 0.5) * 1e9)
+    wrong = WORLD_FROM_NED @ weaving(AIDED_S + 0.5) + [4.0, 0.0, 0.0]
+    flown.navigation.aid(AidedPlace(t_ns, wrong, WORLD_FROM_NED, SIGMA_M))
+    assert flown.navigation.n_refused == 1
+    place, *_ = flown.error(AIDED_S + 0.9)
+    assert float(np.linalg.norm(place)) < 0.3
+
+
+def test_places_refused_for_a_second_are_believed() -> None:
+    flown = Flown(hovering, 6, 2.5)
+    jump = np.array([4.0, -1.0, 0.0])
+    for t_s in np.arange(AIDED_S, AIDED_S + 2.3, 1.0 / 15.0):
+        at = WORLD_FROM_NED @ hovering(t_s) + jump
+        flown.navigation.aid(AidedPlace(round(t_s * 1e9), at, WORLD_FROM_NED, SIGMA_M))
+    found = flown.navigation.at(round((AIDED_S + 2.3) * 1e9))
+    assert found is not None
+    assert np.linalg.norm(found.place_m - WORLD_FROM_NED @ hovering(0.0) - jump) < 0.2
+
+
+def test_nothing_is_known_without_accelerations() -> None:
+    navigation = InertialNavigation(AccelerationIntegral())
+    for i in range(100):
+        at = AidedPlace(i * 66_000_000, np.zeros(3), np.eye(3), SIGMA_M)
+        navigation.aid(at)
+        assert navigation.at(at.t_ns) is None
+
+
+def test_an_imu_that_falls_silent_ends_it() -> None:
+    flown = Flown(weaving, 7, 0.0)
+    assert flown.navigation.at(round((AIDED_S + 2.0) * 1e9)) is None
