@@ -65,7 +65,7 @@ class FeedbackHealth:
     """Poses sent to the autopilot, or why none are.
 
     `why_not` is one of a few constant phrases, by which a change is detected; numbers belong in
-    `detail`. Latency is from exposure to sending.
+    `detail`. Latency is from exposure to sending. With `bridging` poses go by dead reckoning.
     """
 
     mode: str = "off"
@@ -77,6 +77,7 @@ class FeedbackHealth:
     latency_p95_ms: float | None = None
     n_sent: int = 0
     n_resets: int = 0
+    bridging: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +195,8 @@ class Health:
         if feedback.mode == "off":
             return "feedback off"
         if feedback.sending:
-            return f"feedback {feedback.rate_hz:.0f}/s"
+            by = " by dead reckoning" if feedback.bridging else ""
+            return f"feedback {feedback.rate_hz:.0f}/s{by}"
         return f"no feedback: {feedback.why_not or 'not yet'}" + _in_brackets(feedback.detail)
 
     def _computer(self) -> str:

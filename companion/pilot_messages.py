@@ -47,6 +47,7 @@ class PilotMessage:
 
 POSITION_ON = PilotMessage(INFO, "vision position on")
 POSITION_LOST = PilotMessage(WARNING, "vision position lost: {reason}", {"reason": LONGEST_REASON})
+DEAD_RECKONING = PilotMessage(WARNING, "tracking lost: dead reckoning")
 POSITION_OFF = PilotMessage(NOTICE, "vision position off: ground command")
 POSITION_STAYS_OFF = PilotMessage(WARNING, "vision position still off: by ground")
 POSITION_ENABLED = PilotMessage(NOTICE, "vision position enabled: disarmed")

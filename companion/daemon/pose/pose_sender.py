@@ -13,12 +13,12 @@ from pathlib import Path
 from companion.config import FeedbackConfig
 from companion.daemon.pose.sent_counter import SentCounter
 from companion.estimation.gate_journal import JournaledGate
-from companion.estimation.pose_gate import PoseToSend
+from companion.estimation.pose_gate import PoseToSend, Sending
 from companion.estimation.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth, LatencyMeter, RateMeter
 from companion.messages import Odometry, Warned
-from companion.pilot_messages import POSITION_ON, position_lost
+from companion.pilot_messages import DEAD_RECKONING, POSITION_ON, PilotText, position_lost
 from companion.telemetry import AttitudeSample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_height import AutopilotHeight
@@ -27,6 +27,10 @@ from drivers.mavlink.pose_messages import pose_messages
 
 TICK_S, IDLE_TICK_S = 0.002, 0.05
 """Between two polls of the gate."""
+TOLD_AFTER_NS = 1_000_000_000
+"""Dead reckoning for longer is told to the pilot; single frames are not tracked now and then."""
+ALOFT = (POSITION_ON(), DEAD_RECKONING())
+"""Last texts while poses are sent."""
 UNHEARD = "the autopilot is silent"
 SWITCHED_OFF = "switched off"
 
@@ -61,7 +65,8 @@ class PoseSender:
         )
         self._rate, self._latency = RateMeter(), LatencyMeter()
         self._n_sent = 0
-        self._last_text: str | None = None
+        self._told: PilotText | None = None
+        self._bridging_since_ns: int | None = None
 
     def restart(self) -> None:
         """Begin anew with another localisation."""
@@ -104,7 +109,7 @@ class PoseSender:
     def step(self) -> None:
         """Send a predicted pose if one is due; to be called when it is."""
         self._counter.step(self._gate)
-        if self._config.mode != "off" or self._last_text == "":
+        if self._config.mode != "off" or self._told in ALOFT:
             self._send(self._gate.due(self._clock.now_ns()))
             self._tell()
 
@@ -117,6 +122,7 @@ class PoseSender:
         return FeedbackHealth(
             mode=self._config.mode,
             sending=self._gate.sending and self._link.alive,
+            bridging=self._gate.state is Sending.BRIDGING,
             why_not=self._gate.why_not or ("" if self._link.alive else UNHEARD),
             rate_hz=self._rate.hz(now_ns),
             latency_p50_ms=self._latency.percentile_ms(50, now_ns),
@@ -137,13 +143,21 @@ class PoseSender:
             self._latency.add(now_ns, (now_ns - pose.t_ns) * 1e-6)
 
     def _tell(self) -> None:
-        """Tell the pilot when poses begin and cease."""
-        state = "" if self._gate.sending else self._gate.why_not
-        if self._gate.sending and self._last_text != "":
-            sent = self._link.say(POSITION_ON())
-        elif not self._gate.sending and self._last_text == "":
-            sent = self._link.say(position_lost(state))
+        """Tell the pilot when poses begin and cease, and when they go by dead reckoning."""
+        state, now_ns = self._gate.state, self._clock.now_ns()
+        if state is not Sending.BRIDGING:
+            self._bridging_since_ns = None
+        elif self._bridging_since_ns is None:
+            self._bridging_since_ns = now_ns
+        if state is Sending.SENDING:
+            text = POSITION_ON()
+        elif self._bridging_since_ns is not None:
+            if now_ns - self._bridging_since_ns < TOLD_AFTER_NS:
+                return
+            text = DEAD_RECKONING()
+        elif self._told in ALOFT:
+            text = position_lost(self._gate.why_not)
         else:
             return
-        if sent:  # else it is tried again
-            self._last_text = state
+        if text != self._told and self._link.say(text):  # else it is tried again
+            self._told = text

@@ -6,6 +6,7 @@ import asyncio
 import json
 import threading
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +88,10 @@ class Vehicle:
         self.boot_ns = self.clock.t_ns
         self.clock.t_ns += silent_s * 10**9
 
-    def run(self, seconds: float, frames: bool = True, resets: int = 0) -> list[Any]:
-        """Go on for a while; the poses that were sent."""
+    def run(
+        self, seconds: float, frames: bool = True, resets: int = 0, blind: bool = False
+    ) -> list[Any]:
+        """Go on for a while; the poses that were sent. Blind: by inertial dead reckoning."""
         n_before = len(self.poses)
         for _ in range(round(seconds * 200)):
             self.clock.t_ns += 5 * MS
@@ -100,7 +103,12 @@ class Vehicle:
                 self._say_slow(boot_ms)
             if frames and now_ns % (50 * MS) == 0:
                 self.seq += 1
-                self.sender.take(self._odometry(now_ns - 40 * MS, resets))
+                odometry = self._odometry(now_ns - 40 * MS, resets)
+                if blind:
+                    odometry = replace(
+                        odometry, state=TrackState.DEAD_RECKONING, quality=1, inertial=True
+                    )
+                self.sender.take(odometry)
             self.sender.step()
             for thread in threading.enumerate() if self.joins else ():
                 if thread.name == "reset counter":
@@ -135,6 +143,10 @@ class Vehicle:
     def poses(self) -> list[Any]:
         kind = "ODOMETRY" if self.mode == "odometry" else "VISION_POSITION_ESTIMATE"
         return self.port.of(kind)
+
+    @property
+    def texts(self) -> list[str]:
+        return [each.text for each in self.port.of("STATUSTEXT")]
 
     @property
     def why_not(self) -> str:
@@ -324,3 +336,24 @@ def test_the_counter_lies_where_the_service_keeps_its_state() -> None:
     assert counter_path("/data/flights", {}) == Path("/data/sent_poses.json")
     state = {"STATE_DIRECTORY": "/var/lib/companion:/other"}
     assert counter_path("/data/flights", state) == Path("/var/lib/companion/sent_poses.json")
+
+
+@flown
+async def test_the_pilot_hears_of_dead_reckoning_that_lasts(tmp_path: Path) -> None:
+    vehicle = Vehicle(tmp_path / "kept.json")
+    await vehicle.begin()
+    vehicle.run(4)
+    assert vehicle.run(0.8, blind=True)
+    vehicle.run(1)
+    assert vehicle.texts == ["Companion: vision position on"]
+    assert vehicle.run(2, blind=True)
+    assert vehicle.sender.health().bridging
+    assert vehicle.texts[1:] == ["Companion: tracking lost: dead reckoning"]
+    vehicle.run(1)
+    assert not vehicle.sender.health().bridging
+    assert vehicle.texts[2:] == ["Companion: vision position on"]
+    vehicle.run(2, blind=True)
+    vehicle.run(1, frames=False)
+    assert vehicle.texts[3:] == [
+        "Companion: tracking lost: dead reckoning", "Companion: vision position lost: no video"
+    ]  # fmt: skip
