@@ -25,7 +25,7 @@ from companion.telemetry import ArmedSample, Telemetry
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.commands import NO_ANSWER, TRIES, Commands
-from drivers.mavlink.imu_rate import ImuRate
+from drivers.mavlink.imu_rate import ImuNews, ImuRate
 from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.status_text import TextLimit, status_text
 from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
@@ -367,6 +367,9 @@ class AutopilotLink:
             news = None if came_hz is None else imu.judge(came_hz, shares)
         if imu.asked_hz != before_hz:
             self._wanted.change(imu.want)
+        self._tell_of_imu(news, now_ns)
+
+    def _tell_of_imu(self, news: ImuNews | None, now_ns: int) -> None:
         if news is not None and news.detail != self._said_of_imu:
             self._said_of_imu = news.detail
             self._warn(Warned(now_ns, news.what, news.detail))
@@ -384,7 +387,9 @@ class AutopilotLink:
         now_ns = self._clock.now_ns()
         refused = result in REFUSALS
         self._wanted.asked(message_id, refused, now_ns)
-        if refused and message_id not in self._missing:
+        if refused and self._imu is not None and message_id in self._imu.ids:
+            self._tell_of_imu(self._imu.refused(message_id), now_ns)
+        elif refused and message_id not in self._missing:
             self._missing.add(message_id)
             name = mavlink.mavlink_map[message_id].msgname
             self._warn(Warned(now_ns, "autopilot does not send a message", name))

@@ -82,6 +82,13 @@ class ImuRate:
                 self.why = "the link did not carry it before"
         return ImuNews(NO_IMU, self.why) if self.why else None
 
+    def refused(self, message_id: int) -> ImuNews | None:
+        """Take a refusal of a message for good; another stands in for all but the last."""
+        if message_id != self.ids[-1]:
+            return None
+        self.asked_hz, self.why = 0.0, "it has no message for it"
+        return ImuNews(NO_IMU, self.why)
+
     def heard(self, message_id: int) -> None:
         """Count a message of any kind."""
         if message_id in BULK:

@@ -395,6 +395,27 @@ def test_the_imu_is_asked_for_as_the_link_carries_it(
     run(test())
 
 
+@pytest.mark.parametrize("n_lacking", [2, 3])
+def test_messages_of_the_imu_that_a_firmware_lacks(short_windows: None, n_lacking: int) -> None:
+    lacks = ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU")[:n_lacking]
+
+    async def test() -> None:
+        with FakeAutopilot("ardupilot", flight=circle(), lacks=lacks) as autopilot:
+            async with linked(autopilot) as heard:
+                if n_lacking == 2:
+                    await heard.until(lambda: heard.kinds()["imu"] > 10, 8.0)
+                    assert "RAW_IMU" in heard.link.rates_hz and not of_imu(heard)
+                else:
+                    await heard.until(lambda: of_imu(heard), 8.0)
+                    assert of_imu(heard) == ["it has no message for it"]
+                    await asyncio.sleep(1.5)
+                    assert heard.link.health.detail.endswith("no IMU: it has no message for it")
+                assert len(imu_intervals_us(autopilot)) == 3  # one of each
+                assert "autopilot does not send a message" not in heard.named()
+
+    run(test())
+
+
 @pytest.mark.parametrize("backend", ["pymavlink", "mavsdk"])
 def test_a_slow_line_has_no_room_for_the_imu(
     short_windows: None, tmp_path: Path, backend: str

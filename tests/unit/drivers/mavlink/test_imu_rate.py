@@ -111,6 +111,15 @@ def test_it_only_goes_down_and_few_times(seed: int) -> None:
     assert n_news == len(set(asked)) - 1 <= 4
 
 
+def test_the_last_refusal_is_the_end() -> None:
+    rate = begun()
+    assert rate.refused(105) is None and rate.refused(26) is None and rate.asked_hz == 100
+    news = rate.refused(27)
+    assert news is not None and news.what == NO_IMU and rate.asked_hz == 0
+    assert str(rate) == "no IMU: it has no message for it"
+    assert rate.judge(0.0, ALONE) is None
+
+
 def test_silence_keeps_what_was_found_and_a_reboot_forgets_it() -> None:
     rate = begun()
     rate.judge(67.0, ALONE)
