@@ -104,9 +104,10 @@ class LinkConfig:
     """Library that holds the wire."""
     attitude_hz: Expert[Annotated[float, Meta(ge=0, le=400)]] = 50.0
     """Rate of the attitude requested from the autopilot, Hz; 0 requests none, here and below."""
-    imu_hz: Expert[Annotated[float, Meta(ge=0, le=1000)]] = 0.0
-    """Rate of accelerations and rates of turn, Hz. With 50 or more they give the scale where there
-    are neither satellites nor a rangefinder."""
+    imu_hz: Expert[Literal["auto"] | Annotated[float, Meta(ge=0, le=1000)]] = "auto"
+    """Rate of accelerations and rates of turn, Hz; "auto" is 100, or less where the link carries
+    less, and none below 50. They give the scale where there are neither satellites nor a
+    rangefinder."""
     position_hz: Expert[Annotated[float, Meta(ge=0, le=100)]] = 10.0
     """Rate of local, global and GPS position, Hz."""
     height_hz: Expert[Annotated[float, Meta(ge=0, le=100)]] = 10.0

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -115,6 +115,9 @@ def with_value(config: Config, name: str, value: Any, where: str) -> Config:
     except msgspec.ValidationError as error:
         words = ", ".join(words_of(name))
         wanted = f"wanted one of {words}" if words else str(error)
+        if (limits := number_or_word(name)) is not None:
+            word, least, most = limits
+            wanted = f"wanted {word} or a number from {least:.15g} to {most:.15g}"
         raise ConfigError(f"{where}: {name}: {wanted}, given is {value!r}") from error
     return with_values(config, {name: checked})
 
@@ -138,6 +141,16 @@ def words_of(name: str) -> tuple[str, ...]:
     """The words that a key may be; none where it is not one of a few."""
     kind = _kind(name)
     return get_args(kind) if get_origin(kind) is Literal else ()
+
+
+def number_or_word(name: str) -> tuple[str, float, float] | None:
+    """The word and the bounds of a key that may be either; None of any other key."""
+    kind = _kind(name)
+    if get_origin(kind) is not Union:
+        return None
+    of_word, of_number = get_args(kind)
+    (limits,) = of_number.__metadata__
+    return get_args(of_word)[0], limits.ge, limits.le
 
 
 def dump(config: Config) -> dict[str, Any]:

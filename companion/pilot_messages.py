@@ -213,6 +213,7 @@ OF_WARNING: Mapping[str, PilotMessage] = {
 """Message for the pilot by the kind (`what`) of a `Warned`."""
 JOURNAL_ONLY = frozenset({
     "a node elsewhere makes the depth", "questions came over the network that cannot be read",
+    "the autopilot is not asked for its IMU", "the autopilot's IMU is asked for less often",
     "the flight can be seen", "the viewer cannot be shown", "the viewer has gone",
     "the viewer does not keep up", "viewers cannot connect",
 })  # fmt: skip

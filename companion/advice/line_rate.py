@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from companion.advice.imu_room import (
+    BAUD_NAME,
+    BITS_PER_BYTE,
+    MAX_LOAD,
+    USUAL_BAUDS,
+    asked_bytes_per_s,
+    imu_bytes_per_s,
+)
 from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
 from companion.config import FeedbackConfig, LinkConfig
 
-MAX_LOAD = 0.6
-"""Largest utilisation; beyond, stamps are delayed."""
-BITS_PER_BYTE = 10
 POSE_BYTES = {"odometry": 245, "vision_position": 129 + 69}
 OTHER_BYTES_PER_S = 700.0
 """Our heartbeat, time synchronisation and status."""
-ATTITUDE_BYTES, IMU_BYTES, POSITION_BYTES, HEIGHT_BYTES = 44, 41, 40 + 40 + 64, 28 + 51
-USUAL_BAUDS = (115200, 230400, 460800, 921600, 1500000)
 LINE_PARAMETERS = {
     ARDUPILOT: tuple(f"SERIAL{n}_{what}" for n in range(1, 9) for what in ("BAUD", "PROTOCOL")),
     PX4: (
@@ -22,7 +25,6 @@ LINE_PARAMETERS = {
 }  # fmt: skip
 PX4_PORTS = {101: "TEL1", 102: "TEL2", 103: "TEL3", 104: "TEL4"}
 ARDUPILOT_MAVLINK = (1, 2)
-_BAUD_NAME = {ARDUPILOT: "SERIALn_BAUD", PX4: "SER_…_BAUD"}
 
 
 def line_parameters(firmware: str) -> tuple[str, ...]:
@@ -40,13 +42,7 @@ def check_line(
 ) -> list[Finding]:
     """Findings on the capacity of a serial line both ways, and PX4's own rate limit."""
     up = feedback.rate_hz * POSE_BYTES[mode] + OTHER_BYTES_PER_S
-    down = (
-        link.attitude_hz * ATTITUDE_BYTES
-        + link.imu_hz * IMU_BYTES
-        + link.position_hz * POSITION_BYTES
-        + link.height_hz * HEIGHT_BYTES
-        + OTHER_BYTES_PER_S
-    )
+    down = asked_bytes_per_s(link) + imu_bytes_per_s(link, baud / BITS_PER_BYTE, firmware)
     needed_baud = max(up, down) * BITS_PER_BYTE / MAX_LOAD
     findings = []
     ports = _ports_at(firmware, values, baud)
@@ -54,7 +50,7 @@ def check_line(
         enough = next((each for each in USUAL_BAUDS if each >= needed_baud), USUAL_BAUDS[-1])
         findings.append(
             Finding(
-                ports[0] if len(ports) == 1 else _BAUD_NAME[firmware], float(baud),
+                ports[0] if len(ports) == 1 else BAUD_NAME[firmware], float(baud),
                 f"{enough} or more, and the same in link.url",
                 f"we send {up / 1000:.1f} kB/s and ask for {down / 1000:.1f} kB/s; this line "
                 f"carries {baud / BITS_PER_BYTE / 1000:.1f} kB/s each way",

@@ -14,9 +14,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TextIO
 
+from companion.advice.imu_room import BITS_PER_BYTE, LOOP_RATE, check_loop_rate, imu_room
 from companion.advice.line_rate import check_line, line_parameters
 from companion.advice.pose_parameters import advise, names_to_read
-from companion.advice.wanted import FIRMWARES, Finding
+from companion.advice.wanted import ARDUPILOT, FIRMWARES, Finding
 from companion.config import Config, LinkConfig
 from companion.errors import ConfigError, InputError, SourceError
 from drivers.mavlink.asking_link import asking_link
@@ -45,6 +46,8 @@ class Examination:
     mode: str
     findings: list[Finding]
     n_examined: int
+    comes: str = ""
+    """What the daemon hears of the autopilot; without one, the IMU that it will ask for."""
     written: list[dict[str, Any]] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     """Parameters that the autopilot refused, in words."""
@@ -90,9 +93,7 @@ def doctor(
     link = replace(config.link, url=_url_to_ask_at(config, daemon))
     decide: Ask = (lambda question: True) if yes else ask
     show = None if as_json else lambda examination: _print_findings(examination, config, out)
-    found = asyncio.run(
-        _examine(config, link, _latency_ms(daemon), decide if write else None, show)
-    )
+    found = asyncio.run(_examine(config, link, daemon, decide if write else None, show))
     if as_json:
         print(json.dumps(_document(found), ensure_ascii=False), file=out)
     else:
@@ -103,11 +104,11 @@ def doctor(
 async def _examine(
     config: Config,
     link_config: LinkConfig,
-    latency_ms: float | None,
+    daemon: Mapping[str, Any] | None,
     decide: Ask | None,
     show: Callable[[Examination], None] | None,
 ) -> Examination:
-    feedback = config.feedback
+    feedback, latency_ms = config.feedback, _latency_ms(daemon)
     mode = "odometry" if feedback.mode == "off" else feedback.mode
     patience_s = SEARCH_PATIENCE_S if link_config.url.endswith(":auto") else PATIENCE_S
     async with asking_link(link_config, patience_s) as (link, vehicle, baud):
@@ -121,15 +122,18 @@ async def _examine(
 
         async def look() -> tuple[list[Finding], int]:
             ports = line_parameters(firmware) if baud > 0 else ()
-            read = await parameters.read([*names_to_read(firmware), *ports])
+            loop = (LOOP_RATE,) if firmware == ARDUPILOT else ()
+            read = await parameters.read([*names_to_read(firmware), *ports, *loop])
             values = {name: each.value for name, each in read.items()}
             findings = advise(firmware, values, feedback, mode, latency_ms)
             if baud:
                 findings += check_line(firmware, values, config.link, feedback, mode, baud)
+            findings += check_loop_rate(values, config.link)
             return findings, len(values)
 
         findings, n_examined = await look()
-        found = Examination(vehicle, link_config.url, mode, findings, n_examined)
+        comes = _heard_by(daemon) or _imu_to_be(config.link, baud, firmware)
+        found = Examination(vehicle, link_config.url, mode, findings, n_examined, comes)
         if show is not None:
             show(found)
         if decide is None or not _to_set(found):
@@ -214,6 +218,24 @@ def _latency_ms(daemon: Mapping[str, Any] | None) -> float | None:
     return float(latency) if isinstance(latency, (int, float)) else None
 
 
+def _heard_by(daemon: Mapping[str, Any] | None) -> str:
+    """What the running daemon says of the autopilot; "" without one."""
+    for source in (daemon or {}).get("sources") or ():
+        if source.get("name") == "autopilot":
+            return f"the daemon hears {source.get('detail') or source.get('state')}"
+    return ""
+
+
+def _imu_to_be(link: LinkConfig, baud: int, firmware: str) -> str:
+    """What the daemon will ask for; "" where that is set by hand."""
+    if link.imu_hz != "auto":
+        return ""
+    room = imu_room(link, baud / BITS_PER_BYTE if baud else None, firmware)
+    if not room.rate_hz:
+        return f"no IMU will be asked for: {room.why}"
+    return f"IMU: {room.message} at {room.rate_hz:.0f} Hz will be asked for, less where less comes"
+
+
 # -- what is shown -------------------------------------------------------------------------------
 
 
@@ -223,6 +245,7 @@ def _document(found: Examination) -> dict[str, Any]:
         "link": found.where,
         "mode": found.mode,
         "n_examined": found.n_examined,
+        "comes": found.comes,
         "in_the_way": [_plain(finding) for finding in found.blocking],
         "notes": [_plain(finding) for finding in found.findings if not finding.blocking],
         "written": found.written,
@@ -241,6 +264,8 @@ def _print_findings(found: Examination, config: Config, out: TextIO) -> None:
     print(f"{found.vehicle}, by {found.where}", file=out)
     if config.feedback.mode == "off":
         print("feedback.mode is off; examined for odometry", file=out)
+    if found.comes:
+        print(found.comes, file=out)
     if found.blocking:
         width = max(len(finding.name) for finding in found.blocking)
         print(f"\nThese stand in the way of {found.mode}:", file=out)

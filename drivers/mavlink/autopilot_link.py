@@ -15,6 +15,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.advice.imu_room import imu_room
 from companion.config import LinkConfig
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import RateMeter, SourceHealth, SourceMeter
@@ -24,6 +25,7 @@ from companion.telemetry import ArmedSample, Telemetry
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.commands import NO_ANSWER, TRIES, Commands
+from drivers.mavlink.imu_rate import ImuNews, ImuRate
 from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.status_text import TextLimit, status_text
 from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
@@ -75,6 +77,7 @@ class AutopilotLink:
         self._meter = SourceMeter("autopilot")
         self._rates: defaultdict[str, RateMeter] = defaultdict(RateMeter)
         self._wanted = MessageRates(wanted(config))
+        self._imu = ImuRate() if config.imu_hz == "auto" else None
         self._commands = Commands(self.send)
         self._text_limit = TextLimit()
         self.system_status: int = mavlink.MAV_STATE_BOOT
@@ -87,6 +90,7 @@ class AutopilotLink:
         self._n_reboots = 0
         self._strangers: set[int] = set()
         self._missing: set[int] = set()
+        self._said_of_imu = ""
         self._questions: dict[int, None] = {}
         port.identity = (config.system_id or FIRST_SYSTEM, config.component_id)
         self._on: dict[int, Take] = {
@@ -225,6 +229,8 @@ class AutopilotLink:
         if vehicle is None or system != vehicle.system_id or component != AUTOPILOT:
             return
         self._heard(receive_ns)
+        if self._imu is not None:
+            self._imu.heard(kind)
         if kind in COUNTED:
             self._rates[message.get_type()].add(receive_ns)
             self._wanted.came(kind)
@@ -259,7 +265,7 @@ class AutopilotLink:
             detail = f"after {silent_s:.1f} s"
             self._warn(Warned(now_ns, "autopilot heard again", detail, good=True))
             self._meter.n_reopened += 1
-            self._wanted.restart()
+            self._restart_rates(rebooted=False)
         self.alive = True
         self._heard_ns = max(self._heard_ns, now_ns)
         self._meter.came(now_ns)
@@ -291,8 +297,13 @@ class AutopilotLink:
     def _rebooted(self, now_ns: int) -> None:
         self._n_reboots = self.clock_filter.n_reboots
         self._questions.clear()
-        self._wanted.restart()
+        self._restart_rates(rebooted=True)
         self._warn(Warned(now_ns, "autopilot rebooted", "its boot time went back"))
+
+    def _restart_rates(self, rebooted: bool) -> None:
+        self._wanted.restart()
+        if self._imu is not None:
+            self._imu.restart(rebooted)
 
     # -- what is done in turn --------------------------------------------------------------------
 
@@ -338,17 +349,47 @@ class AutopilotLink:
             elif (due := self._wanted.due(now_ns)) is not None:
                 await self._ask_for(*due)
                 continue
+            elif self._imu is not None and self.vehicle is not None:
+                self._choose_imu_rate(self._imu, self.vehicle, now_ns)
             await asyncio.sleep(WATCH_S)
 
+    def _choose_imu_rate(self, imu: ImuRate, vehicle: Vehicle, now_ns: int) -> None:
+        """Change the rate that is requested, where what came says so."""
+        shares = self._wanted.shares()
+        if shares is None:
+            return
+        before_hz = imu.asked_hz
+        if not imu.begun:
+            room = imu_room(self._config, self.port.capacity_bytes_per_s, vehicle.firmware)
+            news = imu.begin(room, shares)
+        else:
+            came_hz = self._wanted.take_window(imu.ids)
+            news = None if came_hz is None else imu.judge(came_hz, shares)
+        if imu.asked_hz != before_hz:
+            self._wanted.change(imu.want)
+        self._tell_of_imu(news, now_ns)
+
+    def _tell_of_imu(self, news: ImuNews | None, now_ns: int) -> None:
+        if news is not None and news.detail != self._said_of_imu:
+            self._said_of_imu = news.detail
+            self._warn(Warned(now_ns, news.what, news.detail))
+
     async def _ask_for(self, message_id: int, rate_hz: float) -> None:
+        """Request a message at a rate; at 0, what the autopilot sends by itself."""
+        interval_us = 1e6 / rate_hz if rate_hz else 0.0
         result = await self.command(
-            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz,
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us,
             timeout_s=REQUEST_S, tries=2,
         )  # fmt: skip
+        if result == NO_ANSWER and not rate_hz:
+            await asyncio.sleep(WATCH_S)
+            return
         now_ns = self._clock.now_ns()
         refused = result in REFUSALS
         self._wanted.asked(message_id, refused, now_ns)
-        if refused and message_id not in self._missing:
+        if refused and self._imu is not None and message_id in self._imu.ids:
+            self._tell_of_imu(self._imu.refused(message_id), now_ns)
+        elif refused and message_id not in self._missing:
             self._missing.add(message_id)
             name = mavlink.mavlink_map[message_id].msgname
             self._warn(Warned(now_ns, "autopilot does not send a message", name))
@@ -372,4 +413,5 @@ class AutopilotLink:
             return ""
         report = self.clock_filter.report()
         clock = "clock not known" if report is None else f"clock ±{report.sigma_ms:.1f} ms"
-        return f"{self.vehicle}, {clock}"
+        parts = [str(self.vehicle), clock, str(self._imu or "")]
+        return ", ".join(part for part in parts if part)

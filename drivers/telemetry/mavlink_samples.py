@@ -43,6 +43,12 @@ IMU_IDS = (
     mavlink.MAVLINK_MSG_ID_RAW_IMU,
 )
 """Message types of one quantity, best first."""
+IMU_REQUESTS = (
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU,
+)
+"""Those of the first IMU."""
 GPS_HZ, TIME_HZ = 5.0, 1.0
 """More than receivers give, and enough to map GPS time to boot time."""
 
@@ -58,18 +64,11 @@ class Wanted:
 
 
 def wanted(config: LinkConfig) -> list[Wanted]:
-    """Quantities that the samples of a flight need."""
+    """Quantities that the samples of a flight need, but an IMU whose rate is to be found."""
     # both firmwares have all of these; ArduPilot's older versions lack the first of some
     rates = [
         Wanted(ATTITUDE_IDS, config.attitude_hz),
-        Wanted(
-            (
-                mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
-                mavlink.MAVLINK_MSG_ID_SCALED_IMU,
-                mavlink.MAVLINK_MSG_ID_RAW_IMU,
-            ),
-            config.imu_hz,
-        ),
+        Wanted(IMU_REQUESTS, 0.0 if config.imu_hz == "auto" else config.imu_hz),
         Wanted((mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,), config.position_hz, always=False),
         Wanted((mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,), config.position_hz, always=False),
         Wanted(

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from msgspec import Meta
 
@@ -120,6 +120,10 @@ def _values(hint: Any, marks: tuple[Any, ...]) -> str:
     kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
     if get_origin(kind) is Literal:
         return ", ".join(get_args(kind))
+    if get_origin(kind) is Union:
+        return ", ".join(
+            _values(each, getattr(each, "__metadata__", ())) for each in get_args(kind)
+        )
     limits = next((mark for mark in marks if isinstance(mark, Meta)), None)
     return "" if limits is None else f"{limits.ge:.15g} to {limits.le:.15g}"
 

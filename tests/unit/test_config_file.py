@@ -84,6 +84,25 @@ def test_whole_numbers_are_taken_for_numbers(tmp_path: Path) -> None:
     assert isinstance(voxel, float)
 
 
+@pytest.mark.parametrize(
+    ("text", "value"), [("auto", "auto"), ('"auto"', "auto"), ("100", 100.0), ("0", 0.0)]
+)
+def test_a_rate_may_be_a_word(text: str, value: str | float, tmp_path: Path) -> None:
+    config = load_config(None, [f"expert.link.imu_hz={text}"])
+    assert config.link.imu_hz == value and type(config.link.imu_hz) is type(value)
+    path = tmp_path / "written.toml"
+    path.write_text(to_toml(config), "utf-8")
+    assert load_config(path) == config
+    path.write_text(f"[link]\nimu_hz = {text if text != 'auto' else repr(text)}\n", "utf-8")
+    assert load_config(path, warn=lambda _line: None) == config  # as of the version before
+
+
+@pytest.mark.parametrize("text", ["fast", "1001", "-1", "true"])
+def test_a_rate_that_is_neither_says_both(text: str) -> None:
+    with pytest.raises(ConfigError, match="wanted auto or a number from 0 to 1000, given is"):
+        load_config(None, [f"expert.link.imu_hz={text}"])
+
+
 def test_unknown_key_names_the_nearest(tmp_path: Path) -> None:
     message = refusal(write(tmp_path, "[features]\nnfeatures = 500\n"))
     assert "flight.toml" in message

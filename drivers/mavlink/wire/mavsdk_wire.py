@@ -51,6 +51,7 @@ class MavsdkWire(Wire):
                 f'link.url: "{endpoint}": MAVSDK has no IPv6; set expert.link.backend = "pymavlink"'
             )
         self._endpoint = endpoint
+        self.is_line = endpoint.kind == "serial"
         self._search = BaudSearch((endpoint.baud,) if endpoint.baud else BAUDS)
         self._searching = False
         self._pace = RateLimit(self.bytes_per_s, LONGEST)
@@ -79,7 +80,7 @@ class MavsdkWire(Wire):
 
     async def _open(self) -> int:
         await self._ended()
-        if self._is_serial:
+        if self.is_line:
             if not self._searching:
                 self._search.begin(time.monotonic_ns())
             self._searching = False
@@ -155,7 +156,7 @@ class MavsdkWire(Wire):
         now_ns = time.monotonic_ns()
         if not self._heard_ns and complaints.newest:
             self.trouble = f"{self.name}: {complaints.newest}"
-        if not self._is_serial:
+        if not self.is_line:
             return
         if self._identity_of_device() != self._device:
             self.lose("unplugged")
@@ -164,10 +165,6 @@ class MavsdkWire(Wire):
         elif self._search.look(now_ns):
             self._searching = True
             self.lose(f"no MAVLink heard yet, listening at {self._search.baud} baud")
-
-    @property
-    def _is_serial(self) -> bool:
-        return self._endpoint.kind == "serial"
 
     def _identity_of_device(self) -> tuple[int, int, int] | None:
         try:
@@ -178,7 +175,7 @@ class MavsdkWire(Wire):
 
     def _mavsdk_url(self) -> str:
         kind = KIND_OF[self._endpoint.kind]
-        if self._is_serial:
+        if self.is_line:
             return f"{kind}://{self._endpoint.device}:{self._search.baud}"
         return f"{kind}://{self._endpoint.host}:{self._endpoint.port}"
 

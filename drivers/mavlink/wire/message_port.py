@@ -25,6 +25,10 @@ class MavlinkPort(Protocol):
         """True while the wire is open; says nothing about an autopilot at its other end."""
 
     @property
+    def capacity_bytes_per_s(self) -> float | None:
+        """Capacity of a serial line each way; None of a network, whose is not known."""
+
+    @property
     def trouble(self) -> str:
         """Problem of the wire, for people; "" without one."""
         return ""

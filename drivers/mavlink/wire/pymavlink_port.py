@@ -66,6 +66,11 @@ class PymavlinkPort:
         return self._wire.connected
 
     @property
+    def capacity_bytes_per_s(self) -> float | None:
+        """See `MavlinkPort`."""
+        return self._wire.bytes_per_s if self._wire.is_line else None
+
+    @property
     def trouble(self) -> str:
         """Problem of the wire or the router's listeners, for people; "" without one."""
         keyless = ""

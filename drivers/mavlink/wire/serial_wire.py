@@ -29,6 +29,8 @@ VMIN = 6
 class SerialWire(Wire):
     """Serial line, opened by its path, exclusively."""
 
+    is_line = True
+
     def __init__(self, endpoint: Endpoint) -> None:
         super().__init__(str(endpoint), 0.0, PacketQueue(LEAST_QUEUE_BYTES))
         self.search = BaudSearch((endpoint.baud,) if endpoint.baud else BAUDS)

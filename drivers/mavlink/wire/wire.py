@@ -55,6 +55,8 @@ class Wire(ABC):
     while it is not open they are dropped. `read_limit` holds back a peer that sends too much.
     """
 
+    is_line = False
+    """True of a serial line, whose `bytes_per_s` is its baud rate's."""
     read_size = 65536
     reads_at_once = 1
 

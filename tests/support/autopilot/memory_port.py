@@ -19,6 +19,7 @@ class MemoryPort:
         self.name = "memory"
         self.identity = (0, 0)
         self.connected, self.trouble = True, ""
+        self.capacity_bytes_per_s: float | None = None
         self.n_received = self.n_sent = self.n_dropped = self.n_bad = 0
         self.sent: list[Any] = []
         self._on_message: OnMessage | None = None

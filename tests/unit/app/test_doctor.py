@@ -158,6 +158,11 @@ def test_slow_serial_line(config: Config, tmp_path: Path) -> None:
         status, text = examine(config, url)
         assert status == 1
         assert "SERIAL1_BAUD    is 57600, wanted 230400 or more" in text
+        assert "\nno IMU will be asked for: 57600 baud have no room for it; set SERIAL" in text
+        autopilot.parameters["SCHED_LOOP_RATE"] = 50
+        _, text = examine(config, autopilot.url)
+        assert "\nIMU: HIGHRES_IMU at 100 Hz will be asked for" in text
+        assert "SCHED_LOOP_RATE is 50, wanted 63 or more" in text
 
 
 def test_it_says_nothing_but_that_it_is_there(config: Config) -> None:
@@ -179,7 +184,8 @@ def test_beside_a_daemon_it_goes_through_its_router(config: Config, tmp_path: Pa
 
     async def run() -> tuple[int, str]:
         port = PymavlinkPort(config.link, config.router, FlightClock())
-        document = {"feedback": {"latency_p50_ms": 48.2}}
+        source = {"name": "autopilot", "detail": "ArduPilot, system 1, IMU 99 of 100 Hz"}
+        document = {"feedback": {"latency_p50_ms": 48.2}, "sources": [source]}
         daemon = StatusSocket(tmp_path / "status.sock", lambda: document, lambda text: None)
         await daemon.start()
         running = asyncio.ensure_future(port.run(lambda message, t_ns: None))
@@ -196,6 +202,7 @@ def test_beside_a_daemon_it_goes_through_its_router(config: Config, tmp_path: Pa
     assert status == 1
     assert f"by tcp:127.0.0.1:{place}" in text
     assert "VISO_DELAY_MS   is 10, wanted 48" in text
+    assert "the daemon hears ArduPilot, system 1, IMU 99 of 100 Hz\n" in text
 
 
 def test_link_held_by_a_daemon_without_a_router(config: Config, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine
@@ -27,15 +28,17 @@ from companion.telemetry import (
     Telemetry,
 )
 from companion.timing.clock import FlightClock
+from drivers.mavlink import message_rates
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.commands import NO_ANSWER
+from drivers.mavlink.imu_rate import FEWER, NO_IMU
 from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
 from drivers.mavlink.vehicle import vehicle_of
+from drivers.mavlink.wire.link_port import link_port
 from drivers.mavlink.wire.message_port import MavlinkPort
-from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 from drivers.telemetry.live_positions import LivePositions
-from drivers.telemetry.mavlink_samples import Wanted, wanted
+from drivers.telemetry.mavlink_samples import IMU_REQUESTS, Wanted, wanted
 from drivers.telemetry.telemetry_log import GeodeticFix, kind_of
 from drivers.telemetry.telemetry_tlog import read_tlog
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
@@ -95,9 +98,25 @@ async def linked(autopilot: FakeAutopilot, **keys: Any) -> AsyncIterator[Heard]:
     """A link to a pretended autopilot, up to the first attitude."""
     config = LinkConfig(url=autopilot.url, **keys)
     clock = FlightClock()
-    async with running(config, PymavlinkPort(config, RouterConfig(), clock), clock) as heard:
+    async with running(config, link_port(config, RouterConfig(), clock), clock) as heard:
         await heard.until(lambda: heard.kinds()["attitude"])
         yield heard
+
+
+def of_imu(heard: Heard) -> list[str]:
+    """What was said of the rate of the IMU."""
+    return [each.detail for each in heard.warned if each.what in (NO_IMU, FEWER)]
+
+
+def imu_intervals_us(autopilot: FakeAutopilot) -> list[float]:
+    """Intervals that were asked for, of any message of the IMU."""
+    asked = [each.message for each in autopilot.commands(SET_INTERVAL)]
+    return [each.param2 for each in asked if int(each.param1) in IMU_REQUESTS]
+
+
+@pytest.fixture
+def short_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(message_rates, "CHECK_NS", SECOND)
 
 
 @contextlib.asynccontextmanager
@@ -349,6 +368,99 @@ def test_a_rate_that_falls_short_is_asked_for_again() -> None:
                 await heard.until(lambda: 31 in intervals(autopilot), 7.0)
                 assert intervals(autopilot).count(31) == 1
                 assert autopilot.rates_hz["ATTITUDE_QUATERNION"] == 50
+
+    run(test())
+
+
+@pytest.mark.parametrize("backend", ["pymavlink", "mavsdk"])
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_the_imu_is_asked_for_as_the_link_carries_it(
+    short_windows: None, firmware: str, backend: str
+) -> None:
+    async def test() -> None:
+        with FakeAutopilot(firmware, "udpin:127.0.0.1:0", circle()) as autopilot:
+            async with linked(autopilot, backend=backend) as heard:
+                assert not imu_intervals_us(autopilot)  # before it is known how the others come
+                await heard.until(lambda: heard.kinds()["imu"] > 150, 8.0)
+                assert imu_intervals_us(autopilot) == [10_000]
+                assert 80 < heard.link.rates_hz["HIGHRES_IMU"] < 120
+                assert re.search(r", IMU \d+ of 100 Hz$", heard.link.health.detail)
+                autopilot.clear()
+                autopilot.reboot(silent_s=0.3)
+                heard.samples.clear()
+                await heard.until(lambda: heard.kinds()["imu"] > 50, 8.0)
+                assert set(imu_intervals_us(autopilot)) == {10_000}
+                assert not of_imu(heard)
+
+    run(test())
+
+
+@pytest.mark.parametrize("n_lacking", [2, 3])
+def test_messages_of_the_imu_that_a_firmware_lacks(short_windows: None, n_lacking: int) -> None:
+    lacks = ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU")[:n_lacking]
+
+    async def test() -> None:
+        with FakeAutopilot("ardupilot", flight=circle(), lacks=lacks) as autopilot:
+            async with linked(autopilot) as heard:
+                if n_lacking == 2:
+                    await heard.until(lambda: heard.kinds()["imu"] > 10, 8.0)
+                    assert "RAW_IMU" in heard.link.rates_hz and not of_imu(heard)
+                else:
+                    await heard.until(lambda: of_imu(heard), 8.0)
+                    assert of_imu(heard) == ["it has no message for it"]
+                    await asyncio.sleep(1.5)
+                    assert heard.link.health.detail.endswith("no IMU: it has no message for it")
+                assert len(imu_intervals_us(autopilot)) == 3  # one of each
+                assert "autopilot does not send a message" not in heard.named()
+
+    run(test())
+
+
+@pytest.mark.parametrize("backend", ["pymavlink", "mavsdk"])
+def test_a_slow_line_has_no_room_for_the_imu(
+    short_windows: None, tmp_path: Path, backend: str
+) -> None:
+    async def test() -> None:
+        with FakeAutopilot("ardupilot", f"pty:{tmp_path / 'tty'}:57600", circle()) as autopilot:
+            async with linked(autopilot, backend=backend) as heard:
+                await heard.until(lambda: of_imu(heard), 8.0)
+                await asyncio.sleep(1.5)
+                assert not imu_intervals_us(autopilot) and not heard.kinds()["imu"]
+                (said,) = of_imu(heard)
+                assert said.startswith("57600 baud have no room for it; set SERIALn_BAUD")
+                assert heard.link.health.detail.endswith(f"no IMU: {said}")
+
+    run(test())
+
+
+def test_less_that_comes_of_the_imu_is_asked_for(short_windows: None) -> None:
+    async def test() -> None:
+        with FakeAutopilot("ardupilot", flight=circle(), max_rate_hz=66.0) as autopilot:
+            async with linked(autopilot, attitude_hz=50) as heard:
+                await heard.until(lambda: of_imu(heard), 12.0)
+                (said,) = of_imu(heard)
+                assert re.fullmatch(r"6\d of 100 Hz came: 6\d Hz from now on", said)
+                await heard.until(lambda: len(imu_intervals_us(autopilot)) == 2)
+                assert imu_intervals_us(autopilot)[0] == 10_000
+                assert imu_intervals_us(autopilot)[1] in range(15_000, 18_000, 1000)
+                await asyncio.sleep(3.5)
+                assert len(imu_intervals_us(autopilot)) == 2 and of_imu(heard) == [said]
+
+    run(test())
+
+
+def test_a_saturated_line_is_left_to_the_others(short_windows: None) -> None:
+    async def test() -> None:
+        with FakeAutopilot("ardupilot", flight=circle()) as autopilot:
+            autopilot.line_bytes_per_s = 5500.0
+            async with linked(autopilot) as heard:
+                await heard.until(lambda: NO_IMU in heard.named(), 15.0)
+                assert imu_intervals_us(autopilot)[0] == 10_000
+                await heard.until(lambda: imu_intervals_us(autopilot)[-1] == 0)
+                assert len(imu_intervals_us(autopilot)) <= 4
+                assert "other messages became fewer" in of_imu(heard)[0]
+                await heard.until(lambda: "HIGHRES_IMU" not in heard.link.rates_hz, 8.0)
+                await heard.until(lambda: heard.link.rates_hz["ATTITUDE_QUATERNION"] > 40, 8.0)
 
     run(test())
 
