@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import FeedbackConfig
+from companion.config import FeedbackConfig, Measurement
 from companion.estimation.pose_gate import PoseGate, PoseToSend
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import Odometry, TrackState
@@ -221,6 +221,16 @@ def test_without_an_attitude_nothing_is_sent() -> None:
     assert not flight.run(3)
     assert flight.gate.why_not == "no autopilot attitude"
     assert not flight.run(3, world_from_body=rolled_over(0))
+
+
+@pytest.mark.parametrize("use", [(), ("imu", "position", "satellites", "range", "height")])
+def test_without_belief_in_the_attitude_nothing_is_sent(use: tuple[Measurement, ...]) -> None:
+    flight = Flight()
+    flight.gate = PoseGate(FeedbackConfig(mode="odometry"), use=use)
+    assert not flight.run(3)
+    assert flight.gate.why_not == "attitude is not believed"
+    flight.gate = PoseGate(FeedbackConfig(mode="odometry"), use=["attitude"])
+    assert flight.run(3)
 
 
 def test_poses_stop_without_attitude() -> None:
