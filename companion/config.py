@@ -9,7 +9,7 @@ checked where a configuration is read (`companion.config_file`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar, get_args
 
 from msgspec import Meta
 
@@ -17,6 +17,9 @@ T = TypeVar("T")
 EXPERT = "expert"
 Expert = Annotated[T, EXPERT]
 """A key that few drones need: its default was found by tests, or fits nearly all."""
+Measurement = Literal["attitude", "imu", "position", "satellites", "range", "height", "airspeed"]
+"""A kind of measurement, as `telemetry.use` names it."""
+MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +221,15 @@ class RecorderConfig:
 
 @dataclass(frozen=True, slots=True)
 class TelemetryConfig:
-    """Time alignment of the autopilot's log with the flight's clock."""
+    """Telemetry of the autopilot: what is believed of it, and the time alignment of its log.
 
+    What is not believed decides nothing about the pose, and is recorded as it comes.
+    """
+
+    use: tuple[Measurement, ...] = MEASUREMENTS
+    """Kinds of measurement that are believed, each at most once. imu: accelerations and rates of
+    turn; position: the autopilot's own estimate; satellites: GPS; range: rangefinder; height:
+    barometer. Without attitude no pose is sent."""
     log: Expert[str] = ""
     """The log to read; "" takes the one beside the images."""
     align: Expert[Literal["auto", "never"]] = "auto"

@@ -114,11 +114,13 @@ def with_value(config: Config, name: str, value: Any, where: str) -> Config:
         checked = msgspec.convert(value, _types()[name])
     except msgspec.ValidationError as error:
         words = ", ".join(words_of(name))
-        wanted = f"wanted one of {words}" if words else str(error)
+        wanted = f"wanted one of {words}" if words else _wanted_list(name) or str(error)
         if (limits := number_or_word(name)) is not None:
             word, least, most = limits
             wanted = f"wanted {word} or a number from {least:.15g} to {most:.15g}"
         raise ConfigError(f"{where}: {name}: {wanted}, given is {value!r}") from error
+    if listed_words_of(name) and len(set(checked)) < len(checked):
+        raise ConfigError(f"{where}: {name}: {_wanted_list(name)}, given is {value!r}")
     return with_values(config, {name: checked})
 
 
@@ -151,6 +153,13 @@ def number_or_word(name: str) -> tuple[str, float, float] | None:
     of_word, of_number = get_args(kind)
     (limits,) = of_number.__metadata__
     return get_args(of_word)[0], limits.ge, limits.le
+
+
+def listed_words_of(name: str) -> tuple[str, ...]:
+    """The words that the list of a key may hold, each once; none where it is no list of words."""
+    kind = _kind(name)
+    of_each = get_args(kind)[0] if get_origin(kind) is tuple else None
+    return get_args(of_each) if get_origin(of_each) is Literal else ()
 
 
 def dump(config: Config) -> dict[str, Any]:
@@ -260,6 +269,11 @@ def _split(override: str) -> tuple[str, str]:
     if not (equals and section and key):
         raise ConfigError(f"--set {override}: wanted section.key=value")
     return name.strip(), text.strip()
+
+
+def _wanted_list(name: str) -> str:
+    words = ", ".join(listed_words_of(name))
+    return f"wanted a list of {words}, each at most once" if words else ""
 
 
 def _parse(text: str, name: str) -> Any:

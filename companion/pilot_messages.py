@@ -143,6 +143,7 @@ REASONS: Mapping[str, str] = {
     "belief must hold first": "being checked",
     "the autopilot is silent": "autopilot silent",
     "no autopilot attitude": "no attitude",
+    "attitude is not believed": "attitude not used",
     "no autopilot height": "no height",
     "position reset": "position reset",
     "no autopilot clock": "no clock",

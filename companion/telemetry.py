@@ -5,10 +5,12 @@ From its schema follow codec, recording topic, table and curve. See `messages` f
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import ClassVar, get_args
 
+from companion.config import MEASUREMENTS, Measurement
 from companion.geometry.transforms import Array
 from companion.telemetry_schema import QUATERNION, VECTOR, Schema, fields_of
 
@@ -109,3 +111,26 @@ TELEMETRY: tuple[type[Telemetry], ...] = get_args(Telemetry)
 """In order of their channels in a recording."""
 FIELDS = {kind: fields_of(kind) for kind in TELEMETRY}
 """Fields of each, without its time."""
+MEASURED: Mapping[type[Telemetry] | PositionSource, Measurement | None] = {
+    AttitudeSample: "attitude", ImuSample: "imu", RangeSample: "range", HeightSample: "height",
+    AirspeedSample: "airspeed", ArmedSample: None,
+    PositionSource.LOCAL: "position", PositionSource.GLOBAL: "position",
+    PositionSource.GPS: "satellites",
+}  # fmt: skip
+"""Measurement of each kind of sample, and of each source of positions; None of a state."""
+
+
+def is_believed(sample: Telemetry, use: Collection[Measurement]) -> bool:
+    """True if a sample may decide about the pose: what it measures is in use, or it is a state."""
+    measured = MEASURED[sample.source if isinstance(sample, PositionSample) else type(sample)]
+    return measured is None or measured in use
+
+
+def belief_in_words(use: Collection[Measurement]) -> str:
+    """Telemetry that is believed, and what follows for poses sent; "" where it is everything."""
+    if set(use) == set(MEASUREMENTS):
+        return ""
+    named = ", ".join(each for each in MEASUREMENTS if each in use)
+    believed = f"only {named}" if named else "nothing"
+    said = f"of the autopilot's telemetry {believed} is believed (telemetry.use)"
+    return said if "attitude" in use else f"{said}: without attitude no pose is sent"

@@ -39,11 +39,11 @@ class ImuRoom:
     message: str
     rate_hz: float
     why: str = ""
-    """Why none fits, and what to do."""
+    """Reason why none fits, and what to do."""
 
 
 def imu_room(link: LinkConfig, bytes_per_s: float | None, firmware: str) -> ImuRoom:
-    """What fits a link of a capacity; None where that is not known beforehand, as of a network."""
+    """Room on a link of a capacity; None where that is not known beforehand, as of a network."""
     best = next(iter(IMU_BYTES))
     if bytes_per_s is None:
         return ImuRoom(best, MOST_HZ)

@@ -62,7 +62,11 @@ def replay_as_flown(
         made = [
             payload
             for step, pose in poses_as_sent(
-                told.config.feedback, told.gate, _attitudes(told), lambda seq: _known(of_frame, seq)
+                told.config.feedback,
+                told.config.telemetry.use,
+                told.gate,
+                _attitudes(told),
+                lambda seq: _known(of_frame, seq),
             )
             if step.sent
             for payload in payloads_of(pose, told.config.feedback.mode)

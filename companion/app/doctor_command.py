@@ -47,7 +47,7 @@ class Examination:
     findings: list[Finding]
     n_examined: int
     comes: str = ""
-    """What the daemon hears of the autopilot; without one, the IMU that it will ask for."""
+    """Note on what the daemon hears of the autopilot; without one, the IMU it will ask for."""
     written: list[dict[str, Any]] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     """Parameters that the autopilot refused, in words."""
@@ -219,7 +219,7 @@ def _latency_ms(daemon: Mapping[str, Any] | None) -> float | None:
 
 
 def _heard_by(daemon: Mapping[str, Any] | None) -> str:
-    """What the running daemon says of the autopilot; "" without one."""
+    """Words of the running daemon about the autopilot; "" without one."""
     for source in (daemon or {}).get("sources") or ():
         if source.get("name") == "autopilot":
             return f"the daemon hears {source.get('detail') or source.get('state')}"
@@ -227,7 +227,7 @@ def _heard_by(daemon: Mapping[str, Any] | None) -> str:
 
 
 def _imu_to_be(link: LinkConfig, baud: int, firmware: str) -> str:
-    """What the daemon will ask for; "" where that is set by hand."""
+    """Rate that the daemon will ask for, in words; "" where that is set by hand."""
     if link.imu_hz != "auto":
         return ""
     room = imu_room(link, baud / BITS_PER_BYTE if baud else None, firmware)

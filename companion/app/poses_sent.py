@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from companion.config import FeedbackConfig
+from companion.config import Config
 from companion.estimation.pose_gate import PoseGate
 from companion.geometry.transforms import Pose
 from companion.messages import Message, Odometry
@@ -22,8 +22,8 @@ class PosesSent:
     afterwards.
     """
 
-    def __init__(self, config: FeedbackConfig) -> None:
-        self._gate = PoseGate(config)
+    def __init__(self, config: Config) -> None:
+        self._gate = PoseGate(config.feedback, use=config.telemetry.use)
         self.poses: list[tuple[int, Pose]] = []
         """Times, ns, and `world_from_body`."""
 

@@ -93,7 +93,7 @@ def replay(
     map fails, all frames are tracked and written with the cloud so far; then StageError.
     """
     camera, log = given.flight.camera, given.log
-    watched, sent = Watched(), PosesSent(config.feedback)
+    watched, sent = Watched(), PosesSent(config)
     live: LiveViewer | None = None
     names = ("localisation", "depth", "results") if config.depth.enabled else LEAST
     setup = Setup(config, camera, out, origin=log.origin, is_live=False)
@@ -123,6 +123,7 @@ def replay(
                 config=shown(config), versions=versions(), command=command_shown(sys.argv),
                 peak_memory_mb=peak_memory_mb(), camera=camera, n_frames_total=given.n_frames,
                 completed=completed, dropped=dropped, rates_hz=dict(log.rates_hz),
+                believed=config.telemetry.use,
             ))  # fmt: skip
 
         try:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from companion.config import MEASUREMENTS
 from companion.timing.clock import wait_s
 from drivers.system.status_socket import ask_status
 
@@ -73,6 +74,7 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
     rows = [
         ("pose", ", ".join(pose)),
         ("scale", document.get("scale") or "not known"),
+        *_belief(document.get("believed", MEASUREMENTS)),
         ("feedback", _feedback(document.get("feedback") or {})),
         ("flight", document.get("flight") or "none"),
         ("reduced", document.get("degraded") or "nothing"),
@@ -82,6 +84,13 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         ("running for", _number(document.get("uptime_s"), " s")),
     ]
     return [f"{name:12}{value}" for name, value in rows]
+
+
+def _belief(believed: Sequence[Any]) -> list[tuple[str, str]]:
+    """Row of the telemetry that is believed, where that is not everything."""
+    if set(believed) >= set(MEASUREMENTS):
+        return []
+    return [("believed", f"{', '.join(map(str, believed)) or 'nothing'} (telemetry.use)")]
 
 
 def _settings(settings: Mapping[str, Any]) -> str:

@@ -33,12 +33,13 @@ from companion.daemon.pose.pose_sender import PoseSender
 from companion.daemon.recorder_notes import RecorderNotes
 from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
+from companion.geometry.geodesy import GeoOrigin
 from companion.health import LatencyMeter
 from companion.messages import Frame, Odometry, Warned
 from companion.pilot_messages import PilotText, of_warning
 from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import Snapshot
-from companion.telemetry import ArmedSample, AttitudeSample, Telemetry
+from companion.telemetry import ArmedSample, AttitudeSample, Telemetry, belief_in_words
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_registry import camera_source
@@ -47,7 +48,7 @@ from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.origin_keeper import OriginKeeper
 from drivers.mavlink.wire.link_port import link_port
 from drivers.system.clock_is_set import clock_is_set
-from drivers.system.journal import Journal
+from drivers.system.journal import WARNING, Journal
 from drivers.system.metrics import Metrics
 from drivers.system.service_manager import ServiceManager
 from drivers.system.status_socket import StatusSocket, own_socket_path
@@ -71,6 +72,9 @@ class Daemon:
             lambda why: self._on_warned(Warned(clock.now_ns(), NOT_KEPT, why)), self._reconfigured,
         )  # fmt: skip
         config = settings.config
+        belief = belief_in_words(config.telemetry.use)
+        if belief:
+            journal.say(belief, WARNING)
         self._service = ServiceManager()
         self._loop_delay = LatencyMeter()
         self._feed = CameraFeed(
@@ -181,7 +185,7 @@ class Daemon:
         if self._link is not None and feedback.set_origin:
             keeper = OriginKeeper(
                 feedback, self._link, self._journal.say,
-                lambda: self._settings.config.feedback.mode != "off",
+                lambda: self._settings.config.feedback.mode != "off", self._believed_origin,
             )  # fmt: skip
             work.append(keeper.run())
         return work
@@ -258,6 +262,11 @@ class Daemon:
         if link is None:
             return facts_of(flight, config, None, None, {})
         return facts_of(flight, config, link.clock_filter.report(), link.origin, link.rates_hz)
+
+    def _believed_origin(self) -> GeoOrigin | None:
+        """Origin of positions; None where one kind of them is not believed: it may come of both."""
+        believed = {"position", "satellites"} <= set(self._settings.config.telemetry.use)
+        return self._link.origin if self._link is not None and believed else None
 
     def _autopilot_boot_s(self) -> float | None:
         """Boot time of the autopilot, CLOCK_MONOTONIC; None while its clock is unknown."""

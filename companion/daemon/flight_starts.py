@@ -136,8 +136,8 @@ class FlightStarts:
             if self._reports is not None:
                 self._reports.restart(self.camera)
             self._watch.restart()
-            self._flights.begin(self.config, self.camera, take_up)
+            flight = self._flights.begin(self.config, self.camera, take_up)
             if self._sender is not None:
-                self._sender.begin_flight()
+                self._sender.begin_flight(flight.believed)
         else:
             self._flights.prepare(self.config, self.camera)

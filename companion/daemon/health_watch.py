@@ -72,7 +72,7 @@ class HealthWatch:
         self._feed, self._link, self._sender = feed, link, sender
         self._loop_delay = loop_delay
         self._began_ns = clock.now_ns()
-        self._config = config.daemon
+        self._config, self._believed = config.daemon, config.telemetry.use
         self._governor = Governor(config.daemon.hot_c)
         self._lines = StatusLines(config.daemon.status_every_s)
         self._load_reader = SystemLoad(Path(config.daemon.flights))
@@ -98,6 +98,7 @@ class HealthWatch:
 
     def reconfigure(self, config: Config) -> None:
         """Apply a changed configuration."""
+        self._believed = config.telemetry.use
         if config.daemon == self._config:
             return
         if config.daemon.hot_c != self._config.hot_c:
@@ -224,7 +225,9 @@ class HealthWatch:
 
     def document(self) -> dict[str, Any]:
         """Status document of `companion status`."""
-        return {"version": __version__, **self.health().to_json()}
+        flight = self._flights.current
+        believed = self._believed if flight is None else flight.believed
+        return {"version": __version__, "believed": list(believed), **self.health().to_json()}
 
     def health(self) -> Health:
         """Health now."""

@@ -78,6 +78,7 @@ def fingerprint(config: Config, camera: Camera) -> str:
         camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
         camera.distortion.value, camera.coefficients, features.n_levels, features.scale_factor,
         None if mount is None else mount.matrix().tolist(), config.feedback.mode != "off",
+        sorted(config.telemetry.use),
     )  # fmt: skip
     return hashlib.sha256(repr(identity).encode()).hexdigest()
 

@@ -8,10 +8,10 @@ are left out.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict
 
-from companion.config import FeedbackConfig
+from companion.config import FeedbackConfig, Measurement
 from companion.estimation.pose_gate import PoseGate, PoseToSend
 from companion.estimation.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
@@ -45,13 +45,14 @@ class JournaledGate(PoseGate):
 
         super().__init__(config, counter, asked_down_m, asked_may_start)
 
-    def begin(self) -> None:
-        """Begin the journal of a flight, with its recording."""
+    def begin(self, use: Collection[Measurement]) -> None:
+        """Begin the journal of a flight, with its recording, and with what it believes."""
+        self._use = use
         self._n_attitudes = 0
         self._say(BEGIN, self._now_ns())
 
     def take_attitude(self, sample: AttitudeSample) -> None:
-        """As `PoseGate.take_attitude`, journaled."""
+        """As `PoseGate.take_attitude`, journaled; one that is not believed counts, too."""
         self._n_attitudes += 1
         super().take_attitude(sample)
 
@@ -107,8 +108,8 @@ class JournaledGate(PoseGate):
 
 
 def poses_as_sent(
-    config: FeedbackConfig, steps: Iterable[GateStep], attitudes: Iterable[AttitudeSample],
-    odometry_of: Callable[[int], Odometry],
+    config: FeedbackConfig, use: Collection[Measurement], steps: Iterable[GateStep],
+    attitudes: Iterable[AttitudeSample], odometry_of: Callable[[int], Odometry],
 ) -> Iterator[tuple[GateStep, PoseToSend]]:  # fmt: skip
     """Poses of a gate by its journal, from the beginning of a flight.
 
@@ -125,7 +126,7 @@ def poses_as_sent(
         counter.value, counter.sent = step.counter, step.counter_sent
         return str(answers.get("why_not_start", ""))
 
-    gate = PoseGate(config, counter, down_m, may_start)
+    gate = PoseGate(config, counter, down_m, may_start, use)
     waiting = deque(attitudes)
     n_taken = 0
     for step in steps:

@@ -41,7 +41,7 @@ from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.map_part import map_of, part_around
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
-from companion.telemetry import AttitudeSample, ImuSample, Telemetry
+from companion.telemetry import AttitudeSample, ImuSample, Telemetry, is_believed
 from companion.timing.clock import Timer
 
 FINAL_ITERATIONS = 8
@@ -61,8 +61,9 @@ class LocalisationStage:
     """Localises the camera.
 
     With `background` keyframes are mapped in another thread, so that no frame waits; `order` is
-    then that of mapping and frames, as FrameTracked told it in an earlier flight. Position
-    estimates of an autopilot that flies on ours are ignored.
+    then that of mapping and frames, as FrameTracked told it in an earlier flight. Of telemetry it
+    believes what `telemetry.use` names, but no position estimates of an autopilot that flies on
+    ours.
     """
 
     def __init__(
@@ -131,6 +132,8 @@ class LocalisationStage:
 
     def _take_samples(self) -> None:
         for sample in self._samples:
+            if not is_believed(sample, self._config.telemetry.use):
+                continue
             if isinstance(sample, AttitudeSample | ImuSample):
                 self._acceleration.take(sample)
             if isinstance(sample, AttitudeSample):

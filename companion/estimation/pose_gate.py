@@ -10,18 +10,18 @@ limit. After others, and after every discontinuity, the conditions must hold aga
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from companion.config import FeedbackConfig
+from companion.config import MEASUREMENTS, FeedbackConfig, Measurement
 from companion.estimation.attitude_history import MAX_EXTRAPOLATION_NS, AttitudeHistory
 from companion.estimation.reset_counter import ResetCounter
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Odometry, TrackState
-from companion.telemetry import AttitudeSample
+from companion.telemetry import AttitudeSample, is_believed
 
 MAX_TILT_ERROR_RAD = np.radians(8.0)
 MAX_AGE_NS = 300_000_000
@@ -44,6 +44,7 @@ TILTED = "tilt differs from the autopilot's"
 LATE = "poses come too late"
 SILENT = "no frames"
 NO_ATTITUDE = "no autopilot attitude"
+NOT_BELIEVED = "attitude is not believed"
 RESTARTED = "localisation begins anew"
 RESET = "position reset"
 REBOOTED = "autopilot rebooted"
@@ -84,8 +85,9 @@ class PoseGate:
     """Odometry and attitude in; poses to send out. `now_ns` is the time of the call.
 
     `start_down_m` gives the autopilot's own down coordinate at the time of a frame, None to
-    withhold poses for want of it; without it poses stay in our world. `may_start` gives other
-    reasons not to start sending, "" if none.
+    withhold poses for want of it; without it poses stay in our world. That is where the receiver
+    counts from, no measurement of ours: it is asked whatever of telemetry is in `use`. `may_start`
+    gives other reasons not to start sending, "" if none.
     """
 
     def __init__(
@@ -94,8 +96,10 @@ class PoseGate:
         counter: ResetCounter | None = None,
         start_down_m: Callable[[int], float | None] | None = None,
         may_start: Callable[[int], str] = lambda _now_ns: "",
+        use: Collection[Measurement] = MEASUREMENTS,
     ) -> None:
         self._config = config
+        self._use = use
         self._attitude = AttitudeHistory(400, MAX_ATTITUDE_GAP_NS)
         self._counter = counter or ResetCounter()
         self._start_down_m, self._may_start = start_down_m, may_start
@@ -148,7 +152,9 @@ class PoseGate:
         self._stop(why_not)
 
     def take_attitude(self, sample: AttitudeSample) -> None:
-        """Add an attitude of the autopilot, for checks and predictions."""
+        """Add an attitude of the autopilot, for checks and predictions, where it is believed."""
+        if not is_believed(sample, self._use):
+            return
         if not 0.5 < float(np.linalg.norm(sample.ned_from_body)) < 2.0:  # rejects nan too
             return
         rates = sample.rates_body_rad_s
@@ -238,6 +244,8 @@ class PoseGate:
 
     def _rejection_reason(self, odometry: Odometry, now_ns: int) -> str:
         """Reason why a pose is rejected; "" if accepted."""
+        if "attitude" not in self._use:
+            return NOT_BELIEVED
         pose, velocity = odometry.world_from_body, odometry.velocity_world_m_s
         if odometry.state is TrackState.INITIALISING:
             return INITIALISING

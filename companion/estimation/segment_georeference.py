@@ -65,9 +65,9 @@ class SegmentGeoreferences:
         self._spaced: dict[int, list[tuple[int, int]]] = {}
         """Ids and times of the keyframes that the inertial scale takes."""
         self.reckoned_world: Callable[[int], BodyPlace | None] = lambda _t_ns: None
-        """Where inertial navigation had the body at a recent frame."""
+        """Place of the body by inertial navigation at a recent frame."""
         self._reckoned: dict[int, tuple[BodyPlace, Georeference | None]] = {}
-        """Where a segment began by it, and how that placed the segment, by first keyframe."""
+        """Place at which a segment began by it, and the segment so placed, by first keyframe."""
 
     def of(self, segment: SlamMap) -> Georeference | None:
         """Georeference of a segment; None until known."""
@@ -281,7 +281,7 @@ class SegmentGeoreferences:
     def _begun_by_navigation(
         self, segment: SlamMap, first: Keyframe
     ) -> tuple[BodyPlace, Georeference | None] | None:
-        """Where inertial navigation had the body as a segment began, and the segment placed so.
+        """Place of the body by inertial navigation as a segment began, and the segment so placed.
 
         Found once, while the navigation does not go by this segment.
         """

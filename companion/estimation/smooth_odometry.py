@@ -242,7 +242,7 @@ class SmoothOdometry:
         return found
 
     def reckoned_world(self, t_ns: int) -> BodyPlace | None:
-        """Where inertial navigation had the body at one of the latest frames; None if nowhere."""
+        """Place by inertial navigation at one of the latest frames; None if that had none."""
         return next((each for each in self._reckoned_world if each.t_ns == t_ns), None)
 
     def _dead_reckon(self, track: Track, raw: Pose) -> Odometry:
@@ -281,7 +281,7 @@ class SmoothOdometry:
             self._owed_m = self._owed_m - correction
 
     def place_in_map(self, place_m: Array, map_from_camera: Array) -> Array | None:
-        """Where in the active map the camera is (3,), for a place (3,) of the body.
+        """Place of the camera (3,) in the active map, for a place (3,) of the body.
 
         The place is in the frame of the odometry, metres; the rotation (3, 3) is the camera's in
         the map. None without a georeference.
@@ -301,9 +301,11 @@ class SmoothOdometry:
         rotation = self._navigation.world_from_attitude @ attitude.ned_from_body
         placed, self._velocity = Pose(rotation, reckoned.place_m), reckoned.velocity_m_s
         self._dead_reckoning = True
-        if self._last is not None:
-            self._last = (track.t_ns, self._last[1], placed)
         georeference = self._georeference
+        if self._last is not None:
+            camera = self._odometry_from_world.inverse() @ placed @ self._camera_from_body.inverse()
+            pose = georeference.world_from_map.inverse().apply_to_pose(camera)
+            self._last = (track.t_ns, pose, placed)
         drift_m = self._drift_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
         return Odometry(
             track.seq, track.t_ns, TrackState.DEAD_RECKONING, self.reset_counter, 1, placed,
@@ -337,14 +339,15 @@ class SmoothOdometry:
 
     def _update_georeference(self, georeference: Georeference) -> None:
         """Change the georeference of the same map, keeping the last pose."""
-        if self._last is not None:
+        before = self._georeference
+        if self._last is not None and before is not None:
             _, pose, placed = self._last
             raw = self._raw(georeference, pose)
             yaw_offset = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
             self._odometry_from_world = Pose(
                 yaw_offset, placed.translation - yaw_offset @ raw.translation
             )
-            ratio = georeference.world_from_map.scale / self._georeference.world_from_map.scale
+            ratio = georeference.world_from_map.scale / before.world_from_map.scale
             self._navigation.move(np.eye(3), placed.translation, placed.translation, ratio)
         self._georeference = georeference
 
@@ -375,8 +378,8 @@ class SmoothOdometry:
 
         The output stays continuous; the difference is slewed.
         """
-        if self._last is None or self._georeference is None:
-            return
+        if self._last is None or self._georeference is None or self._dead_reckoning:
+            return  # what dead reckoning is off by shows when the map is seen again
         t_ns, _, placed = self._last
         self._last = (t_ns, map_from_camera, placed)
         self._update_georeference(self._georeference)

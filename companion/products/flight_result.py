@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from companion.config import MEASUREMENTS, Measurement
 from companion.dense.local_scale import local_scale_of_points
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
@@ -62,6 +63,8 @@ class RunFacts:
     completed: bool
     dropped: Mapping[str, int] = field(default_factory=dict)
     rates_hz: Mapping[str, float] = field(default_factory=dict)
+    believed: tuple[Measurement, ...] = MEASUREMENTS
+    """Telemetry that could decide about the pose, by `telemetry.use`."""
 
 
 class WorldPose(NamedTuple):

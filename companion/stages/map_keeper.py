@@ -93,7 +93,8 @@ class MapKeeper:
         if said["boot"] != self._same["boot"]:
             raise CheckpointError("the computer was started anew since")
         if said["fingerprint"] != self._same["fingerprint"]:
-            raise CheckpointError("camera, calibration or feedback.mode are others now")
+            others = "camera, calibration, feedback.mode or telemetry.use"
+            raise CheckpointError(f"{others} are others now")
         age_ns = since_boot_ns() - said["tracked_ns"]
         if not 0 <= age_ns <= MAX_ABSENT_NS:
             raise CheckpointError(f"it is {age_ns * 1e-9:.0f} s old")

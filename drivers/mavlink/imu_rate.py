@@ -37,7 +37,7 @@ Shares = Mapping[int, float]
 
 @dataclass(frozen=True, slots=True)
 class ImuNews:
-    """What changed, for people."""
+    """Change of the rate, in words."""
 
     what: str
     detail: str
@@ -52,7 +52,7 @@ class ImuRate:
         self.came_hz: float | None = None
         """Measured; None before the first window."""
         self.why = ""
-        """Why none is requested."""
+        """Reason why none is requested."""
         self.begun = False
         self._carried_hz = math.inf
         self._others: Shares = {}
@@ -60,7 +60,7 @@ class ImuRate:
 
     @property
     def want(self) -> Wanted:
-        """What to request now; a rate of 0 leaves it to the autopilot."""
+        """Request now; a rate of 0 leaves it to the autopilot."""
         return Wanted(self.ids, self.asked_hz)
 
     def restart(self, rebooted: bool) -> None:

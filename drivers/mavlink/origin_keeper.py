@@ -25,13 +25,16 @@ NOWHERE_DEG = 1e-7
 
 
 class OriginKeeper:
-    """Ensures that the autopilot has an origin; the link itself requests the present one."""
+    """Ensures that the autopilot has an origin; the link itself requests the present one.
+
+    `known` gives the place that it was at before, None where there is none to be believed.
+    """
 
     def __init__(
         self, config: FeedbackConfig, link: AutopilotLink, say: Callable[[str], None],
-        is_wanted: Callable[[], bool] = lambda: True,
+        is_wanted: Callable[[], bool], known: Callable[[], GeoOrigin | None],
     ) -> None:  # fmt: skip
-        self._link, self._say, self._is_wanted = link, say, is_wanted
+        self._link, self._say, self._is_wanted, self._known = link, say, is_wanted, known
         self._place = GeoOrigin(
             config.origin_latitude_deg, config.origin_longitude_deg, config.origin_altitude_m
         )
@@ -53,7 +56,7 @@ class OriginKeeper:
 
     async def _set(self) -> None:
         """Set it by the command, and by the message that older firmware has."""
-        place = self._link.origin or self._place
+        place = self._known() or self._place
         if place.latitude_deg == 0 and place.longitude_deg == 0:
             place = GeoOrigin(NOWHERE_DEG, NOWHERE_DEG, place.altitude_m)
             self._say(

@@ -6,19 +6,19 @@ The camera's rotation comes from its own gyroscope, where the video has that, el
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from companion.config import TelemetryConfig
+from companion.config import Measurement, TelemetryConfig
 from companion.errors import FlightError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, rotation_from_quaternion, vector_from_rotation
 from companion.messages import ClockReport, Frame, Warned
-from companion.telemetry import AttitudeSample, ImuSample, Telemetry
+from companion.telemetry import AttitudeSample, ImuSample, Telemetry, is_believed
 from companion.timing.image_rotation import RotationMeter
 from companion.timing.rotation_alignment import RotationRecord, TimeAlignment, align_rotations
 from drivers.telemetry.gpmf_gyro import gyro_rotation
@@ -46,7 +46,7 @@ def read_unaligned(
     reasons: list[str] = []
     for see in (_from_gyro, _from_images):
         seen = see(camera, frames, pictures)
-        found = None if seen is None else _best(seen, logs, pictures.start_ns, reasons)
+        found = None if seen is None else _best(seen, logs, pictures.start_ns, config.use, reasons)
         if seen is not None and found is not None:
             return _moved(*found, seen.by_what, pictures)
     raise FlightError(
@@ -65,13 +65,14 @@ class _Rotation:
 
 
 def _best(
-    seen: _Rotation, logs: Sequence[tuple[Path, TelemetryLog]], start_ns: int, reasons: list[str]
-) -> tuple[TelemetryLog, TimeAlignment, Path] | None:
+    seen: _Rotation, logs: Sequence[tuple[Path, TelemetryLog]], start_ns: int,
+    use: Collection[Measurement], reasons: list[str],
+) -> tuple[TelemetryLog, TimeAlignment, Path] | None:  # fmt: skip
     found = []
     for path, log in logs:
-        logged = _from_log(log.samples, start_ns)
+        logged = _from_log([s for s in log.samples if is_believed(s, use)], start_ns)
         if logged is None:
-            reasons.append(f"{path.name} has neither rates nor attitude")
+            reasons.append(f"{path.name} has neither rates nor attitude{_left_out(use)}")
             continue
         t_s = seen.record.t_s
         step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
@@ -157,6 +158,10 @@ def _from_log(samples: Sequence[Telemetry], start_ns: int) -> RotationRecord | N
             vector_from_rotation(a.T @ b) for a, b in pairwise(turned)
         ])  # fmt: skip
     return RotationRecord(t_s, np.vstack([np.zeros(3), np.cumsum(turns, axis=0)]))
+
+
+def _left_out(use: Collection[Measurement]) -> str:
+    return "" if {"imu", "attitude"} <= set(use) else " that telemetry.use lets count"
 
 
 def _ascending(t_s: Sequence[float], values: Sequence[Array]) -> tuple[Array, Array]:

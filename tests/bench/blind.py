@@ -56,11 +56,11 @@ def fly(path: Path, seconds: float, options: argparse.Namespace) -> None:
     config = load_config(None, options.set)
     flight = open_flight(path, config.camera, config.telemetry)
     stage = LocalisationStage(config, flight.camera, lambda _: nullcontext())
-    sent, seen = PosesSent(config.feedback), list[Odometry]()
+    sent, seen = PosesSent(config), list[Odometry]()
 
     def is_blind(t_s: float) -> bool:
         since_s = t_s - options.first_s
-        return since_s >= 0 and since_s % options.every_s < seconds
+        return bool(since_s >= 0 and since_s % options.every_s < seconds)
 
     samples = [s for s in flight.telemetry().samples if s.t_ns > flight.start_ns - 10**10]
     for message in in_order_of_time(samples, flight.frames()):

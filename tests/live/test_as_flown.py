@@ -8,12 +8,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from companion.config import MEASUREMENTS, CameraConfig, TelemetryConfig
+from companion.telemetry import MEASURED, PositionSample
+from drivers.recording.decisions import decisions_of
+from drivers.recording.recorded_flight import open_recording
 from tests.support.processes.flying import Flying
 from tests.support.processes.program import Run, replay
 
@@ -35,10 +39,13 @@ def load() -> Iterator[None]:
             process.wait()
 
 
-def flown(folder: Path, codec: str) -> Path:
+def flown(folder: Path, codec: str, use: tuple[str, ...] = MEASUREMENTS) -> Path:
     """A flight with load, and with a stage killed; its folder."""
-    with Flying(folder, f"recorder.codec={codec}", "recorder.jpeg_quality=90") as flying:
+    codecs = f"recorder.codec={codec}", "recorder.jpeg_quality=90"
+    with Flying(folder, *codecs, f"telemetry.use={list(use)}") as flying:
         flying.take_off()
+        assert flying.daemon.status()["believed"] == list(use)
+        assert bool(flying.daemon.said("is believed (telemetry.use)")) == (use != MEASUREMENTS)
         time.sleep(FLY_S)
         flying.daemon.signal_stage("results", signal.SIGKILL)
         with load():
@@ -64,8 +71,16 @@ def again(path: Path, out: Path) -> tuple[Run, dict[str, Any]]:
 
 @pytest.mark.alone
 def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> None:
-    path = flown(tmp_path, "png")
+    """Of what was believed: what was not is in the recording as well."""
+    path = flown(tmp_path, "png", ("attitude", "satellites"))
     done, found = again(path, tmp_path / "again")
+    recorded = open_recording(path / "flight.mcap", CameraConfig(), TelemetryConfig())
+    with closing(recorded.recording):
+        told = decisions_of(recorded.recording)
+    assert told.config.telemetry.use == ("attitude", "satellites")
+    assert {"attitude", "position", "satellites", "height"} <= {
+        MEASURED[s.source if isinstance(s, PositionSample) else type(s)] for s in told.samples
+    }
     assert found["tracked_again"]
     assert found["frames_same"] == found["frames"] > 100
     assert found["same"] == found["sent"] == found["made_again"] > 100

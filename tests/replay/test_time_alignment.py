@@ -44,6 +44,12 @@ def test_aligned_by_rotation_and_said(folder: Path) -> None:
     assert np.linalg.norm(a[:, 1:4] - b[:, 1:4], axis=1).max() < 0.5
 
 
+def test_rotation_that_is_not_believed_aligns_nothing(folder: Path) -> None:
+    only = ["--set", 'telemetry.use=["position", "range"]']
+    line = refused(replay_here(folder, folder / "out", *FASTER, *only))
+    assert "telemetry.tlog has neither rates nor attitude that telemetry.use lets count" in line
+
+
 def test_offset_that_is_given(folder: Path) -> None:
     run = replay_here(folder, folder / "out", *FASTER, f"--offset={true_offset_s():.3f}")
     assert run.status == 0, run.stderr

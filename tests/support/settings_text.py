@@ -18,7 +18,7 @@ from companion.config_file import toml_value
 ROOT = Path(__file__).parents[2]
 PURPOSES = {
     "Camera": ("camera", "mount"),
-    "Autopilot": ("link", "router", "feedback", "control"),
+    "Autopilot": ("link", "router", "telemetry", "feedback", "control"),
     "Flights, and what is kept of them": ("daemon", "recorder", "export"),
     "Dense map": ("depth", "cloud", "opencl"),
     "Looking on, other machines": ("stream", "distributed"),
@@ -118,8 +118,9 @@ def _texts(kind: type) -> dict[str, str]:
 
 def _values(hint: Any, marks: tuple[Any, ...]) -> str:
     kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-    if get_origin(kind) is Literal:
-        return ", ".join(get_args(kind))
+    of_each = get_args(kind)[0] if get_origin(kind) is tuple else kind
+    if get_origin(of_each) is Literal:
+        return ", ".join(get_args(of_each))
     if get_origin(kind) is Union:
         return ", ".join(
             _values(each, getattr(each, "__metadata__", ())) for each in get_args(kind)

@@ -24,6 +24,8 @@ from tests.support.settings_text import described_toml, settings, settings_page
 ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
+SINCE = {"telemetry.use"}
+"""Keys that version did not have."""
 
 
 def write(folder: Path, text: str) -> Path:
@@ -152,6 +154,10 @@ def test_key_outside_a_section(tmp_path: Path) -> None:
         ("depth.stride=0", ">= 1", "0"),
         ("feedback.mode=on", "off, odometry, vision_position", "'on'"),
         ("router.clients=[1]", "`str`", "[1]"),
+        ("telemetry.use=attitude", "a list of attitude, imu, position", "'attitude'"),
+        ('telemetry.use=["compass"]', "airspeed, each at most once", "['compass']"),
+        ("telemetry.use=[true]", "a list of attitude", "[True]"),
+        ('telemetry.use=["imu", "range", "imu"]', "once", "['imu', 'range', 'imu']"),
     ],
 )
 def test_wrong_value_says_what_was_wanted_and_given(override: str, wanted: str, given: str) -> None:
@@ -174,8 +180,18 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     assert "UTF-8" in refusal(tmp_path / "latin.toml")
 
 
+def test_a_list_of_words_is_any_part_of_them(tmp_path: Path) -> None:
+    path = write(tmp_path, '[telemetry]\nuse = ["range", "attitude"]\n')
+    assert load_config(path).telemetry.use == ("range", "attitude")
+    assert load_config(path, ['telemetry.use=["imu"]']).telemetry.use == ("imu",)
+    assert load_config(path, ["telemetry.use=[]"]).telemetry.use == ()
+    twice = refusal(write(tmp_path, '[telemetry]\nuse = ["imu", "imu"]\n'))
+    assert "flight.toml: telemetry.use: wanted a list of attitude, imu" in twice
+
+
 def test_written_configuration_reads_back_the_same(tmp_path: Path) -> None:
-    config = load_config(None, ['opencl.device=a "quoted" \\ naïve', "cloud.voxel_m=1e-3"])
+    use = 'telemetry.use=["imu", "attitude"]'
+    config = load_config(None, ['opencl.device=a "quoted" \\ naïve', "cloud.voxel_m=1e-3", use])
     assert load_config(write(tmp_path, to_toml(config))) == config
 
 
@@ -215,7 +231,7 @@ def test_a_file_of_the_version_before_counts_and_each_old_key_is_told() -> None:
             wanted = tuple(value) if isinstance(value, list) else value
             assert value_of_key(config, now) == wanted != value_of_key(Config(), now)
     assert len(told) == sum(current_key(name) != name for name in before)
-    assert {current_key(name) for name in before} - {""} == set(dump(Config()))
+    assert {current_key(name) for name in before} - {""} == set(dump(Config())) - SINCE
 
 
 def test_an_old_key_on_the_command_line_counts() -> None:

@@ -50,12 +50,16 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         signals.take()
         return 0
     from companion.app.replay_command import RecordedInput, replay
+    from companion.telemetry import belief_in_words
 
     if arguments.paced:
         from companion.app.paced_replay import replay_paced as replay
     given = RecordedInput(arguments.flight, config, arguments.start, arguments.stop)
     for remark in given.log.remarks:
         print(f"telemetry: {remark}")
+    belief = belief_in_words(config.telemetry.use)
+    if belief:
+        print(f"telemetry: {belief}")
     replay(given, arguments.out, config, arguments.viewer, progress, print)
     if config.export.formats:
         _export_into(arguments.out, arguments.out, config.export)

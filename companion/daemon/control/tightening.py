@@ -7,7 +7,7 @@ that starts in the air.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from companion.config import Config
@@ -27,6 +27,10 @@ def _to_more(now: float, wanted: float) -> bool:
 
 def _to_off(now: str, wanted: str) -> bool:
     return wanted in (now, "off")
+
+
+def _to_fewer(now: Collection[str], wanted: Collection[str]) -> bool:
+    return set(wanted) <= set(now)
 
 
 def _not_at_all(now: Any, wanted: Any) -> bool:
@@ -58,6 +62,8 @@ WHILE_ARMED: Mapping[str, MayChange] = {
     "expert.georeference.min_travel_m": _to_more,
     "expert.georeference.max_sigma_scale": _to_less,
     "expert.tracking.min_inliers": _to_more,
+    # a reload never changes it; a daemon that starts in the air might
+    "telemetry.use": _to_fewer,
 }
 """Every key of [feedback], and those of other sections that decide which poses are sent."""
 

@@ -41,4 +41,5 @@ def facts_of(
         completed=True,
         dropped=flight.dropped(),
         rates_hz=dict(rates_hz),
+        believed=flight.believed,
     )

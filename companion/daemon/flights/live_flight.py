@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from companion.config import Config
+from companion.config import Config, Measurement
 from companion.daemon.flights.viewing import Viewing
 from companion.flight_notes import FlightNote
 from companion.geometry.camera import Camera
@@ -154,6 +154,11 @@ class LiveFlight:
         self._dense_share = dense
         self._processes.order("localisation", SetLoadLevel(features))
         self._processes.order("depth", SetLoadLevel(dense))
+
+    @property
+    def believed(self) -> tuple[Measurement, ...]:
+        """Telemetry that may decide about its pose, by `telemetry.use`."""
+        return self._config.telemetry.use
 
     @property
     def dense(self) -> bool:

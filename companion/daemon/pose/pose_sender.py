@@ -7,10 +7,10 @@ sent.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
-from companion.config import FeedbackConfig
+from companion.config import FeedbackConfig, Measurement
 from companion.daemon.pose.sent_counter import SentCounter
 from companion.estimation.gate_journal import JournaledGate
 from companion.estimation.pose_gate import PoseToSend, Sending
@@ -72,9 +72,9 @@ class PoseSender:
         """Begin anew with another localisation."""
         self._gate.restart()
 
-    def begin_flight(self) -> None:
-        """A flight has begun, and its recording."""
-        self._gate.begin()
+    def begin_flight(self, use: Collection[Measurement]) -> None:
+        """A flight has begun, and its recording; of telemetry it believes what is in `use`."""
+        self._gate.begin(use)
 
     def reconfigure(self, config: FeedbackConfig) -> None:
         """Apply other limits, from the next pose on, or another message."""

@@ -17,6 +17,7 @@ from companion.products.flight_result import FlightResult, RunFacts, WorldPose
 from companion.products.report import plots
 from companion.products.report.cloud_views import CloudView, cloud_views
 from companion.products.report.templates import rendered
+from companion.telemetry import belief_in_words
 
 N_DEPTH_PICTURES = 6
 LAST_CENTURY_NS = 946_684_800 * 10**9
@@ -41,6 +42,7 @@ def report_page(
         when=when(result.first_t_ns),
         plots=_plots(result, facts, segments, numbers["duration_s"]),
         autopilot=_autopilot_name(result),
+        belief=belief_in_words(facts.believed),
         views=[_view(view) for view in cloud_views(cloud, [p for _, p in segments])],
         depths=_depths(result),
         stages={**numbers["stages"], **kernel_stages(result)},

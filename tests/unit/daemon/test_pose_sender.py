@@ -244,6 +244,25 @@ async def test_nothing_begins_in_the_air_without_a_height(tmp_path: Path) -> Non
     assert vehicle.run(1)[0].z == -4.0
 
 
+@flown
+async def test_poses_begin_at_the_height_of_an_autopilot_whose_position_is_not_believed(
+    tmp_path: Path,
+) -> None:
+    """It is where the receiver counts from: by any other number the vehicle would climb or fall."""
+    vehicle = Vehicle(tmp_path / "kept.json")
+    await vehicle.begin()
+    vehicle.sender.begin_flight(("attitude", "imu"))
+    assert {pose.z for pose in vehicle.run(4)} == {-7.5}
+
+
+@flown
+async def test_nothing_is_sent_where_the_attitude_is_not_believed(tmp_path: Path) -> None:
+    vehicle = Vehicle(tmp_path / "kept.json")
+    await vehicle.begin()
+    vehicle.sender.begin_flight(("imu", "position", "satellites"))
+    assert not vehicle.run(4) and vehicle.why_not == "attitude is not believed"
+
+
 @pytest.mark.parametrize(("armed", "landed_state"), [(False, None), (True, 1)])
 def test_on_the_ground_poses_begin_at_0(
     tmp_path: Path, armed: bool, landed_state: int | None

@@ -7,23 +7,33 @@ from typing import Any
 
 import pytest
 
-from companion.config import Config, FeedbackConfig, GeoreferenceConfig, TrackingConfig
+from companion.config import (
+    Config,
+    FeedbackConfig,
+    GeoreferenceConfig,
+    Measurement,
+    TelemetryConfig,
+    TrackingConfig,
+)
 from companion.config_file import value_of_key, with_values
 from companion.daemon.control.flight_parameters import PARAMETERS
+from companion.daemon.control.reload import reloaded
 from companion.daemon.control.tightening import WHILE_ARMED, may_change, tightened
 
-FLYING = Config(feedback=FeedbackConfig(mode="odometry"))
+FLYING = Config(
+    feedback=FeedbackConfig(mode="odometry"), telemetry=TelemetryConfig(use=("attitude", "imu"))
+)
 TIGHTER: dict[str, Any] = {
     "feedback.mode": "off", "feedback.max_sigma_m": 0.5, "feedback.min_quality": 40,
     "feedback.max_gap_ms": 100.0, "feedback.resume_after_s": 2.0, "feedback.max_jump_m": 0.5,
     "expert.georeference.min_travel_m": 6.0, "expert.georeference.max_sigma_scale": 0.05,
-    "expert.tracking.min_inliers": 30,
+    "expert.tracking.min_inliers": 30, "telemetry.use": ("attitude",),
 }  # fmt: skip
 LOOSER: dict[str, Any] = {
     "feedback.mode": "vision_position", "feedback.max_sigma_m": 2.0, "feedback.min_quality": 10,
     "feedback.max_gap_ms": 300.0, "feedback.resume_after_s": 0.5, "feedback.max_jump_m": 2.0,
     "expert.georeference.min_travel_m": 1.0, "expert.georeference.max_sigma_scale": 0.3,
-    "expert.tracking.min_inliers": 10,
+    "expert.tracking.min_inliers": 10, "telemetry.use": ("imu", "attitude", "satellites"),
 }  # fmt: skip
 FREE = {"feedback.rate_hz": 60.0}
 FIXED: dict[str, Any] = {
@@ -68,8 +78,17 @@ def test_what_is_read_again_counts_where_it_is_tighter(name: str) -> None:
     assert tightened(FLYING, wanted) == (wanted, {})
 
 
+@pytest.mark.parametrize("use", [(*FLYING.telemetry.use, "satellites"), ("attitude",)])
+def test_what_is_believed_stays_as_at_the_start(use: tuple[Measurement, ...]) -> None:
+    """Whether armed or not: one flight believes one list."""
+    read = with_values(FLYING, {"telemetry.use": use, "depth.stride": 4})
+    config, cannot = reloaded(FLYING, read)
+    assert cannot == ["telemetry.use"]
+    assert config == with_values(FLYING, {"depth.stride": 4})
+
+
 def test_feedback_that_is_off_stays_off() -> None:
-    off = Config(feedback=FeedbackConfig(mode="off"))
+    off = with_values(FLYING, {"feedback.mode": "off"})
     assert tightened(off, FLYING)[0].feedback.mode == "off"
     vision = with_values(FLYING, {"feedback.mode": "vision_position"})
     assert tightened(vision, FLYING)[0].feedback.mode == "vision_position"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.config import Config, FeedbackConfig
+from companion.config import Config, FeedbackConfig, TelemetryConfig
 from companion.daemon.flights import kept_map_place
 from companion.daemon.flights.kept_map_place import kept_map_path
 from companion.estimation.checkpoint import (
@@ -241,6 +241,8 @@ def test_other_camera_or_scale_source_is_rejected(tmp_path: Path, checkpoint: Ch
         Setup(Config(), replace(CAMERA, body_from_camera=Pose.identity())),
         # then the scale may be the autopilot's own idea, on which it must not fly
         Setup(Config(feedback=FeedbackConfig(mode="odometry")), CAMERA),
+        # or come of what is believed no more
+        Setup(Config(telemetry=TelemetryConfig(use=("attitude", "imu"))), CAMERA),
     ]
     for other in others:
         keep(path, checkpoint)

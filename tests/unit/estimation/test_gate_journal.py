@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from companion.config import FeedbackConfig
+from companion.config import MEASUREMENTS, FeedbackConfig, Measurement
 from companion.estimation.gate_journal import JournaledGate, poses_as_sent
 from companion.estimation.pose_gate import PoseToSend
 from companion.estimation.reset_counter import ResetCounter
@@ -33,6 +33,7 @@ class Flight:
     given: list[PoseToSend] = field(default_factory=list)
     now_ns: int = 10**12
     heard: bool = True
+    use: tuple[Measurement, ...] = MEASUREMENTS
 
     def fly(self, n_frames: int) -> None:
         config = FeedbackConfig(mode="odometry")
@@ -49,7 +50,7 @@ class Flight:
             config, counter, lambda t_ns: -12.5 + 1e-10 * (t_ns - 10**12), may_start,
             lambda: self.now_ns, lambda: self.heard, self.steps.append,
         )  # fmt: skip
-        gate.begin()
+        gate.begin(self.use)
         reset = 0
         for seq in range(n_frames):
             self.heard = self.rng.random() < 0.95
@@ -107,18 +108,22 @@ def recorded(step: GateStep) -> GateStep:
     return step_of(step.t_ns, decision_bytes(step))
 
 
+def made_again(flight: Flight, steps: list[GateStep]) -> list[PoseToSend]:
+    made = poses_as_sent(
+        FeedbackConfig(mode="odometry"), flight.use, steps, flight.attitudes,
+        flight.odometry.__getitem__,
+    )  # fmt: skip
+    return [pose for _, pose in made]
+
+
 @pytest.mark.parametrize("n", range(2))
 def test_the_poses_come_again_from_what_was_recorded(n: int) -> None:
-    flight = Flight(np.random.default_rng(n))
+    flight = Flight(np.random.default_rng(n), use=MEASUREMENTS if n else ("attitude",))
     flight.fly(1500)
     assert len(flight.given) > 300
     assert any(pose.predicted for pose in flight.given)
     assert len({pose.reset_counter for pose in flight.given}) > 1
-    steps = [recorded(step) for step in flight.steps]
-    made = poses_as_sent(
-        FeedbackConfig(mode="odometry"), steps, flight.attitudes, flight.odometry.__getitem__
-    )
-    again = [pose for _, pose in made]
+    again = made_again(flight, [recorded(step) for step in flight.steps])
     assert len(again) == len(flight.given)
     for ours, given in zip(again, flight.given, strict=True):
         assert ours.t_ns == given.t_ns and ours.reset_counter == given.reset_counter
@@ -132,10 +137,14 @@ def test_a_step_that_is_missing_shows() -> None:
     flight = Flight(np.random.default_rng(7))
     flight.fly(1000)
     steps = [step for step in flight.steps if step.what != "due"]
-    made = poses_as_sent(
-        FeedbackConfig(mode="odometry"), steps, flight.attitudes, flight.odometry.__getitem__
-    )
-    assert len(list(made)) < len(flight.given)
+    assert len(made_again(flight, steps)) < len(flight.given)
+
+
+def test_attitudes_that_are_not_believed_are_counted_and_allow_no_pose() -> None:
+    flight = Flight(np.random.default_rng(3), use=("imu", "satellites"))
+    flight.fly(300)
+    assert flight.steps[-1].n_attitudes == len(flight.attitudes) == 900
+    assert flight.given == made_again(flight, [recorded(step) for step in flight.steps]) == []
 
 
 def test_steps_are_read_back_to_the_last_bit() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import FeedbackConfig
+from companion.config import FeedbackConfig, Measurement
 from companion.estimation.pose_gate import PoseGate, PoseToSend, Sending
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import Odometry, TrackState
@@ -43,6 +43,9 @@ class Flight:
         self.has_attitude = True
         """Whether the autopilot says its attitude, and how late."""
         self.delay_ns = 0
+
+    def state(self) -> Sending:
+        return self.gate.state
 
     def yaw(self, t_ns: int) -> float:
         return 0.7 + self.yaw_rate_rad_s * (t_ns - 10**12) * 1e-9
@@ -223,6 +226,16 @@ def test_without_an_attitude_nothing_is_sent() -> None:
     assert not flight.run(3, world_from_body=rolled_over(0))
 
 
+@pytest.mark.parametrize("use", [(), ("imu", "position", "satellites", "range", "height")])
+def test_without_belief_in_the_attitude_nothing_is_sent(use: tuple[Measurement, ...]) -> None:
+    flight = Flight()
+    flight.gate = PoseGate(FeedbackConfig(mode="odometry"), use=use)
+    assert not flight.run(3)
+    assert flight.gate.why_not == "attitude is not believed"
+    flight.gate = PoseGate(FeedbackConfig(mode="odometry"), use=["attitude"])
+    assert flight.run(3)
+
+
 def test_poses_stop_without_attitude() -> None:
     """And none is predicted unchecked: attitude is extrapolated by at most 120 ms."""
     flight = Flight()
@@ -373,20 +386,20 @@ def test_odometry_message() -> None:
     assert (speed.x, speed.y, speed.z) == (1.0, 0.5, -0.2)
 
 
-BLIND = {"state": TrackState.DEAD_RECKONING, "quality": 1, "inertial": True}
+BLIND: dict[str, Any] = {"state": TrackState.DEAD_RECKONING, "quality": 1, "inertial": True}
 
 
 def test_inertial_dead_reckoning_bridges_what_is_not_tracked() -> None:
     flight = Flight()
     flight.run(2)
-    assert flight.gate.state is Sending.SENDING
+    assert flight.state() is Sending.SENDING
     poses = flight.run(3, **BLIND)
-    assert flight.gate.state is Sending.BRIDGING
+    assert flight.state() is Sending.BRIDGING
     assert len(poses) > 3 * 29
     assert min(pose.quality for pose in poses) == 1
     # tracked again: no proof is needed, as nothing has jumped
     assert len(flight.run(1)) > 29
-    assert flight.gate.state is Sending.SENDING
+    assert flight.state() is Sending.SENDING
 
 
 def test_a_bridge_ends_where_its_uncertainty_does() -> None:
@@ -397,7 +410,7 @@ def test_a_bridge_ends_where_its_uncertainty_does() -> None:
     assert (flight.gate.state, flight.gate.why_not) == (Sending.OFF, "lost")
     assert not flight.run(2, **BLIND)  # nothing begins on a bridge
     assert not flight.run(0.9)
-    assert flight.gate.state is Sending.PROVING
+    assert flight.state() is Sending.PROVING
     assert flight.run(0.3)
 
 
@@ -413,7 +426,7 @@ def test_a_bridge_is_level_by_the_autopilot_too() -> None:
     flight.run(2)
     tilted = Pose(rotation_from_quaternion(quaternion_from_euler(0.4, -0.2, 0.7)), np.zeros(3))
     flight.run(1, **BLIND, world_from_body=tilted)
-    assert flight.gate.state is Sending.OFF
+    assert flight.state() is Sending.OFF
 
 
 def test_a_reset_while_bridging_needs_proof() -> None:
@@ -421,4 +434,4 @@ def test_a_reset_while_bridging_needs_proof() -> None:
     flight.run(2)
     flight.run(1, **BLIND)
     assert not [pose for pose in flight.run(0.9, reset_counter=1) if pose.reset_counter]
-    assert flight.gate.state is Sending.PROVING
+    assert flight.state() is Sending.PROVING

@@ -19,6 +19,7 @@ import pytest
 
 from companion.app.cli import READER_GONE
 from companion.app.status_command import show_status, status_table
+from companion.config import MEASUREMENTS
 from companion.dense.device_choice import measured, why_taken
 from companion.dense.opencl import ListedDevice
 from companion.errors import ConfigError, SourceError
@@ -265,6 +266,22 @@ def test_table_shows_what_matters() -> None:
     pose = next(line for line in lines if line.startswith("pose") and "runs" in line)
     assert pose.split()[:6] == ["pose", "runs", "29.9/s", "31", "ms", "41"]
     assert lines[-1].split() == ["frames", "are", "missing", "2"]
+
+
+@pytest.mark.parametrize(
+    ("believed", "row"),
+    [
+        (["attitude", "imu"], "believed    attitude, imu (telemetry.use)"),
+        ([], "believed    nothing (telemetry.use)"),
+        (MEASUREMENTS, ""),
+        ([*MEASUREMENTS, "of another version"], ""),
+    ],
+)
+def test_table_says_what_is_believed_where_it_is_not_everything(
+    believed: list[str], row: str
+) -> None:
+    lines = status_table({**HEALTH.to_json(), "believed": believed}).splitlines()
+    assert [line for line in lines if "believed" in line] == ([row] if row else [])
 
 
 def test_table_of_a_daemon_of_another_version_is_shown_all_the_same() -> None:
