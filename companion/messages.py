@@ -91,6 +91,10 @@ class Odometry:
     sigma_yaw_rad: float = float("inf")
     inertial: bool = False
     """Dead reckoning goes by accelerometers."""
+    sigma_scale: float = 0.0
+    """Relative standard deviation of the scale, by which all distances are wrong alike."""
+    sigma_by_scale_m: float = 0.0
+    """Part of `sigma_position_m` that comes of it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -135,6 +135,7 @@ REASONS: Mapping[str, str] = {
     "lost": "tracking lost",
     "no metric scale": "no scale",
     "position too uncertain": "uncertain",
+    "scale too uncertain": "scale uncertain",
     "quality too low": "low quality",
     "tilt differs from the autopilot's": "attitude mismatch",
     "poses come too late": "too late",

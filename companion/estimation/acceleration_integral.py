@@ -73,8 +73,7 @@ class AccelerationIntegral:
     @property
     def newest_ns(self) -> int:
         """Time up to which there are integrals; before there are any, before all times."""
-        newest = self._series.newest
-        return -(2**62) if newest is None else newest[0]
+        return -(2**62) if self._last is None else self._last[0]
 
     @property
     def density_m_s2(self) -> float:
@@ -86,8 +85,12 @@ class AccelerationIntegral:
         """Integrals between two times; None where measurements are missing."""
         if not self.has_samples:
             return None
-        (start, end), ok = self._series.at(np.array([from_ns, to_ns]))
-        if not ok.all() or start[8, 0] != end[8, 0]:
+        (start, end), (from_ok, to_ok) = self._series.at(np.array([from_ns, to_ns]))
+        newest = self._series.newest
+        if newest is not None and newest[0] < to_ns <= self.newest_ns:  # the series is sparse
+            share = (to_ns - newest[0]) / (self.newest_ns - newest[0])
+            end, to_ok = newest[1] + share * (self._sums - newest[1]), np.bool_(True)
+        if not (from_ok and to_ok) or start[8, 0] != end[8, 0]:
             return None
         dt_s = (to_ns - from_ns) * 1e-9
         change = end - start

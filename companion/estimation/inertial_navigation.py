@@ -21,12 +21,13 @@ from companion.estimation.inertial_scale import (
     SIGMA_BIAS_M_S2,
     SIGMA_SPEED_M_S,
     SIGMA_TILT_M_S2,
-    TILT_TAU_S,
 )
 from companion.geometry.transforms import Array
 
 N_STATE = 11
 PLACE, VELOCITY, BIAS, TILT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
+TILT_TAU_S = 20.0
+"""An autopilot's attitude is wrong otherwise after each manoeuvre."""
 BIAS_WALK_M_S2 = 1e-3
 """Random walk of the bias, m/s2 per root of a second: 0.06 in an hour, by warming."""
 LEAST_SIGMA_PLACE_M = 0.005

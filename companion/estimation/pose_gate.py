@@ -26,6 +26,9 @@ from companion.telemetry import AttitudeSample, is_believed
 MAX_TILT_ERROR_RAD = np.radians(8.0)
 MAX_AGE_NS = 300_000_000
 """An older pose is of no use to an autopilot."""
+MAX_SIGMA_SCALE = 0.05
+"""Relative; with it velocities are 5 % off, 0.5 m/s at 10 m/s, which an autopilot's EKF takes for
+noise: ArduPilot's VISO_VEL_M_NSE is 0.1 m/s and more, its innovation gates are five of these."""
 HYSTERESIS = 0.8
 """To start sending, a pose must be better than the limits by this factor."""
 MAX_EXTENT_M = 1e5
@@ -38,6 +41,7 @@ NOT_YET = "no pose yet"
 INITIALISING = "initialising"
 LOST = "lost"
 NO_SCALE = "no metric scale"
+SCALE_UNCERTAIN = "scale too uncertain"
 UNCERTAIN = "position too uncertain"
 POOR = "quality too low"
 TILTED = "tilt differs from the autopilot's"
@@ -258,8 +262,12 @@ class PoseGate:
         if not np.isfinite(numbers).all() or np.abs(pose.translation).max() > MAX_EXTENT_M:
             return UNCERTAIN
         hysteresis = 1.0 if self.sending else HYSTERESIS
-        if not odometry.sigma_position_m <= hysteresis * self._config.max_sigma_m:
+        # a scale that is off shortens all ways alike, and no place where the body stands
+        sigma_m = np.sqrt(odometry.sigma_position_m**2 - odometry.sigma_by_scale_m**2)
+        if not sigma_m <= hysteresis * self._config.max_sigma_m:
             return UNCERTAIN
+        if not odometry.sigma_scale <= hysteresis * MAX_SIGMA_SCALE:
+            return SCALE_UNCERTAIN
         if odometry.quality * hysteresis < self._config.min_quality and not bridging:
             return POOR
         if now_ns - odometry.t_ns > MAX_AGE_NS:

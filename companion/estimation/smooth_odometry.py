@@ -52,6 +52,17 @@ class _PathPoint(NamedTuple):
     slewed: Array
 
 
+class _Drift(NamedTuple):
+    """Standard deviations, m: by scale, by the map's drift, and by slew corrections.
+
+    The last moved the pose but not the body.
+    """
+
+    by_scale_m: float
+    by_map_m: float
+    by_slew_m: float
+
+
 class _RejectedPoses(NamedTuple):
     """Poses outside the innovation gate since the last accepted one.
 
@@ -174,6 +185,9 @@ class SmoothOdometry:
                 * to_world.scale
             )
             sigma_velocity = velocity_map[1] * to_world.scale
+        if self._reckoned is not None and self._reckoned.sigma_velocity_m_s < sigma_velocity:
+            self._velocity = self._reckoned.velocity_m_s
+            sigma_velocity = self._reckoned.sigma_velocity_m_s
         self._last = (track.t_ns, pose, placed)
         noise_m = NOISE_INFLATION * track.sigma_position * georeference.world_from_map.scale
         self._navigation.move(
@@ -183,16 +197,15 @@ class SmoothOdometry:
         if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
             turned = placed.rotation @ attitude.ned_from_body.T
             self._navigation.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
-        drift_sigma_m = self._drift_sigma_m(
-            track.t_ns, placed.translation, georeference.sigma_scale
-        )
+        drift = self._drift_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter, self._quality(track), placed,
             self._velocity.copy(),
-            float(np.linalg.norm([FLOOR_M, noise_m, drift_sigma_m])),
+            float(np.linalg.norm([FLOOR_M, noise_m, *drift])),
             sigma_velocity,
             float(np.hypot(FLOOR_RAD, NOISE_INFLATION * track.sigma_rotation_rad)),
             self._sigma_yaw_rad(georeference, NOISE_INFLATION * track.sigma_rotation_rad),
+            sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
 
     def _sigma_yaw_rad(self, georeference: Georeference, noise_rad: float) -> float:
@@ -203,11 +216,8 @@ class SmoothOdometry:
         apart_rad = _yaw(self._odometry_from_world.rotation)
         return float(np.linalg.norm([FLOOR_RAD, noise_rad, georeference.sigma_yaw_rad, apart_rad]))
 
-    def _drift_sigma_m(self, t_ns: int, position: Array, sigma_scale: float) -> float:
-        """Drift standard deviation over the last seconds, along each axis.
-
-        Scale error, drift, and slew corrections, which moved the pose but not the body.
-        """
+    def _drift_sigma_m(self, t_ns: int, position: Array, sigma_scale: float) -> _Drift:
+        """Drift standard deviations over the last seconds, along each axis."""
         path_length_m = 0.0
         if self._path:
             path_length_m = self._path[-1].path_length_m + float(
@@ -217,11 +227,11 @@ class SmoothOdometry:
         while self._path[0].t_ns < t_ns - DRIFT_WINDOW_NS:
             self._path.popleft()
         since = self._path[0]
-        return float(np.linalg.norm([
+        return _Drift(
             sigma_scale * float(np.linalg.norm(position - since.position)),
             SIGMA_DRIFT * (path_length_m - since.path_length_m),
             float(np.linalg.norm(self._slewed - since.slewed)) / np.sqrt(3.0),
-        ]))  # fmt: skip
+        )
 
     def begin(self, t_ns: int, attitude: BodyAttitude | None) -> Reckoned | None:
         """Go on by inertial navigation to the next frame, with its attitude where that is known.
@@ -306,13 +316,14 @@ class SmoothOdometry:
             camera = self._odometry_from_world.inverse() @ placed @ self._camera_from_body.inverse()
             pose = georeference.world_from_map.inverse().apply_to_pose(camera)
             self._last = (track.t_ns, pose, placed)
-        drift_m = self._drift_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
+        drift = self._drift_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
         return Odometry(
             track.seq, track.t_ns, TrackState.DEAD_RECKONING, self.reset_counter, 1, placed,
             reckoned.velocity_m_s,
-            float(np.linalg.norm([FLOOR_M, reckoned.sigma_place_m, drift_m])),
+            float(np.linalg.norm([FLOOR_M, reckoned.sigma_place_m, *drift])),
             reckoned.sigma_velocity_m_s, float(SIGMA_RECKONED_RAD),
             self._sigma_yaw_rad(georeference, float(SIGMA_RECKONED_RAD)), inertial=True,
+            sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
 
     def _raw(self, georeference: Georeference, map_from_camera: Pose) -> Pose:

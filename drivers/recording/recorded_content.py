@@ -91,6 +91,8 @@ def odometry_bytes(odometry: Odometry) -> bytes:
             "sigma_attitude_rad": odometry.sigma_attitude_rad,
             "sigma_yaw_rad": odometry.sigma_yaw_rad,
             "inertial": odometry.inertial,
+            "sigma_scale": odometry.sigma_scale,
+            "sigma_by_scale_m": odometry.sigma_by_scale_m,
         }
     )
 

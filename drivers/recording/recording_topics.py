@@ -126,7 +126,8 @@ TOPICS: dict[str, Any] = {
             "position_m": NUMBERS, "world_from_body": NUMBERS, "rotation": NUMBERS,
             "velocity_world_m_s": NUMBERS,
             "sigma_position_m": NUMBER, "sigma_velocity_m_s": NUMBER, "sigma_attitude_rad": NUMBER,
-            "sigma_yaw_rad": NUMBER,
+            "sigma_yaw_rad": NUMBER, "inertial": FLAG,
+            "sigma_scale": NUMBER, "sigma_by_scale_m": NUMBER,
         },
     ),
     TRACKING: _Json(
