@@ -350,24 +350,10 @@ class AutopilotLink:
                 await self._ask_for(*due)
                 continue
             elif self._imu is not None and self.vehicle is not None:
-                self._choose_imu_rate(self._imu, self.vehicle, now_ns)
+                capacity, firmware = self.port.capacity_bytes_per_s, self.vehicle.firmware
+                news = self._imu.step(self._wanted, imu_room(self._config, capacity, firmware))
+                self._tell_of_imu(news, now_ns)
             await asyncio.sleep(WATCH_S)
-
-    def _choose_imu_rate(self, imu: ImuRate, vehicle: Vehicle, now_ns: int) -> None:
-        """Change the rate that is requested, where what came says so."""
-        shares = self._wanted.shares()
-        if shares is None:
-            return
-        before_hz = imu.asked_hz
-        if not imu.begun:
-            room = imu_room(self._config, self.port.capacity_bytes_per_s, vehicle.firmware)
-            news = imu.begin(room, shares)
-        else:
-            came_hz = self._wanted.take_window(imu.ids)
-            news = None if came_hz is None else imu.judge(came_hz, shares)
-        if imu.asked_hz != before_hz:
-            self._wanted.change(imu.want)
-        self._tell_of_imu(news, now_ns)
 
     def _tell_of_imu(self, news: ImuNews | None, now_ns: int) -> None:
         if news is not None and news.detail != self._said_of_imu:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.advice.imu_room import LEAST_HZ, ImuRoom, in_whole_ms
+from drivers.mavlink.message_rates import MessageRates
 from drivers.telemetry.mavlink_samples import IMU_REQUESTS, Wanted
 
 SHORT = 0.8
@@ -68,6 +69,20 @@ class ImuRate:
         self.begun, self.asked_hz, self.came_hz, self.why = False, 0.0, None, ""
         if rebooted:
             self._carried_hz = math.inf
+
+    def step(self, rates: MessageRates, room: ImuRoom) -> ImuNews | None:
+        """Take what was measured, and change what is requested; to be called often."""
+        others, before_hz = rates.shares(), self.asked_hz
+        if others is None:
+            return None
+        news = None
+        if not self.begun:
+            news = self.begin(room, others)
+        elif (came_hz := rates.take_window(self.ids)) is not None:
+            news = self.judge(came_hz, others)
+        if self.asked_hz != before_hz:
+            rates.change(self.want)
+        return news
 
     def begin(self, room: ImuRoom, others: Shares) -> ImuNews | None:
         """Choose the rate, when the others' shares without the IMU are known."""

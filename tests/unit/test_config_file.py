@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import Config
+from companion.config import MEASUREMENTS, Config
 from companion.config_file import (
     command_shown,
     current_key,
@@ -185,6 +185,7 @@ def test_a_list_of_words_is_any_part_of_them(tmp_path: Path) -> None:
     assert load_config(path).telemetry.use == ("range", "attitude")
     assert load_config(path, ['telemetry.use=["imu"]']).telemetry.use == ("imu",)
     assert load_config(path, ["telemetry.use=[]"]).telemetry.use == ()
+    assert load_config(path, [f"telemetry.use={list(MEASUREMENTS)}"]) == Config()
     twice = refusal(write(tmp_path, '[telemetry]\nuse = ["imu", "imu"]\n'))
     assert "flight.toml: telemetry.use: wanted a list of attitude, imu" in twice
 

@@ -20,7 +20,6 @@ known time, `fly(unix_ns=…, at_monotonic_ns=…)` keeps both together.
     latency        latency_ms and jitter_ms each way, loss: the share of packets lost each way
     rates_hz       by name of message; SET_MESSAGE_INTERVAL changes it, so may a test
     max_rate_hz    of any message, whatever is asked
-    line_bytes_per_s   what streams may fill; a message that finds no room is left out
     lacks          names of messages that this firmware has not
     parameters     a Parameters (fake_parameters.py): parameters["EKF2_EV_CTRL"]
     gps            False: no fix; local position then needs an origin and follows the vision given,
@@ -69,7 +68,6 @@ from tests.support.autopilot.fake_parameters import Parameters
 from tests.support.autopilot.fake_wire import wire
 
 TICK_S = 0.02
-LINE_BUFFER_BYTES = 256
 SIGNING_EPOCH_S = 1_420_070_400
 """MAVLink signing counts its time from 2015."""
 DO_SET_GLOBAL_ORIGIN = 611
@@ -130,8 +128,6 @@ class FakeAutopilot:
         self.flight = flight or hover()
         self.lacks = set(lacks)
         self.drift_ppm, self.max_rate_hz = drift_ppm, max_rate_hz
-        self.line_bytes_per_s = math.inf
-        self._line_free_bytes, self._line_ns = 0.0, 0
         self.latency_ms, self.jitter_ms, self.loss = latency_ms, jitter_ms, loss
         self.asks_timesync_hz = (
             timesync_hz if timesync_hz is not None else {"px4": 10.0}.get(firmware, 0.1)
@@ -403,20 +399,11 @@ class FakeAutopilot:
             if rate_hz <= 0 or kind in self.lacks:
                 continue
             if self._is_due(kind, min(rate_hz, self.max_rate_hz), now_ns):
-                message = self._message(kind, now_ns) if self._has_room(now_ns) else None
+                message = self._message(kind, now_ns)
                 if message is not None:
                     self.send(message)
-                    self._line_free_bytes -= len(self.last_packets[-1])
             wake_ns = min(wake_ns, self._due_ns[kind])
         return wake_ns
-
-    def _has_room(self, now_ns: int) -> bool:
-        passed_s, self._line_ns = (now_ns - self._line_ns) * 1e-9, now_ns
-        if math.isinf(self.line_bytes_per_s):
-            return True
-        free = self._line_free_bytes + passed_s * self.line_bytes_per_s
-        self._line_free_bytes = min(free, LINE_BUFFER_BYTES)
-        return free > 0
 
     def _is_due(self, kind: str, rate_hz: float, now_ns: int) -> bool:
         due_ns = self._due_ns.get(kind, 0)

@@ -433,38 +433,6 @@ def test_a_slow_line_has_no_room_for_the_imu(
     run(test())
 
 
-def test_less_that_comes_of_the_imu_is_asked_for(short_windows: None) -> None:
-    async def test() -> None:
-        with FakeAutopilot("ardupilot", flight=circle(), max_rate_hz=66.0) as autopilot:
-            async with linked(autopilot, attitude_hz=50) as heard:
-                await heard.until(lambda: of_imu(heard), 12.0)
-                (said,) = of_imu(heard)
-                assert re.fullmatch(r"6\d of 100 Hz came: 6\d Hz from now on", said)
-                await heard.until(lambda: len(imu_intervals_us(autopilot)) == 2)
-                assert imu_intervals_us(autopilot)[0] == 10_000
-                assert imu_intervals_us(autopilot)[1] in range(15_000, 18_000, 1000)
-                await asyncio.sleep(3.5)
-                assert len(imu_intervals_us(autopilot)) == 2 and of_imu(heard) == [said]
-
-    run(test())
-
-
-def test_a_saturated_line_is_left_to_the_others(short_windows: None) -> None:
-    async def test() -> None:
-        with FakeAutopilot("ardupilot", flight=circle()) as autopilot:
-            autopilot.line_bytes_per_s = 5500.0
-            async with linked(autopilot) as heard:
-                await heard.until(lambda: NO_IMU in heard.named(), 15.0)
-                assert imu_intervals_us(autopilot)[0] == 10_000
-                await heard.until(lambda: imu_intervals_us(autopilot)[-1] == 0)
-                assert len(imu_intervals_us(autopilot)) <= 4
-                assert "other messages became fewer" in of_imu(heard)[0]
-                await heard.until(lambda: "HIGHRES_IMU" not in heard.link.rates_hz, 8.0)
-                await heard.until(lambda: heard.link.rates_hz["ATTITUDE_QUATERNION"] > 40, 8.0)
-
-    run(test())
-
-
 def test_a_signed_link(tmp_path: Path) -> None:
     key = bytes(range(32))
     (tmp_path / "key").write_text(key.hex())

@@ -3,16 +3,68 @@
 from __future__ import annotations
 
 import random
+from collections import Counter, defaultdict
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.advice.imu_room import ImuRoom
-from drivers.mavlink.imu_rate import FEWER, NO_IMU, ImuRate
+from drivers.mavlink.imu_rate import FEWER, NO_IMU, ImuNews, ImuRate
+from drivers.mavlink.message_rates import MessageRates
+from drivers.telemetry.mavlink_samples import Wanted
 
-ATTITUDE, PRESSURE = 31, 29
+ATTITUDE, PRESSURE, HIGHRES_IMU = 31, 29, 105
+BYTES = {ATTITUDE: 44, PRESSURE: 28, HIGHRES_IMU: 75}
 ALONE = {ATTITUDE: 1.0, PRESSURE: 0.98}
 ROOM = ImuRoom("HIGHRES_IMU", 100.0)
+
+
+class Simulated:
+    """An autopilot and its messages, in time of their own; what finds no room is left out."""
+
+    def __init__(self, most_hz: float = 400.0, bytes_per_s: float = 1e6) -> None:
+        wants = [Wanted((31, 30), 50.0), Wanted((29,), 10.0), Wanted((32,), 10.0, always=False)]
+        self.rates, self.imu = MessageRates(wants), ImuRate()
+        self.most_hz, self.bytes_per_s = most_hz, bytes_per_s
+        self.sent_hz: dict[int, float] = {}
+        self.came: Counter[int] = Counter()
+        self.asked: list[tuple[float, int, float]] = []
+        self.news: list[ImuNews] = []
+        self._t_ms, self._free, self._next_ms = 0, 0.0, defaultdict[int, float](float)
+
+    def run(self, seconds: float) -> None:
+        self.came.clear()
+        for _ in range(round(seconds * 1000)):
+            self._t_ms += 1
+            self._send()
+            now_ns = self._t_ms * 1_000_000
+            if self._t_ms % 100 == 0 and (news := self.imu.step(self.rates, ROOM)) is not None:
+                self.news.append(news)
+            while self._t_ms % 100 == 0 and (due := self.rates.due(now_ns)) is not None:
+                self.asked.append((self._t_ms * 1e-3, *due))
+                self.sent_hz[due[0]] = due[1]
+                self.rates.asked(due[0], False, now_ns)
+
+    def reboot(self) -> None:
+        self.sent_hz.clear()
+        self.rates.restart()
+        self.imu.restart(rebooted=True)
+
+    def of_imu(self) -> list[float]:
+        """Rates that were asked for."""
+        return [rate_hz for _, kind, rate_hz in self.asked if kind == HIGHRES_IMU]
+
+    def _send(self) -> None:
+        self._free = min(self._free + self.bytes_per_s * 1e-3, 200.0)
+        for kind, rate_hz in self.sent_hz.items():
+            if rate_hz and self._t_ms >= self._next_ms[kind]:
+                self._next_ms[kind] = max(self._t_ms, self._next_ms[kind]) + 1000 / min(
+                    rate_hz, self.most_hz
+                )
+                if self._free > 0:
+                    self._free -= BYTES.get(kind, 40)
+                    self.came[kind] += 1
+                    self.rates.came(kind)
 
 
 def begun(room: ImuRoom = ROOM) -> ImuRate:
@@ -140,3 +192,50 @@ def test_what_was_too_little_stays_so_after_silence() -> None:
     rate.restart(rebooted=False)
     news = rate.begin(ROOM, ALONE)
     assert news is not None and news.what == NO_IMU and rate.asked_hz == 0
+
+
+def test_asked_for_after_the_others_were_measured_and_once() -> None:
+    autopilot = Simulated()
+    autopilot.run(60)
+    assert autopilot.of_imu() == [100.0] and not autopilot.news
+    assert next(t_s for t_s, kind, _ in autopilot.asked if kind == HIGHRES_IMU) >= 3.0
+    assert str(autopilot.imu) == "IMU 100 of 100 Hz"
+
+
+def test_after_a_reboot_it_is_asked_for_again() -> None:
+    autopilot = Simulated()
+    autopilot.run(10)
+    autopilot.reboot()
+    autopilot.run(10)
+    assert autopilot.of_imu() == [100.0, 100.0] and autopilot.came[HIGHRES_IMU] > 500
+
+
+def test_an_autopilot_that_sends_less() -> None:
+    autopilot = Simulated(most_hz=66.0)
+    autopilot.run(60)
+    first, *_, last = autopilot.of_imu()
+    assert first == 100 and last == pytest.approx(62.5, abs=5)
+    assert [each.what for each in autopilot.news] == [FEWER]
+
+
+def test_a_slow_loop_leaves_none() -> None:
+    autopilot = Simulated(most_hz=40.0)
+    autopilot.run(60)
+    assert autopilot.of_imu()[-1] == 0 and [each.what for each in autopilot.news] == [NO_IMU]
+    autopilot.run(60)
+    assert autopilot.came[HIGHRES_IMU] == 0
+
+
+@pytest.mark.parametrize("bytes_per_s", [3000.0, 4000.0, 6000.0, 8000.0])
+def test_a_line_that_carries_less_settles_and_the_others_have_their_rates(
+    bytes_per_s: float,
+) -> None:
+    autopilot = Simulated(bytes_per_s=bytes_per_s)
+    autopilot.run(60)
+    n_asked = len(autopilot.of_imu())
+    autopilot.run(90)
+    assert len(autopilot.of_imu()) == n_asked <= 6
+    assert autopilot.came[ATTITUDE] >= 0.8 * 50 * 90
+    assert autopilot.came[PRESSURE] >= 0.8 * 10 * 90
+    assert autopilot.news and autopilot.imu.asked_hz < 100
+    assert autopilot.imu.asked_hz == 0 or autopilot.came[HIGHRES_IMU] >= 0.8 * 50 * 90
