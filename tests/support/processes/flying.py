@@ -33,7 +33,7 @@ from tests.support.processes.strain import Strain
 
 PathOf = Callable[[int], Pose]
 """`world_from_body` by CLOCK_MONOTONIC, ns."""
-LACKS = ("DISTANCE_SENSOR", "HIGHRES_IMU", "SCALED_IMU", "RAW_IMU")
+RANGE, IMU = ("DISTANCE_SENSOR",), ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU")
 TAKE_OFF_S = 60.0
 STOP_S = 3.0
 MOST_AWAY_M, MOST_TURNED_DEG = 1.0, 5.0
@@ -62,13 +62,16 @@ class Flying:
         start: bool = True,
         program: tuple[str, ...] = PROGRAM,
         path: PathOf = world_from_body,
+        has_imu: bool = False,
     ) -> None:
         self._path = path
         self.camera = HttpCamera(on=camera_on, world_from_body=path)
         self.strain = Strain()
         # a rangefinder would tell the scale sooner, but no place to compare with the truth; and an
         # IMU is a tenth of a core, here and in the daemon, that what is measured does not need
-        self.autopilot = FakeAutopilot("ardupilot", url, _flight(path), lacks=LACKS)
+        self.autopilot = FakeAutopilot(
+            "ardupilot", url, _flight(path), lacks=RANGE + IMU * (not has_imu)
+        )
         # the flight's clock is the monotonic one, and so is what the camera films
         self.autopilot.fly(at_monotonic_ns=0, arm=False)
         calibration = self.camera.write_calibration(folder / "camera.json")

@@ -1,0 +1,56 @@
+"""A camera that is covered in flight: poses go on by accelerometers while they are certain."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.processes.flying import Flying
+
+TOLD = "tracking lost: dead reckoning"
+
+
+@pytest.fixture(scope="module")
+def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
+    with Flying(tmp_path_factory.mktemp("covered"), has_imu=True) as begun:
+        begun.take_off()
+        # the rates of the other messages are measured before the IMU is asked for
+        begun.autopilot.wait_for("ODOMETRY", 600, 60)
+        yield begun
+
+
+def test_poses_go_on_while_it_is_covered_for_two_seconds(flying: Flying) -> None:
+    flying.until_sending()
+    n_resets = flying.daemon.status()["feedback"]["n_resets"]
+    covered_ns = time.monotonic_ns()
+    flying.camera.covered = True
+    flying.daemon.until(lambda health: health["feedback"]["bridging"], 10, "it bridges")
+    flying.until_told(TOLD, covered_ns)
+    time.sleep(max(0.0, 2.0 - (time.monotonic_ns() - covered_ns) * 1e-9))
+    flying.camera.covered = False
+    seen_ns = time.monotonic_ns()
+    flying.daemon.until(lambda health: health["tracker"] == "tracking", 10, "it is found")
+    flying.until_told("vision position on", seen_ns)
+    flying.assert_went_on(covered_ns)
+    assert flying.daemon.status()["feedback"]["n_resets"] == n_resets
+    flying.assert_true_poses()
+
+
+def test_they_end_when_they_are_uncertain(flying: Flying) -> None:
+    flying.until_sending()
+    covered_ns = time.monotonic_ns()
+    flying.camera.covered = True
+    flying.until_told("vision position lost", covered_ns, 60)
+    flying.daemon.until(lambda health: not health["feedback"]["sending"], 5, "no poses")
+    flying.camera.covered = False
+    seen_ns = time.monotonic_ns()
+    flying.until_told("vision position on", seen_ns, 30)
+    flying.assert_true_poses()
+    assert max(flying.poses.sigma_m) <= 1.0 + 1e-6
+
+
+def test_it_ends_well(flying: Flying) -> None:
+    flying.assert_stops()
+    assert not flying.daemon.said("Traceback")
