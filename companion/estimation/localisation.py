@@ -22,6 +22,7 @@ from companion.estimation.segment_georeference import SegmentGeoreferences
 from companion.estimation.smooth_odometry import (
     SIGMA_DEAD_RECKONING_M_S,
     BodyAttitude,
+    MapView,
     SmoothOdometry,
 )
 from companion.geometry.camera import Camera
@@ -370,9 +371,12 @@ class LocalisationStage:
     def _odometry_of(self, track: Track) -> Odometry:
         """Odometry of a track of the active segment, in its own frame."""
         segment = self._tracker.map
+        first = segment.keyframes.get(segment.first_keyframe_id)
         return self._odometry.step(
-            track, segment.first_keyframe_id, self._georeferences.of(segment), self._motion.velocity
-        )
+            track, segment.first_keyframe_id, self._georeferences.of(segment),
+            self._motion.velocity,
+            None if first is None else MapView(first.t_ns, first.camera_from_map.inverse()),
+        )  # fmt: skip
 
     def _body_attitude(self, t_ns: int) -> BodyAttitude | None:
         """Attitude of the body at a frame, where the autopilot's is that of the camera."""

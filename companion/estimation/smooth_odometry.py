@@ -84,6 +84,13 @@ class BodyAttitude(NamedTuple):
     ned_from_body: Array
 
 
+class MapView(NamedTuple):
+    """Time of a keyframe, and its pose in the map."""
+
+    t_ns: int
+    map_from_camera: Pose
+
+
 class BodyPlace(NamedTuple):
     """Place (3,) of the body by inertial navigation, world NED, metres; sigma of its velocity."""
 
@@ -140,18 +147,20 @@ class SmoothOdometry:
         segment: int,
         georeference: Georeference | None,
         velocity_map: tuple[Array, float] | None,
+        first: MapView | None = None,
     ) -> Odometry:
         """Odometry of the frame that has begun.
 
-        `segment` identifies the map of the track, `georeference` is that of this map, and
-        `velocity_map` the camera velocity in it with its standard deviation.
+        `segment` identifies the map of the track, `georeference` is that of this map,
+        `velocity_map` the camera velocity in it with its standard deviation, and `first` its first
+        view.
         """
         pose = track.map_from_camera
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None or georeference is None:
             return self._unknown(track)
         if segment != self._segment or self._georeference is None:
-            self._start_map(segment, georeference, pose)
+            self._start_map(segment, georeference, pose, first)
         elif georeference is not self._georeference:
             self._update_georeference(georeference)
         raw = self._raw(georeference, pose)
@@ -243,9 +252,7 @@ class SmoothOdometry:
         if found is not None and found.sigma_place_m > MAX_SIGMA_RECKONED_M:
             found = None
         self._attitude, self._reckoned = attitude, found
-        if found is None:
-            self._reckoned_world.clear()
-        else:
+        if found is not None:
             world_m = self._odometry_from_world.inverse().apply(found.place_m)
             place = BodyPlace(t_ns, np.asarray(world_m), found.sigma_velocity_m_s)
             self._reckoned_world.append(place)
@@ -330,15 +337,26 @@ class SmoothOdometry:
         """`world_from_body` by the map at present."""
         return georeference.world_from_map.apply_to_pose(map_from_camera) @ self._camera_from_body
 
-    def _start_map(self, segment: int, georeference: Georeference, pose: Pose) -> None:
-        """Start in another map, or the first one; poses are unrelated to the last."""
+    def _start_map(
+        self, segment: int, georeference: Georeference, pose: Pose, first: MapView | None
+    ) -> None:
+        """Start in another map, or the first one; poses are unrelated to the last.
+
+        A map without an origin continues from where inertial navigation had the body at its first
+        view, else from the last known position.
+        """
         offset = np.zeros(3)
         if self._last is not None:
             self.reset_counter += 1
-            if not georeference.has_origin:  # continue from the last known position
-                offset = self._last[2].translation - self._raw(georeference, pose).translation
-            else:
+            reckoned = None if first is None else self.reckoned_world(first.t_ns)
+            if georeference.has_origin:
                 self._navigation.reset()
+            elif first is not None and reckoned is not None:
+                place_m = self._odometry_from_world.apply(reckoned.place_world_m)
+                offset = place_m - self._raw(georeference, first.map_from_camera).translation
+            else:
+                offset = self._last[2].translation - self._raw(georeference, pose).translation
+        self._reckoned_world.clear()
         self._owed_m = np.zeros(3)
         self._odometry_from_world = Pose(np.eye(3), offset)
         self._anchored = georeference.has_origin

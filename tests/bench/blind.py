@@ -6,8 +6,8 @@
 Images are black for so long, again and again. For every span one line: what was given out while
 blind (share of frames with a pose, its error and what was stated at the end), when tracking went
 on, and by how much the displacement across the span, to the pose a second after the next that was
-tracked, is off. Errors are of displacements since the last tracked frame, heading of the whole path
-aligned; scale errors are in them.
+tracked, is off. Errors are of displacements since the last tracked frame, with the heading aligned
+over the seconds before it; scale errors are in them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from companion.messages import Frame, Odometry, TrackState
 from companion.runtime.in_order import in_order_of_time
 from drivers.open_flight import open_flight
 
-SETTLED_S = 1.0
+SETTLED_S, ALIGNED_S = 1.0, 15.0
 
 
 def true_places(flight: Path) -> tuple[Array, Array]:
@@ -87,9 +87,6 @@ def report(
     posed = [o for o in seen if o.world_from_body is not None]
     t_ns = np.array([o.t_ns for o in posed])
     found = np.stack([o.world_from_body.translation for o in posed if o.world_from_body])
-    turn = heading(found, true_at(t_ns))
-    found = found @ turn.T
-    off_m = found - true_at(t_ns)
     t_s = (t_ns - start_ns) * 1e-9
     tracked = np.array([o.state is TrackState.TRACKING for o in posed])
     blind = np.array([is_blind(t) for t in t_s])
@@ -104,6 +101,9 @@ def report(
         if not len(before) or not len(after):
             continue
         last, again = before[-1], after[0]
+        aligned = before[t_s[before] > t_s[last] - ALIGNED_S]
+        turn = heading(found[aligned], true_at(t_ns[aligned]))
+        off_m = found @ turn.T - true_at(t_ns)
         settled = after[np.searchsorted(t_s[after], t_s[again] + SETTLED_S, "right") - 1]
         inside = np.flatnonzero(blind & (t_s >= begins_s) & (t_s < begins_s + seconds))
         n_blind = np.count_nonzero((all_s >= begins_s) & (all_s < begins_s + seconds))

@@ -9,7 +9,7 @@ import pytest
 
 from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial_navigation import InertialNavigation
-from companion.estimation.smooth_odometry import BodyAttitude, SmoothOdometry
+from companion.estimation.smooth_odometry import BodyAttitude, MapView, SmoothOdometry
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
@@ -170,3 +170,33 @@ def test_accelerometers_carry_the_pose_on() -> None:
     sigmas = [each.sigma_position_m for each in found[100:120]]
     assert sigmas[-1] > sigmas[0]
     assert {each.reset_counter for each in found} == {0}
+
+
+def test_another_map_goes_on_from_where_accelerometers_had_its_first_view() -> None:
+    """Its scale is known two seconds later only, and the body has moved on."""
+    integral = AccelerationIntegral()
+    odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
+    level, placed = np.array([1.0, 0.0, 0.0, 0.0]), replace(PLACED, has_origin=False)
+    found, first = [], Pose(np.eye(3), np.array([50.0, 0.0, 7.0]))
+    for k in range(200):
+        for step in range(10):
+            t_ns = (k * 10 + step - 9) * 10_000_000
+            integral.take(ImuSample(t_ns, np.zeros(3), np.array([0.0, 0.0, -9.80665])))
+            integral.take(AttitudeSample(t_ns, level))
+        odometry.begin(k * 100_000_000, BodyAttitude(k * 100_000_000, np.eye(3)))
+        velocity = np.array([SPEED, 0.0, 0.0]), 0.1
+        if k < 100:
+            seen, map_number, known = track(k), 0, placed
+        elif k < 120:
+            seen, map_number, known = Track(k, k * 100_000_000, TrackState.LOST), 0, placed
+        else:  # a map of half the scale; its georeference comes late
+            at = first.translation + [2.0 * SPEED * (k - 120) / 10, 0.0, 0.0]
+            seen, map_number = replace(track(k), map_from_camera=Pose(np.eye(3), at)), 120
+            half = replace(placed, world_from_map=Similarity(1.0, np.eye(3), np.zeros(3)))
+            known = half if k >= 140 else None
+        view = MapView(12_000_000_000, first) if map_number else None
+        found.append(odometry.step(seen, map_number, known, velocity, view))
+    places = np.array([north(each) for each in found])
+    assert np.abs(np.diff(places) - 0.2).max() < 0.05
+    assert found[139].inertial and not found[140].inertial
+    assert (found[139].reset_counter, found[140].reset_counter) == (0, 1)
