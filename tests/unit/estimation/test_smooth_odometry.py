@@ -177,6 +177,7 @@ def test_another_map_goes_on_from_where_accelerometers_had_its_first_view() -> N
     integral = AccelerationIntegral()
     odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
     level, placed = np.array([1.0, 0.0, 0.0, 0.0]), replace(PLACED, has_origin=False)
+    known: Georeference | None = placed
     found, first = [], Pose(np.eye(3), np.array([50.0, 0.0, 7.0]))
     for k in range(200):
         for step in range(10):
@@ -186,9 +187,9 @@ def test_another_map_goes_on_from_where_accelerometers_had_its_first_view() -> N
         odometry.begin(k * 100_000_000, BodyAttitude(k * 100_000_000, np.eye(3)))
         velocity = np.array([SPEED, 0.0, 0.0]), 0.1
         if k < 100:
-            seen, map_number, known = track(k), 0, placed
+            seen, map_number = track(k), 0
         elif k < 120:
-            seen, map_number, known = Track(k, k * 100_000_000, TrackState.LOST), 0, placed
+            seen, map_number = Track(k, k * 100_000_000, TrackState.LOST), 0
         else:  # a map of half the scale; its georeference comes late
             at = first.translation + [2.0 * SPEED * (k - 120) / 10, 0.0, 0.0]
             seen, map_number = replace(track(k), map_from_camera=Pose(np.eye(3), at)), 120
