@@ -37,6 +37,8 @@ SIGMA_HELD_M_S2 = 3.0
 """Acceleration that may have come since."""
 REFUSED = 16.3
 """Chi-square of three degrees of freedom exceeded once in a thousand times."""
+NORMALISED_TAU = 30
+"""Places, two seconds of them."""
 MAX_REFUSED_NS = 1_000_000_000
 """Places refused for longer are believed: the filter begins anew."""
 
@@ -73,6 +75,8 @@ class InertialNavigation:
         self._refused_since_ns: int | None = None
         self.world_from_attitude = np.eye(3)
         """Rotation (3, 3) from the autopilot's NED axes to those of the places."""
+        self._normalised = 1.0
+        """Mean squared innovation per degree of freedom, of the latest places."""
         self.n_refused = 0
         """Places that were refused by the innovation gate."""
 
@@ -121,9 +125,11 @@ class InertialNavigation:
                 return None
             x, covariance = self._predicted(change)
         held_s = (t_ns - end_ns) * 1e-9
-        sigma_v = float(np.hypot(_sigma(covariance, VELOCITY), SIGMA_HELD_M_S2 * held_s))
+        # accelerations that do not fit what is seen are stated as less certain
+        unlikely = max(1.0, float(np.sqrt(self._normalised)))
+        sigma_v = unlikely * float(np.hypot(_sigma(covariance, VELOCITY), SIGMA_HELD_M_S2 * held_s))
         moved_m = SIGMA_HELD_M_S2 * held_s * held_s / 2.0
-        sigma_p = float(np.linalg.norm([
+        sigma_p = unlikely * float(np.linalg.norm([
             _sigma(covariance, PLACE), moved_m, _sigma(covariance, VELOCITY) * held_s
         ]))  # fmt: skip
         return Reckoned(x[PLACE] + held_s * x[VELOCITY], x[VELOCITY].copy(), sigma_p, sigma_v)
@@ -141,7 +147,9 @@ class InertialNavigation:
         innovation = place.place_m - x[PLACE]
         seen = covariance[PLACE]
         spread = seen[:, PLACE] + variance * np.eye(3)
-        if float(innovation @ np.linalg.solve(spread, innovation)) > REFUSED:
+        squared = float(innovation @ np.linalg.solve(spread, innovation))
+        self._normalised += (squared / 3.0 - self._normalised) / NORMALISED_TAU
+        if squared > REFUSED:
             self.n_refused += 1
             since_ns = self._refused_since_ns or place.t_ns
             self._refused_since_ns = since_ns

@@ -87,7 +87,9 @@ class FlownByVision(FakeAutopilot):
     """See above."""
 
     def __init__(self, firmware: str = "ardupilot", url: str = "udpin:127.0.0.1:0") -> None:
-        super().__init__(firmware, url, OverPattern(self._pose_at), gps=False)
+        # its way is computed in steps, whose second differences are no accelerations
+        lacks = ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU")
+        super().__init__(firmware, url, OverPattern(self._pose_at), gps=False, lacks=lacks)
         self._chance = np.random.default_rng(5)
         self._gust = np.zeros(3)
         self._place, self._velocity = np.array([0.0, 0.0, -LEGS_M]), np.zeros(3)
