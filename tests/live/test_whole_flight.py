@@ -73,6 +73,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
         f"expert.camera.starts_at_unix_s={out.begins_unix_s}",
         f"link.url=udpin:127.0.0.1:{udp_port}", "feedback.mode=odometry",
         f"expert.daemon.prometheus_port={metrics_port}",
+        # the IMU is a tenth of a core, here and in the daemon, that the dense map shall have
+        "expert.link.imu_hz=0",
     )  # fmt: skip
     with Daemon(folder, *settings) as daemon:
         daemon.until(lambda health: True, 20, "it answers")
