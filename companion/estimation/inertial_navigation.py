@@ -12,20 +12,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimation.acceleration_integral import (
-    GRAVITY_NED_M_S2,
-    AccelerationIntegral,
-    Change,
-)
-from companion.estimation.inertial_scale import (
+from companion.estimation.acceleration_integral import AccelerationIntegral, Change
+from companion.estimation.inertial_motion import (
+    BIAS,
+    PLACE,
     SIGMA_BIAS_M_S2,
     SIGMA_SPEED_M_S,
     SIGMA_TILT_M_S2,
+    TILT,
+    VELOCITY,
+    motion,
 )
 from companion.geometry.transforms import Array
 
 N_STATE = 11
-PLACE, VELOCITY, BIAS, TILT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
 TILT_TAU_S = 20.0
 """An autopilot's attitude is wrong otherwise after each manoeuvre."""
 BIAS_WALK_M_S2 = 1e-3
@@ -179,27 +179,14 @@ class InertialNavigation:
 
     def _predicted(self, change: Change) -> tuple[Array, Array]:
         """State and covariance after a change of motion that accelerometers measured."""
-        dt, one, turn = change.dt_s, np.eye(3), self.world_from_attitude
-        gravity = GRAVITY_NED_M_S2 * dt  # is not turned with what was measured
-        step = np.eye(N_STATE)
-        step[PLACE, VELOCITY] = dt * one
-        step[PLACE, BIAS] = turn @ change.displacement_by_bias
-        step[VELOCITY, BIAS] = turn @ change.velocity_by_bias
-        step[PLACE, TILT] = 0.5 * dt * dt * one[:, :2]
-        step[VELOCITY, TILT] = dt * one[:, :2]
-        held = float(np.exp(-dt / TILT_TAU_S))
-        step[TILT, TILT] = held * np.eye(2)
-        x = step @ self._x
-        x[PLACE] += turn @ (change.displacement_m - 0.5 * dt * gravity) + 0.5 * dt * gravity
-        x[VELOCITY] += turn @ (change.velocity_m_s - gravity) + gravity
         density = self._integral.density_m_s2
-        noise = np.zeros((N_STATE, N_STATE))
-        noise[PLACE, PLACE] = density**2 * dt**3 / 3.0 * one
-        noise[PLACE, VELOCITY] = noise[VELOCITY, PLACE] = density**2 * dt**2 / 2.0 * one
-        noise[VELOCITY, VELOCITY] = density**2 * dt * one
-        noise[BIAS, BIAS] = BIAS_WALK_M_S2**2 * dt * one
-        noise[TILT, TILT] = SIGMA_TILT_M_S2**2 * (1.0 - held**2) * np.eye(2)
-        return x, step @ self._covariance @ step.T + noise
+        found = motion(change, self.world_from_attitude, density, TILT_TAU_S, N_STATE)
+        x = found.step @ self._x
+        x[PLACE] += found.moved_m
+        x[VELOCITY] += found.gained_m_s
+        covariance = found.step @ self._covariance @ found.step.T + found.noise
+        covariance[BIAS, BIAS] += BIAS_WALK_M_S2**2 * change.dt_s * np.eye(3)
+        return x, covariance
 
 
 def _sigma(covariance: Array, part: slice) -> float:

@@ -17,19 +17,23 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from companion.estimation.acceleration_integral import (
-    GRAVITY_NED_M_S2,
-    AccelerationIntegral,
-    Change,
-)
+from companion.estimation.acceleration_integral import AccelerationIntegral, Change
 from companion.estimation.georeference import AlignmentSample, mean_rotation
+from companion.estimation.inertial_motion import (
+    BIAS,
+    PLACE,
+    SIGMA_BIAS_M_S2,
+    SIGMA_SPEED_M_S,
+    SIGMA_TILT_M_S2,
+    TILT,
+    VELOCITY,
+    motion,
+)
 from companion.estimation.trajectory_alignment import Scale
 from companion.geometry.transforms import Array
 
-SIGMA_BIAS_M_S2 = 0.15
-"""Of a calibrated MEMS accelerometer: 15 mg from one power-on to the next."""
-SIGMA_TILT_M_S2, TILT_TAU_S = 0.1, 200.0
-"""Horizontal acceleration by a tilt of 0.6 degrees of the levelled map, and how long it stays."""
+TILT_TAU_S = 200.0
+"""A tilt of the levelled map stays so long."""
 SIGMA_DRIFT = 1e-3
 """Drift of the map over a way of one unit, in units."""
 MAP_NOISES = (2e-4, 4e-4, 8e-4, 1.6e-3)
@@ -39,11 +43,8 @@ LEAST_SCALE, MOST_SCALE = 0.1, 1000.0
 N_SCALES = 25
 SPAN = 4.5
 """Standard deviations on either side that a finer bank covers."""
-SIGMA_SPEED_M_S = 20.0
 N_STATE = 14
-PLACE, VELOCITY, BIAS, TILT, DRIFT = (
-    slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)
-)  # fmt: skip
+DRIFT = slice(11, 14)
 SIGMA_SENSITIVITY = 0.01
 """Of an accelerometer's own scale: datasheets of those in autopilots state 0.5 to 1 %."""
 MOST_SUSTAINED_M_S2 = 2.0
@@ -153,29 +154,13 @@ class ScaleBank:
         self._grow(VELOCITY, np.full(len(self._log), SIGMA_SPEED_M_S**2))
 
     def _predict(self, change: Change, turn: Array, density: float) -> None:
-        dt, one = change.dt_s, np.eye(3)
-        gravity = GRAVITY_NED_M_S2 * dt  # is not turned with what was measured
-        gained = turn @ (change.velocity_m_s - gravity) + gravity
-        moved = turn @ (change.displacement_m - 0.5 * dt * gravity) + 0.5 * dt * gravity
-        self._gained_m_s += gained
-        self._lasted_s += dt
-        held = float(np.exp(-dt / TILT_TAU_S))
-        step = np.eye(N_STATE)
-        step[PLACE, VELOCITY] = dt * one
-        step[PLACE, BIAS] = turn @ change.displacement_by_bias
-        step[VELOCITY, BIAS] = turn @ change.velocity_by_bias
-        step[PLACE, TILT] = 0.5 * dt * dt * one[:, :2]
-        step[VELOCITY, TILT] = dt * one[:, :2]
-        step[TILT, TILT] = held * np.eye(2)
-        noise = np.zeros((N_STATE, N_STATE))
-        noise[PLACE, PLACE] = density**2 * dt**3 / 3.0 * one
-        noise[PLACE, VELOCITY] = noise[VELOCITY, PLACE] = density**2 * dt**2 / 2.0 * one
-        noise[VELOCITY, VELOCITY] = density**2 * dt * one
-        noise[TILT, TILT] = SIGMA_TILT_M_S2**2 * (1.0 - held**2) * np.eye(2)
-        self._x = self._x @ step.T
-        self._x[:, PLACE] += moved
-        self._x[:, VELOCITY] += gained
-        self._covariance = step @ self._covariance @ step.T + noise
+        found = motion(change, turn, density, TILT_TAU_S, N_STATE)
+        self._gained_m_s += found.gained_m_s
+        self._lasted_s += change.dt_s
+        self._x = self._x @ found.step.T
+        self._x[:, PLACE] += found.moved_m
+        self._x[:, VELOCITY] += found.gained_m_s
+        self._covariance = found.step @ self._covariance @ found.step.T + found.noise
 
     def _correct(self, levelled: Array, lever_m: Array) -> None:
         """Compare with a place in the map: that of the body, and drift."""
