@@ -14,6 +14,7 @@ from __future__ import annotations
 import mmap
 import os
 import pickle
+import resource
 import socket
 import struct
 from typing import Any
@@ -127,6 +128,12 @@ class Parcel:
         at = _HEADER.size + n_kind
         kind = packet[_HEADER.size : at].decode()
         return cls(kind, t_ns, n_bytes, bytearray(packet[at:]), memory)
+
+
+def allow_descriptors() -> None:
+    """Raise this process's limit, and its children's: each large message that waits holds one."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def _write(descriptor: int, parts: list[memoryview]) -> None:

@@ -6,20 +6,21 @@ own state: the table says whether it begins again within the flight, or ends it.
 
 from __future__ import annotations
 
-import resource
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from companion.runtime.parcel import Parcel
-from companion.runtime.stage_process import StageProcess
+from companion.runtime.parcel import Parcel, allow_descriptors
+from companion.runtime.stage_process import FRAME, StageProcess
 from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_start import Start
 from companion.runtime.stages import START_S, Death, Stage
 from companion.timing.clock import monotonic_s
 
 MAP = "MapUpdate"
 STALLED = "it hung for {:.0f} s and was ended"
+NO_PROCESS = "no process could be started for it: {}"
 LONGEST_WAIT_S = 30.0
 """Longest pause between two starts of a stage that dies repeatedly."""
 TICK_S = 0.02
@@ -42,24 +43,20 @@ class Supervisor:
     """A stage could never start because of the user's input."""
 
 
-def _allow_descriptors() -> None:
-    """Raise this process's limit, and its children's: each large message that waits holds one."""
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-
-
 class Processes:
     """Processes of the given stages. `publish` may be called from any thread, and never waits."""
 
-    def __init__(self, stages: Iterable[Stage], supervisor: Supervisor) -> None:
-        _allow_descriptors()
-        self._supervisor = supervisor
+    def __init__(self, stages: Iterable[Stage], start: Start, supervisor: Supervisor) -> None:
+        allow_descriptors()
+        self._start_child, self._supervisor = start, supervisor
         self._rows = {stage.name: stage for stage in stages}
         self._listens = {
             stage.name: {kind.__name__ for kind in stage.listens} for stage in self._rows.values()
         }
         self.muted: set[str] = set()
-        """Stages that get no messages."""
+        """Stages that get no messages,"""
+        self.without_frames: set[str] = set()
+        """and those that get no frames."""
         self.n_restarted = dict.fromkeys(self._rows, 0)
         self._lock = threading.Lock()
         self._over = threading.Event()
@@ -114,7 +111,9 @@ class Processes:
         if parcel.kind == MAP:
             self._newest_map = parcel
         for name, process in list(self.by_name.items()):
-            if parcel.kind in self._listens[name] and name not in self.muted:
+            if parcel.kind not in self._listens[name] or name in self.muted:
+                continue
+            if parcel.kind != FRAME or name not in self.without_frames:
                 process.offer(parcel)
 
     def order(self, name: str, control: Any) -> None:
@@ -188,15 +187,14 @@ class Processes:
             late[stage.name] = process.failed.why if process.failed is not None else ""
 
     def _start(self, stage: Stage) -> StageProcess:
-        return StageProcess(stage, self._deliver, lambda why: self._ended(stage, why))
+        return StageProcess(
+            stage, self._start_child, self._supervisor.heard, lambda why: self._ended(stage, why)
+        )
 
     def _set_up(self, stage: Stage) -> None:
         if self._flies or not stage.with_flight:
             n, failed = self.n_restarted[stage.name], dict(self._failed_devices)
             self.by_name[stage.name].begin(self._supervisor.setup(stage, n, failed))
-
-    def _deliver(self, parcel: Parcel) -> None:
-        self._supervisor.heard(parcel)
 
     def _ended(self, stage: Stage, why: str) -> None:
         """Handle the end of a stage's process; called from its own thread."""
@@ -217,16 +215,22 @@ class Processes:
         never_up = not n_before and gone.progress is None and name not in self._added
         if gone.failed is not None and gone.failed.by_input and never_up:
             self._supervisor.unusable(why)
-        if n_before and self._over.wait(min(2.0 ** (n_before - 1), LONGEST_WAIT_S)):
-            return
+        while not (n_before and self._over.wait(min(2.0 ** (n_before - 1), LONGEST_WAIT_S))):
+            n_before += 1
+            try:
+                return self._start_again(stage, gone)
+            except OSError as error:
+                self._supervisor.restarted(stage, NO_PROCESS.format(error.strerror))
+
+    def _start_again(self, stage: Stage, gone: StageProcess) -> None:
         with self._lock:
             if self._over.is_set():
                 return
-            self.n_restarted[name] += 1
-            self.by_name[name] = self._start(stage)
+            self.by_name[stage.name] = self._start(stage)
+            self.n_restarted[stage.name] += 1
             gone.kill()
             self._set_up(stage)
-        self.bring_up_to_date(name)
+        self.bring_up_to_date(stage.name)
 
     def _blame_driver(self, gone: StageProcess, why: str) -> None:
         """Exclude a device whose driver has ended a stage from the rest of the flight.

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 import resource
-import signal
 import socket
 import sys
 
-# The daemon says when to end: not Ctrl-C, which is for its own group of processes, nor systemd. No
-# session of its own, though: the scheduler would share the processor between sessions first, and
-# priorities would not count between stages (sched(7), autogroup).
-os.setpgid(0, 0)
-for number in (signal.SIGINT, signal.SIGTERM):
-    signal.signal(number, signal.SIG_IGN)
+from companion.runtime.stage_start import ignore_signals
+
+if __name__ == "__main__":
+    ignore_signals()  # from the begin on, not after a second of imports
 
 # before numpy loads, as in companion.__main__
 for variable in (
@@ -25,6 +22,7 @@ os.environ.setdefault("OPENCV_OPENCL_RUNTIME", "disabled")
 
 import threading  # noqa: E402
 from collections.abc import Callable  # noqa: E402
+from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
 from companion.errors import CompanionError, InputError  # noqa: E402
@@ -54,15 +52,21 @@ SWITCH_S = 5e-4
 
 
 def main() -> int:
-    """Run one stage until told to finish, or until the daemon is gone."""
-    stage = stage_named(sys.argv[1])
+    """Run the stage of the command line; the exit status."""
+    return run(sys.argv[1], int(sys.argv[2]))
+
+
+def run(name: str, descriptor: int) -> int:
+    """Run one stage until told to finish, or until the daemon is gone; the exit status."""
+    Path("/proc/self/comm").write_text(name, "utf-8")  # its name in top and ps
+    stage = stage_named(name)
     os.nice(min(stage.nice, LOWEST_NICE))
     if stage.nice == 0:
         _take_real_time()
     if stage.nice > LOWEST_NICE:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     sys.setswitchinterval(SWITCH_S)
-    daemon = socket.socket(fileno=int(sys.argv[2]))
+    daemon = socket.socket(fileno=descriptor)
     module = module_of(stage.name)  # which takes a second, and may be long before there is a flight
     try:
         setup: Setup = Parcel.receive(daemon).open()

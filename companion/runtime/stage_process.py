@@ -6,14 +6,14 @@ makes the caller wait but `wait`.
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import socket
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from typing import Any
 
+from companion.messages import Frame
 from companion.runtime.mailbox import Mailbox
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_protocol import (
@@ -25,10 +25,11 @@ from companion.runtime.stage_protocol import (
     Setup,
     Taken,
 )
+from companion.runtime.stage_start import NOT_STARTED, UNKNOWN_STATUS, Start
 from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Stage, drop_policy
 from companion.timing.clock import monotonic_s
 
-CHILD = "companion.runtime.stage_child"
+FRAME = Frame.__name__
 BY_DRIVER = (
     signal.SIGABRT, signal.SIGALRM, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV,
 )  # fmt: skip
@@ -43,8 +44,9 @@ class StageProcess:
     """
 
     def __init__(
-        self, stage: Stage, deliver: Callable[[Parcel], None], ended: Callable[[str], None]
-    ) -> None:
+        self, stage: Stage, start: Start, deliver: Callable[[Parcel], None],
+        ended: Callable[[str], None],
+    ) -> None:  # fmt: skip
         self.stage = stage
         self.progress: Progress | None = None
         """None until the stage is ready."""
@@ -60,6 +62,7 @@ class StageProcess:
         self.asked_to_end = False
         """True once it was asked to finish, or killed."""
         self._driver = DriverAtWork()
+        self._frame_ns = -(2**63)
         self._n_sent = self._n_taken = 0
         """Bytes of shared memory, so far."""
         self._was_taken = threading.Condition()
@@ -69,19 +72,20 @@ class StageProcess:
             lambda parcel: parcel.n_bytes, QUEUE_BYTES,
         )  # fmt: skip
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._child = subprocess.Popen(
-            [sys.executable, "-m", CHILD, stage.name, str(theirs.fileno())],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=(theirs.fileno(),),
-        )  # fmt: skip
-        theirs.close()
+        with theirs:
+            try:
+                self._child = start(stage.name, theirs.fileno())
+            except OSError:
+                self._socket.close()
+                raise
         self._writer = threading.Thread(target=self._write, name=f"to {stage.name}", daemon=True)
         self._reader = threading.Thread(target=self._read, name=f"from {stage.name}", daemon=True)
         self._writer.start()
         self._reader.start()
 
     @property
-    def pid(self) -> int:
-        """Process id."""
+    def pid(self) -> int | None:
+        """Process id; None as long as it is not known."""
         return self._child.pid
 
     @property
@@ -124,6 +128,10 @@ class StageProcess:
         """
         if self._begun_s is None:
             return
+        if parcel.kind == FRAME:
+            if parcel.t_ns - self._frame_ns < self.stage.frame_every_ns:
+                return
+            self._frame_ns = parcel.t_ns
         self._outbox.put(parcel)
         if self._offered_s is None:
             self._offered_s = monotonic_s()
@@ -151,7 +159,7 @@ class StageProcess:
     def interrupt(self, why: str = "") -> None:
         """End it as if it had died by itself: `ended` is called, with this reason if given."""
         self._interrupted = why
-        self._child.kill()
+        self._end()
 
     @property
     def driver(self) -> DriverAtWork | None:
@@ -166,13 +174,17 @@ class StageProcess:
         """End it now."""
         self.asked_to_end = True
         self._outbox.close()
-        if self._child.poll() is None:
-            self._child.kill()
+        self._end()
         self._child.wait()
         for thread in (self._reader, self._writer):
             if thread is not threading.current_thread():
                 thread.join()
         self._socket.close()
+
+    def _end(self) -> None:
+        self._child.kill()
+        with contextlib.suppress(OSError):  # nobody else closes the socket of one never started
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def _write(self) -> None:
         try:
@@ -232,6 +244,10 @@ REPORTS = {kind.__name__ for kind in (Taken, Progress, DriverAtWork, Failed, Fin
 
 
 def _in_words(status: int) -> str:
+    if status == NOT_STARTED:
+        return "its process could not be started"
+    if status == UNKNOWN_STATUS:
+        return "ended, and the fork server does not say how"
     if status == -signal.SIGALRM:
         return "a driver does not come back"
     if status < 0:

@@ -73,6 +73,8 @@ class Stage:
     """It writes into the flight's folder; each restart into one of its own."""
     is_source: bool = False
     """Other stages wait for its last results."""
+    frame_every_ns: int = 0
+    """Least interval of its frames; between them they are left out."""
 
 
 STAGES = (
@@ -101,7 +103,8 @@ STAGES = (
             Frame, PositionSample, *CURVES, Warned, Health, GeoOrigin, Odometry, Track,
             KeyframeAdded, MapUpdate, DepthMap, PointChunk,
         ),
-        nice=10, frames=Frames.EVERY, answer_s=30.0, finish_s=3.0, with_flight=True,
+        nice=10, frames=Frames.EVERY, answer_s=30.0, finish_s=6.0, with_flight=True,
+        frame_every_ns=60_000_000,
     ),
     Stage(
         "results",

@@ -30,6 +30,7 @@ class Shown(Enum):
     TRACKING = "Tracking"
     DEAD_RECKONING = "Coasting"
     LOST = "Lost"
+    STANDING = "Standing"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

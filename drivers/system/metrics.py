@@ -15,6 +15,7 @@
 | `feedback_sending`, `feedback_rate_hz` | | |
 | `feedback_sent_total`, `feedback_resets_total` | | |
 | `feedback_latency_seconds` | quantile | exposure to sending |
+| `flow_sending`, `flow_rate_hz`, `flow_sent_total` | | optical flow |
 | `degradation_level` | | 0: nothing is left out |
 | `cpu_share`, `gpu_share` | | 0 to 1 |
 | `memory_used_bytes`, `memory_total_bytes`, `disk_free_bytes` | | |
@@ -176,6 +177,10 @@ def _of_flight(health: Health) -> Iterator[Metric]:
             ("0.95",): _times(feedback.latency_p95_ms, 1e-3),
         },
     )  # fmt: skip
+    flow = health.flow
+    yield _gauge("flow_sending", "Whether the autopilot is given flow.", (), _one(flow.sending))
+    yield _gauge("flow_rate_hz", "Flow messages sent a second.", (), _one(flow.rate_hz))
+    yield _counter("flow_sent", "Flow messages sent.", (), _one(flow.n_sent))
     yield _gauge("degradation_level", "0 where nothing is left out.", (), _one(health.degradation))
     yield _gauge(
         "event_loop_delay_seconds", "How late the event loop comes.", ("quantile",),

@@ -28,7 +28,7 @@ def main() -> None:
     with LiveViewer(
         ViewerConfig(), flight.camera, name="orbit", stream=stream, origin=flight.origin
     ) as viewer:
-        process = psutil.Process(viewer.pid)
+        process = psutil.Process(viewer.stage.pid)
         for message in flight.messages(float(seconds)):
             began = time.perf_counter()
             viewer.take(message)

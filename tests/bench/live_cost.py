@@ -74,7 +74,10 @@ NAMES = {"companion.streaming.export_process": "viewers"}
 
 def name_of(process: psutil.Process) -> str:
     """Stage of a child of the daemon."""
-    line = process.cmdline()
+    name = str(process.name())
+    if not name.startswith("python"):
+        return name
+    line = process.cmdline()  # before they had names of their own
     if "-m" not in line:
         return "daemon"
     at = line.index("-m")

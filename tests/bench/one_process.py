@@ -42,6 +42,7 @@ from companion.geometry.camera import Camera
 from companion.health import LatencyMeter
 from companion.messages import Frame, MapUpdate, Odometry, PointChunk, Track, Warned
 from companion.products.flight_result import RunFacts
+from companion.runtime.fork_server import ForkServer
 from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_feed import CameraFeed
@@ -76,19 +77,30 @@ class Flown:
         self._answered = threading.Event()
         self._seq = -1
         dates = FlightDates(self.clock, lambda: None, lambda: True)
-        self.flights = Flights(self.clock, self.journal, self._listener, self._facts, dates)
+        self.server = ForkServer()
+        self.flights = Flights(
+            self.clock, self.journal, self._listener, self._facts, dates, self.server.start
+        )
         self.feed = CameraFeed(
             camera_source(config.camera), self.clock, config.camera, lambda f: None, self._warned
         )
         self.watch = HealthWatch(
-            config, self.clock, self.journal, self.feed, None, None, self.flights, LatencyMeter()
+            config,
+            self.clock,
+            self.journal,
+            self.feed,
+            None,
+            None,
+            None,
+            self.flights,
+            LatencyMeter(),
         )
         self.flight = self.flights.begin(config, camera)
         until_s = time.monotonic() + START_S
         while not (self.flight.ready and self.flight.stages_up):
             assert time.monotonic() < until_s, "stages do not come up"
             time.sleep(0.1)
-        self.pids = {kind: stage.pid for kind, stage in self.flight.stages.items()}
+        self.pids = self.flight.pids
         self._main = Path(f"/proc/{self.pids['localisation']}/schedstat")
 
     def cpu_ms(self) -> float:
@@ -143,8 +155,6 @@ def row_of(flown: Flown, seen: Seen, t_s: float) -> dict[str, float]:
     processes = {"own": psutil.Process()}
     for kind, pid in flown.pids.items():
         processes[kind] = psutil.Process(pid)
-    if flown.flight.viewing is not None:
-        processes["viewers"] = psutil.Process(flown.flight.viewing.pid)
     update = seen.update
     row: dict[str, float] = {
         "minute": round(t_s / 60, 1), "p50_ms": round(float(np.percentile(ms, 50)), 2),
@@ -240,6 +250,7 @@ def fly(arguments: argparse.Namespace, config: Config, seen: Seen, rows_file: Pa
             print(seen.rows[-1], flush=True)
     for stage in flown.flight.stages.values():
         stage.kill()
+    flown.server.close()
 
 
 def verdict(seen: Seen) -> tuple[list[str], list[str]]:

@@ -12,7 +12,7 @@ import pytest
 
 from tests.support.processes.flying import Flying
 
-STAGE = "companion.runtime.stage_child"
+VIEWER = "companion.streaming.viewer.ground_process"
 NO_SIGN_S = 10.0
 
 
@@ -82,11 +82,9 @@ def test_what_hangs_is_named_and_goes_on_when_it_can(flying: Flying) -> None:
 
 
 def viewer_of(flying: Flying) -> psutil.Process | None:
-    """The newest process that is no stage's."""
+    """The newest process of a viewer."""
     found = [
-        child
-        for child in psutil.Process(flying.daemon.pid).children()
-        if STAGE not in child.cmdline()
+        child for child in psutil.Process(flying.daemon.pid).children() if VIEWER in child.cmdline()
     ]
     # one of the last flight may still be ending
     return max(found, key=lambda child: child.create_time(), default=None)

@@ -17,6 +17,7 @@ from companion.messages import Frame, Warned
 from companion.products.flight_result import RunFacts
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import KeepMap
+from companion.runtime.stage_start import Start
 from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock
 from drivers.recording.flights_folder import COUNTER, flight_name, next_number
@@ -33,8 +34,9 @@ class Flights:
         listener: Callable[[LiveFlight], Listener],
         facts: Callable[[LiveFlight], RunFacts],
         dates: FlightDates,
+        start: Start,
     ) -> None:
-        self._dates = dates
+        self._dates, self._start = dates, start
         self._counter: NewestFile | None = None
         self._last_number = 0
         self._clock, self._journal, self._listener, self._facts = clock, journal, listener, facts
@@ -56,7 +58,7 @@ class Flights:
     def prepare(self, config: Config, camera: Camera) -> None:
         """Start the processes of the next flight."""
         if self._standby is None:
-            self._standby = LiveFlight(config, camera, self._clock, self._listener)
+            self._standby = LiveFlight(config, camera, self._clock, self._listener, self._start)
 
     def begin(self, config: Config, camera: Camera, take_up: bool = True) -> LiveFlight:
         """Begin a flight; the one before must have been ended.

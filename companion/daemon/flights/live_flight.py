@@ -11,12 +11,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from companion.config import Config, Measurement
-from companion.daemon.flights.viewing import Viewing
+from companion.daemon.flights.viewing import NOWHERE, VIEWERS, Viewing
 from companion.flight_notes import FlightNote
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
-from companion.messages import Frame, Georeferenced, MapUpdate, Odometry, PointChunk, Track, Warned
+from companion.messages import (
+    Frame,
+    Georeferenced,
+    MapUpdate,
+    Odometry,
+    OpticalFlow,
+    PointChunk,
+    Track,
+    Warned,
+)
 from companion.products.flight_result import RunFacts
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor
@@ -24,11 +33,14 @@ from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import (
     Finish,
     KeepMap,
+    Listening,
+    SetBudget,
     SetLoadLevel,
     Setup,
     Snapshot,
     TakeSnapshot,
 )
+from companion.runtime.stage_start import Start
 from companion.runtime.stages import STAGES, Stage, stage_named
 from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock, monotonic_s
@@ -50,6 +62,7 @@ class Listener:
     localisation_died: Callable[[], None]
     unusable: Callable[[str], None]
     """A stage could never start because of the user's input."""
+    flow: Callable[[OpticalFlow], None] = lambda _: None
     snapshot: Callable[[Snapshot], None] = lambda _: None
     points_made: Callable[[int], None] = lambda _: None
     """Time of the keyframe whose points they are."""
@@ -66,6 +79,7 @@ class LiveFlight:
         camera: Camera,
         clock: FlightClock,
         listener: Callable[[LiveFlight], Listener],
+        start: Start,
     ) -> None:
         self._config, self.camera, self._clock = config, camera, clock
         self._began_s = monotonic_s()
@@ -86,6 +100,7 @@ class LiveFlight:
         self._dense_share = 1.0
         self._processes = Processes(
             stages_of(config),
+            start,
             Supervisor(
                 self._setup, self._hear, self._say_restarted, self._die, self._listener.unusable
             ),
@@ -95,6 +110,12 @@ class LiveFlight:
     def stages(self) -> dict[str, StageProcess]:
         """Processes of the stages, by name."""
         return self._processes.by_name
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids that are known, by stage."""
+        pids = {name: process.pid for name, process in self.stages.items()}
+        return {name: pid for name, pid in pids.items() if pid is not None}
 
     @property
     def n_restarted(self) -> dict[str, int]:
@@ -116,41 +137,43 @@ class LiveFlight:
         self.folder, self._began_s = folder, monotonic_s()
         if keep is not None:
             self._processes.order("localisation", keep)
+        if VIEWERS in self.stages:  # before the exporter tells where it listens
+            self._viewing = Viewing(self._config, lambda: self.stages[VIEWERS], self._warn)
         self._processes.fly()
         self._flies = True
-        if self._config.daemon.viewer != "none" or self._config.stream.listen:
-            self._viewing = Viewing(self._config, self.camera, folder.name, self._warn)
 
     def frame(self, frame: Frame) -> None:
         """Take a frame of the camera's size; never waits."""
         if self._takes:
             self.n_frames += 1
-            self._publish(Parcel.of(frame))
+            self._processes.publish(Parcel.of(frame))
 
     def take(self, message: Telemetry | Warned | FlightNote) -> None:
         """Take telemetry, a warning for the log, or a note for the recorder; never waits."""
         if self._takes:
-            self._publish(Parcel.of(message))
+            self._processes.publish(Parcel.of(message))
 
     def publish_health(self, health: Health, origin: GeoOrigin | None) -> None:
         """Send health to viewers and results once a second, and a changed world's origin."""
         if not self._takes or health.t_ns - self._health_ns < HEALTH_EVERY_NS:
             return
         self._health_ns = health.t_ns
-        self._publish(Parcel.of(health))
+        self._processes.publish(Parcel.of(health))
         if origin is not None and origin != self._origin:
             self._origin = origin
-            self._publish(Parcel.of(origin))
+            self._processes.publish(Parcel.of(origin))
 
     @property
     def viewing(self) -> Viewing | None:
-        """The viewers' exporter; None if nobody may view."""
+        """State of the viewers; None if nobody may view."""
         return self._viewing
 
     def set_load_levels(self, features: float, dense: float, viewer: bool) -> None:
         """Set the share of work of the stages; see companion.runtime.governor."""
-        if self._viewing is not None:
-            self._viewing.pictures = viewer
+        if viewer:
+            self._processes.without_frames.discard(VIEWERS)
+        else:
+            self._processes.without_frames.add(VIEWERS)
         self._dense_share = dense
         self._processes.order("localisation", SetLoadLevel(features))
         self._processes.order("depth", SetLoadLevel(dense))
@@ -180,8 +203,9 @@ class LiveFlight:
 
     def set_budget(self, kbit_s: float) -> None:
         """Limit the rate of all viewers together; 0 for no limit."""
-        if self._viewing is not None:
-            self._viewing.set_budget(kbit_s)
+        stream = replace(self._config.stream, budget_kbit_s=kbit_s)
+        self._config = replace(self._config, stream=stream)
+        self._processes.order(VIEWERS, SetBudget(kbit_s))
 
     def take_snapshot(self, number: int, origin: GeoOrigin | None) -> None:
         """Write the cloud as it is now; progress goes to the listener."""
@@ -210,19 +234,21 @@ class LiveFlight:
         def finish_of(stage: Stage) -> Finish:
             hurried = self._processes.hurried
             of_flight = facts(self) if stage.name == "results" else None
-            return Finish(hurried, of_flight, self.keep_map)
+            is_shown = self._viewing is not None and self._viewing.is_shown
+            return Finish(hurried, of_flight, self.keep_map, n_viewers=int(is_shown))
 
         for name, why in self._processes.finish(finish_of).items():
-            self._warn(NOT_FINISHED, f"{name}: {why}" if why else name)
+            if name != VIEWERS:  # of what they did not see all is in the results
+                self._warn(NOT_FINISHED, f"{name}: {why}" if why else name)
         if self._viewing is not None:
             self._viewing.close(self._processes.hurried)
 
     def dropped(self) -> dict[str, int]:
-        """Messages dropped by each stage, frames most of all, and by the viewers."""
-        counts = {f"{name} frames": process.n_dropped for name, process in self.stages.items()}
-        if self._viewing is not None:
-            counts["viewer messages"] = self._viewing.n_dropped
-        return counts
+        """Messages dropped by each stage, frames most of all."""
+        return {
+            "viewer messages" if name == VIEWERS else f"{name} frames": process.n_dropped
+            for name, process in self.stages.items()
+        }
 
     @property
     def _takes(self) -> bool:
@@ -234,15 +260,15 @@ class LiveFlight:
             folder = folder / f"part-{n_restarted + 1}"
         return Setup(self._config, self.camera, folder, failed_devices=failed_devices)
 
-    def _publish(self, parcel: Parcel) -> None:
-        self._processes.publish(parcel)
-        if self._viewing is not None:
-            self._viewing.offer(parcel)
-
     def _hear(self, parcel: Parcel) -> None:
         """Take a message of a stage; called from the stages' threads."""
         if parcel.kind == Odometry.__name__:
             self._listener.odometry(parcel.open())
+        elif parcel.kind == Listening.__name__:
+            if self._viewing is not None:
+                self._viewing.take_port(parcel.open().port)
+        elif parcel.kind == OpticalFlow.__name__:
+            self._listener.flow(parcel.open())
         elif parcel.kind == Snapshot.__name__:
             self._listener.snapshot(parcel.open())
         elif parcel.kind == Georeferenced.__name__:
@@ -257,13 +283,16 @@ class LiveFlight:
             self._listener.mapped(parcel.open())
         if parcel.kind == PointChunk.__name__:
             self._listener.points_made(parcel.t_ns)
-        self._publish(parcel)
+        self._processes.publish(parcel)
 
     def _die(self, why: str) -> None:
         self._warn(LOCALISATION_DIED, why)
         self._listener.localisation_died()
 
     def _say_restarted(self, stage: Stage, why: str) -> None:
+        if stage.name == VIEWERS and self._viewing is not None:
+            self._viewing.stage_gone(why)
+            return
         self._warn(RESTARTED, f"{stage.name}: {why}")
 
     def _warn(self, what: str, detail: str, good: bool = False) -> None:
@@ -271,8 +300,10 @@ class LiveFlight:
 
 
 def stages_of(config: Config) -> list[Stage]:
-    """Stages of a live flight, viewers apart, which are watched by `Viewing`."""
-    left_out = {"viewers"}
+    """Stages of a live flight."""
+    left_out = set()
+    if config.daemon.viewer == NOWHERE and not config.stream.listen:
+        left_out.add(VIEWERS)
     if not config.recorder.enabled:
         left_out.add("recorder")
     if not makes_depth(config):

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from companion.config import Config
 from companion.config_file import command_shown, shown
-from companion.daemon.flights.viewing import Viewing
 from companion.daemon.nodes.kept_chunks import KeptChunks
+from companion.daemon.nodes.remote_viewing import RemoteViewing
 from companion.geometry.camera import Camera
 from companion.messages import DepthMap, MapUpdate, Message, PointChunk, Warned
 from companion.products.flight_result import RunFacts
@@ -56,9 +56,9 @@ class RemoteFlight:
         self._is_new = False
         """True while new points are made; those found in the folder come first."""
         self._numbers: OrderedDict[int, tuple[str, int]] = OrderedDict()
-        self._viewing: Viewing | None = None
+        self._viewing: RemoteViewing | None = None
         if config.stream.listen or config.daemon.viewer != "none":
-            self._viewing = Viewing(config, camera, flight, self._warn)
+            self._viewing = RemoteViewing(config, camera, flight, self._warn)
         setup = Setup(config, camera, folder, _free(folder), is_live=False)
         self._stages = InOrder(map(stage_named, STAGES), setup, self._watch, journal.say)
         for kept in self.kept.found:
@@ -83,6 +83,8 @@ class RemoteFlight:
     def step(self) -> None:
         """Pass on what was made since the last bundle; to be called often."""
         self._stages.collect()
+        if self._viewing is not None:
+            self._viewing.step()
 
     def close(self, hurry: bool) -> None:
         """Complete open depth maps, and write all results; the page only without `hurry`.

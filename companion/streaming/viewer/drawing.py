@@ -52,7 +52,7 @@ WIDTH = 640
 """Width of pictures; smaller ones, of a thin link, are enlarged."""
 STATE_LEVEL = {
     Shown.WAITING: 0.0, Shown.LOST: 0.0, Shown.INITIALISING: 1.0, Shown.DEAD_RECKONING: 2.0,
-    Shown.TRACKING: 3.0,
+    Shown.TRACKING: 3.0, Shown.STANDING: 3.0,
 }  # fmt: skip
 PLOTTED = {
     "rate_hz": ("rate", 1.0), "latency_ms": ("latency", 1.0), "link_kbit_s": ("link", 1.0),

@@ -9,7 +9,7 @@ import threading
 
 from companion.errors import InputError
 from companion.streaming.ground_link import GroundLink
-from companion.streaming.live_viewer import READY
+from companion.streaming.onboard_viewer import READY
 from companion.streaming.viewer.colours import Colours
 from companion.streaming.viewer.ground_viewer import show
 from companion.streaming.viewer.screen import Screen

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,11 +16,12 @@ import pytest
 
 from companion.config import Config
 from companion.messages import MapUpdate
-from companion.runtime import stage_process
+from companion.runtime import stage_start
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_start import Child, Start, start_alone
 from companion.runtime.stages import Stage
 from tests.support.flights.topic_flight import CAMERA
 from tests.support.processes.stage_heard import SOON_S, Heard
@@ -57,11 +59,14 @@ class Ended:
 class Flight:
     """Tiny stages in a flight: what one of them says goes to all that listen, as in the daemon."""
 
-    def __init__(self, *rows: Stage, folder: Path | None = None) -> None:
+    def __init__(
+        self, *rows: Stage, folder: Path | None = None, start: Start = start_alone
+    ) -> None:
         self.heard, self._folder = Heard(), folder
         note = self.heard.note
         self.processes = Processes(
             rows or STAGES,
+            start,
             Supervisor(
                 self._setup, self._hear,
                 lambda stage, why: note(Ended("restarted", f"{stage.name}: {why}")),
@@ -92,7 +97,8 @@ class Flight:
 
     def pids(self) -> list[int]:
         """Of all processes."""
-        return [self.process(name).pid for name in self.processes.by_name]
+        pids = [self.process(name).pid for name in self.processes.by_name]
+        return [pid for pid in pids if pid is not None]
 
     def until_ended(self, how: str, why: str) -> None:
         self.heard.until(lambda: Ended(how, why) in self.heard.all)
@@ -111,7 +117,7 @@ class Flight:
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stage_process, "CHILD", TINY_CHILD)
+    monkeypatch.setattr(stage_start, "CHILD", TINY_CHILD)
 
 
 Fly = Callable[..., Flight]
@@ -122,8 +128,8 @@ def fly() -> Iterator[Fly]:
     """Begins a flight, which is ended."""
     begun: list[Flight] = []
 
-    def begin(*rows: Stage, folder: Path | None = None) -> Flight:
-        begun.append(Flight(*rows, folder=folder))
+    def begin(*rows: Stage, folder: Path | None = None, start: Start = start_alone) -> Flight:
+        begun.append(Flight(*rows, folder=folder, start=start))
         begun[-1].processes.fly()
         return begun[-1]
 
@@ -144,7 +150,7 @@ def map_update(revision: int) -> Parcel:
 def flying() -> Iterator[Flight]:
     """One flight for the tests of what goes on during one."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(stage_process, "CHILD", TINY_CHILD)
+        patched.setattr(stage_start, "CHILD", TINY_CHILD)
         flight = Flight(SOURCE, READER, replace(WRITER, answer_s=0.2))
         with closing(flight):
             assert {each.stage for each in flight.heard.all} == {"source", "reader"}, "stand by"
@@ -244,6 +250,28 @@ def test_what_cannot_start_because_of_the_user_is_told(fly: Fly, tmp_path: Path)
     flight.close()  # does not wait for the pause before the next
     assert time.monotonic() - begun_s < 0.9
     assert len(flight.began("reader")) == 2
+
+
+def test_where_no_process_can_be_started_another_start_follows(fly: Fly) -> None:
+    n_refused = 0
+
+    def start(name: str, descriptor: int) -> Child:
+        nonlocal n_refused
+        if flight is not None and n_refused < 2:
+            n_refused += 1
+            raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+        return start_alone(name, descriptor)
+
+    flight: Flight | None = None
+    flight = fly(READER, start=start)
+    flight.until_up("reader")
+    flight.do("reader", "exit", "7")
+    flight.heard.until(lambda: len(flight.began("reader")) == 2)
+    refused = "reader: no process could be started for it: Resource temporarily unavailable"
+    assert [each.why for each in endings(flight)] == [
+        "reader: ended with status 7", refused, refused
+    ]  # fmt: skip
+    assert flight.processes.n_restarted == {"reader": 1}
 
 
 def test_last_words_of_sources_reach_the_others_before_these_end() -> None:

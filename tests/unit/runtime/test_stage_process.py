@@ -12,10 +12,11 @@ import pytest
 
 from companion.config import Config
 from companion.messages import DepthMap, Frame
-from companion.runtime import stage_process
+from companion.runtime import stage_start
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, Progress, Setup
+from companion.runtime.stage_start import start_alone
 from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Stage
 from companion.timing.clock import monotonic_s
 from tests.support.flights.topic_flight import CAMERA
@@ -32,7 +33,7 @@ class Tiny:
 
     def __init__(self, stage: Stage) -> None:
         self.heard, self.ended = Heard(), Heard()
-        self.process = StageProcess(stage, self.heard.parcel, self.ended.note)
+        self.process = StageProcess(stage, start_alone, self.heard.parcel, self.ended.note)
         self.stage = self.process
 
     def do(self, what: str, detail: str = "") -> None:
@@ -73,7 +74,7 @@ Start = Callable[[Stage], Tiny]
 
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
-    monkeypatch.setattr(stage_process, "CHILD", "tests.support.processes.tiny_stage_child")
+    monkeypatch.setattr(stage_start, "CHILD", "tests.support.processes.tiny_stage_child")
     begun: list[Tiny] = []
 
     def started(stage: Stage) -> Tiny:

@@ -15,10 +15,11 @@ from companion.config import Config
 from companion.dense.device_takeover import FAILED_OVER
 from companion.geometry.camera import Camera, Distortion
 from companion.messages import DepthMap, Warned
-from companion.runtime import stage_process
+from companion.runtime import stage_start
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Setup
+from companion.runtime.stage_start import start_alone
 from companion.runtime.stages import Frames, stage_named
 from tests.support.flights.mapped_plane import told
 from tests.support.reference.failing_driver import fail, two_devices
@@ -33,7 +34,7 @@ LONG_S = 150.0
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A driver that has made a depth map is waited for eight seconds instead of thirty."""
-    monkeypatch.setattr(stage_process, "CHILD", "tests.support.processes.impatient_stage_child")
+    monkeypatch.setattr(stage_start, "CHILD", "tests.support.processes.impatient_stage_child")
 
 
 class Stage:
@@ -43,7 +44,7 @@ class Stage:
         self._came = threading.Condition()
         self.out: list[Any] = []
         self.why: str | None = None
-        self.process = StageProcess(DEPTH, self._take, self._ended)
+        self.process = StageProcess(DEPTH, start_alone, self._take, self._ended)
         self.process.begin(Setup(Config(), CAMERA, failed_devices=failed))
         self.until(lambda: self.process.progress is not None or self.why is not None)
 

@@ -15,6 +15,7 @@ from companion.messages import MapUpdate, PointChunk
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from companion.runtime.stage_start import start_alone
 from companion.runtime.stages import stage_named
 from tests.support.reference.scoring import read_ply
 
@@ -26,8 +27,9 @@ PATIENCE_S = 60.0
 def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> None:
     told: queue.Queue[Any] = queue.Queue()
     stage = StageProcess(
-        stage_named("results"), lambda parcel: told.put(parcel.open()), lambda why: told.put(why)
-    )
+        stage_named("results"), start_alone, lambda parcel: told.put(parcel.open()),
+        lambda why: told.put(why),
+    )  # fmt: skip
     stage.order(TakeSnapshot(0))  # before it knows what to do: passed over
     stage.begin(Setup(Config(), CAMERA, tmp_path))
     try:

@@ -53,8 +53,8 @@ def test_a_viewer_that_hangs_neither_stalls_nor_outlives_the_flight() -> None:
                 viewer.take(frames[n % 30])
                 viewer.take(flown.track(n % flown.N_FRAMES))
                 slowest = max(slowest, time.perf_counter() - start)
-            assert viewer._ground is not None
-            children = [viewer.pid, viewer._ground.pid]
+            assert viewer.onboard is not None
+            children = [viewer.stage.pid, viewer.onboard.pid]
             start = time.perf_counter()
         assert time.perf_counter() - start < 10
         assert slowest < 0.5
@@ -63,10 +63,10 @@ def test_a_viewer_that_hangs_neither_stalls_nor_outlives_the_flight() -> None:
 
 def test_an_exporter_that_dies_does_not_end_the_flight() -> None:
     with LiveViewer(ViewerConfig(), CAMERA) as viewer:
-        assert viewer.alive
-        viewer.interrupt()
-        assert viewer._stage.wait(10.0)
-        assert not viewer.alive
+        assert viewer.stage.alive
+        viewer.stage.interrupt()
+        assert viewer.stage.wait(10.0)
+        assert not viewer.stage.alive
         for seq in range(400):
             viewer.take(flown.frame(seq))
     assert viewer.n_dropped > 0
@@ -117,6 +117,11 @@ def test_who_connects_sees_the_flight_of_all_of_it_the_newest() -> None:
     assert viewer.n_dropped == 0
 
 
+def closed(viewer: LiveViewer) -> str:
+    """Reason why nobody can connect, or ""."""
+    return str(viewer.report.get("closed", ""))
+
+
 def test_a_port_in_use_is_reported_and_opened_when_free() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
@@ -126,13 +131,13 @@ def test_a_port_in_use_is_reported_and_opened_when_free() -> None:
             ViewerConfig(), CAMERA, stream=StreamConfig(listen=f"127.0.0.1:{port}")
         ) as viewer:
             end = time.monotonic() + 10
-            while not viewer.closed and time.monotonic() < end:
+            while not closed(viewer) and time.monotonic() < end:
                 time.sleep(0.02)
-            assert "in use" in viewer.closed
+            assert "in use" in closed(viewer)
             other.close()
-            while viewer.closed and time.monotonic() < end:
+            while closed(viewer) and time.monotonic() < end:
                 time.sleep(0.02)
-            assert not viewer.closed and listens("127.0.0.1", port)
+            assert not closed(viewer) and listens("127.0.0.1", port)
 
 
 @pytest.mark.parametrize("where", ["rerun+http://127.0.0.1:1/proxy", "rerun+http:///proxy"])
