@@ -38,6 +38,8 @@ class TrackState(Enum):
     DEAD_RECKONING = "coasting"
     """No map points found; the pose is propagated by the autopilot's attitude and velocity."""
     LOST = "lost"
+    STANDING = "standing"
+    """Of an odometry only: the vehicle stands on the ground, at a fixed place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +97,32 @@ class Odometry:
     """Relative standard deviation of the scale, by which all distances are wrong alike."""
     sigma_by_scale_m: float = 0.0
     """Part of `sigma_position_m` that comes of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpticalFlow:
+    """Flow of the ground from the frame before to this one, as a sensor that looks down sees it.
+
+    `flow_rad_s` (2,) is the angular rate of the ground below about the body's x and y axes by
+    translation alone: with the velocity v of the camera in body axes and the distance r of the
+    ground along the body's down axis it is (-v_y / r, v_x / r), so that flying forward gives
+    positive y and flying to the right negative x. None where it could not be measured, because of
+    `why_not`. `turn_rad` (3,) is the body's rotation vector in the interval of `dt_s` up to `t_ns`,
+    in body axes. A sensor without gyroscopes sees the sum of both.
+    """
+
+    seq: int
+    t_ns: int
+    dt_s: float
+    flow_rad_s: Array | None = None
+    turn_rad: Array | None = None
+    sigma_rad_s: float = float("inf")
+    """Standard deviation of the flow about each axis by the image alone."""
+    quality: int = 0
+    """0..255; 0: none."""
+    distance_m: float | None = None
+    """Distance of the ground along the body's down axis; None where unknown."""
+    why_not: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,5 +345,5 @@ class ClockReport:
 
 Message = (
     Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
-    | PointChunk | Warned | Georeferenced | FrameTracked
+    | PointChunk | Warned | Georeferenced | FrameTracked | OpticalFlow
 )  # fmt: skip

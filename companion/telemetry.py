@@ -93,6 +93,17 @@ class ArmedSample:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LandedSample:
+    """State of the autopilot's landing detector: True in `landed` while it stands on the ground."""
+
+    schema: ClassVar[Schema] = Schema(
+        "landed", "Whether the autopilot's landing detector says that it stands on the ground"
+    )
+    t_ns: int
+    landed: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class AirspeedSample:
     """Indicated airspeed: by a pitot tube, for air as dense as at sea level, not calibrated."""
 
@@ -105,7 +116,7 @@ class AirspeedSample:
 
 Telemetry = (
     AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
-    | AirspeedSample
+    | AirspeedSample | LandedSample
 )  # fmt: skip
 TELEMETRY: tuple[type[Telemetry], ...] = get_args(Telemetry)
 """In order of their channels in a recording."""
@@ -113,7 +124,7 @@ FIELDS = {kind: fields_of(kind) for kind in TELEMETRY}
 """Fields of each, without its time."""
 MEASURED: Mapping[type[Telemetry] | PositionSource, Measurement | None] = {
     AttitudeSample: "attitude", ImuSample: "imu", RangeSample: "range", HeightSample: "height",
-    AirspeedSample: "airspeed", ArmedSample: None,
+    AirspeedSample: "airspeed", ArmedSample: None, LandedSample: None,
     PositionSource.LOCAL: "position", PositionSource.GLOBAL: "position",
     PositionSource.GPS: "satellites",
 }  # fmt: skip

@@ -99,6 +99,11 @@ class Georeferencer:
             each.prune(before_ns, keyframes_ns)
 
     @property
+    def has_positions(self) -> bool:
+        """True once there was a position that may place a map."""
+        return any(len(self._positions[source]) for source in self._sources)
+
+    @property
     def has_ranges(self) -> bool:
         """True if there are enough ranges to compare with a map."""
         return len(self._range) >= MIN_RANGES

@@ -11,20 +11,25 @@ from dataclasses import replace
 import numpy as np
 
 from companion.config import Config
-from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
+from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.checkpoint import MAX_BYTES, Checkpoint
 from companion.estimation.georeference import Georeferencer
-from companion.estimation.inertial_navigation import InertialNavigation, Reckoned
-from companion.estimation.motion_filter import MotionFilter
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_navigation import (
+    BodyAttitude,
+    InertialNavigation,
+    Reckoned,
+)
+from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
+from companion.estimation.optical_flow import FlowMeter
 from companion.estimation.resumption import Resumption, Verdict
 from companion.estimation.segment_georeference import SegmentGeoreferences
 from companion.estimation.smooth_odometry import (
-    SIGMA_DEAD_RECKONING_M_S,
-    BodyAttitude,
     MapView,
     SmoothOdometry,
 )
+from companion.estimation.standing import Standing
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
@@ -42,15 +47,11 @@ from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.map_part import map_of, part_around
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
-from companion.telemetry import AttitudeSample, ImuSample, Telemetry, is_believed
+from companion.telemetry import AttitudeSample, HeightSample, ImuSample, Telemetry, is_believed
 from companion.timing.clock import Timer
 
 FINAL_ITERATIONS = 8
 """Iterations of the final global adjustment; 4 and 16 give the sample flight within 0.1 mm."""
-MIN_DEAD_RECKONING_NS = 150_000_000
-MAX_DEAD_RECKONING_NS, MAX_DEAD_RECKONING_NO_ATTITUDE_NS = 4_000_000_000, 400_000_000
-"""Longest dead reckoning without tracking, with and without attitude."""
-SIGMA_DEAD_RECKONING_RAD_S = np.radians(0.2)
 TELEMETRY_KEPT_NS = 600_000_000_000
 """Older telemetry is only needed at the times of keyframes."""
 PRUNE_PERIOD_NS = 60_000_000_000
@@ -76,18 +77,19 @@ class LocalisationStage:
         self._times = times
         self._tracker = Tracker(config, camera, times, background, order)
         self._attitude = CameraAttitude(camera.body_from_camera)
-        self._motion = MotionFilter()
+        self._motion = CameraMotion()
         self._georeferencer = Georeferencer(
             config.georeference, camera.body_from_camera, sensors_only=config.feedback.mode != "off"
         )
         self._acceleration = AccelerationIntegral()
         self._navigation = InertialNavigation(self._acceleration)
+        self._standing = Standing()
         self._odometry = SmoothOdometry(camera, config.feedback.max_jump_m, self._navigation)
         self._georeferences = SegmentGeoreferences(
             self._georeferencer, self._attitude, self._acceleration, camera.body_from_camera
         )
-        self._last: Track | None = None
-        """The last frame with a pose, in the frame of the active segment."""
+        self._imu = JudgedAcceleration(self._acceleration, self._withdraw_accelerations)
+        self._flow = FlowMeter(camera)
         self._t_ns = 0
         self._samples: list[Telemetry] = []
         """Telemetry since the last frame: taken with the next, while nothing is mapped."""
@@ -135,8 +137,12 @@ class LocalisationStage:
         for sample in self._samples:
             if not is_believed(sample, self._config.telemetry.use):
                 continue
+            self._standing.take(sample)
+            self._flow.take(sample)
+            if isinstance(sample, HeightSample):
+                self._odometry.take_height(sample.t_ns, sample.height_m, self._standing.armed)
             if isinstance(sample, AttitudeSample | ImuSample):
-                self._acceleration.take(sample)
+                self._imu.take(sample)
             if isinstance(sample, AttitudeSample):
                 self._attitude.add(sample)
             else:
@@ -154,7 +160,7 @@ class LocalisationStage:
         A copy. None while a stored map is being verified, and with a scale while attitude, needed
         for verification, is missing.
         """
-        last, segment = self._last, self._tracker.map
+        last, segment = self._motion.last, self._tracker.map
         if self._resumption is not None or last is None or last.map_from_camera is None:
             return None
         if last.t_ns != self._t_ns or self.state is not TrackState.TRACKING:
@@ -210,16 +216,32 @@ class LocalisationStage:
                 frame.t_ns, frame.seq, self._n_samples, self._tracker.map_lock.point,
                 self._tracker.feature_ratio,
             )  # fmt: skip
+        yield from self._flow_of(frame)
+
+    def _flow_of(self, frame: Frame) -> Iterator[Message]:
+        """Optical flow for the autopilot, and for the way from a lift-off to a metric map."""
+        asked, wanted = self._config.feedback.flow != "off", self._odometry.wants_flow(frame.t_ns)
+        if not asked and not wanted:
+            return
+        with self._times("optical flow"):
+            flow = self._flow.step(frame, self._attitude)
+        if wanted and self._flow.over_ground is not None:
+            self._odometry.take_flow(self._flow.over_ground, self._attitude.correction[1])
+        if asked:
+            yield flow
 
     def _tracked(self, frame: Frame) -> Iterator[Message]:
         self._t_ns = frame.t_ns
         self._take_samples()
         attitude = self._attitude.at(frame.t_ns)
         self._apply_map_correction()
-        reckoned = self._odometry.begin(frame.t_ns, self._body_attitude(frame.t_ns))
+        stands = not self._georeferencer.has_positions and self._standing.at(frame.t_ns, frame.grey)
+        if stands and self.state is TrackState.INITIALISING:
+            self._tracker.stand()
+        reckoned = self._odometry.begin(frame.t_ns, self._body_attitude(frame.t_ns), stands)
         predicted = self._predicted(frame.t_ns, attitude, reckoned)
         before = self._tracker.map
-        aligned = predicted is not None and attitude is not None and self._motion.aligned
+        aligned = predicted is not None and attitude is not None and self._motion.filter.aligned
         rotation_in_map = predicted.rotation if predicted is not None and aligned else None
         tracked = self._tracker.step(frame, Prior(predicted, attitude, rotation_in_map))
         other_map = self._tracker.map is not before
@@ -232,15 +254,18 @@ class LocalisationStage:
                 measured = self._attitude.at(message.t_ns)
                 if message.seq == frame.seq or measured is not None:
                     # angular rates are held without attitude; those of backfilled frames are rough
-                    self._motion.correct(message.t_ns, message.map_from_camera, measured)
+                    self._motion.filter.correct(message.t_ns, message.map_from_camera, measured)
                 self._attitude.compare(message, message.map_from_camera.rotation)
                 if message.seq == frame.seq:
-                    self._last = message
+                    self._motion.last = message
                     yield self._odometry_of(message)
                 placed = self._georeferences.main_from_newest.apply_to_pose(message.map_from_camera)
                 yield replace(message, map_from_camera=placed)
             elif isinstance(message, Track):
-                dead_reckoned = self._dead_reckoned(message, predicted)
+                dead_reckoned = self._motion.dead_reckoned(
+                    message, predicted, self._georeferences.of(self._tracker.map),
+                    self._attitude.at(message.t_ns) is not None,
+                )  # fmt: skip
                 yield self._odometry_of(dead_reckoned or message)
                 yield (
                     message
@@ -256,6 +281,7 @@ class LocalisationStage:
             yield update
         if self._resumption is not None:
             yield from self._check_resumption(self._resumption, frame.t_ns)
+        yield from self._imu.warnings()
         yield from self._check_attitude(frame.t_ns)
         self._prune(frame.t_ns)
 
@@ -272,7 +298,9 @@ class LocalisationStage:
 
     def _check_resumption(self, resumption: Resumption, t_ns: int) -> Iterator[MapUpdate | Warned]:
         """Verify the stored map; resume or drop it."""
-        last = self._last if self._last is not None and self._last.t_ns == t_ns else None
+        last = self._motion.last
+        if last is not None and last.t_ns != t_ns:
+            last = None
         kept, segment = resumption.kept, self._tracker.map
         in_use = segment.first_keyframe_id == kept.part.first_keyframe_id
         verdict = Verdict.REFUSED
@@ -300,7 +328,6 @@ class LocalisationStage:
         """Clear motion state after another map became active."""
         self._motion.reset()
         self._attitude.reset()
-        self._last = None
 
     def _map_update(self) -> MapUpdate:
         with self._times("georeference"):
@@ -308,64 +335,22 @@ class LocalisationStage:
 
     def _apply_map_correction(self) -> None:
         """Move the motion state with corrections of the map."""
-        last, segment = self._last, self._tracker.map
-        if last is None or last.keyframe_id is None or last.map_from_camera is None:
-            return
-        camera_from_map = segment.pose_of(last.keyframe_id)
-        relative = last.keyframe_from_camera
-        if camera_from_map is None or relative is None:
-            return
-        unit = segment.unit_of.get(last.keyframe_id, 1.0)
-        inside = Pose(relative.rotation, unit * relative.translation)
-        now = camera_from_map.inverse() @ inside
-        if np.array_equal(now.translation, last.map_from_camera.translation):
-            return
-        self._motion.correct_map(last.map_from_camera, now)
-        self._odometry.correct_map(now)
-        self._last = replace(last, map_from_camera=now)
+        now = self._motion.follow(self._tracker.map)
+        if now is not None:
+            self._odometry.correct_map(now)
 
     def _predicted(
         self, t_ns: int, attitude: Array | None, reckoned: Reckoned | None
     ) -> Pose | None:
-        """Predicted pose in the active segment; None when unknown.
+        """Predicted pose in the active segment; None when unknown."""
 
-        Constant velocity between frames; over longer spans inertial navigation, else the velocity
-        of the autopilot.
-        """
-        predicted, last = self._motion.predict(t_ns, attitude), self._last
-        if predicted is None or last is None or last.map_from_camera is None:
-            return predicted
-        placed = self._georeferences.of(self._tracker.map)
-        if placed is None or t_ns - last.t_ns < MIN_DEAD_RECKONING_NS:
-            return predicted
-        if reckoned is not None:
-            place = self._odometry.place_in_map(reckoned.place_m, predicted.rotation)
-            return predicted if place is None else Pose(predicted.rotation, place)
-        moved_m = self._georeferencer.displacement_by_velocity(last.t_ns, t_ns)
-        if moved_m is None:
-            return predicted
-        to_map = placed.world_from_map.inverse()
-        moved = to_map.scale * to_map.rotation @ moved_m
-        return Pose(predicted.rotation, last.map_from_camera.translation + moved)
+        def place_of(rotation: Array) -> Array | None:
+            assert reckoned is not None
+            return self._odometry.place_in_map(reckoned.place_m, rotation)
 
-    def _dead_reckoned(self, track: Track, predicted: Pose | None) -> Track | None:
-        """Dead-reckoned track of a lost frame; None where too uncertain."""
-        placed = self._georeferences.of(self._tracker.map)
-        last = self._last
-        if track.state is not TrackState.LOST or None in (predicted, placed, last):
-            return None
-        assert last is not None
-        assert placed is not None
-        lost_ns = track.t_ns - last.t_ns
-        attitude = self._attitude.at(track.t_ns) is not None
-        if lost_ns > (MAX_DEAD_RECKONING_NS if attitude else MAX_DEAD_RECKONING_NO_ATTITUDE_NS):
-            return None
-        sigma_m = SIGMA_DEAD_RECKONING_M_S * lost_ns * 1e-9
-        return replace(
-            track, state=TrackState.DEAD_RECKONING, map_from_camera=predicted,
-            sigma_position=last.sigma_position + sigma_m / placed.world_from_map.scale,
-            sigma_rotation_rad=last.sigma_rotation_rad
-            + SIGMA_DEAD_RECKONING_RAD_S * lost_ns * 1e-9,
+        return self._motion.predicted(
+            t_ns, attitude, self._georeferences.of(self._tracker.map),
+            None if reckoned is None else place_of, self._georeferencer.displacement_by_velocity,
         )  # fmt: skip
 
     def _odometry_of(self, track: Track) -> Odometry:
@@ -374,7 +359,7 @@ class LocalisationStage:
         first = segment.keyframes.get(segment.first_keyframe_id)
         return self._odometry.step(
             track, segment.first_keyframe_id, self._georeferences.of(segment),
-            self._motion.velocity,
+            self._motion.filter.velocity,
             None if first is None else MapView(first.t_ns, first.camera_from_map.inverse()),
         )  # fmt: skip
 
@@ -402,20 +387,23 @@ class LocalisationStage:
         if checked.now_from_before is not None:
             self._correct_attitudes(checked.now_from_before)
         if checked.before_from_now_ned is not None:
-            self._motion.correct_attitude(checked.before_from_now_ned)
+            self._motion.filter.correct_attitude(checked.before_from_now_ned)
         if checked.invalid_since_ns is not None:
             self._invalidate_attitudes(checked.invalid_since_ns)
         if checked.reinitialise:
             self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)
-            self._motion.reset()
-            self._attitude.reset()
-            self._navigation.reset()
-            self._last = None
+            self._reset_motion()
+            self._odometry.discard_map(segment.first_keyframe_id)
         return checked.warnings
+
+    def _withdraw_accelerations(self, since_ns: int) -> None:
+        """Forget what accelerations since a time gave: they were wrong."""
+        self._navigation.forget()
+        self._georeferences.withdraw_accelerations(since_ns)
 
     def _invalidate_attitudes(self, since_ns: int) -> None:
         """Clear attitudes of keyframes since a time, which were not those of the camera."""
-        self._motion.discard_alignment()
+        self._motion.filter.discard_alignment()
         for segment in self._tracker.segments:
             for keyframe in segment.keyframes.values():
                 if keyframe.t_ns >= since_ns:

@@ -254,7 +254,8 @@ class PoseGate:
         if odometry.state is TrackState.INITIALISING:
             return INITIALISING
         bridging = odometry.inertial and self.sending
-        if odometry.state is not TrackState.TRACKING and not bridging:
+        seen = odometry.state in (TrackState.TRACKING, TrackState.STANDING)
+        if not seen and not bridging:
             return LOST
         if pose is None or velocity is None:
             return NO_SCALE if self._accepted is None else LOST
@@ -262,9 +263,7 @@ class PoseGate:
         if not np.isfinite(numbers).all() or np.abs(pose.translation).max() > MAX_EXTENT_M:
             return UNCERTAIN
         hysteresis = 1.0 if self.sending else HYSTERESIS
-        # a scale that is off shortens all ways alike, and no place where the body stands
-        sigma_m = np.sqrt(odometry.sigma_position_m**2 - odometry.sigma_by_scale_m**2)
-        if not sigma_m <= hysteresis * self._config.max_sigma_m:
+        if not _sigma_place_m(odometry) <= hysteresis * self._config.max_sigma_m:
             return UNCERTAIN
         if not odometry.sigma_scale <= hysteresis * MAX_SIGMA_SCALE:
             return SCALE_UNCERTAIN
@@ -322,7 +321,7 @@ class PoseGate:
     def _predicted(self, accepted: Odometry, ahead_ns: int) -> PoseToSend | None:
         """A pose extrapolated by velocity, and rotated by measured attitude.
 
-        None where the attitude is unknown.
+        None where the attitude is unknown, or the pose too uncertain by then.
         """
         before, now = self._attitude.at(accepted.t_ns), self._attitude.at(accepted.t_ns + ahead_ns)
         if before is None or now is None:
@@ -331,8 +330,12 @@ class PoseGate:
         pose = replace(self._pose_of(accepted), t_ns=accepted.t_ns + ahead_ns, predicted=True)
         rotation = pose.world_from_body.rotation @ before.T @ now
         ahead_s = ahead_ns * 1e-9
+        grown_m = pose.sigma_velocity_m_s * ahead_s
+        if not np.hypot(_sigma_place_m(accepted), grown_m) <= self._config.max_sigma_m:
+            self._last_rejection = self._last_rejection or UNCERTAIN
+            return None
         position = pose.world_from_body.translation + pose.velocity_world_m_s * ahead_s
-        sigma_m = float(np.hypot(pose.sigma_position_m, pose.sigma_velocity_m_s * ahead_s))
+        sigma_m = float(np.hypot(pose.sigma_position_m, grown_m))
         return replace(pose, world_from_body=Pose(rotation, position), sigma_position_m=sigma_m)
 
     def _stamped(self, pose: PoseToSend) -> PoseToSend | None:
@@ -341,3 +344,11 @@ class PoseGate:
             return None
         self._last_stamp_ns = pose.t_ns
         return pose
+
+
+def _sigma_place_m(odometry: Odometry) -> float:
+    """Standard deviation of the place apart from the scale.
+
+    A scale that is off shortens all ways alike, and no place where the body stands.
+    """
+    return float(np.sqrt(odometry.sigma_position_m**2 - odometry.sigma_by_scale_m**2))

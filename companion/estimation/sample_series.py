@@ -58,6 +58,10 @@ class SampleSeries:
         self._times[:n], self._values[:n] = times[keep], self._values[: self._n][keep]
         self._n = n
 
+    def drop_since(self, t_ns: int) -> None:
+        """Drop samples from a time on."""
+        self._n = int(np.searchsorted(self._times[: self._n], t_ns))
+
     def at(self, t_ns: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Interpolated values, and a mask of times with samples near enough on both sides."""
         times, values = self._times[: self._n], self._values[: self._n]

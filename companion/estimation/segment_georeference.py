@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.georeference import AlignmentSample, Georeferencer, place_new_map
 from companion.estimation.height_above_ground import HeightAboveGround
-from companion.estimation.inertial_scale import InertialScale, settled
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_scale import InertialScale, settled
+from companion.estimation.inertial.judged_acceleration import ByAcceleration
 from companion.estimation.smooth_odometry import BodyPlace
 from companion.estimation.trajectory_alignment import (
     DISAGREE,
@@ -60,6 +61,7 @@ class SegmentGeoreferences:
         self._main: int | None = None
         self._revision = 0
         self._acceleration = acceleration
+        self._by_acceleration = ByAcceleration()
         self._inertial: dict[int, InertialScale] = {}
         """By first keyframe of a segment, as is:"""
         self._spaced: dict[int, list[tuple[int, int]]] = {}
@@ -113,6 +115,7 @@ class SegmentGeoreferences:
                     self._inertial_scale(segment, final),
                 )
                 if found is not None:
+                    self._by_acceleration.note(t_ns, segment.first_keyframe_id, self._known, found)
                     self._known[segment.first_keyframe_id] = self._more_certain(segment, found)
         main = self._main_of(segments, final)
         anchor = self.of(main)
@@ -170,10 +173,23 @@ class SegmentGeoreferences:
             return AlignmentSample(t_ns, pose.inverse(), attitude)
 
         lever_m, delay_ns = mount.rotation.T @ mount.translation, self._attitude.correction[1]
-        if final:
-            return settled(len(spaced), sample_at, self._acceleration, lever_m, delay_ns)
-        estimate = self._inertial.setdefault(key, InertialScale(lever_m))
-        return estimate.update(len(spaced), sample_at, self._acceleration, delay_ns)
+        begun = self._begun_by_navigation(segment, next(iter(segment.keyframes.values())))
+        start = None if begun is None else begun[0].start
+        if final and self._acceleration.believed:
+            return settled(len(spaced), sample_at, self._acceleration, lever_m, delay_ns, start)
+        estimate = self._inertial.get(key)
+        if estimate is None:
+            estimate = self._inertial[key] = InertialScale(lever_m, start)
+        found = estimate.update(len(spaced), sample_at, self._acceleration, delay_ns)
+        return found if self._acceleration.believed else None
+
+    def withdraw_accelerations(self, since_ns: int) -> None:
+        """Take back what accelerations since a time gave; scales begin anew with those before."""
+        self._by_acceleration.withdraw(since_ns, self._known)
+        self._inertial.clear()
+        late = [k for k, (start, _) in self._reckoned.items() if start.t_ns >= since_ns]
+        for key in late:
+            del self._reckoned[key]
 
     def displacements_of(
         self, segment: SlamMap, keyframes: list[Keyframe]
@@ -287,6 +303,8 @@ class SegmentGeoreferences:
         """
         key = segment.first_keyframe_id
         if key not in self._reckoned:
+            if first.keyframe_id != key:
+                return None  # a later one that is left may have aided the navigation
             last = max(segment.keyframes.values(), key=lambda k: k.t_ns)
             start, end = self.reckoned_world(first.t_ns), self.reckoned_world(last.t_ns)
             if start is None or end is None or last is first:
@@ -294,7 +312,8 @@ class SegmentGeoreferences:
             samples = self._samples(segment, [first, last])
             levers = [self._georeferencer.lever_of(sample) for sample in samples]
             moved_m = end.place_world_m + levers[1] - start.place_world_m - levers[0]
-            sigma_m = end.sigma_velocity_m_s * (last.t_ns - first.t_ns) * 1e-9
+            sigma_m_s = float(np.sqrt(np.diag(end.start.covariance)[:3].max()))
+            sigma_m = sigma_m_s * (last.t_ns - first.t_ns) * 1e-9
             from_m = start.place_world_m + levers[0]
             placed = place_new_map(samples, from_m, moved_m, sigma_m, "accelerometers")
             self._reckoned[key] = start, placed

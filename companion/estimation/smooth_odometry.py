@@ -11,19 +11,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimation.inertial_navigation import AidedPlace, InertialNavigation, Reckoned
+from companion.estimation.ground_aiding import SIGMA_STANDING_M_S, GroundAiding
+from companion.estimation.inertial.inertial_motion import InertialStart
+from companion.estimation.inertial.inertial_navigation import (
+    AidedPlace,
+    BodyAttitude,
+    InertialNavigation,
+    Reckoned,
+)
+from companion.estimation.innovation_gate import MIN_CONSISTENT_NS, InnovationGate
+from companion.estimation.odometry_drift import OdometryDrift
+from companion.estimation.odometry_frame import OdometryFrame
+from companion.estimation.optical_flow import GroundVelocity
+from companion.estimation.trajectory_alignment import SIGMA_YAW_RAD
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose, yaw_rotation
+from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
 
-MAX_SLEW_M_S = 0.15
-MAX_SLEW_RAD_S = np.radians(0.5)
-MAX_ACCELERATION_M_S2 = 4.0
-MIN_CONSISTENT_NS, MIN_CONSISTENT_FRAMES = 500_000_000, 3
-"""Poses outside the innovation gate are accepted, as a reset, after agreeing with each other for so
-long: longer than any gap bridged (feedback.max_gap_ms is at most 300), at any frame rate; and never
-with fewer frames."""
-DRIFT_WINDOW_NS = 10_000_000_000
 SIGMA_DEAD_RECKONING_M_S = 0.3
 """Standard deviation of the velocity used in dead reckoning."""
 MAX_SIGMA_RECKONED_M = 5.0
@@ -35,53 +39,10 @@ MAX_SIGMA_SCALE_AIDING = 0.05
 SIGMA_RECKONED_RAD = np.radians(1.0)
 """Of the autopilot's attitude over some seconds."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
-SIGMA_DRIFT = 0.005
-"""Ratio of path length: drift of a map before adjustment."""
 NOISE_INFLATION = 3.0
 """Inflation for correlated errors of the matches of one image."""
 FULL_COUNT = 150
 GRID = 4
-
-
-class _PathPoint(NamedTuple):
-    """Position, path length, and accumulated slew correction at a time."""
-
-    t_ns: int
-    position: Array
-    path_length_m: float
-    slewed: Array
-
-
-class _Drift(NamedTuple):
-    """Standard deviations, m: by scale, by the map's drift, and by slew corrections.
-
-    The last moved the pose but not the body.
-    """
-
-    by_scale_m: float
-    by_map_m: float
-    by_slew_m: float
-
-
-class _RejectedPoses(NamedTuple):
-    """Poses outside the innovation gate since the last accepted one.
-
-    The newest `n` of them, from `agreed_since_ns` to `t_ns`, agree with each other; the newest is
-    at `position`.
-    """
-
-    since_ns: int
-    agreed_since_ns: int
-    t_ns: int
-    position: Array
-    n: int
-
-
-class BodyAttitude(NamedTuple):
-    """Attitude `ned_from_body` (3, 3) of a frame, at its time by the autopilot's stamps."""
-
-    t_ns: int
-    ned_from_body: Array
 
 
 class MapView(NamedTuple):
@@ -92,11 +53,11 @@ class MapView(NamedTuple):
 
 
 class BodyPlace(NamedTuple):
-    """Place (3,) of the body by inertial navigation, world NED, metres; sigma of its velocity."""
+    """Place (3,) of the body by inertial navigation, world NED, metres; its motion by the same."""
 
     t_ns: int
     place_world_m: Array
-    sigma_velocity_m_s: float
+    start: InertialStart
 
 
 class OdometryState(NamedTuple):
@@ -120,25 +81,24 @@ class SmoothOdometry:
         mount = camera.body_from_camera
         self._camera_from_body = mount.inverse() if mount is not None else Pose.identity()
         self._size = np.array([camera.width, camera.height], np.float64)
-        self._max_jump_m = max_jump_m
+        self._gate = InnovationGate(max_jump_m)
+        self._drift = OdometryDrift()
         self._navigation = navigation
-        self._owed_m = np.zeros(3)
-        """Of the last reacquisition, not slewed yet."""
         self._attitude: BodyAttitude | None = None
         self._reckoned: Reckoned | None = None
         """Attitude of the frame that has begun, and where inertial navigation has the body."""
         self._reckoned_world: deque[BodyPlace] = deque(maxlen=MAX_RECKONED_PLACES)
         self._segment: int | None = None
         self._georeference: Georeference | None = None
-        self._odometry_from_world = Pose.identity()
+        self._frame = OdometryFrame()
         self._last: tuple[int, Pose, Pose] | None = None
         """Time, `map_from_camera` and `odometry_from_body` of the last accepted frame."""
-        self._anchored = False
         self._velocity = np.zeros(3)
-        self._rejected: _RejectedPoses | None = None
         self._dead_reckoning = False
-        self._path: deque[_PathPoint] = deque()
-        self._slewed = np.zeros(3)
+        self._given = False
+        """True once a pose was given out."""
+        self._ground = GroundAiding(navigation)
+        self._map_aided_ns: int | None = None
         self.reset_counter = 0
 
     def step(
@@ -155,11 +115,25 @@ class SmoothOdometry:
         `velocity_map` the camera velocity in it with its standard deviation, and `first` its first
         view.
         """
+        found = (
+            self._standing(track)
+            if self._ground.stood is not None
+            else self._of_map(track, segment, georeference, velocity_map, first)
+        )
+        self._given = self._given or found.world_from_body is not None
+        return found
+
+    def _of_map(
+        self, track: Track, segment: int, georeference: Georeference | None,
+        velocity_map: tuple[Array, float] | None, first: MapView | None,
+    ) -> Odometry:  # fmt: skip
         pose = track.map_from_camera
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None or georeference is None:
             return self._unknown(track)
         if segment != self._segment or self._georeference is None:
+            if self._reckoned is not None and georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING:
+                return self._unknown(track)  # it would also be slower and faster than the body
             self._start_map(segment, georeference, pose, first)
         elif georeference is not self._georeference:
             self._update_georeference(georeference)
@@ -170,28 +144,28 @@ class SmoothOdometry:
             return self._dead_reckon(track, raw)
         if self._dead_reckoning:
             self._reacquire(raw, track.t_ns)
-        before = self._odometry_from_world, self._slewed
-        here = self._odometry_from_world @ raw
-        self._slew(raw, track.t_ns)
-        placed = self._odometry_from_world @ raw
-        within_gate = self._within_gate(placed, track.t_ns)
-        if not within_gate and not self._consistent(placed, track.t_ns):
-            self._odometry_from_world, self._slewed = before
+        frame = self._frame
+        here = frame.from_world @ raw
+        if self._last is not None:
+            frame = frame.slewed(raw, min((track.t_ns - self._last[0]) * 1e-9, 1.0))
+        placed = frame.from_world @ raw
+        within_gate = self._last is None or self._gate.reachable(
+            self._last[2].translation, placed.translation, track.t_ns - self._last[0],
+            self._velocity,
+        )  # fmt: skip
+        if not within_gate and not self._gate.agree(placed.translation, track.t_ns, self._velocity):
             return self._unknown(track)
-        rejected_ns = track.t_ns - self._rejected.since_ns if self._rejected is not None else 0
-        if not within_gate or rejected_ns >= MIN_CONSISTENT_NS:
+        self._frame = frame
+        if not within_gate or self._gate.refused_ns(track.t_ns) >= MIN_CONSISTENT_NS:
             self.reset_counter += 1
-            self._path.clear()
+            self._drift.clear()
             self._navigation.reset()
-        self._rejected = None
+        self._gate.clear()
         sigma_velocity = float("inf")
         if velocity_map is not None:
             to_world = georeference.world_from_map
             self._velocity = (
-                self._odometry_from_world.rotation
-                @ to_world.rotation
-                @ velocity_map[0]
-                * to_world.scale
+                frame.from_world.rotation @ to_world.rotation @ velocity_map[0] * to_world.scale
             )
             sigma_velocity = velocity_map[1] * to_world.scale
         if self._reckoned is not None and self._reckoned.sigma_velocity_m_s < sigma_velocity:
@@ -206,7 +180,10 @@ class SmoothOdometry:
         if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
             turned = placed.rotation @ attitude.ned_from_body.T
             self._navigation.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
-        drift = self._drift_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
+            self._map_aided_ns = track.t_ns
+        drift = self._drift.add(
+            track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m
+        )
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter, self._quality(track), placed,
             self._velocity.copy(),
@@ -217,44 +194,35 @@ class SmoothOdometry:
             sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
 
-    def _sigma_yaw_rad(self, georeference: Georeference, noise_rad: float) -> float:
+    def _sigma_yaw_rad(self, georeference: Georeference | None, noise_rad: float) -> float:
         """Standard deviation of the heading against north.
 
-        Of the georeference, of the difference to it that is not slewed yet, and noise.
+        Of the georeference, of the difference to it that is not slewed yet, and noise; before there
+        is one, of the autopilot's heading.
         """
-        apart_rad = _yaw(self._odometry_from_world.rotation)
-        return float(np.linalg.norm([FLOOR_RAD, noise_rad, georeference.sigma_yaw_rad, apart_rad]))
+        sigma_rad = float(SIGMA_YAW_RAD) if georeference is None else georeference.sigma_yaw_rad
+        return float(np.linalg.norm([FLOOR_RAD, noise_rad, sigma_rad, self._frame.yaw_rad]))
 
-    def _drift_sigma_m(self, t_ns: int, position: Array, sigma_scale: float) -> _Drift:
-        """Drift standard deviations over the last seconds, along each axis."""
-        path_length_m = 0.0
-        if self._path:
-            path_length_m = self._path[-1].path_length_m + float(
-                np.linalg.norm(position - self._path[-1].position)
-            )
-        self._path.append(_PathPoint(t_ns, position, path_length_m, self._slewed))
-        while self._path[0].t_ns < t_ns - DRIFT_WINDOW_NS:
-            self._path.popleft()
-        since = self._path[0]
-        return _Drift(
-            sigma_scale * float(np.linalg.norm(position - since.position)),
-            SIGMA_DRIFT * (path_length_m - since.path_length_m),
-            float(np.linalg.norm(self._slewed - since.slewed)) / np.sqrt(3.0),
-        )
-
-    def begin(self, t_ns: int, attitude: BodyAttitude | None) -> Reckoned | None:
+    def begin(
+        self, t_ns: int, attitude: BodyAttitude | None, standing: bool = False
+    ) -> Reckoned | None:
         """Go on by inertial navigation to the next frame, with its attitude where that is known.
 
         Where the body should be then, in the frame of the odometry; None where unknown, or too
-        uncertain to be of use.
+        uncertain to be of use. `standing` where the vehicle stands on the ground.
         """
+        if standing and attitude is not None:
+            self._ground.stand(attitude.t_ns, self._place_now())
+        else:
+            at_ns = t_ns if attitude is None else attitude.t_ns
+            self._ground.fly(at_ns, float(self._place_now()[2]), self.wants_flow(t_ns))
         found = None if attitude is None else self._navigation.at(attitude.t_ns)
         if found is not None and found.sigma_place_m > MAX_SIGMA_RECKONED_M:
             found = None
         self._attitude, self._reckoned = attitude, found
         if found is not None:
-            world_m = self._odometry_from_world.inverse().apply(found.place_m)
-            place = BodyPlace(t_ns, np.asarray(world_m), found.sigma_velocity_m_s)
+            world_m = self._frame.from_world.inverse().apply(found.place_m)
+            place = BodyPlace(t_ns, np.asarray(world_m), found.start._replace(t_ns=t_ns))
             self._reckoned_world.append(place)
         return found
 
@@ -265,7 +233,7 @@ class SmoothOdometry:
     def _dead_reckon(self, track: Track, raw: Pose) -> Odometry:
         """Odometry by dead reckoning: of lowest quality and growing uncertainty."""
         assert track.map_from_camera is not None
-        placed = self._odometry_from_world @ raw
+        placed = self._frame.from_world @ raw
         if self._last is not None:
             dt_s = max((track.t_ns - self._last[0]) * 1e-9, 1e-3)
             self._velocity = (placed.translation - self._last[2].translation) / dt_s
@@ -291,11 +259,9 @@ class SmoothOdometry:
         expected = self._last[2].translation + self._velocity * ((t_ns - self._last[0]) * 1e-9)
         if self._reckoned is not None:
             expected = self._reckoned.place_m
-        correction = expected - (self._odometry_from_world @ raw).translation
-        if float(np.linalg.norm(correction)) < self._max_jump_m:
-            before = self._odometry_from_world
-            self._odometry_from_world = Pose(before.rotation, before.translation + correction)
-            self._owed_m = self._owed_m - correction
+        correction = expected - (self._frame.from_world @ raw).translation
+        if float(np.linalg.norm(correction)) < self._gate.max_jump_m:
+            self._frame = self._frame.shifted(correction)
 
     def place_in_map(self, place_m: Array, map_from_camera: Array) -> Array | None:
         """Place of the camera (3,) in the active map, for a place (3,) of the body.
@@ -306,31 +272,69 @@ class SmoothOdometry:
         if self._georeference is None:
             return None
         to_world = self._georeference.world_from_map
-        world_m = self._odometry_from_world.inverse().apply(place_m)
+        world_m = self._frame.from_world.inverse().apply(place_m)
         lever_m = to_world.rotation @ map_from_camera @ self._camera_from_body.translation
         return np.asarray(to_world.inverse().apply(world_m - lever_m))
 
     def _unknown(self, track: Track) -> Odometry:
         """Odometry without a pose by the map: by inertial navigation, as far as that knows it."""
         attitude, reckoned = self._attitude, self._reckoned
-        if attitude is None or reckoned is None or self._georeference is None:
+        if attitude is None or reckoned is None:
             return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
         rotation = self._navigation.world_from_attitude @ attitude.ned_from_body
         placed, self._velocity = Pose(rotation, reckoned.place_m), reckoned.velocity_m_s
         self._dead_reckoning = True
         georeference = self._georeference
-        if self._last is not None:
-            camera = self._odometry_from_world.inverse() @ placed @ self._camera_from_body.inverse()
+        sigma_scale = 0.0 if georeference is None else georeference.sigma_scale
+        if self._last is not None and georeference is not None:
+            camera = self._frame.from_world.inverse() @ placed @ self._camera_from_body.inverse()
             pose = georeference.world_from_map.inverse().apply_to_pose(camera)
             self._last = (track.t_ns, pose, placed)
-        drift = self._drift_sigma_m(track.t_ns, placed.translation, georeference.sigma_scale)
+        drift = self._drift.add(track.t_ns, placed.translation, sigma_scale, self._frame.slewed_m)
         return Odometry(
             track.seq, track.t_ns, TrackState.DEAD_RECKONING, self.reset_counter, 1, placed,
             reckoned.velocity_m_s,
             float(np.linalg.norm([FLOOR_M, reckoned.sigma_place_m, *drift])),
             reckoned.sigma_velocity_m_s, float(SIGMA_RECKONED_RAD),
             self._sigma_yaw_rad(georeference, float(SIGMA_RECKONED_RAD)), inertial=True,
-            sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
+            sigma_scale=sigma_scale, sigma_by_scale_m=drift.by_scale_m,
+        )  # fmt: skip
+
+    def wants_flow(self, t_ns: int) -> bool:
+        """True at a frame from a lift-off until a map has a scale."""
+        return self._ground.wants_flow(self._map_aided_ns, t_ns)
+
+    def take_height(self, t_ns: int, height_m: float, rotors: bool) -> None:
+        """Take a barometric height, which aids from the ground until a map has a scale.
+
+        `rotors` where they may turn.
+        """
+        self._ground.take_height(t_ns, height_m, rotors)
+
+    def take_flow(self, measured: GroundVelocity, delay_ns: int) -> None:
+        """Aid inertial navigation by flow over the ground that the vehicle has lifted off.
+
+        Autopilot stamps are late by `delay_ns`.
+        """
+        self._ground.take_flow(measured, delay_ns)
+
+    def _place_now(self) -> Array:
+        """Place (3,) of the body as far as it is known: where it begins, if not at all."""
+        if self._reckoned is not None:
+            return self._reckoned.place_m
+        return np.zeros(3) if self._last is None else self._last[2].translation
+
+    def _standing(self, track: Track) -> Odometry:
+        """Odometry of a vehicle that stands on the ground: at a fixed place, as the attitude is."""
+        attitude, fixed = self._attitude, self._ground.stood
+        assert attitude is not None
+        assert fixed is not None
+        placed = Pose(fixed.world_from_attitude @ attitude.ned_from_body, fixed.place_m)
+        self._velocity, self._dead_reckoning = np.zeros(3), True
+        return Odometry(
+            track.seq, track.t_ns, TrackState.STANDING, self.reset_counter, 100, placed,
+            np.zeros(3), FLOOR_M, SIGMA_STANDING_M_S, float(SIGMA_RECKONED_RAD),
+            self._sigma_yaw_rad(self._georeference, float(SIGMA_RECKONED_RAD)),
         )  # fmt: skip
 
     def _raw(self, georeference: Georeference, map_from_camera: Pose) -> Pose:
@@ -340,31 +344,49 @@ class SmoothOdometry:
     def _start_map(
         self, segment: int, georeference: Georeference, pose: Pose, first: MapView | None
     ) -> None:
-        """Start in another map, or the first one; poses are unrelated to the last.
+        """Start in another map, or the first one.
 
-        A map without an origin continues from where inertial navigation had the body at its first
-        view, else from the last known position.
+        A map without an origin goes on from where inertial navigation had the body at its first
+        view, else from the last known position; without a jump where that is close to where
+        inertial navigation has the body now. All else is a reset: its poses are unrelated.
         """
-        offset = np.zeros(3)
-        if self._last is not None:
-            self.reset_counter += 1
-            reckoned = None if first is None else self.reckoned_world(first.t_ns)
-            if georeference.has_origin:
+        began = None if first is None else self.reckoned_world(first.t_ns)
+        raw, before = self._raw(georeference, pose), self._frame
+        turn, offset, owed_m, continuous = np.eye(3), np.zeros(3), np.zeros(3), False
+        if not georeference.has_origin and first is not None and began is not None:
+            turn = self._heading_reckoned(raw)
+            raw_first = self._raw(georeference, first.map_from_camera)
+            offset = before.from_world.apply(began.place_world_m) - turn @ raw_first.translation
+            if self._reckoned is not None:
+                owed_m = turn @ raw.translation + offset - self._reckoned.place_m
+                continuous = float(np.linalg.norm(owed_m)) < self._gate.max_jump_m
+        elif not georeference.has_origin and self._last is not None:
+            offset = self._last[2].translation - raw.translation
+        if not continuous:
+            self.reset_counter += self._given
+            self._drift.clear()
+            if self._last is not None and georeference.has_origin:
                 self._navigation.reset()
-            elif first is not None and reckoned is not None:
-                place_m = self._odometry_from_world.apply(reckoned.place_world_m)
-                offset = place_m - self._raw(georeference, first.map_from_camera).translation
-            else:
-                offset = self._last[2].translation - self._raw(georeference, pose).translation
+        self._frame = OdometryFrame(
+            Pose(turn, offset), georeference.has_origin, slewed_m=before.slewed_m
+        )
+        if continuous:
+            self._frame = self._frame.shifted(-owed_m)
         self._reckoned_world.clear()
-        self._owed_m = np.zeros(3)
-        self._odometry_from_world = Pose(np.eye(3), offset)
-        self._anchored = georeference.has_origin
         self._segment, self._georeference = segment, georeference
-        self._last = None
-        self._rejected = None
-        self._dead_reckoning = False
-        self._path.clear()
+        self._last, self._dead_reckoning = None, False
+        self._gate.clear()
+
+    def _heading_reckoned(self, raw: Pose) -> Array:
+        """Rotation about the vertical (3, 3) from a world to the frame of the navigation.
+
+        `raw` is the pose of the body in that world now.
+        """
+        attitude = self._attitude
+        if attitude is None:
+            return np.eye(3)
+        here = self._navigation.world_from_attitude @ attitude.ned_from_body
+        return yaw_rotation(yaw_angle(here @ raw.rotation.T))
 
     def _update_georeference(self, georeference: Georeference) -> None:
         """Change the georeference of the same map, keeping the last pose."""
@@ -372,10 +394,7 @@ class SmoothOdometry:
         if self._last is not None and before is not None:
             _, pose, placed = self._last
             raw = self._raw(georeference, pose)
-            yaw_offset = yaw_rotation(_yaw(placed.rotation @ raw.rotation.T))
-            self._odometry_from_world = Pose(
-                yaw_offset, placed.translation - yaw_offset @ raw.translation
-            )
+            self._frame = self._frame.holding(placed, raw)
             ratio = georeference.world_from_map.scale / before.world_from_map.scale
             self._navigation.move(np.eye(3), placed.translation, placed.translation, ratio)
         self._georeference = georeference
@@ -386,7 +405,7 @@ class SmoothOdometry:
         if self._last is None:
             return None
         return OdometryState(
-            self._odometry_from_world, self._anchored, self._last[2].translation.copy(),
+            self._frame.from_world, self._frame.anchored, self._last[2].translation.copy(),
             self._velocity.copy(),
         )  # fmt: skip
 
@@ -396,11 +415,18 @@ class SmoothOdometry:
         The next pose is taken as is, since the motion meanwhile is unknown.
         """
         self._segment, self._georeference = segment, georeference
-        self._odometry_from_world, self._anchored = state.odometry_from_world, state.anchored
-        self._last, self._rejected, self._dead_reckoning = None, None, False
-        self._path.clear()
-        self._owed_m = np.zeros(3)
+        self._frame = OdometryFrame(
+            state.odometry_from_world, state.anchored, slewed_m=self._frame.slewed_m
+        )
+        self._last, self._dead_reckoning = None, False
+        self._gate.clear()
+        self._drift.clear()
         self._navigation.reset()
+
+    def discard_map(self, segment: int) -> None:
+        """Handle a map that was found wrong: what aided inertial navigation was wrong, too."""
+        if segment == self._segment:
+            self._navigation.reset()
 
     def correct_map(self, map_from_camera: Pose) -> None:
         """Apply a correction of the map: `map_from_camera` of the last accepted frame now.
@@ -413,66 +439,6 @@ class SmoothOdometry:
         self._last = (t_ns, map_from_camera, placed)
         self._update_georeference(self._georeference)
 
-    def _slew(self, raw: Pose, t_ns: int) -> None:
-        """Slew towards the pose by the map, where that started with a world position.
-
-        A map that started without one stays in its frame, but for what a reacquisition owes: the
-        correction may be large, and an autopilot would fly it.
-        """
-        if self._last is None:
-            return
-        dt_s = min((t_ns - self._last[0]) * 1e-9, 1.0)
-        if not self._anchored:
-            owed_m = float(np.linalg.norm(self._owed_m))
-            step = self._owed_m * min(1.0, MAX_SLEW_M_S * dt_s / max(owed_m, 1e-12))
-            before = self._odometry_from_world
-            self._odometry_from_world = Pose(before.rotation, before.translation + step)
-            self._owed_m, self._slewed = self._owed_m - step, self._slewed + step
-            return
-        here = self._odometry_from_world @ raw
-        yaw = _yaw(self._odometry_from_world.rotation)
-        most = float(MAX_SLEW_RAD_S) * dt_s
-        yaw_offset = yaw_rotation(yaw - float(np.clip(yaw, -most, most)))
-        away = here.translation - raw.translation
-        far = float(np.linalg.norm(away))
-        remaining = max(far - MAX_SLEW_M_S * dt_s, 0.0) / max(far, 1e-12)
-        at = raw.translation + remaining * away
-        self._slewed = self._slewed + at - here.translation
-        self._odometry_from_world = Pose(yaw_offset, at - yaw_offset @ raw.translation)
-
-    def _within_gate(self, placed: Pose, t_ns: int) -> bool:
-        """Innovation gate: whether motion can have brought the body here."""
-        if self._last is None:
-            return True
-        return self._reachable(self._last[2].translation, placed.translation, t_ns - self._last[0])
-
-    def _consistent(self, placed: Pose, t_ns: int) -> bool:
-        """Add a pose outside the gate; whether enough of them agree."""
-        position, rejected = placed.translation, self._rejected
-        if rejected is None or not self._reachable(
-            rejected.position, position, t_ns - rejected.t_ns
-        ):
-            self._rejected = _RejectedPoses(
-                rejected.since_ns if rejected else t_ns, t_ns, t_ns, position, 1
-            )
-            return False
-        self._rejected = rejected = rejected._replace(
-            t_ns=t_ns, position=position, n=rejected.n + 1
-        )
-        return (
-            t_ns - rejected.agreed_since_ns >= MIN_CONSISTENT_NS
-            and rejected.n >= MIN_CONSISTENT_FRAMES
-        )
-
-    def _reachable(self, before: Array, after: Array, dt_ns: int) -> bool:
-        """True if the body can have moved between two positions (3,), world, metres, in `dt_ns`."""
-        dt_s = dt_ns * 1e-9
-        expected = before + self._velocity * min(dt_s, 1.0)
-        away_m = float(np.linalg.norm(after - expected))
-        speed = float(np.linalg.norm(self._velocity))
-        beyond_s = max(dt_s - 1.0, 0.0)
-        return away_m < self._max_jump_m + 0.5 * MAX_ACCELERATION_M_S2 * dt_s**2 + speed * beyond_s
-
     def _quality(self, track: Track) -> int:
         """1..100, from the number, image coverage and match ratio of inliers."""
         if track.keypoints_px is None or not len(track.keypoints_px):
@@ -482,7 +448,3 @@ class SmoothOdometry:
         count = min(1.0, track.n_inliers / FULL_COUNT)
         found = track.n_inliers / max(track.n_matches, 1)
         return int(np.clip(round(100 * count * np.sqrt(spread) * np.sqrt(found)), 1, 100))
-
-
-def _yaw(rotation: Array) -> float:
-    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))

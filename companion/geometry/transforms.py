@@ -219,6 +219,11 @@ def yaw_rotation(yaw_rad: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def yaw_angle(rotation: Array) -> float:
+    """Angle about the down axis, in radians, of a rotation (3, 3) that is level or nearly so."""
+    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
 def angle_between(rotation_a: Array, rotation_b: Array) -> float:
     """Angle in radians of the rotation from a to b."""
     return float(np.linalg.norm(vector_from_rotation(rotation_a.T @ rotation_b)))

@@ -49,8 +49,8 @@ IMU_REQUESTS = (
     mavlink.MAVLINK_MSG_ID_RAW_IMU,
 )
 """Those of the first IMU."""
-GPS_HZ, TIME_HZ = 5.0, 1.0
-"""More than receivers give, and enough to map GPS time to boot time."""
+GPS_HZ, TIME_HZ, LANDED_HZ = 5.0, 1.0, 1.0
+"""More than receivers give; enough to map GPS time to boot time; as autopilots send it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +77,7 @@ def wanted(config: LinkConfig) -> list[Wanted]:
         Wanted((mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,), config.height_hz),
         Wanted((mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,), config.height_hz, always=False),
         Wanted((mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,), TIME_HZ),
+        Wanted((mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,), LANDED_HZ, always=False),
     ]
     return [each for each in rates if each.rate_hz > 0]
 
@@ -217,6 +218,11 @@ READERS: dict[int, tuple[Reader, ...]] = {
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: (_pressure, _airspeed),
 }
 """Readers of each message type: samples without a time yet, None without a valid value."""
+
+
+def landed(message: Any) -> bool:
+    """True if an EXTENDED_SYS_STATE says that the vehicle stands on the ground."""
+    return bool(message.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND)
 
 
 def samples_of(message: Any) -> list[Telemetry | GeodeticFix]:

@@ -23,6 +23,7 @@ from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
     ImuSample,
+    LandedSample,
     PositionSample,
     PositionSource,
     Telemetry,
@@ -117,7 +118,7 @@ class TelemetryCollector:
         host_ns: HostTimes,
         clock: ClockReport | None,
         warnings: Sequence[Warned] = (),
-        on_host_clock: Sequence[ArmedSample] = (),
+        on_host_clock: Sequence[ArmedSample | LandedSample] = (),
     ) -> TelemetryLog:
         """Log on the flight's clock and about one origin; `on_host_clock` already was."""
         times = host_ns(*self.stamps())
@@ -242,4 +243,4 @@ class LogContent:
     host_ns: HostTimes | None = None
     clock: ClockReport | None = None
     warnings: tuple[Warned, ...] = ()
-    on_host_clock: tuple[ArmedSample, ...] = ()
+    on_host_clock: tuple[ArmedSample | LandedSample, ...] = ()

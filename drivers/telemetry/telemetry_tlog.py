@@ -15,10 +15,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import Warned
-from companion.telemetry import ArmedSample
+from companion.telemetry import ArmedSample, LandedSample
 from companion.timing.log_clock import BootSegments, estimate_clock
 from companion.timing.stamp_filter import valid_stamps
-from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, READERS, boot_ns, samples_of
+from drivers.telemetry.mavlink_samples import (
+    ATTITUDE_IDS,
+    IMU_IDS,
+    READERS,
+    boot_ns,
+    landed,
+    samples_of,
+)
 from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector
 from drivers.telemetry.tlog_records import LEAST_US, MOST_US, Record, TlogRecords
 
@@ -68,7 +75,7 @@ class _Reader:
         self._collected = TelemetryCollector(name)
         self._exchanges: list[tuple[int, int, int, int]] = []
         self._one_way: list[tuple[int, int, int]] = []
-        self._unstamped: list[ArmedSample] = []
+        self._unstamped: list[ArmedSample | LandedSample] = []
         self._segments = BootSegments()
         self._armed: bool | None = None
         self._unix_minus_boot_ns: int | None = None
@@ -109,6 +116,9 @@ class _Reader:
                 self._unstamped.append(ArmedSample(receive_ns, armed))
                 self._armed = armed
             return
+        if kind == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
+            self._unstamped.append(LandedSample(receive_ns, landed(message)))
+            return
         if kind == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME and message.time_unix_usec:
             self._unix_minus_boot_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
         samples = samples_of(message)
@@ -146,6 +156,7 @@ def _chosen(counts: Counter[int]) -> set[int]:
         *READERS,
         mavlink.MAVLINK_MSG_ID_TIMESYNC,
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+        mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
         mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
         mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
     }.difference(ATTITUDE_IDS, IMU_IDS)

@@ -61,7 +61,7 @@ def main() -> None:
         tempfile.TemporaryDirectory() as name,
         LiveViewer(ViewerConfig(), camera, name="hour", stream=stream) as live,
     ):
-        exporter, folder = psutil.Process(live.pid), Path(name)
+        exporter, folder = psutil.Process(live.stage.pid), Path(name)
         first = viewer_in(folder, "first")
         places: dict[int, Pose] = {}
         print("| keyframes | points | exporter | viewer |\n|---|---|---|---|")
@@ -82,7 +82,7 @@ def main() -> None:
             if (k + 1) % MAP_EVERY == 0:
                 live.take(MapUpdate(k, t_ns, dict(places), np.zeros((0, 3)), None))
             time.sleep(EACH_S)
-            while live._stage.waiting_bytes > MOST_WAITING_BYTES:
+            while live.stage.waiting_bytes > MOST_WAITING_BYTES:
                 time.sleep(EACH_S)
             if (k + 1) % (n_keyframes // 6) == 0:
                 row = (k + 1, (k + 1) * POINTS, mib(exporter), mib(first))

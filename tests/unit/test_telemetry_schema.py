@@ -16,6 +16,7 @@ from companion.telemetry import (
     AttitudeSample,
     HeightSample,
     ImuSample,
+    LandedSample,
     PositionSample,
     PositionSource,
     RangeSample,
@@ -60,6 +61,7 @@ WRITTEN: list[tuple[Telemetry, str, str]] = [
     (RangeSample(5, 7.5), '{"distance_m":7.5}', "5,range,7.5"),
     (HeightSample(5, -3.25), '{"height_m":-3.25}', "5,height,-3.25"),
     (ArmedSample(5, True), '{"armed":true}', "5,armed,1.0"),
+    (LandedSample(5, True), '{"landed":true}', "5,landed,1.0"),
 ]
 NUMBERS = '{"type": "array", "items": {"type": ["number", "null"]}}'
 SCHEMAS = {

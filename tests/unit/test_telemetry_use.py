@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from companion.config import MEASUREMENTS, Config, Measurement, TelemetryConfig
-from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.georeference import Georeferencer
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.camera import Camera
 from companion.messages import Frame, FrameTracked
@@ -23,6 +23,7 @@ from companion.telemetry import (
     AttitudeSample,
     HeightSample,
     ImuSample,
+    LandedSample,
     PositionSample,
     PositionSource,
     RangeSample,
@@ -42,6 +43,7 @@ SAMPLES: list[tuple[Telemetry, Measurement | None]] = [
     (HeightSample(1, 5.0), "height"),
     (AirspeedSample(1, 5.0), "airspeed"),
     (ArmedSample(1, True), None),
+    (LandedSample(1, True), None),
 ]
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 

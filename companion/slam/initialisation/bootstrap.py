@@ -54,6 +54,11 @@ class Bootstrap:
             np.radians(MIN_PARALLAX_DEG), MIN_PARALLAX_PX / camera.focal_px
         )
 
+    def restart(self) -> None:
+        """Take the next frame as the reference."""
+        self._reference = self._given = None
+        self.pending.clear()
+
     def step(
         self, frame: Frame, features: Features, ned_from_camera: Array | None
     ) -> TwoViewReconstruction | None:

@@ -147,6 +147,10 @@ class Tracker:
         """Extract this ratio of the configured features from now on."""
         self._extractor.feature_ratio = share
 
+    def stand(self) -> None:
+        """The next frame is the first view of a map: the camera has not moved up to it."""
+        self._bootstrap.restart()
+
     def reinitialise(self, number: int, keep: bool) -> None:
         """Discard the active map, found wrong for the `number`th time in a row; with the lock held.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from companion.estimation.acceleration_integral import GRAVITY_NED_M_S2
+from companion.estimation.inertial.acceleration_integral import GRAVITY_NED_M_S2
 from companion.geometry.transforms import Array, quaternion_from_rotation, rotation_from_vector
 from companion.telemetry import AttitudeSample, ImuSample
 
@@ -45,7 +45,8 @@ class MeasuredMotion:
         self, path: Path, rng: np.random.Generator, seconds: float, axes: Array | None = None
     ) -> None:
         self._path, self._rng, self._seconds, self._axes = path, rng, seconds, axes
-        self._bias = rng.normal(scale=0.08, size=3)
+        self.bias_m_s2 = rng.normal(scale=0.08, size=3)
+        """Of the accelerometers, in body axes (3,)."""
         self.tilt = rotation_from_vector(rng.normal(scale=0.005, size=3))
         """Error (3, 3) of the autopilot's attitude."""
 
@@ -59,5 +60,5 @@ class MeasuredMotion:
                 yield AttitudeSample(t_ns, quaternion_from_rotation(self.tilt @ turn))
             a = (path(t_s + h) - 2 * path(t_s) + path(t_s - h)) / h**2
             noise = self._rng.normal(scale=0.08, size=3)
-            force = turn.T @ (a - GRAVITY_NED_M_S2) + self._bias + noise
+            force = turn.T @ (a - GRAVITY_NED_M_S2) + self.bias_m_s2 + noise
             yield ImuSample(t_ns, np.zeros(3), force if self._axes is None else self._axes @ force)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from companion.config import FeedbackConfig
-from companion.estimation.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial_navigation import InertialNavigation
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_navigation import InertialNavigation
 from companion.estimation.pose_gate import PoseGate, PoseToSend
 from companion.estimation.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera

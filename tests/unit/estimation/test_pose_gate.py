@@ -414,6 +414,23 @@ def test_a_bridge_ends_where_its_uncertainty_does() -> None:
     assert flight.run(0.3)
 
 
+def test_none_is_predicted_beyond_the_limit() -> None:
+    """Which is of the place apart from the scale."""
+    flight = Flight(max_sigma_m=1.0)
+    flight.run(2)
+    scaled: dict[str, Any] = {
+        "sigma_position_m": 1.05,
+        "sigma_by_scale_m": 0.4,
+        "sigma_velocity_m_s": 1.0,
+    }
+    assert any(pose.predicted for pose in flight.run(0.5, **scaled))
+    flight.run(0.1, sigma_position_m=0.9999, sigma_velocity_m_s=1.0)
+    poses = flight.run(0.5, sigma_position_m=0.9999, sigma_velocity_m_s=1.0)
+    assert len(poses) == 10
+    assert not any(pose.predicted for pose in poses)
+    assert flight.state() is Sending.SENDING
+
+
 def test_dead_reckoning_by_a_held_velocity_is_not_sent() -> None:
     flight = Flight()
     flight.run(2)
@@ -435,3 +452,17 @@ def test_a_reset_while_bridging_needs_proof() -> None:
     flight.run(1, **BLIND)
     assert not [pose for pose in flight.run(0.9, reset_counter=1) if pose.reset_counter]
     assert flight.state() is Sending.PROVING
+
+
+def test_a_stand_is_sent_and_a_lift_off_bridged() -> None:
+    """Before there is any map; proof is the same."""
+    flight = Flight()
+    stand: dict[str, Any] = {"state": TrackState.STANDING, "quality": 100, "sigma_position_m": 0.02}
+    assert not flight.run(0.9, **stand)
+    assert flight.run(1.0, **stand)
+    assert flight.state() is Sending.SENDING
+    assert len(flight.run(2.0, **BLIND)) > 50
+    assert flight.state() is Sending.BRIDGING
+    assert len(flight.run(1.0)) > 25
+    assert flight.state() is Sending.SENDING
+    assert {pose.reset_counter for _, pose in flight.sent} == {0}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from companion.config import GeoreferenceConfig
-from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.camera_attitude import CameraAttitude
 from companion.estimation.georeference import Georeferencer
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.segment_georeference import SegmentGeoreferences
 from companion.geometry.transforms import Array, Pose, Similarity, quaternion_from_rotation
 from companion.messages import Georeference

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.estimation.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial_navigation import InertialNavigation
-from companion.estimation.smooth_odometry import BodyAttitude, MapView, SmoothOdometry
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_navigation import BodyAttitude, InertialNavigation
+from companion.estimation.optical_flow import GroundVelocity
+from companion.estimation.smooth_odometry import MapView, SmoothOdometry
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
@@ -172,8 +173,14 @@ def test_accelerometers_carry_the_pose_on() -> None:
     assert {each.reset_counter for each in found} == {0}
 
 
-def test_another_map_goes_on_from_where_accelerometers_had_its_first_view() -> None:
-    """Its scale is known two seconds later only, and the body has moved on."""
+@pytest.mark.parametrize(("scale", "n_resets"), [(1.0, 0), (1.1, 0), (2.0, 1)])
+def test_another_map_goes_on_from_where_accelerometers_had_its_first_view(
+    scale: float, n_resets: int
+) -> None:
+    """Its scale is known two seconds later only, and the body has moved on by 4 m.
+
+    It is a reset only if both differ by more than the gate allows.
+    """
     integral = AccelerationIntegral()
     odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
     level, placed = np.array([1.0, 0.0, 0.0, 0.0]), replace(PLACED, has_origin=False)
@@ -193,11 +200,59 @@ def test_another_map_goes_on_from_where_accelerometers_had_its_first_view() -> N
         else:  # a map of half the scale; its georeference comes late
             at = first.translation + [2.0 * SPEED * (k - 120) / 10, 0.0, 0.0]
             seen, map_number = replace(track(k), map_from_camera=Pose(np.eye(3), at)), 120
-            half = replace(placed, world_from_map=Similarity(1.0, np.eye(3), np.zeros(3)))
+            half = replace(placed, world_from_map=Similarity(scale, np.eye(3), np.zeros(3)))
             known = half if k >= 140 else None
         view = MapView(12_000_000_000, first) if map_number else None
         found.append(odometry.step(seen, map_number, known, velocity, view))
     places = np.array([north(each) for each in found])
-    assert np.abs(np.diff(places) - 0.2).max() < 0.05
+    steps = np.diff(places) - 0.2
+    assert np.abs(steps[:139]).max() < 0.05
+    assert abs(steps[139]) < 0.05 or n_resets
+    assert np.abs(steps[140:] - 0.2 * (scale - 1.0)).max() < 0.05
     assert found[139].inertial and not found[140].inertial
-    assert (found[139].reset_counter, found[140].reset_counter) == (0, 1)
+    assert [each.reset_counter for each in found[139:141]] == [0, n_resets]
+
+
+@pytest.mark.parametrize("flow", [False, True])
+def test_a_vehicle_that_lifts_off_is_carried_on_by_accelerometers(flow: bool) -> None:
+    """It stands, climbs by 1 m/s2 for 2 s, and no map is known yet; lift-off shows 0.4 s late.
+
+    Optical flow over the ground that it stood on makes its place more certain, beside a barometer
+    that is heard at the times of the same frames.
+    """
+    integral = AccelerationIntegral()
+    odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
+    level, lift_s, found = np.array([1.0, 0.0, 0.0, 0.0]), 3.0, []
+    for k in range(60):
+        for step in range(10):
+            ms = (k * 10 + step - 9) * 10
+            up_m_s2 = 1.0 if lift_s * 1000 <= ms else 0.0
+            force = np.array([0.1, -0.05, 0.08 - 9.80665 - up_m_s2])  # with its bias
+            integral.take(ImuSample(ms * 1_000_000, np.zeros(3), force))
+            integral.take(AttitudeSample(ms * 1_000_000, level))
+        t_ns = k * 100_000_000
+        standing = 10 <= k < 34
+        if flow:
+            odometry.take_height(t_ns, 100.0 + 0.5 * max(k / 10 - lift_s, 0.0) ** 2, rotors=False)
+        odometry.begin(t_ns, BodyAttitude(t_ns, np.eye(3)), standing)
+        waiting = Track(k, t_ns, TrackState.INITIALISING)
+        found.append(odometry.step(waiting, 0, None, None))
+        assert odometry.wants_flow(t_ns) == (k >= 34)
+        if flow and k >= 34:
+            climbed_s = k / 10 - 0.05 - lift_s
+            flow_hz = np.array([0.0, 0.0, -climbed_s / (0.2 + 0.5 * climbed_s**2)])
+            measured = GroundVelocity(t_ns - 50_000_000, flow_hz, 4e-4 * np.eye(3))
+            odometry.take_flow(measured, 0)
+    assert {each.quality for each in found[:10]} == {-1}
+    stood = found[10:34]
+    assert {each.state for each in stood} == {TrackState.STANDING}
+    assert all(np.abs(each.world_from_body.translation).max() < 1e-9 for each in stood)  # type: ignore[union-attr]
+    assert {each.sigma_position_m for each in stood} == {0.02}
+    flown = found[34:]
+    assert {(each.state, each.inertial) for each in flown} == {(TrackState.DEAD_RECKONING, True)}
+    downs = np.array([each.world_from_body.translation[2] for each in flown])  # type: ignore[union-attr]
+    true = np.array([-0.5 * (k / 10 - lift_s) ** 2 for k in range(34, 60)])
+    assert np.abs(downs - true).max() < 0.1
+    assert flown[-1].sigma_position_m < (0.15 if flow else 0.5)
+    assert flown[-1].sigma_position_m > 0.03
+    assert {each.reset_counter for each in found} == {0}

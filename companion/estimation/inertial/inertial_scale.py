@@ -17,9 +17,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from companion.estimation.acceleration_integral import AccelerationIntegral, Change
 from companion.estimation.georeference import AlignmentSample, mean_rotation
-from companion.estimation.inertial_motion import (
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral, Change
+from companion.estimation.inertial.inertial_motion import (
     BIAS,
     PLACE,
     SIGMA_BIAS_M_S2,
@@ -27,6 +27,7 @@ from companion.estimation.inertial_motion import (
     SIGMA_TILT_M_S2,
     TILT,
     VELOCITY,
+    InertialStart,
     motion,
 )
 from companion.estimation.trajectory_alignment import Scale
@@ -44,12 +45,13 @@ N_SCALES = 25
 SPAN = 4.5
 """Standard deviations on either side that a finer bank covers."""
 N_STATE = 14
-DRIFT = slice(11, 14)
+START, DRIFT = slice(VELOCITY.start, BIAS.stop), slice(11, 14)
 SIGMA_SENSITIVITY = 0.01
 """Of an accelerometer's own scale: datasheets of those in autopilots state 0.5 to 1 %."""
 MOST_SUSTAINED_M_S2 = 2.0
 """A vehicle does not accelerate so on average over seconds; turned axes of the IMU look so."""
-LEAST_PLACES = 8
+LEAST_PLACES, LEAST_PLACES_STARTED = 8, 3
+"""Without and with a known velocity at the first."""
 WINDOW = 200
 """Places that a new bank begins with: 80 s and more."""
 AT_ONCE = 10
@@ -65,17 +67,19 @@ class ScaleBank:
     """Filters of N_SCALES scales, evenly spaced in their logarithm, times all MAP_NOISES.
 
     Their state is place, velocity, bias in body axes, horizontal acceleration by tilt, and the
-    drift of the map; all in NED, metres, seconds, but for the bias.
+    drift of the map; all in NED, metres, seconds, but for the bias. Where the motion was known at
+    the first place, that is its `start`.
     """
 
     def __init__(
-        self, centre_log: float, half_width: float, level: Array, lever_camera_m: Array
-    ) -> None:
+        self, centre_log: float, half_width: float, level: Array, lever_camera_m: Array,
+        start: InertialStart | None = None,
+    ) -> None:  # fmt: skip
         logs = centre_log + half_width * np.linspace(-1.0, 1.0, N_SCALES)
         grid, noises = np.meshgrid(logs, MAP_NOISES, indexing="ij")
         self._log, self._scale = grid.ravel(), np.exp(grid.ravel())
         self._sigma_map_m = self._scale * noises.ravel()
-        self._level, self._lever_camera_m = level, lever_camera_m
+        self._level, self._lever_camera_m, self._start = level, lever_camera_m, start
         n = len(self._log)
         self._x, self._covariance = np.zeros((n, N_STATE)), np.zeros((n, N_STATE, N_STATE))
         self._covariance[:, BIAS, BIAS] = SIGMA_BIAS_M_S2**2 * np.eye(3)
@@ -100,7 +104,7 @@ class ScaleBank:
             t_ns = sample.t_ns + delay_ns
             change = None if self._last is None else integral.between(self._last[0], t_ns)
             if change is None or self._last is None:
-                self._begin(levelled, lever_m)
+                self._begin(sample.t_ns, levelled, lever_m)
             else:
                 _, before, turn_before = self._last
                 self._predict(change, 0.5 * (turn_before + turn), integral.density_m_s2)
@@ -144,14 +148,19 @@ class ScaleBank:
     def _grow(self, part: slice, variance: Array) -> None:
         self._covariance[:, part, part] += variance[:, None, None] * np.eye(3)
 
-    def _begin(self, levelled: Array, lever_m: Array) -> None:
+    def _begin(self, t_ns: int, levelled: Array, lever_m: Array) -> None:
         """Place and velocity anew: there are no measurements since the last sample."""
         for part in (PLACE, VELOCITY):
             self._covariance[:, part, :] = self._covariance[:, :, part] = 0.0
         self._x[:, PLACE] = self._scale[:, None] * levelled - lever_m - self._x[:, DRIFT]
         self._x[:, VELOCITY] = 0.0
         self._grow(PLACE, 1e4 * self._sigma_map_m**2)
-        self._grow(VELOCITY, np.full(len(self._log), SIGMA_SPEED_M_S**2))
+        start = self._start
+        if start is not None and start.t_ns == t_ns:
+            self._x[:, START] = np.r_[start.velocity_ned_m_s, start.bias_body_m_s2]
+            self._covariance[:, START, START] = start.covariance
+        else:
+            self._grow(VELOCITY, np.full(len(self._log), SIGMA_SPEED_M_S**2))
 
     def _predict(self, change: Change, turn: Array, density: float) -> None:
         found = motion(change, turn, density, TILT_TAU_S, N_STATE)
@@ -187,10 +196,16 @@ class InertialScale:
 
     A bank that has narrowed the scale gives way to one that covers less more finely, and one whose
     map has moved to one of the latest places; that catches up a few places with each call.
+    `start` is the motion at its first keyframe, where inertial navigation knew it.
     """
 
-    def __init__(self, lever_camera_m: Array, at_once: int = AT_ONCE, window: int = WINDOW) -> None:
-        self._lever_camera_m, self._at_once, self._window = lever_camera_m, at_once, window
+    def __init__(
+        self, lever_camera_m: Array, start: InertialStart | None = None, at_once: int = AT_ONCE,
+        window: int = WINDOW,
+    ) -> None:  # fmt: skip
+        self._lever_camera_m, self._start = lever_camera_m, start
+        self._least_places = LEAST_PLACES if start is None else LEAST_PLACES_STARTED
+        self._at_once, self._window = at_once, window
         self._bank: ScaleBank | None = None
         self._next: ScaleBank | None = None
         self._n_taken = self._n_next = 0
@@ -203,7 +218,7 @@ class InertialScale:
 
         `sample_at` gives a keyframe as the map has it now, None where that has lost it.
         """
-        if n < LEAST_PLACES:
+        if n < self._least_places:
             return None
         if self._bank is None:
             half = 0.5 * float(np.log(MOST_SCALE / LEAST_SCALE))
@@ -236,7 +251,7 @@ class InertialScale:
         level = mean_rotation(samples)
         if level is None:
             return None
-        return ScaleBank(centre_log, half_width, level, self._lever_camera_m)
+        return ScaleBank(centre_log, half_width, level, self._lever_camera_m, self._start)
 
     def _advance(
         self, bank: ScaleBank, begin: int, n: int, sample_at: SampleAt,
@@ -249,7 +264,7 @@ class InertialScale:
 
     def _is_coarse(self, bank: ScaleBank) -> bool:
         """True if the scale is narrow within the bank, or near its edge."""
-        if bank.n < LEAST_PLACES:
+        if bank.n < self._least_places:
             return False
         mean, sigma = bank.posterior
         low, high = float(bank.logs[0]), float(bank.logs[-1])
@@ -257,7 +272,7 @@ class InertialScale:
         return near_edge or 2.0 * SPAN * sigma < 0.4 * (high - low)
 
     def _scale(self, bank: ScaleBank) -> Scale | None:
-        if bank.n < LEAST_PLACES or bank.sustained_m_s2 > MOST_SUSTAINED_M_S2:
+        if bank.n < self._least_places or bank.sustained_m_s2 > MOST_SUSTAINED_M_S2:
             return None
         mean, sigma = bank.posterior
         spacing = 0.3 * float(bank.logs[1] - bank.logs[0])  # of an even spread between two
@@ -268,10 +283,10 @@ class InertialScale:
 
 def settled(
     n: int, sample_at: SampleAt, integral: AccelerationIntegral, lever_camera_m: Array,
-    delay_ns: int = 0,
+    delay_ns: int = 0, start: InertialStart | None = None,
 ) -> Scale | None:  # fmt: skip
     """Scale by all keyframes of a finished map; None while it is unknown."""
-    estimate, found = InertialScale(lever_camera_m, at_once=n, window=n), None
+    estimate, found = InertialScale(lever_camera_m, start, at_once=n, window=n), None
     for _ in range(NARROWINGS):
         found = estimate.update(n, sample_at, integral, delay_ns)
     return found

@@ -7,8 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.estimation.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial_navigation import AidedPlace, InertialNavigation
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_navigation import (
+    AidedFlow,
+    AidedHeight,
+    AidedPlace,
+    InertialNavigation,
+)
 from companion.geometry.transforms import Array, yaw_rotation
 from tests.support.flights.measured_motion import (
     STEP_S,
@@ -29,7 +34,7 @@ Place = Callable[[float], Array]
 class Flown:
     """Aided 15 times a second up to AIDED_S, then by accelerations alone."""
 
-    def __init__(self, path: Place, seed: int, seconds: float) -> None:
+    def __init__(self, path: Place, seed: int, seconds: float, barometer: bool = False) -> None:
         self.path, rng = path, np.random.default_rng(seed)
         self.integral = AccelerationIntegral()
         self.navigation = InertialNavigation(self.integral)
@@ -43,6 +48,9 @@ class Flown:
                 noisy = WORLD_FROM_NED @ path(t_s) + rng.normal(scale=SIGMA_M, size=3)
                 turn = WORLD_FROM_NED @ turned(t_s) @ (motion.tilt @ turned(t_s)).T
                 self.navigation.aid(AidedPlace(sample.t_ns, noisy, turn, SIGMA_M))
+            if barometer and sample.t_ns % 200_000_000 == 10_000_000:
+                height_m = 300.0 - path(t_s)[2] + rng.normal(scale=0.3)
+                self.navigation.aid(AidedHeight(sample.t_ns, height_m))
 
     def error(self, t_s: float) -> tuple[Array, Array, float, float]:
         """Errors of place and velocity (3,), and what is stated of both."""
@@ -134,3 +142,47 @@ def test_nothing_is_known_without_accelerations() -> None:
 def test_an_imu_that_falls_silent_ends_it() -> None:
     flown = Flown(weaving, 7, 0.0)
     assert flown.navigation.at(round((AIDED_S + 2.0) * 1e9)) is None
+
+
+def test_flow_over_the_ground_bounds_the_drift() -> None:
+    """Ten seconds without a place, with flow five times a second, one of them far off."""
+    flown, unaided = (Flown(weaving, 2, 10.0) for _ in range(2))
+    rng, sigma_hz, ground_down_m = np.random.default_rng(4), 0.02, -10.0
+    assert not flown.navigation.knows_ground
+    flown.navigation.lift_off(ground_down_m + 0.1, 0.15)
+    assert flown.navigation.knows_ground
+    for k, t_s in enumerate(np.arange(AIDED_S + 0.2, AIDED_S + 9.8, 0.2)):
+        flow_hz = velocity(weaving, t_s) / (ground_down_m - weaving(t_s)[2])
+        flow_hz = flow_hz + rng.normal(scale=sigma_hz, size=3) + 5.0 * (k == 20)
+        covariance_hz2 = sigma_hz**2 * np.eye(3)
+        flown.navigation.aid(AidedFlow(round(t_s * 1e9), flow_hz, covariance_hz2))
+    assert flown.navigation.n_refused == 1
+    place, speed, sigma_m, sigma_m_s = flown.error(AIDED_S + 9.9)
+    assert float(np.linalg.norm(place)) < 1.0
+    assert float(np.linalg.norm(speed)) < 0.2
+    assert np.abs(place).max() < 3.5 * sigma_m and np.abs(speed).max() < 3.5 * sigma_m_s
+    assert sigma_m < 0.5 * unaided.error(AIDED_S + 9.9)[2]
+    flown.navigation.reset()
+    assert not flown.navigation.knows_ground
+
+
+def test_flow_does_not_move_the_height() -> None:
+    """Over roofs it is twice as fast as over the ground that is known."""
+    flown, unaided = (Flown(weaving, 3, 4.0) for _ in range(2))
+    flown.navigation.lift_off(-10.0, 0.15)
+    for t_s in np.arange(AIDED_S + 0.2, AIDED_S + 3.8, 0.2):
+        flow_hz = velocity(weaving, t_s) / 5.0
+        flown.navigation.aid(AidedFlow(round(t_s * 1e9), flow_hz, 4e-4 * np.eye(3)))
+    down, expected = (each.error(AIDED_S + 3.9)[0][2] for each in (flown, unaided))
+    assert down == pytest.approx(expected, abs=0.1)
+
+
+def test_a_barometer_bounds_the_drift_of_the_height() -> None:
+    """Twenty seconds without a place; its zero is known from the time before."""
+    end_s = AIDED_S + 19.9
+    aided_m, unaided_m = (
+        [Flown(weaving, seed, 20.0, barometer).error(end_s)[0][2] for seed in range(3)]
+        for barometer in (True, False)
+    )
+    assert np.abs(aided_m).max() < 0.7
+    assert np.abs(aided_m).max() < 0.5 * np.abs(unaided_m).max()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.acceleration_integral import AccelerationIntegral
 from companion.estimation.georeference import AlignmentSample
-from companion.estimation.inertial_scale import InertialScale, settled
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_motion import InertialStart
+from companion.estimation.inertial.inertial_scale import LEAST_PLACES, InertialScale, settled
 from companion.estimation.trajectory_alignment import Scale
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from tests.support.flights.measured_motion import (
@@ -16,6 +17,7 @@ from tests.support.flights.measured_motion import (
     hovering,
     straight,
     turned,
+    velocity,
     weaving,
 )
 
@@ -33,6 +35,7 @@ class Flight:
         rng = np.random.default_rng(seed)
         self.integral = AccelerationIntegral()
         motion = MeasuredMotion(path, rng, SECONDS + 1.0, axes)
+        self.bias_m_s2 = motion.bias_m_s2
         for sample in motion.samples():
             self.integral.take(sample)
         self.samples: list[AlignmentSample] = []
@@ -47,8 +50,8 @@ class Flight:
     def scale(self) -> Scale | None:
         return settled(len(self.samples), self.samples.__getitem__, self.integral, LEVER_M)
 
-    def live(self) -> list[Scale | None]:
-        estimate = InertialScale(LEVER_M)
+    def live(self, start: InertialStart | None = None) -> list[Scale | None]:
+        estimate = InertialScale(LEVER_M, start)
         return [
             estimate.update(n, self.samples.__getitem__, self.integral)
             for n in range(1, len(self.samples) + 1)
@@ -79,6 +82,25 @@ def test_none_is_stated_where_nothing_shows_it(path: Path) -> None:
     """A steady flight looks the same at each scale, and so does none at all."""
     for each in Flight(path).live():
         assert each is None or each.sigma > 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_velocity_known_at_the_first_keyframe_gives_it_at_once(seed: int) -> None:
+    """In steady flight too, as long as the velocity is carried on well enough."""
+    flight, rng = Flight(straight, seed), np.random.default_rng(seed)
+    first, sigma_m_s, sigma_m_s2 = flight.samples[0].t_ns, 0.1, 0.05
+    v_m_s = velocity(straight, first * 1e-9) + rng.normal(scale=sigma_m_s, size=3)
+    bias_m_s2 = flight.bias_m_s2 + rng.normal(scale=sigma_m_s2, size=3)
+    covariance = np.diag(np.repeat([sigma_m_s**2, sigma_m_s2**2], 3))
+    found = flight.live(InertialStart(first, v_m_s, bias_m_s2, covariance))
+    early = found[LEAST_PLACES]
+    assert early is not None and early.sigma < 0.06
+    off = [
+        np.log(each.scale / METRES_PER_UNIT) / each.sigma
+        for each in found
+        if each is not None and each.sigma < 0.1
+    ]
+    assert len(off) > 30 and np.abs(off).max() < 3.5
 
 
 def test_an_imu_mounted_otherwise_gives_none() -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimation.acceleration_integral import GRAVITY_NED_M_S2, Change
+from companion.estimation.inertial.acceleration_integral import GRAVITY_NED_M_S2, Change
 from companion.geometry.transforms import Array
 
 PLACE, VELOCITY, BIAS, TILT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
@@ -19,6 +19,18 @@ SIGMA_BIAS_M_S2 = 0.15
 SIGMA_TILT_M_S2 = 0.1
 """Horizontal acceleration by a tilt of 0.6 degrees."""
 SIGMA_SPEED_M_S = 20.0
+
+
+class InertialStart(NamedTuple):
+    """Velocity (3,), NED, m/s, and bias (3,) of the accelerometers in body axes, m/s2, at a time.
+
+    With their covariance (6, 6), in that order.
+    """
+
+    t_ns: int
+    velocity_ned_m_s: Array
+    bias_body_m_s2: Array
+    covariance: Array
 
 
 class Motion(NamedTuple):

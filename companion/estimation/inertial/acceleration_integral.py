@@ -20,8 +20,9 @@ GRAVITY_NED_M_S2 = np.array([0.0, 0.0, 9.80665])
 """Standard gravity (CGPM 1901); what it differs by on earth, 0.3 %, counts as bias."""
 MAX_GAP_NS = 100_000_000
 """Longer without a sample, nothing is integrated across."""
-NOISE_TAU = 500
-"""Samples over which the white noise is averaged."""
+NOISE_TAU, ONSET_TAU, ONSET = 500, 50, 2.0
+"""Samples over which the white noise is averaged. Where that of the second is so many times that of
+the first, it has set in: motors have started. By chance it is so at six standard deviations."""
 LEAST_NOISE_M_S2 = 0.00980665 / np.sqrt(12.0)
 """Rounding to 1 mg, as RAW_IMU states it."""
 
@@ -40,6 +41,8 @@ class AccelerationIntegral:
     """Integrates what arrives; attitude and IMU may come in any order up to a few samples."""
 
     def __init__(self) -> None:
+        self.believed = True
+        """False while nobody knows yet whether the samples are right."""
         self._waiting: deque[ImuSample] = deque(maxlen=1000)
         self._attitudes: tuple[AttitudeSample, ...] = ()
         self._series = SampleSeries()
@@ -48,7 +51,7 @@ class AccelerationIntegral:
         self._sums = np.zeros((9, 3))
         """Rows: velocity, displacement, their derivatives by bias, and the number of gaps."""
         self._raw: deque[Array] = deque(maxlen=3)
-        self._noise_variance = 0.0
+        self._noise_variance = self._newest_variance = 0.0
         self._n = 0
         self._interval_s = 0.01
 
@@ -64,6 +67,12 @@ class AccelerationIntegral:
     def prune(self, before_ns: int, keyframes_ns: Array) -> None:
         """Drop integrals before a time, except at the times of keyframes (N,), sorted."""
         self._series.prune(before_ns, keyframes_ns)
+
+    def withdraw(self, since_ns: int) -> None:
+        """Drop integrals from a time on: the samples were wrong. There is a gap."""
+        self._series.drop_since(since_ns)
+        self._waiting.clear()
+        self._last = None
 
     @property
     def has_samples(self) -> bool:
@@ -108,6 +117,9 @@ class AccelerationIntegral:
         variance = float(((first - 2.0 * middle + last) ** 2).mean()) / 6.0
         self._n = min(self._n + 1, NOISE_TAU)
         self._noise_variance += (variance - self._noise_variance) / self._n
+        self._newest_variance += (variance - self._newest_variance) / min(self._n, ONSET_TAU)
+        if self._newest_variance > ONSET * self._noise_variance:
+            self._noise_variance, self._n = self._newest_variance, ONSET_TAU
 
     def _integrate(self) -> None:
         if len(self._attitudes) < 2:

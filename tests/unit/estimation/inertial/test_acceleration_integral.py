@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.acceleration_integral import GRAVITY_NED_M_S2, AccelerationIntegral
+from companion.estimation.inertial.acceleration_integral import (
+    GRAVITY_NED_M_S2,
+    AccelerationIntegral,
+)
 from companion.geometry.transforms import (
     Array,
     quaternion_from_rotation,
@@ -85,3 +88,16 @@ def test_white_noise_is_measured_by_itself(rng: np.random.Generator) -> None:
         integral.take(AttitudeSample(t_ns, np.array([1.0, 0, 0, 0])))
         integral.take(ImuSample(t_ns, np.zeros(3), rng.normal(scale=0.08, size=3)))
     assert integral.density_m_s2 == pytest.approx(0.08 * np.sqrt(0.01), rel=0.1)
+
+
+def test_noise_that_sets_in_is_known_within_half_a_second(rng: np.random.Generator) -> None:
+    """Motors that start; and when they stop, it is believed only slowly."""
+    integral, densities = AccelerationIntegral(), []
+    for i in range(2000):
+        scale = 0.5 if 1000 <= i < 1500 else 0.08
+        integral.take(ImuSample(i * 10_000_000, np.zeros(3), rng.normal(scale=scale, size=3)))
+        densities.append(integral.density_m_s2)
+    assert densities[990] == pytest.approx(0.008, rel=0.1)
+    assert densities[1050] > 0.033
+    assert densities[1490] == pytest.approx(0.05, rel=0.15)
+    assert densities[1600] > 0.03
