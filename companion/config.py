@@ -156,6 +156,9 @@ class FeedbackConfig:
     """Its longitude, degrees."""
     origin_altitude_m: Annotated[float, Meta(ge=-500, le=9000)] = 0.0
     """Its altitude above mean sea level, metres."""
+    flow: Literal["off", "optical_flow", "optical_flow_rad"] = "off"
+    """Send the flow of the ground from the first two frames on, without any scale: OPTICAL_FLOW
+    for ArduPilot, OPTICAL_FLOW_RAD for PX4."""
     obstacle_distance: bool = False
     """Send OBSTACLE_DISTANCE from the newest part of the cloud."""
 

@@ -81,6 +81,19 @@ class FeedbackHealth:
 
 
 @dataclass(frozen=True, slots=True)
+class FlowHealth:
+    """Optical flow sent to the autopilot; `why_not` says why the last frame has none."""
+
+    message: str = "off"
+    sending: bool = False
+    why_not: str = ""
+    rate_hz: float = 0.0
+    quality: int = 0
+    latency_p50_ms: float | None = None
+    n_sent: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessLoad:
     """One of our processes. `cpu_cores` is 1.5 where it keeps one and a half cores busy."""
 
@@ -150,6 +163,7 @@ class Health:
     """Number of warnings since the start, by kind."""
     set_by_ground: Mapping[str, Any] = field(default_factory=dict)
     """Keys of the configuration set over MAVLink, and their values."""
+    flow: FlowHealth = field(default_factory=FlowHealth)
 
     def to_json(self) -> dict[str, Any]:
         """Plain types; a number that is not finite is null."""
@@ -161,7 +175,7 @@ class Health:
 
     def line(self) -> str:
         """One line for the journal, the most important first."""
-        parts = [self._pose(), self._feedback()]
+        parts = [self._pose(), self._feedback(), self._flow()]
         parts += [_source(source) for source in self.sources]
         parts += [_stage(stage) for stage in self.stages if not stage.alive or stage.n_restarted]
         parts.append(self._computer())
@@ -178,6 +192,7 @@ class Health:
             tuple((source.name, source.state, source.n_reopened) for source in self.sources),
             tuple((stage.name, stage.alive, stage.n_restarted) for stage in self.stages),
             (self.feedback.mode, self.feedback.sending, self.feedback.why_not),
+            (self.flow.message, self.flow.sending),
             self.flight,
             self.degradation,
         )
@@ -198,6 +213,14 @@ class Health:
             by = " by dead reckoning" if feedback.bridging else ""
             return f"feedback {feedback.rate_hz:.0f}/s{by}"
         return f"no feedback: {feedback.why_not or 'not yet'}" + _in_brackets(feedback.detail)
+
+    def _flow(self) -> str:
+        flow = self.flow
+        if flow.message == "off":
+            return ""
+        if flow.sending:
+            return f"flow {flow.rate_hz:.0f}/s"
+        return f"no flow: {flow.why_not or 'not yet'}"
 
     def _computer(self) -> str:
         load = self.load

@@ -47,7 +47,7 @@ class PilotMessage:
 
 POSITION_ON = PilotMessage(INFO, "vision position on")
 POSITION_LOST = PilotMessage(WARNING, "vision position lost: {reason}", {"reason": LONGEST_REASON})
-DEAD_RECKONING = PilotMessage(WARNING, "tracking lost: dead reckoning")
+DEAD_RECKONING = PilotMessage(WARNING, "position by dead reckoning")
 POSITION_OFF = PilotMessage(NOTICE, "vision position off: ground command")
 POSITION_STAYS_OFF = PilotMessage(WARNING, "vision position still off: by ground")
 POSITION_ENABLED = PilotMessage(NOTICE, "vision position enabled: disarmed")
@@ -61,6 +61,8 @@ MAP_RESUMED = PilotMessage(NOTICE, "map resumed after restart")
 MAP_NOT_RESUMED = PilotMessage(NOTICE, "old map not recognised: new map")
 MAP_NOT_SAVED = PilotMessage(NOTICE, "map not saved for a restart")
 MOUNT_CORRECTED = PilotMessage(NOTICE, "camera mount angle corrected")
+IMU_NOT_USED = PilotMessage(NOTICE, "autopilot IMU data not used")
+IMU_USED = PilotMessage(INFO, "autopilot IMU data used again")
 
 # -- camera and autopilot -----------------------------------------------------------------
 
@@ -171,6 +173,8 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "old map not recognised: new map": MAP_NOT_RESUMED,
     "the map cannot be kept for a restart in flight": MAP_NOT_SAVED,
     "camera and autopilot were found to disagree, corrected": MOUNT_CORRECTED,
+    "the autopilot's IMU is not used: no scale and no dead reckoning by it": IMU_NOT_USED,
+    "the autopilot's IMU is used again": IMU_USED,
     "settings cannot be kept": SETTINGS_NOT_SAVED,
     "reset counter is not kept": SETTINGS_NOT_SAVED,
     "dense map on another OpenCL device": MAP_OTHER_DEVICE,

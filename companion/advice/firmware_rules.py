@@ -66,6 +66,11 @@ def _proximity(context: Context, values: Values) -> Wanted | None:
     return OneOf((2,)) if context.feedback.obstacle_distance else None
 
 
+def _for_flow(message: str, wanted: Wanted) -> Callable[[Context, Values], Wanted | None]:
+    """The condition where that message of optical flow is sent."""
+    return lambda context, values: wanted if context.feedback.flow == message else None
+
+
 def fused(context: Context, values: Values) -> Wanted:
     """Pose components that EKF2 is to fuse."""
     if context.mode == "odometry":
@@ -89,6 +94,8 @@ OUR_BODY = (
     "the pose that we send is that of the body already, not the camera's: another offset would be "
     "taken off twice"
 )
+
+FLOW_IN_BODY = "our flow is about the body's axes, whatever way the camera looks"
 
 ARDUPILOT_RULES = (
     Rule(
@@ -123,6 +130,11 @@ ARDUPILOT_RULES = (
          "counts from arrival"),
     Rule("PRX1_TYPE", _proximity, "2 takes OBSTACLE_DISTANCE, which feedback.obstacle_distance "
          "sends", reboot=True),
+    Rule("FLOW_TYPE", _for_flow("optical_flow", OneOf((5,))), "5 (MAVLink) takes OPTICAL_FLOW, "
+         "which feedback.flow sends", reboot=True),
+    Rule("FLOW_ORIENT_YAW", _for_flow("optical_flow", OneOf((0,))), FLOW_IN_BODY),
+    Rule("FLOW_OPTIONS", _for_flow("optical_flow", OneOf((0,))), "the body's rotation is in our "
+         "flow; 1 (stabilised) would take it for motion"),
 )  # fmt: skip
 
 PX4_RULES = (
@@ -147,6 +159,9 @@ PX4_RULES = (
     Rule("EKF2_EV_POS_X", _same_as("EKF2_IMU_POS_X"), OUR_BODY),
     Rule("EKF2_EV_POS_Y", _same_as("EKF2_IMU_POS_Y"), OUR_BODY),
     Rule("EKF2_EV_POS_Z", _same_as("EKF2_IMU_POS_Z"), OUR_BODY),
+    Rule("EKF2_OF_CTRL", _for_flow("optical_flow_rad", OneOf((1,))), "1 fuses OPTICAL_FLOW_RAD, "
+         "which feedback.flow sends"),
+    Rule("SENS_FLOW_ROT", _for_flow("optical_flow_rad", OneOf((0,))), FLOW_IN_BODY),
     Rule("COM_ARM_WO_GPS", _always(OneOf((1, 2))), "0 refuses to arm without a GPS fix"),
 )  # fmt: skip
 

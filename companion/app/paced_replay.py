@@ -15,6 +15,7 @@ from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.errors import StageError
 from companion.messages import Frame, Odometry, Warned
 from companion.products.flight_result import RunFacts
+from companion.runtime.fork_server import ForkServer
 from companion.runtime.stages import START_S
 from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock, monotonic_s, wait_s
@@ -49,12 +50,14 @@ def replay_paced(
     def odometry(message: Odometry) -> None:
         watched.state = message.state
 
+    server = ForkServer()
     flight = LiveFlight(
         live, given.flight.camera, FlightClock(),
         lambda _: Listener(
             odometry, watched.take, warned, lambda: unusable("localisation has died"), unusable,
             mapped=watched.take,
         ),
+        server.start,
     )  # fmt: skip
 
     def facts(flown: LiveFlight) -> RunFacts:
@@ -75,6 +78,7 @@ def replay_paced(
     finally:
         progress.finish()
         flight.finish(facts)
+        server.close()
     if faults:
         raise StageError(f"{faults[0]}; results so far are in {out}")
 

@@ -76,6 +76,7 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         ("scale", document.get("scale") or "not known"),
         *_belief(document.get("believed", MEASUREMENTS)),
         ("feedback", _feedback(document.get("feedback") or {})),
+        *_flow(document.get("flow") or {}),
         ("flight", document.get("flight") or "none"),
         ("reduced", document.get("degraded") or "nothing"),
         ("set", _settings(document.get("set_by_ground") or {})),
@@ -112,6 +113,20 @@ def _feedback(feedback: Mapping[str, Any]) -> str:
         f" ({_number(feedback.get('latency_p95_ms'), ' ms')} p95),"
         f" {feedback.get('n_resets', 0)} resets"
     )
+
+
+def _flow(flow: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Row of the optical flow that is sent, unless it is off."""
+    if flow.get("message", "off") == "off":
+        return []
+    if not flow.get("sending"):
+        return [("flow", f"not sent: {flow.get('why_not') or 'not yet'}")]
+    parts = [
+        str(flow["message"]), _number(flow.get("rate_hz"), "/s"),
+        flow.get("why_not") or f"quality {flow.get('quality')} of 255",
+        f"{_number(flow.get('latency_p50_ms'), ' ms')} after exposure",
+    ]  # fmt: skip
+    return [("flow", ", ".join(parts))]
 
 
 def _source(source: Mapping[str, Any]) -> tuple[str, ...]:

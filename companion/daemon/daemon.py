@@ -28,6 +28,7 @@ from companion.daemon.health_watch import HealthWatch
 from companion.daemon.link_watch import LinkWatch
 from companion.daemon.loop_delay import measure_loop_delay
 from companion.daemon.periodic_checks import PeriodicChecks
+from companion.daemon.pose.flow_sender import FlowSender
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.daemon.recorder_notes import RecorderNotes
@@ -35,10 +36,11 @@ from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import LatencyMeter
-from companion.messages import Frame, Odometry, Warned
+from companion.messages import Frame, Odometry, OpticalFlow, Warned
 from companion.pilot_messages import PilotText, of_warning
 from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import Snapshot
+from companion.runtime.stage_start import Start
 from companion.telemetry import ArmedSample, AttitudeSample, Telemetry, belief_in_words
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_feed import CameraFeed
@@ -62,7 +64,7 @@ END_S = 2.6
 class Daemon:
     """All parts of the daemon; `run` gives the exit status. Create it within the event loop."""
 
-    def __init__(self, load: Callable[[], Config]) -> None:
+    def __init__(self, load: Callable[[], Config], start: Start) -> None:
         self._clock = clock = FlightClock()
         self._journal = journal = Journal()
         self._loop = asyncio.get_running_loop()
@@ -82,6 +84,7 @@ class Daemon:
         )
         self._link: AutopilotLink | None = None
         self._sender: PoseSender | None = None
+        self._flow_sender: FlowSender | None = None
         self._reports: VehicleReports | None = None
         self._ground: GroundControl | None = None
         link_watch: LinkWatch | None = None
@@ -96,13 +99,22 @@ class Daemon:
                 config.feedback, self._link, clock, counter_path(config.daemon.flights),
                 self._on_warned, lambda step: self._flights.take(step),
             )  # fmt: skip
+            self._flow_sender = FlowSender(config.feedback, self._link, clock)
             date = AutopilotDate(self._link)
         dates = FlightDates(
             clock, lambda: date.ahead_ns if date is not None else None, clock_is_set
         )
-        self._flights = flights = Flights(clock, journal, self._listener, self._facts, dates)
+        self._flights = flights = Flights(clock, journal, self._listener, self._facts, dates, start)
         self._watch = watch = HealthWatch(
-            config, clock, journal, self._feed, self._link, self._sender, flights, self._loop_delay
+            config,
+            clock,
+            journal,
+            self._feed,
+            self._link,
+            self._sender,
+            self._flow_sender,
+            flights,
+            self._loop_delay,
         )
         watch.set_by_ground = settings.by_ground
         self._notes = RecorderNotes(clock, flights, watch, self._link)
@@ -214,6 +226,8 @@ class Daemon:
         if isinstance(sample, AttitudeSample):
             if self._sender is not None:
                 self._sender.take_attitude(sample)
+            if self._flow_sender is not None:
+                self._flow_sender.take_attitude(sample)
         elif isinstance(sample, ArmedSample):
             self._starts.set_armed(sample.armed)
 
@@ -230,6 +244,7 @@ class Daemon:
         reports = self._reports if self._settings.config.feedback.obstacle_distance else None
         return Listener(
             odometry=current(self._on_odometry),
+            flow=current(self._on_flow),
             georeferenced=current(self._watch.take_georeference),
             warned=self._on_warned,
             localisation_died=lambda: self._soon(self._starts.localisation_died, flight),
@@ -244,6 +259,10 @@ class Daemon:
         if self._sender is not None:
             self._sender.take(odometry)
 
+    def _on_flow(self, flow: OpticalFlow) -> None:
+        if self._flow_sender is not None:
+            self._flow_sender.take(flow)
+
     def _on_snapshot(self, snapshot: Snapshot) -> None:
         if self._ground is not None:
             self._ground.snapshot_told(snapshot)
@@ -253,6 +272,8 @@ class Daemon:
         self._watch.reconfigure(config)
         if self._sender is not None:
             self._sender.reconfigure(config.feedback)
+        if self._flow_sender is not None:
+            self._flow_sender.reconfigure(config.feedback)
         self._starts.reconfigure(old, config)
 
     # -- what the parts ask for -----------------------------------------------------------------
@@ -291,10 +312,13 @@ class Daemon:
             pass
 
 
-async def _run(load: Callable[[], Config]) -> int:
-    return await Daemon(load).run()
+async def _run(load: Callable[[], Config], start: Start) -> int:
+    return await Daemon(load, start).run()
 
 
-def run(load: Callable[[], Config]) -> int:
-    """Run the daemon with the configuration that `load` reads; the exit status."""
-    return asyncio.run(_run(load))
+def run(load: Callable[[], Config], start: Start) -> int:
+    """Run the daemon with the configuration that `load` reads; the exit status.
+
+    `start` starts processes of stages.
+    """
+    return asyncio.run(_run(load, start))

@@ -100,6 +100,10 @@ class FlightStarts:
             self._flights.end()  # a map whose scale is the autopilot's own is none to fly on
             self._begin_if_due(take_up=False)
             return
+        if flight is not None and old.feedback.flow == "off" != config.feedback.flow:
+            self._flights.end()  # its localisation measures no flow
+            self._begin_if_due(take_up=False)
+            return
         if flight is not None:
             flight.set_dense(makes_depth(config))
             flight.set_budget(config.stream.budget_kbit_s)

@@ -14,10 +14,13 @@ from typing import Any
 from companion import __version__
 from companion.config import Config
 from companion.daemon.flights.flights import Flights
+from companion.daemon.flights.viewing import VIEWERS
+from companion.daemon.pose.flow_sender import FlowSender
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.health import (
     ComputerLoad,
     FeedbackHealth,
+    FlowHealth,
     Health,
     LatencyMeter,
     StageHealth,
@@ -51,6 +54,7 @@ IN_WORDS = {
     TrackState.TRACKING: "tracking",
     TrackState.DEAD_RECKONING: "coasting",
     TrackState.LOST: "lost",
+    TrackState.STANDING: "standing",
 }
 
 
@@ -65,11 +69,13 @@ class HealthWatch:
         feed: CameraFeed,
         link: AutopilotLink | None,
         sender: PoseSender | None,
+        flow_sender: FlowSender | None,
         flights: Flights,
         loop_delay: LatencyMeter,
     ) -> None:
         self._clock, self._journal, self._flights = clock, journal, flights
         self._feed, self._link, self._sender = feed, link, sender
+        self._flow_sender = flow_sender
         self._loop_delay = loop_delay
         self._began_ns = clock.now_ns()
         self._config, self._believed = config.daemon, config.telemetry.use
@@ -184,9 +190,7 @@ class HealthWatch:
         loop = asyncio.get_running_loop()
         while True:
             flight = self._flights.current
-            pids = {"daemon": 0} | ({k: s.pid for k, s in flight.stages.items()} if flight else {})
-            if flight is not None and flight.viewing is not None:
-                pids["viewers"] = flight.viewing.pid
+            pids = {"daemon": 0} | (flight.pids if flight is not None else {})
             self.load = await loop.run_in_executor(None, self._load_reader.read, pids)
             self._step_governor()
             await asyncio.sleep(GOVERN_NS * 1e-9)
@@ -244,6 +248,7 @@ class HealthWatch:
             scale=self._scale,
             pose_latency_p95_ms=self._pose.health(now_ns).latency_p95_ms,
             feedback=self._sender.health() if self._sender is not None else FeedbackHealth(),
+            flow=self._flow_sender.health() if self._flow_sender is not None else FlowHealth(),
             flight=flight.folder.name if flight is not None and flight.folder is not None else "",
             load=self.load,
             degradation=self._governor.level.number,
@@ -278,17 +283,18 @@ class HealthWatch:
             hangs = said is not None and no_sign_s > NO_SIGN_S and not is_off
             if is_off:
                 detail = "switched off"
+            n_dropped = stage.n_dropped
+            if kind == VIEWERS and flight.viewing is not None:
+                detail, n_dropped = flight.viewing.detail, n_dropped + flight.viewing.n_skipped
             out.append(
                 replace(
                     measured,
                     alive=stage.alive and not hangs,
                     n=said.n_done if said is not None else 0,
-                    n_dropped=stage.n_dropped,
+                    n_dropped=n_dropped,
                     waiting_mb=stage.waiting_bytes * 1e-6,
                     n_restarted=flight.n_restarted.get(kind, 0),
                     detail=f"no sign of it for {no_sign_s:.0f} s" if hangs else detail,
                 )
             )
-        if flight.viewing is not None:
-            out.append(flight.viewing.health())
         return tuple(out)

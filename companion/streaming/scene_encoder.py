@@ -61,6 +61,7 @@ IN_WORDS = {
     TrackState.TRACKING: Shown.TRACKING,
     TrackState.DEAD_RECKONING: Shown.DEAD_RECKONING,
     TrackState.LOST: Shown.LOST,
+    TrackState.STANDING: Shown.STANDING,
 }
 
 

@@ -16,10 +16,14 @@ from typing import Any, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.telemetry.mavlink_samples import landed
 
 MAX_AGE_NS = 500_000_000
 """Longest extrapolation of a height by its rate of change: both messages come at 10 Hz, and a
 multicopter that accelerates by 2 m/s2 is 0.25 m elsewhere after this."""
+STILL_M_S = 0.1
+"""Vertical rate on the ground: a landed state is told once a second only, and a vehicle that lifts
+off has climbed by a metre until the next."""
 LANDED_AGE_NS = 2_000_000_000
 """Validity of EXTENDED_SYS_STATE; autopilots that send it do so each second."""
 MOST_AWAY_M = 1e5
@@ -73,8 +77,14 @@ class AutopilotHeight:
         vehicle = self._link.vehicle
         if vehicle is None:
             return False
+        if not vehicle.armed:
+            return True
+        climbs = any(
+            height is not None and abs(height.rate_m_s) > STILL_M_S
+            for height in (self._local, self._below_home)
+        )
         landed = self._landed_ns is not None and t_ns - self._landed_ns < LANDED_AGE_NS
-        return landed or not vehicle.armed
+        return landed and not climbs
 
     def _take_local(self, message: Any, _receive_ns: int) -> None:
         taken = self._height(message.time_boot_ms, message.z, message.vz)
@@ -93,8 +103,7 @@ class AutopilotHeight:
             self.home_down_m = -taken.down_m
 
     def _take_state(self, message: Any, receive_ns: int) -> None:
-        landed = message.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
-        self._landed_ns = receive_ns if landed else None
+        self._landed_ns = receive_ns if landed(message) else None
 
     def _height(self, boot_ms: int, down_m: float, rate_m_s: float) -> _Height | None:
         t_ns = self._link.clock_filter.host_ns(boot_ms * 1_000_000)

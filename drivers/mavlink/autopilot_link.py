@@ -21,7 +21,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.health import RateMeter, SourceHealth, SourceMeter
 from companion.messages import Warned
 from companion.pilot_messages import PilotText
-from companion.telemetry import ArmedSample, Telemetry
+from companion.telemetry import ArmedSample, LandedSample, Telemetry
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.commands import NO_ANSWER, TRIES, Commands
@@ -34,7 +34,7 @@ from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.wire import run_together
 from drivers.system.within import within
 from drivers.telemetry.live_samples import LiveSamples
-from drivers.telemetry.mavlink_samples import READERS, wanted
+from drivers.telemetry.mavlink_samples import READERS, landed, wanted
 
 FIRST_SYSTEM = 1
 """System id that we use until the vehicle is heard: on UDP it may send only then."""
@@ -95,6 +95,7 @@ class AutopilotLink:
         port.identity = (config.system_id or FIRST_SYSTEM, config.component_id)
         self._on: dict[int, Take] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._take_heartbeat,
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._take_landed,
             mavlink.MAVLINK_MSG_ID_TIMESYNC: self._take_timesync,
             mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._take_acknowledgement,
         }
@@ -275,6 +276,9 @@ class AutopilotLink:
         if self.vehicle.armed is not self._armed:
             self._armed = self.vehicle.armed
             self._deliver(ArmedSample(receive_ns, self._armed))
+
+    def _take_landed(self, message: Any, receive_ns: int) -> None:
+        self._deliver(LandedSample(receive_ns, landed(message)))
 
     def _take_timesync(self, message: Any, receive_ns: int) -> None:
         targets = zip(timesync_target(message), self.port.identity, strict=True)

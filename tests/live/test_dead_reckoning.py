@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.processes.flying import Flying
 
-TOLD = "tracking lost: dead reckoning"
+TOLD = "position by dead reckoning"
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,8 @@ def test_they_end_when_they_are_uncertain(flying: Flying) -> None:
     seen_ns = time.monotonic_ns()
     flying.until_told("vision position on", seen_ns, 30)
     flying.assert_true_poses()
-    assert max(flying.poses.sigma_m) <= 1.0 + 1e-6
+    # of the place; what the scale is uncertain by over the last seconds comes on top: 0.1 m
+    assert max(flying.poses.sigma_m) <= (1.0**2 + 0.15**2) ** 0.5
 
 
 def test_it_ends_well(flying: Flying) -> None:

@@ -166,7 +166,7 @@ def test_a_wedged_pose_loop_is_ended_by_the_watchdog(
     began_s = time.monotonic()
     while "Watchdog timeout" not in container.run("journalctl", "--unit=companion", "--no-pager"):
         assert time.monotonic() < began_s + 120
-        container.run("pkill", "-STOP", "-f", "stage_child localisation", check=False)
+        container.run("pkill", "-STOP", "-x", "localisation", check=False)
         time.sleep(0.2)
     told(f"watchdog after {time.monotonic() - began_s:.0f} s")
     until(lambda: int(service.shown("NRestarts")) > n_before, 60, "another start")

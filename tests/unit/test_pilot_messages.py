@@ -15,6 +15,7 @@ from companion.daemon.control.flight_parameters import PARAMETERS
 from companion.daemon.flights import live_flight, recording_recovery, viewing
 from companion.daemon.pose import pose_sender
 from companion.estimation import localisation, pose_gate
+from companion.estimation.inertial import imu_verdict
 from companion.messages import Warned
 from companion.pilot_messages import (
     INFO,
@@ -128,6 +129,7 @@ def test_every_warning_has_its_words() -> None:
         localisation.MAP_RESUMED, localisation.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
         link_watch.NO_MAVLINK, live_flight.RESTARTED, live_flight.LOCALISATION_DIED,
         live_flight.NOT_FINISHED,
+        imu_verdict.NOT_USED, imu_verdict.USED_AGAIN,
         viewing.SHOWN, viewing.NO_VIEWER, viewing.GONE, viewing.BEHIND, viewing.CLOSED,
         recording_recovery.CUT_SHORT, ground_requests.TOO_MANY,
         topics_work.MALFORMED, topics_work.TAKEN,

@@ -29,9 +29,12 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
         signals.defer()
         return run_depth_node(load(), lambda: signals.received is not None)
-    from companion.daemon.daemon import run
+    from companion.runtime.fork_server import ForkServer
 
-    return run(load)
+    with ForkServer(copy=True) as server:  # before there are threads and what only the daemon needs
+        from companion.daemon.daemon import run
+
+        return run(load, server.start)
 
 
 def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:

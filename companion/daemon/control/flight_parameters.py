@@ -30,6 +30,7 @@ class FlightParameter:
 def _table() -> dict[str, FlightParameter]:
     found = (
         FlightParameter("FB_MODE", "feedback.mode", at_once=True),
+        FlightParameter("FB_FLOW", "feedback.flow", at_once=True),
         FlightParameter("FB_RATE_HZ", "feedback.rate_hz", at_once=True),
         FlightParameter("FB_MAX_SIGMA_M", "feedback.max_sigma_m", at_once=True),
         FlightParameter("FB_MIN_QUALITY", "feedback.min_quality", at_once=True),

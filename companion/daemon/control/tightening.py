@@ -56,6 +56,7 @@ WHILE_ARMED: Mapping[str, MayChange] = {
     "feedback.origin_latitude_deg": _not_at_all,
     "feedback.origin_longitude_deg": _not_at_all,
     "feedback.origin_altitude_m": _not_at_all,
+    "feedback.flow": _to_off,
     # obstacle avoidance of the autopilot relies on these messages
     "feedback.obstacle_distance": _not_at_all,
     # a map begun in the air accepts its scale, and its frames, by these

@@ -176,7 +176,7 @@ class Daemon:
         found = [
             (child.create_time(), child.pid)
             for child in self._children()
-            if kind in self._command_of(child)
+            if kind == self._name_of(child)
         ]
         assert found, f"there is no process of {kind}"
         return int(max(found)[1])
@@ -212,11 +212,11 @@ class Daemon:
             return []
 
     @staticmethod
-    def _command_of(child: psutil.Process) -> list[str]:
+    def _name_of(child: psutil.Process) -> str:
         try:
-            return list(child.cmdline())
+            return str(child.name())
         except psutil.Error:
-            return []
+            return ""
 
     def _read(self) -> None:
         stderr = self._running.stderr

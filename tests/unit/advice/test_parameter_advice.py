@@ -138,6 +138,20 @@ def test_compass_and_proximity_are_required_where_used() -> None:
     assert blocking("ardupilot", {"PRX1_TYPE": 0}) == {}
 
 
+def test_flow_needs_its_parameters_where_it_is_sent() -> None:
+    flow = FeedbackConfig(flow="optical_flow")
+    amiss = {"FLOW_TYPE": 0.0, "FLOW_ORIENT_YAW": 9000.0, "FLOW_OPTIONS": 1.0}
+    found = blocking("ardupilot", amiss, feedback=flow)
+    assert {name: found[name].set_to for name in amiss} == {
+        "FLOW_TYPE": 5, "FLOW_ORIENT_YAW": 0, "FLOW_OPTIONS": 0,
+    }  # fmt: skip
+    assert blocking("ardupilot", amiss) == {}
+    amiss = {"EKF2_OF_CTRL": 0.0, "SENS_FLOW_ROT": 6.0}
+    found = blocking("px4", amiss, feedback=FeedbackConfig(flow="optical_flow_rad"))
+    assert {name: found[name].set_to for name in amiss} == {"EKF2_OF_CTRL": 1, "SENS_FLOW_ROT": 0}
+    assert blocking("px4", amiss, feedback=flow) == {}
+
+
 def test_slow_line_is_reported_by_port() -> None:
     link = LinkConfig(url="serial:/dev/ttyTHS1:57600")
     (slow,) = check_line("ardupilot", NEW["ardupilot"], link, FEEDBACK, "odometry", 57600)

@@ -56,7 +56,7 @@ class Run:
         self.is_set, self.set_forward_ns = False, 0
         self.clock.behind_ns = lambda: self.set_forward_ns  # type: ignore[method-assign]
         self.dates = FlightDates(self.clock, lambda: self.autopilot_ahead_ns, lambda: self.is_set)
-        self.flights = Flights(self.clock, Journal({}), never, never, self.dates)
+        self.flights = Flights(self.clock, Journal({}), never, never, self.dates, never)
 
     def begin(self) -> Path:
         """A flight begins, and its stages make its folder."""

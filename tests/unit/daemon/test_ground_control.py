@@ -61,7 +61,7 @@ def control_of(config: Config) -> tuple[GroundControl, Controlled, MemoryPort]:
         raise AssertionError
 
     dates = FlightDates(clock, lambda: None, lambda: True)
-    flights = Flights(clock, journal, never, never, dates)
+    flights = Flights(clock, journal, never, never, dates, never)
     return (
         GroundControl(daemon, link, clock, journal, flights, {}, {}, lambda _: None), daemon, port,
     )  # fmt: skip

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.config import FeedbackConfig, LinkConfig
+from companion.config import FeedbackConfig
 from companion.daemon.pose import kept_counter
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.pose_sender import PoseSender
@@ -22,24 +22,12 @@ from companion.geometry.transforms import Pose
 from companion.messages import Odometry, TrackState, Warned
 from companion.products.atomic_file import write_atomically
 from companion.telemetry import AttitudeSample, Telemetry
-from companion.timing.clock import FlightClock
-from drivers.mavlink.autopilot_link import AutopilotLink
+from tests.support.autopilot.memory_link import SetClock, listen, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
 
 MS = 1_000_000
 DOWN_M = -3.0
 """Of the body in our world."""
-
-
-class SetClock(FlightClock):
-    """Stands still but for who sets it."""
-
-    def __init__(self) -> None:
-        super().__init__(epoch_ns=1_795_000_000 * 10**9)
-        self.t_ns = self.epoch_ns + 2000 * 10**9
-
-    def now_ns(self) -> int:
-        return self.t_ns
 
 
 class Vehicle:
@@ -53,6 +41,7 @@ class Vehicle:
         """What LOCAL_POSITION_NED says; None: it is not sent."""
         self.above_home_m: float | None = None
         self.landed_state: int | None = None
+        self.climb_m_s = 0.0
         self.warned: list[Warned] = []
         self.seq = 0
         self.joins = True
@@ -61,9 +50,7 @@ class Vehicle:
     async def begin(self) -> None:
         """Start a process of ours: one that was killed leaves nothing behind but its files."""
         self.port = MemoryPort()
-        self.link = AutopilotLink(
-            LinkConfig(), self.port, self.clock, self._deliver, self.warned.append
-        )
+        self.link = memory_link(self.port, self.clock, self._deliver, self.warned.append)
         self.sender = PoseSender(
             FeedbackConfig(mode=self.mode),
             self.link,
@@ -72,11 +59,7 @@ class Vehicle:
             self.warned.append,
             lambda step: None,
         )
-        task = asyncio.create_task(self.link.run())
-        await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        task.cancel()  # it listens, and shall do nothing by itself
-        await asyncio.gather(task, return_exceptions=True)
+        await listen(self.link)
         self._reset_counter = 0
 
     def _deliver(self, sample: Telemetry) -> None:
@@ -131,7 +114,7 @@ class Vehicle:
         if self.above_home_m is not None:
             above_mm = round(1e3 * self.above_home_m)
             self._say(mavlink.MAVLink_global_position_int_message(
-                boot_ms, 0, 0, 0, above_mm, 0, 0, 0, 65535
+                boot_ms, 0, 0, 0, above_mm, 0, 0, round(-100 * self.climb_m_s), 65535
             ))  # fmt: skip
         if self.landed_state is not None:
             self._say(mavlink.MAVLink_extended_sys_state_message(0, self.landed_state))
@@ -291,6 +274,22 @@ async def test_a_copter_that_tells_no_local_position_yet_tells_its_climb(tmp_pat
 
 
 @flown
+async def test_a_landed_state_of_a_second_ago_does_not_move_home(tmp_path: Path) -> None:
+    """It is told once a second, and a copter that lifts off climbs meanwhile."""
+    vehicle = Vehicle(tmp_path / "kept.json")
+    vehicle.down_m, vehicle.armed, vehicle.above_home_m = None, False, 584.1
+    vehicle.landed_state = 1
+    await vehicle.begin()
+    vehicle.run(2, frames=False)
+    vehicle.armed, vehicle.above_home_m, vehicle.climb_m_s = True, 584.8, 1.0
+    vehicle.run(1, frames=False)
+    vehicle.landed_state = 2
+    vehicle.run(1, frames=False)
+    vehicle.above_home_m, vehicle.climb_m_s = 589.1, 0.0
+    assert {round(pose.z, 3) for pose in vehicle.run(4)} == {-5.0}
+
+
+@flown
 async def test_a_disk_that_cannot_be_written_is_reported_once(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     vehicle, counters = Vehicle(tmp_path / "file" / "kept.json"), []
@@ -367,12 +366,12 @@ async def test_the_pilot_hears_of_dead_reckoning_that_lasts(tmp_path: Path) -> N
     assert vehicle.texts == ["Companion: vision position on"]
     assert vehicle.run(2, blind=True)
     assert vehicle.sender.health().bridging
-    assert vehicle.texts[1:] == ["Companion: tracking lost: dead reckoning"]
+    assert vehicle.texts[1:] == ["Companion: position by dead reckoning"]
     vehicle.run(1)
     assert not vehicle.sender.health().bridging
     assert vehicle.texts[2:] == ["Companion: vision position on"]
     vehicle.run(2, blind=True)
     vehicle.run(1, frames=False)
     assert vehicle.texts[3:] == [
-        "Companion: tracking lost: dead reckoning", "Companion: vision position lost: no video"
+        "Companion: position by dead reckoning", "Companion: vision position lost: no video"
     ]  # fmt: skip

@@ -196,10 +196,10 @@ def test_finds_the_autopilot_and_stamps_what_it_measures(firmware: str) -> None:
                 assert link.health.state == "running" and link.health.n_dropped < 20
                 # every message is asked for once, and the right ones are
                 assert max(Counter(intervals(autopilot)).values()) == 1
-                assert {31, 105, 32, 33, 24, 29, 132, 2} == set(intervals(autopilot))
+                assert {31, 105, 32, 33, 24, 29, 132, 2, 245} == set(intervals(autopilot))
                 # the attitude of a circle tells the time at which it was measured
                 errors = []
-                for sample in heard.samples[-200:]:
+                for sample in heard.samples[-240:]:
                     if isinstance(sample, AttitudeSample):
                         at_ns = sample.t_ns - heard.clock.epoch_ns - autopilot._fly_ns  # type: ignore[operator]
                         measured = autopilot.flight.message("ATTITUDE", at_ns * 1e-9)
@@ -789,7 +789,7 @@ def test_a_rate_that_comes_is_not_asked_for_again() -> None:
 
 def test_what_is_set_to_zero_is_not_asked_for() -> None:
     ids = {each.ids[0] for each in wanted(LinkConfig(attitude_hz=0, position_hz=0, height_hz=0))}
-    assert ids == {mavlink.MAVLINK_MSG_ID_SYSTEM_TIME}
+    assert ids == {mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE}
 
 
 def test_modes_have_names() -> None:

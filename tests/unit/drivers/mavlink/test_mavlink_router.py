@@ -329,7 +329,9 @@ def test_clients_that_flood_starve_neither_us_nor_another(tmp_path: Path) -> Non
                     floods.append(flood(client, speaker))
                 ground, n_said = Speaker(255, 190), 0
                 begun_s = time.monotonic()
-                while (passed_s := time.monotonic() - begun_s) < 1.0:
+                n_turned_away = 0
+                while (passed_s := time.monotonic() - begun_s) < 1.0 or n_turned_away <= 100:
+                    n_turned_away = counts(scene, "n_dropped_in")
                     for more in floods:
                         more()
                     if passed_s * 20 > n_said:
@@ -348,10 +350,9 @@ def test_clients_that_flood_starve_neither_us_nor_another(tmp_path: Path) -> Non
                 for flooder in (200, 201):
                     assert sources.count(flooder) > 5
                 n_bytes = sum(len(packet.raw) for packet in got)
-                assert n_bytes < 5760 * 1.25
+                assert n_bytes < 5760 * (passed_s + 0.25)
                 assert port.n_dropped == 0
                 assert stream.n_bad_bytes == 0
-                assert counts(scene, "n_dropped_in") > 100
         cable.unplug()
 
     asyncio.run(play())
