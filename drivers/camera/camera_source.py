@@ -41,10 +41,12 @@ class CameraSource(Protocol):
     """Longest time from opening to the first image."""
     silent_s: float
     """Time without an image, after the first, that means that it is silent."""
-    n_dropped: int
-    """Images dropped as damaged or too late."""
     remarks: list[str]
     """Deviations from the request; the reader takes them out."""
+
+    @property
+    def n_dropped(self) -> int:
+        """Images dropped as damaged or too late."""
 
     def open(self) -> None:
         """Open. SourceError: not there now. ConfigError: impossible as configured.

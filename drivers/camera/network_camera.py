@@ -52,10 +52,17 @@ class NetworkCamera:
                 f"camera.url = {self.name!r} is no network address; for files set camera.source to "
                 '"file"'
             )
-        self.n_dropped = 0
         self.remarks: list[str] = []
+        self._n_dropped_before = 0
+        """By connections that were closed."""
         self._config = config
         self._receiver: _Receiver | None = None
+
+    @property
+    def n_dropped(self) -> int:
+        """Images that came damaged, or of which a newer one came first."""
+        receiver = self._receiver
+        return self._n_dropped_before + (0 if receiver is None else receiver.n_dropped)
 
     def open(self) -> None:
         """Connect; see `CameraSource`."""
@@ -75,7 +82,6 @@ class NetworkCamera:
         if receiver is None:
             raise SourceError(f"{self.name}: not open")
         newest = receiver.take(timeout_s)
-        self.n_dropped += receiver.take_n_dropped()
         if newest is None:
             if receiver.error is not None:
                 raise receiver.error
@@ -87,6 +93,7 @@ class NetworkCamera:
         receiver, self._receiver = self._receiver, None
         if receiver is not None:
             receiver.end()
+            self._n_dropped_before += receiver.n_dropped
 
 
 class _Receiver:
@@ -101,7 +108,7 @@ class _Receiver:
         self._ended = threading.Event()
         self._changed = threading.Condition()
         self._newest: _Newest | None = None
-        self._n_dropped = 0
+        self.n_dropped = 0
         self._heard_s = 0.0
         """Arrival of the last packet; RTSP reports a timeout as damaged data."""
         self.thread = threading.Thread(target=self._run, name="network camera", daemon=True)
@@ -112,12 +119,6 @@ class _Receiver:
             self._changed.wait_for(lambda: self._newest or self.error, timeout_s)
             newest, self._newest = self._newest, None
             return newest
-
-    def take_n_dropped(self) -> int:
-        """Images dropped since the last call."""
-        with self._changed:
-            n, self._n_dropped = self._n_dropped, 0
-            return n
 
     def end(self) -> None:
         self._ended.set()
@@ -170,7 +171,7 @@ class _Receiver:
             try:
                 frames = packet.decode()
             except av.error.FFmpegError:
-                self._count_dropped()
+                self.n_dropped += 1
                 continue
             for frame in frames:
                 t_ns = arrived_ns
@@ -178,21 +179,17 @@ class _Receiver:
                     sent_ns = round(frame.pts * frame.time_base * 1_000_000_000)
                     t_ns = clock.monotonic_ns(sent_ns, arrived_ns)
                     if not clock.settled:
-                        self._count_dropped()
+                        self.n_dropped += 1
                         continue
                 if frame.is_corrupt or t_ns <= last_ns:
-                    self._count_dropped()
+                    self.n_dropped += 1
                     continue
                 last_ns = t_ns
                 self._put(_Newest(frame, t_ns))
 
-    def _count_dropped(self) -> None:
-        with self._changed:
-            self._n_dropped += 1
-
     def _put(self, newest: _Newest) -> None:
         with self._changed:
-            self._n_dropped += self._newest is not None
+            self.n_dropped += self._newest is not None
             self._newest = newest
             self._changed.notify()
 

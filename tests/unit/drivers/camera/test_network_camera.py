@@ -62,7 +62,7 @@ def camera(port: int, path: str, **keys: str) -> NetworkCamera:
 
 def taken(source: NetworkCamera, n: int) -> list[Picture]:
     pictures: list[Picture] = []
-    deadline_s = time.monotonic() + 3
+    deadline_s = time.monotonic() + 20
     while len(pictures) < n:
         assert time.monotonic() < deadline_s
         picture = source.read(0.1)
@@ -107,13 +107,18 @@ def test_stamps_tell_when_pictures_were_made(port: int, transport: str) -> None:
 def test_a_slow_reader_gets_the_newest(port: int) -> None:
     source = camera(port, "live")
     source.open()
-    taken(source, 1)
-    n_before = source.n_dropped
-    time.sleep(0.3)
-    (picture,) = taken(source, 1)
-    assert time.monotonic_ns() - picture.monotonic_ns < 280e6
+    try:
+        (first,) = taken(source, 1)
+        n_before = source.n_dropped
+        deadline_s = time.monotonic() + 20
+        while source.n_dropped < n_before + 5:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        (picture,) = taken(source, 1)
+    finally:
+        source.close()
+    assert picture.monotonic_ns - first.monotonic_ns > 4.5e9 / server.RATE_HZ
     assert source.n_dropped >= n_before + 5
-    source.close()
 
 
 def test_power_lost_and_back(film: Path) -> None:
@@ -134,16 +139,16 @@ def test_power_lost_and_back(film: Path) -> None:
         )
         feed = CameraFeed(NetworkCamera(config), FlightClock(), config, deliver, warned.append)
         feed.start()
-        assert came.wait(3)
+        assert came.wait(20)
     try:
-        deadline_s = time.monotonic() + 3
+        deadline_s = time.monotonic() + 20
         while feed.health.state != "missing" and time.monotonic() < deadline_s:
             time.sleep(0.01)
         assert feed.health.state == "missing"
         with server.rtsp_server(film, port):
             back_s = time.monotonic()
             came.clear()
-            assert came.wait(3)
+            assert came.wait(20)
             assert time.monotonic() - back_s < 2
             assert feed.health.n_reopened == 1
             feed.stop()
