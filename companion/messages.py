@@ -30,6 +30,18 @@ class Frame:
     rgb: Bytes
 
 
+NO_PICTURE = 1 << 31
+"""Numbers from here on are those of notices, not of frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameOverdue:
+    """Notice of a frame that was due at `t_ns` and did not come; `seq` is above NO_PICTURE."""
+
+    seq: int
+    t_ns: int
+
+
 class TrackState(Enum):
     """State of the tracker."""
 
@@ -131,6 +143,7 @@ class FrameTracked:
 
     `n_samples` of telemetry had been taken since the beginning. `mapping_point` is where mapping
     stood, see `companion.slam.mapping.mapping_worker.MapLock`; `feature_ratio` the load level.
+    `has_picture` is False of a FrameOverdue.
     """
 
     t_ns: int
@@ -138,6 +151,7 @@ class FrameTracked:
     n_samples: int
     mapping_point: int
     feature_ratio: float
+    has_picture: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -345,5 +359,5 @@ class ClockReport:
 
 Message = (
     Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
-    | PointChunk | Warned | Georeferenced | FrameTracked | OpticalFlow
+    | PointChunk | Warned | Georeferenced | FrameTracked | FrameOverdue | OpticalFlow
 )  # fmt: skip

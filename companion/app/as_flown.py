@@ -21,7 +21,7 @@ from companion.estimation.localisation import (
     LocalisationStage,
 )
 from companion.geometry.camera import Camera
-from companion.messages import Frame, Odometry
+from companion.messages import Frame, FrameOverdue, Odometry
 from companion.products.atomic_file import write_atomically
 from companion.telemetry import AttitudeSample
 from companion.timing.clock import StageTimes
@@ -107,8 +107,12 @@ def _tracked_again(
     n_taken = 0
     try:
         for n_done, step in enumerate(told.frames):
-            frame = next((f for f in pictures if f.seq >= step.seq), None)
-            if frame is None or frame.seq != step.seq or step.n_samples > len(told.samples):
+            given: Frame | FrameOverdue | None = (
+                next((f for f in pictures if f.seq >= step.seq), None)
+                if step.has_picture
+                else FrameOverdue(step.seq, step.t_ns)
+            )
+            if given is None or given.seq != step.seq or step.n_samples > len(told.samples):
                 raise FlightError(
                     f"frame {step.seq} was tracked, but its image or telemetry before it is "
                     "missing in the recording"
@@ -117,7 +121,7 @@ def _tracked_again(
                 stage.step(sample)
             n_taken = step.n_samples
             stage.set_effort(step.feature_ratio)
-            for out in stage.step(frame):
+            for out in stage.step(given):
                 if isinstance(out, Odometry):
                     found[out.seq] = out
             progress.update(n_done + 1, stage.state.value, 0)

@@ -13,7 +13,7 @@ from companion.config import Config
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.errors import StageError
-from companion.messages import Frame, Odometry, Warned
+from companion.messages import Frame, FrameOverdue, Odometry, Warned
 from companion.products.flight_result import RunFacts
 from companion.runtime.fork_server import ForkServer
 from companion.runtime.stages import START_S
@@ -105,5 +105,5 @@ def _play(
             flight.frame(message)
             n_done += 1
             update(n_done)
-        elif isinstance(message, Warned | Telemetry):
+        elif isinstance(message, Warned | Telemetry | FrameOverdue):
             flight.take(message)

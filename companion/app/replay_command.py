@@ -29,6 +29,7 @@ from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stages import Stage, stage_named
 from companion.streaming.live_viewer import LiveViewer
 from companion.timing.clock import monotonic_s
+from companion.timing.overdue_frames import with_notices
 from drivers.flight import ENDS_EARLY, Flight
 from drivers.open_flight import open_flight
 
@@ -72,13 +73,13 @@ class RecordedInput:
         self.n_frames = self.flight.n_frames_between(self._start_ns, self._stop_ns)
 
     def messages(self) -> Iterator[Message]:
-        """All in order of time, with warnings of gaps."""
+        """All in order of time, with warnings of gaps and notices of frames that are missing."""
         yield from self.flight.warnings
         yield from self.log.warnings
         first_ns = self._start_ns - LEAD_NS
         samples = [s for s in self.log.samples if first_ns <= s.t_ns <= self._stop_ns]
         frames = self.flight.frames(self._start_ns, self._stop_ns)
-        yield from with_gap_warnings(in_order_of_time(samples, frames))
+        yield from with_gap_warnings(with_notices(in_order_of_time(samples, frames)))
 
 
 def replay(

@@ -36,13 +36,14 @@ from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import LatencyMeter
-from companion.messages import Frame, Odometry, OpticalFlow, Warned
+from companion.messages import NO_PICTURE, Frame, Odometry, OpticalFlow, Warned
 from companion.pilot_messages import PilotText, of_warning
 from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import Snapshot
 from companion.runtime.stage_start import Start
 from companion.telemetry import ArmedSample, AttitudeSample, Telemetry, belief_in_words
 from companion.timing.clock import FlightClock
+from companion.timing.overdue_frames import OVERDUE_NS, OverdueFrames
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_registry import camera_source
 from drivers.mavlink.autopilot_date import AutopilotDate
@@ -55,6 +56,7 @@ from drivers.system.metrics import Metrics
 from drivers.system.service_manager import ServiceManager
 from drivers.system.status_socket import StatusSocket, own_socket_path
 
+LEAST_WAIT_S = 0.005
 WRITE_S = 0.2
 """Time to write the armed settings at the end."""
 END_S = 2.6
@@ -79,6 +81,7 @@ class Daemon:
             journal.say(belief, WARNING)
         self._service = ServiceManager()
         self._loop_delay = LatencyMeter()
+        self._overdue = OverdueFrames()
         self._feed = CameraFeed(
             camera_source(config.camera), clock, config.camera, self._on_frame, self._on_warned
         )
@@ -187,6 +190,7 @@ class Daemon:
             self._checks.run(),
             self._watch.govern(),
             measure_loop_delay(self._clock, self._loop_delay),
+            self._notice_overdue(),
             self._notes.run(),
             self._recovery.run(),
         ]
@@ -207,10 +211,21 @@ class Daemon:
     def _on_frame(self, frame: Frame) -> None:
         """Take a frame; in the camera's thread."""
         self._watch.frame_came()
+        self._overdue.came(frame, self._clock.now_ns())
         if self._starts.camera is None:
             self._soon(self._starts.camera_known)
             return
         self._flights.frame(frame)
+
+    async def _notice_overdue(self) -> None:
+        """Tell the flight of frames that do not come; ends by cancellation."""
+        while True:
+            now_ns = self._clock.now_ns()
+            notice = self._overdue.due(now_ns)
+            if notice is not None:
+                self._flights.take(notice)
+            due_ns = self._overdue.due_ns() or now_ns + OVERDUE_NS
+            await asyncio.sleep(max((due_ns - now_ns) * 1e-9, LEAST_WAIT_S))
 
     def _on_warned(self, warning: Warned) -> None:
         """Take a warning; in any thread."""
@@ -255,7 +270,8 @@ class Daemon:
         )
 
     def _on_odometry(self, odometry: Odometry) -> None:
-        self._watch.take_odometry(odometry)
+        if odometry.seq < NO_PICTURE:
+            self._watch.take_odometry(odometry)
         if self._sender is not None:
             self._sender.take(odometry)
 

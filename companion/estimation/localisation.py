@@ -34,6 +34,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
     Frame,
+    FrameOverdue,
     FrameTracked,
     KeyframeAdded,
     MapUpdate,
@@ -129,6 +130,8 @@ class LocalisationStage:
         """
         if isinstance(message, Frame):
             return self._frame(message)
+        if isinstance(message, FrameOverdue):
+            return self._without_frame(message)
         if isinstance(message, Telemetry):
             self._samples.append(message)
         return []
@@ -217,6 +220,22 @@ class LocalisationStage:
                 self._tracker.feature_ratio,
             )  # fmt: skip
         yield from self._flow_of(frame)
+
+    def _without_frame(self, overdue: FrameOverdue) -> Iterator[Message]:
+        """The pose by inertial navigation alone, where that is known."""
+        t_ns = overdue.t_ns
+        if t_ns <= self._t_ns:
+            return
+        with self._tracker.map_lock.tracking():
+            self._take_samples()
+            self._apply_map_correction()
+            found = self._odometry.without_frame(overdue.seq, t_ns, self._body_attitude(t_ns))
+            if found is not None:
+                yield found
+            yield FrameTracked(
+                t_ns, overdue.seq, self._n_samples, self._tracker.map_lock.point,
+                self._tracker.feature_ratio, has_picture=False,
+            )  # fmt: skip
 
     def _flow_of(self, frame: Frame) -> Iterator[Message]:
         """Optical flow for the autopilot, and for the way from a lift-off to a metric map."""

@@ -131,6 +131,9 @@ class SmoothOdometry:
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None or georeference is None:
             return self._unknown(track)
+        if self._last is not None and track.t_ns <= self._last[0]:
+            # late: a pose without it was given meanwhile
+            return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
         if segment != self._segment or self._georeference is None:
             if self._reckoned is not None and georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING:
                 return self._unknown(track)  # it would also be slower and faster than the body
@@ -229,6 +232,17 @@ class SmoothOdometry:
     def reckoned_world(self, t_ns: int) -> BodyPlace | None:
         """Place by inertial navigation at one of the latest frames; None if that had none."""
         return next((each for each in self._reckoned_world if each.t_ns == t_ns), None)
+
+    def without_frame(self, seq: int, t_ns: int, attitude: BodyAttitude | None) -> Odometry | None:
+        """Odometry at a time without a frame; None where inertial navigation knows none.
+
+        Nor at a stand: that it lasts takes a picture to say.
+        """
+        if self._ground.stood is not None or not self._given:
+            return None
+        if self.begin(t_ns, attitude) is None:
+            return None
+        return self._unknown(Track(seq, t_ns, TrackState.LOST))
 
     def _dead_reckon(self, track: Track, raw: Pose) -> Odometry:
         """Odometry by dead reckoning: of lowest quality and growing uncertainty."""

@@ -16,6 +16,7 @@ from companion.health import Health
 from companion.messages import (
     DepthMap,
     Frame,
+    FrameOverdue,
     FrameTracked,
     KeyframeAdded,
     LoopClosed,
@@ -79,7 +80,7 @@ class Stage:
 
 STAGES = (
     Stage(
-        "localisation", (Frame, *TELEMETRY), nice=0, frames=Frames.NEWEST,
+        "localisation", (Frame, FrameOverdue, *TELEMETRY), nice=0, frames=Frames.NEWEST,
         finish_s=120.0, hurried_s=0.7, death=Death.ENDS_FLIGHT, is_source=True,
     ),
     Stage(

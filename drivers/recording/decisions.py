@@ -100,8 +100,8 @@ def step_of(t_ns: int, data: bytes) -> GateStep:
 
 def _of(kind: type[Any], t_ns: int, data: bytes) -> Any:
     given = json.loads(data)
-    names = [each.name for each in dataclasses.fields(kind) if each.name != "t_ns"]
-    return kind(t_ns, **{name: given[name] for name in names})
+    told = {each.name: given[each.name] for each in dataclasses.fields(kind) if each.name in given}
+    return kind(t_ns, **told)
 
 
 def _poses(stream: MavlinkStream, data: bytes, config: Config) -> Iterator[tuple[int, bytes]]:

@@ -135,7 +135,7 @@ TOPICS: dict[str, Any] = {
         "What a frame's pose hung on beside its image, for a replay as flown",
         {
             "seq": INTEGER, "n_samples": INTEGER, "mapping_point": INTEGER,
-            "feature_ratio": NUMBER,
+            "feature_ratio": NUMBER, "has_picture": FLAG,
         },
     ),
     GATE: _Json(

@@ -1,4 +1,4 @@
-"""A camera that is covered in flight: poses go on by accelerometers while they are certain."""
+"""A camera that is covered, or gone: poses go on by accelerometers while they are certain."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
         yield begun
 
 
-def test_poses_go_on_while_it_is_covered_for_two_seconds(flying: Flying) -> None:
+@pytest.mark.parametrize("how", ["covered", "stalled"])
+def test_poses_go_on_without_sight_for_two_seconds(flying: Flying, how: str) -> None:
     flying.until_sending()
     n_resets = flying.daemon.status()["feedback"]["n_resets"]
     covered_ns = time.monotonic_ns()
-    flying.camera.covered = True
+    setattr(flying.camera, how, True)
     flying.daemon.until(lambda health: health["feedback"]["bridging"], 10, "it bridges")
     flying.until_told(TOLD, covered_ns)
     time.sleep(max(0.0, 2.0 - (time.monotonic_ns() - covered_ns) * 1e-9))
-    flying.camera.covered = False
+    setattr(flying.camera, how, False)
     seen_ns = time.monotonic_ns()
     flying.daemon.until(lambda health: health["tracker"] == "tracking", 10, "it is found")
     flying.until_told("vision position on", seen_ns)

@@ -13,7 +13,7 @@ from companion.daemon.flights.kept_map_place import kept_map_path
 from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.flight_notes import FlightNote
 from companion.geometry.camera import Camera
-from companion.messages import Frame, Warned
+from companion.messages import Frame, FrameOverdue, Warned
 from companion.products.flight_result import RunFacts
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import KeepMap
@@ -100,8 +100,8 @@ class Flights:
         if flight is not None:
             flight.frame(frame)
 
-    def take(self, message: Telemetry | Warned | FlightNote) -> None:
-        """Take telemetry, a warning, or a note for the recorder."""
+    def take(self, message: Telemetry | Warned | FrameOverdue | FlightNote) -> None:
+        """Take telemetry, a warning, a missing frame, or a note for the recorder."""
         if self.current is not None:
             self.current.take(message)
 

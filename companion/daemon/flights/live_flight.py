@@ -18,6 +18,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import (
     Frame,
+    FrameOverdue,
     Georeferenced,
     MapUpdate,
     Odometry,
@@ -148,8 +149,8 @@ class LiveFlight:
             self.n_frames += 1
             self._processes.publish(Parcel.of(frame))
 
-    def take(self, message: Telemetry | Warned | FlightNote) -> None:
-        """Take telemetry, a warning for the log, or a note for the recorder; never waits."""
+    def take(self, message: Telemetry | Warned | FrameOverdue | FlightNote) -> None:
+        """Take telemetry, a warning, a missing frame or a note for the recorder; never waits."""
         if self._takes:
             self._processes.publish(Parcel.of(message))
 

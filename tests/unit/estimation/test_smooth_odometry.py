@@ -127,7 +127,9 @@ def test_dead_reckoning_grows_uncertain_and_reacquires_without_a_jump() -> None:
 
 def test_lost_camera_has_no_pose() -> None:
     odometry = unaided()
+    assert odometry.without_frame(0, 0, BodyAttitude(0, np.eye(3))) is None
     give(odometry, track(0))
+    assert odometry.without_frame(1, 50_000_000, BodyAttitude(50_000_000, np.eye(3))) is None
     lost = give(odometry, Track(1, 100_000_000, TrackState.LOST))
     assert lost.world_from_body is None
     assert lost.quality == -1
@@ -147,8 +149,12 @@ def test_what_a_reacquisition_was_off_by_is_slewed_away() -> None:
     assert np.abs(np.diff(away_m)).max() < 0.02
 
 
-def test_accelerometers_carry_the_pose_on() -> None:
-    """Where nothing is tracked, no map is known, and the pose by the map cannot be."""
+@pytest.mark.parametrize("pictures", [True, False])
+def test_accelerometers_carry_the_pose_on(pictures: bool) -> None:
+    """Where nothing is tracked, or no frame comes, the pose by the map cannot be known.
+
+    A frame that comes when a pose was given for a later time already gives none.
+    """
     integral = AccelerationIntegral()
     odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
     level = np.array([1.0, 0.0, 0.0, 0.0])
@@ -159,9 +165,17 @@ def test_accelerometers_carry_the_pose_on() -> None:
             force = np.array([0.0, 0.0, -9.80665])
             integral.take(ImuSample(t_ns, np.zeros(3), force))
             integral.take(AttitudeSample(t_ns, level))
-        odometry.begin(k * 100_000_000, BodyAttitude(k * 100_000_000, np.eye(3)))
-        velocity = np.array([SPEED, 0.0, 0.0]), 0.1
+        attitude = BodyAttitude(k * 100_000_000, np.eye(3))
         blind = 100 <= k < 120
+        if blind and not pictures:
+            reckoned = odometry.without_frame(k, k * 100_000_000, attitude)
+            assert reckoned is not None
+            found.append(reckoned)
+            late = replace(track(k), t_ns=k * 100_000_000 - 50_000_000)
+            assert give(odometry, late).world_from_body is None
+            continue
+        odometry.begin(k * 100_000_000, attitude)
+        velocity = np.array([SPEED, 0.0, 0.0]), 0.1
         seen = Track(k, k * 100_000_000, TrackState.LOST) if blind else track(k)
         found.append(odometry.step(seen, 0, PLACED, velocity))
     places = np.array([north(each) for each in found])
@@ -234,6 +248,8 @@ def test_a_vehicle_that_lifts_off_is_carried_on_by_accelerometers(flow: bool) ->
         standing = 10 <= k < 34
         if flow:
             odometry.take_height(t_ns, 100.0 + 0.5 * max(k / 10 - lift_s, 0.0) ** 2, rotors=False)
+        if k == 20:  # that it stands takes a picture to say
+            assert odometry.without_frame(1000, t_ns, BodyAttitude(t_ns, np.eye(3))) is None
         odometry.begin(t_ns, BodyAttitude(t_ns, np.eye(3)), standing)
         waiting = Track(k, t_ns, TrackState.INITIALISING)
         found.append(odometry.step(waiting, 0, None, None))
