@@ -9,6 +9,7 @@ import pytest
 
 from tests.support.processes.flying import Flying
 
+pytestmark = pytest.mark.continues
 TOLD = "position by dead reckoning"
 
 

@@ -20,6 +20,9 @@ from drivers.recording.repair import in_place, unfinished
 from drivers.system.low_priority import give_way
 from tests.support.flights.recorded import record
 
+PATIENCE_S = 300.0
+"""What gives way to all others may wait long, beside other tests."""
+
 WHOLE, CUT = "2026-01-01T00-00-00Z", "2026-01-02T00-00-00Z"
 
 
@@ -77,7 +80,7 @@ async def until_warned(cut: Path, warned: list[Warned], armed: list[bool]) -> No
 def test_the_daemon_does_it_when_disarmed(cut: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording_recovery, "AFTER_S", 0.01)
     warned: list[Warned] = []
-    asyncio.run(asyncio.wait_for(until_warned(cut, warned, [True]), 60))
+    asyncio.run(asyncio.wait_for(until_warned(cut, warned, [True]), PATIENCE_S))
     (warning,) = warned
     assert warning.what == CUT_SHORT and warning.detail.startswith(f"{cut}: repaired, ")
     assert summarise(cut).state == "repaired"

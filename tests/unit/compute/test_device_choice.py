@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -169,6 +171,25 @@ def test_compiler_log_is_shown_on_request() -> None:
     ]  # fmt: skip
     told = [line.strip() for line in opencl_lines([bad], verbose=True)]
     assert told[2:] == ["1", "a", "b", "c", "auto takes none of them"]
+
+
+def test_a_driver_is_not_blamed_for_a_processor_that_is_busy() -> None:
+    """Both share one, of which the driver's program gets a few per cent."""
+    processor, right = min(os.sched_getaffinity(0)), at("0:0", 40)
+    answer = json.dumps(dataclasses.asdict(right))
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as busy:
+        os.sched_setaffinity(busy.pid, {processor})
+        program = (
+            f"import os, time; os.sched_setaffinity(0, {{{processor}}}); os.nice(12)\n"
+            "while time.process_time() < 0.15: pass\n"
+            f"print({answer!r})"
+        )
+        began_s = time.monotonic()
+        found = probed(right.listed, (sys.executable, "-c", program), 0.5)
+        took_s = time.monotonic() - began_s
+        busy.kill()
+    assert took_s > 0.5
+    assert found.problem == ""
 
 
 @pytest.mark.parametrize(
