@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.config import Config
-from companion.estimation.camera_attitude import CameraAttitude
+from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.checkpoint import MAX_BYTES, Checkpoint
 from companion.estimation.georeference import Georeferencer

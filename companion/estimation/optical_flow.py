@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.estimation.camera_attitude import CameraAttitude
+from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, rotation_from_vector, vector_from_rotation
 from companion.messages import Bytes, Floats, Frame, OpticalFlow

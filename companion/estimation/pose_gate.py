@@ -17,7 +17,7 @@ from enum import Enum
 import numpy as np
 
 from companion.config import MEASUREMENTS, FeedbackConfig, Measurement
-from companion.estimation.attitude_history import MAX_EXTRAPOLATION_NS, AttitudeHistory
+from companion.estimation.attitude.attitude_history import MAX_EXTRAPOLATION_NS, AttitudeHistory
 from companion.estimation.reset_counter import ResetCounter
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Odometry, TrackState

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from companion.estimation.camera_attitude import CameraAttitude
+from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.georeference import AlignmentSample, Georeferencer, place_new_map
 from companion.estimation.height_above_ground import HeightAboveGround
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral

@@ -22,7 +22,7 @@ import numpy as np
 
 from companion.app.bench.injected_faults import OFFSET_AXIS, OFFSET_RAD
 from companion.config import Config
-from companion.estimation.camera_attitude import CameraAttitude
+from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (
     Array,

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import Config
-from companion.estimation.attitude_history import AttitudeHistory
+from companion.estimation.attitude.attitude_history import AttitudeHistory
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.pose_gate import MAX_TILT_ERROR_RAD
 from companion.messages import Frame, Odometry, TrackState, Warned

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from companion.config import Config
-from companion.estimation.attitude_history import AttitudeHistory
-from companion.estimation.attitude_verdict import REINITIALISED
+from companion.estimation.attitude.attitude_history import AttitudeHistory
+from companion.estimation.attitude.attitude_verdict import REINITIALISED
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.transforms import (
     quaternion_from_rotation,

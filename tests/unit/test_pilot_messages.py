@@ -136,7 +136,10 @@ def test_every_warning_has_its_words() -> None:
         topics_work.NOT_TAKEN, flight_result.GIVEN_UP, armed_settings.NOT_KEPT,
         localisation.MAP_RESUMED, localisation.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
     }  # fmt: skip
-    for module in ("drivers/mavlink/autopilot_link.py", "companion/estimation/camera_attitude.py"):
+    for module in (
+        "drivers/mavlink/autopilot_link.py",
+        "companion/estimation/attitude/camera_attitude.py",
+    ):
         for node in ast.walk(ast.parse((ROOT / module).read_text("utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == Warned.__name__:
                 whats |= {arg.value for arg in node.args[1:2] if isinstance(arg, ast.Constant)}  # type: ignore[misc]

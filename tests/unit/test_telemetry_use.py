@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.config import MEASUREMENTS, Config, Measurement, TelemetryConfig
-from companion.estimation.camera_attitude import CameraAttitude
+from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.georeference import Georeferencer
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.localisation import LocalisationStage

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.attitude_history import AttitudeHistory
+from companion.estimation.attitude.attitude_history import AttitudeHistory
 from companion.estimation.motion_filter import MotionFilter
 from companion.geometry.transforms import (
     Pose,

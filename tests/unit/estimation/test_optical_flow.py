@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.estimation.camera_attitude import CameraAttitude
+from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.optical_flow import (
     FEATURELESS,
     FIRST,

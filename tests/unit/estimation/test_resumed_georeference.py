@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.config import GeoreferenceConfig
-from companion.estimation.camera_attitude import CameraAttitude
+from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.georeference import Georeferencer
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.segment_georeference import SegmentGeoreferences

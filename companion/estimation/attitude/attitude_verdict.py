@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.estimation.attitude_following import RotationAgreement, RotationComparison
-from companion.estimation.attitude_history import AttitudeHistory
-from companion.estimation.map_tilt import MapTilt, RotationOf
+from companion.estimation.attitude.attitude_following import RotationAgreement, RotationComparison
+from companion.estimation.attitude.attitude_history import AttitudeHistory
+from companion.estimation.attitude.map_tilt import MapTilt, RotationOf
 from companion.geometry.transforms import Array, angle_between
 from companion.messages import Warned
 from companion.telemetry import AttitudeSample

@@ -10,10 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimation.attitude_history import AttitudeHistory
-from companion.estimation.attitude_verdict import AttitudeVerdict
-from companion.estimation.map_tilt import RotationOf
-from companion.estimation.mount_estimation import RATE_STEP_NS, MountEstimate, MountEstimator
+from companion.estimation.attitude.attitude_history import AttitudeHistory
+from companion.estimation.attitude.attitude_verdict import AttitudeVerdict
+from companion.estimation.attitude.map_tilt import RotationOf
+from companion.estimation.attitude.mount_estimation import (
+    RATE_STEP_NS,
+    MountEstimate,
+    MountEstimator,
+)
 from companion.geometry.transforms import Array, Pose, angle_between, rotation_from_vector
 from companion.messages import Track, Warned
 from companion.telemetry import AttitudeSample

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.attitude_history import AttitudeHistory
-from companion.estimation.mount_estimation import MountEstimate, MountEstimator
+from companion.estimation.attitude.attitude_history import AttitudeHistory
+from companion.estimation.attitude.mount_estimation import MountEstimate, MountEstimator
 from companion.geometry.transforms import (
     Array,
     angle_between,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.estimation.attitude_history import AttitudeHistory
+from companion.estimation.attitude.attitude_history import AttitudeHistory
 from companion.geometry.transforms import Array, rotation_from_vector, vectors_from_rotations
 
 SPACING_NS = 150_000_000

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from companion.estimation.attitude_history import AttitudeHistory
-from companion.estimation.attitude_verdict import (
+from companion.estimation.attitude.attitude_history import AttitudeHistory
+from companion.estimation.attitude.attitude_verdict import (
     BODY_FIXED_AGAIN,
     MAX_REINITIALISATIONS,
     MAX_TILT_RAD,
@@ -18,7 +18,7 @@ from companion.estimation.attitude_verdict import (
     REINITIALISED,
     AttitudeVerdict,
 )
-from companion.estimation.map_tilt import MAX_MOUNT_RAD
+from companion.estimation.attitude.map_tilt import MAX_MOUNT_RAD
 from companion.geometry.transforms import (
     Array,
     quaternion_from_euler,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.estimation.attitude_history import AttitudeHistory
+from companion.estimation.attitude.attitude_history import AttitudeHistory
 from companion.geometry.transforms import (
     Array,
     nearest_rotation,

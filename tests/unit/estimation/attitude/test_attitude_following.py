@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.estimation.attitude_following import RotationAgreement, RotationComparison
+from companion.estimation.attitude.attitude_following import RotationAgreement, RotationComparison
 from companion.geometry.transforms import (
     Array,
     angle_between,
