@@ -20,6 +20,8 @@ GRAVITY_NED_M_S2 = np.array([0.0, 0.0, 9.80665])
 """Standard gravity (CGPM 1901); what it differs by on earth, 0.3 %, counts as bias."""
 MAX_GAP_NS = 100_000_000
 """Longer without a sample, nothing is integrated across."""
+NO_GAP = 1e-6
+"""Difference of two interpolated numbers of gaps that are the same but for rounding."""
 NOISE_TAU, ONSET_TAU, ONSET = 500, 50, 2.0
 """Samples over which the white noise is averaged. Where that of the second is so many times that of
 the first, it has set in: motors have started. By chance it is so at six standard deviations."""
@@ -94,12 +96,14 @@ class AccelerationIntegral:
         """Integrals between two times; None where measurements are missing."""
         if not self.has_samples:
             return None
-        (start, end), (from_ok, to_ok) = self._series.at(np.array([from_ns, to_ns]))
+        sums, known = self._series.at(np.array([from_ns, to_ns]))
         newest = self._series.newest
-        if newest is not None and newest[0] < to_ns <= self.newest_ns:  # the series is sparse
-            share = (to_ns - newest[0]) / (self.newest_ns - newest[0])
-            end, to_ok = newest[1] + share * (self._sums - newest[1]), np.bool_(True)
-        if not (from_ok and to_ok) or start[8, 0] != end[8, 0]:
+        for n, t_ns in enumerate((from_ns, to_ns)):
+            if newest is not None and newest[0] < t_ns <= self.newest_ns:  # the series is sparse
+                share = (t_ns - newest[0]) / (self.newest_ns - newest[0])
+                sums[n], known[n] = newest[1] + share * (self._sums - newest[1]), True
+        start, end = sums
+        if not known.all() or abs(start[8, 0] - end[8, 0]) > NO_GAP:
             return None
         dt_s = (to_ns - from_ns) * 1e-9
         change = end - start

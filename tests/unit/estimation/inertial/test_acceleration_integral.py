@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -79,6 +81,26 @@ def test_nothing_is_integrated_over_a_gap() -> None:
     assert integral.between(round(0.5e9), round(1.5e9)) is not None
     assert integral.between(round(3e9), round(5e9)) is not None
     assert integral.between(round(5e9), round(9e9)) is None, "nothing has come yet"
+
+
+@pytest.mark.parametrize("n_gaps", [0, 3, 7])
+def test_no_instant_is_without_integrals_but_in_a_gap(n_gaps: int) -> None:
+    """Nor the newest, between whose sparse samples both ends of an interval may lie."""
+    integral = AccelerationIntegral()
+    t_ms = 0
+    for gap in range(n_gaps + 1):
+        t_ms += 200 * (gap > 0)
+        for _ in range(107):
+            t_ms += 5
+            integral.take(AttitudeSample(t_ms * 1_000_000, np.array([1.0, 0, 0, 0])))
+            integral.take(ImuSample(t_ms * 1_000_000, np.zeros(3), np.array([1.0, 0, -9.80665])))
+    newest = integral.newest_ns
+    for from_ms, to_ms in itertools.combinations(range(0, 300, 7), 2):
+        change = integral.between(newest - to_ms * 1_000_000, newest - from_ms * 1_000_000)
+        assert change is not None
+        assert change.velocity_m_s[0] == pytest.approx(change.dt_s, abs=1e-6)
+    if n_gaps:
+        assert integral.between(newest - 600_000_000, newest) is None
 
 
 def test_white_noise_is_measured_by_itself(rng: np.random.Generator) -> None:
