@@ -14,13 +14,14 @@ OVERDUE_NS = 130_000_000
 """Between the pose gate's 200 ms and what a frame of a busy computer is late by."""
 OVERDUE_PERIODS = 1.7
 """The same of a slow camera: one frame is lost."""
-LONGEST_NS = 30_000_000_000
-"""Inertial navigation is of use for that long at most."""
+LONGEST_NS, SELDOM_NS = 30_000_000_000, 1_000_000_000
+"""Inertial navigation is of use for that long at most; then notices are for the telemetry that
+waits: it is taken with them."""
 N_INTERVALS = 15
 
 
 class OverdueFrames:
-    """Takes the frames, and gives notices one period apart while none comes.
+    """Takes the frames, and gives notices while none comes, one period apart at first.
 
     Times are nanoseconds on the flight's clock. `came` may be called from another thread.
     """
@@ -51,7 +52,7 @@ class OverdueFrames:
             due_ns = self._noticed[1]
         else:
             due_ns = arrived_ns + max(OVERDUE_NS, int(OVERDUE_PERIODS * self._period_ns))
-        return due_ns if due_ns - arrived_ns < LONGEST_NS else None
+        return due_ns
 
     def due(self, now_ns: int) -> FrameOverdue | None:
         """The notice that is due now, if any: of the time at which a frame was to be exposed."""
@@ -60,8 +61,9 @@ class OverdueFrames:
             return None
         if now_ns - due_ns > OVERDUE_NS:
             due_ns = now_ns  # whoever asks was away himself
-        seq, _, latency_ns = newest
-        self._noticed = seq, due_ns + self._period_ns
+        seq, arrived_ns, latency_ns = newest
+        late = due_ns - arrived_ns > LONGEST_NS
+        self._noticed = seq, due_ns + (SELDOM_NS if late else self._period_ns)
         self._n_given += 1
         return FrameOverdue(NO_PICTURE + self._n_given, due_ns - latency_ns)
 
