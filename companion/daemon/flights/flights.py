@@ -18,7 +18,7 @@ from companion.products.flight_result import RunFacts
 from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import KeepMap
 from companion.runtime.stage_start import Start
-from companion.telemetry import Telemetry
+from companion.telemetry import ArmedSample, Telemetry
 from companion.timing.clock import FlightClock
 from drivers.recording.flights_folder import COUNTER, flight_name, next_number
 from drivers.system.journal import WARNING, Journal
@@ -42,6 +42,8 @@ class Flights:
         self._clock, self._journal, self._listener, self._facts = clock, journal, listener, facts
         self.current: LiveFlight | None = None
         self._standby: LiveFlight | None = None
+        self._armed: bool | None = None
+        """State of the motors; None as long as the autopilot was not heard."""
         self._ending: dict[LiveFlight, threading.Thread] = {}
 
     @property
@@ -72,6 +74,8 @@ class Flights:
         folder = self._named(Path(config.daemon.flights))
         flight.begin(folder, KeepMap(kept_map_path(config.daemon.socket), take_up))
         self.current = flight
+        if self._armed is not None:  # the autopilot's word is told on change only
+            flight.take(ArmedSample(self._clock.now_ns(), self._armed))
         self._journal.say(f"flight {folder.name} begins; its results go to {folder}")
         return flight
 
@@ -102,6 +106,8 @@ class Flights:
 
     def take(self, message: Telemetry | Warned | FrameOverdue | FlightNote) -> None:
         """Take telemetry, a warning, a missing frame, or a note for the recorder."""
+        if isinstance(message, ArmedSample):
+            self._armed = message.armed
         if self.current is not None:
             self.current.take(message)
 

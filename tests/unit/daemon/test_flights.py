@@ -1,0 +1,55 @@
+"""Flights know of the motors what the autopilot said before they began."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.config import Config, DaemonConfig
+from companion.daemon.flights import flights as module
+from companion.daemon.flights.flight_dates import FlightDates
+from companion.daemon.flights.flights import Flights
+from companion.geometry.camera import Camera
+from companion.telemetry import ArmedSample
+from companion.timing.clock import FlightClock
+from drivers.system.journal import Journal
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
+
+
+class Begun:
+    """A flight without processes."""
+
+    def __init__(self, *_: Any) -> None:
+        self.taken: list[Any] = []
+        self.folder: Path | None = None
+
+    def begin(self, folder: Path, keep: Any) -> None:
+        self.folder = folder
+
+    def take(self, message: Any) -> None:
+        self.taken.append(message)
+
+
+@pytest.mark.parametrize("armed", [True, False, None])
+def test_a_flight_is_told_whether_the_motors_are_armed(
+    armed: bool | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is heard on change only, and that may have been before the camera was there."""
+    monkeypatch.setattr(module, "LiveFlight", Begun)
+    clock = FlightClock()
+    nothing: Any = None
+    dates = FlightDates(clock, lambda: None, lambda: True)
+    flights = Flights(clock, Journal(), nothing, nothing, dates, nothing)
+    if armed is not None:
+        flights.take(ArmedSample(clock.now_ns(), armed))
+    began_ns = clock.now_ns()
+    config = Config(daemon=DaemonConfig(flights=str(tmp_path)))
+    flight: Any = flights.begin(config, CAMERA)
+    assert flights._counter is not None
+    flights._counter.close(10.0)
+    told = [each.armed for each in flight.taken if isinstance(each, ArmedSample)]
+    assert told == ([] if armed is None else [armed])
+    assert all(each.t_ns >= began_ns for each in flight.taken)
