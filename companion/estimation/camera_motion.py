@@ -81,8 +81,11 @@ class CameraMotion:
             + SIGMA_DEAD_RECKONING_RAD_S * lost_ns * 1e-9,
         )  # fmt: skip
 
-    def follow(self, segment: SlamMap) -> Pose | None:
-        """Move with a correction of the map; where the last frame is now, None if unmoved."""
+    def follow(self, segment: SlamMap) -> tuple[int, Pose] | None:
+        """Move with a correction of the map.
+
+        Time of the last frame with a pose, and where it is now; None if unmoved.
+        """
         last = self.last
         if last is None or last.keyframe_id is None or last.map_from_camera is None:
             return None
@@ -97,4 +100,4 @@ class CameraMotion:
             return None
         self.filter.correct_map(last.map_from_camera, now)
         self.last = replace(last, map_from_camera=now)
-        return now
+        return last.t_ns, now

@@ -232,6 +232,7 @@ class LocalisationStage:
             found = self._odometry.without_frame(overdue.seq, t_ns, self._body_attitude(t_ns))
             if found is not None:
                 yield found
+            self._prune(t_ns)
             yield FrameTracked(
                 t_ns, overdue.seq, self._n_samples, self._tracker.map_lock.point,
                 self._tracker.feature_ratio, has_picture=False,
@@ -354,9 +355,10 @@ class LocalisationStage:
 
     def _apply_map_correction(self) -> None:
         """Move the motion state with corrections of the map."""
-        now = self._motion.follow(self._tracker.map)
-        if now is not None:
-            self._odometry.correct_map(now)
+        segment = self._tracker.map
+        moved = self._motion.follow(segment)
+        if moved is not None:
+            self._odometry.correct_map(segment.first_keyframe_id, *moved)
 
     def _predicted(
         self, t_ns: int, attitude: Array | None, reckoned: Reckoned | None
@@ -417,7 +419,7 @@ class LocalisationStage:
 
     def _withdraw_accelerations(self, since_ns: int) -> None:
         """Forget what accelerations since a time gave: they were wrong."""
-        self._navigation.forget()
+        self._odometry.forget_reckoned()
         self._georeferences.withdraw_accelerations(since_ns)
 
     def _invalidate_attitudes(self, since_ns: int) -> None:

@@ -57,7 +57,7 @@ PROVING = "belief must hold first"
 
 
 class Sending(Enum):
-    """State of the pose output; docs/autopilots.md has its changes as a table."""
+    """State of the pose output; docs/pose.md has its changes as a table."""
 
     OFF = "off"
     PROVING = "proving"

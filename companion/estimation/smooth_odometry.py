@@ -36,6 +36,8 @@ MAX_RECKONED_PLACES = 900
 """By inertial navigation in a row, one a frame: half a minute at 30 a second."""
 MAX_SIGMA_SCALE_AIDING = 0.05
 """Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
+FRESH_NS, MAX_SIGMA_STOOD_M = 300_000_000, 0.3
+"""Of the place of a landing: older, or less certain, the place where it stands is another one."""
 SIGMA_RECKONED_RAD = np.radians(1.0)
 """Of the autopilot's attitude over some seconds."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
@@ -99,6 +101,8 @@ class SmoothOdometry:
         """True once a pose was given out."""
         self._ground = GroundAiding(navigation)
         self._map_aided_ns: int | None = None
+        self._sigma_stood_m = 0.0
+        """Of the place where it stands, since the last reset."""
         self.reset_counter = 0
 
     def step(
@@ -135,7 +139,8 @@ class SmoothOdometry:
             # late: a pose without it was given meanwhile
             return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
         if segment != self._segment or self._georeference is None:
-            if self._reckoned is not None and georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING:
+            goes_on = self._reckoned is not None or self._given
+            if goes_on and georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING:
                 return self._unknown(track)  # it would also be slower and faster than the body
             self._start_map(segment, georeference, pose, first)
         elif georeference is not self._georeference:
@@ -159,7 +164,8 @@ class SmoothOdometry:
         if not within_gate and not self._gate.agree(placed.translation, track.t_ns, self._velocity):
             return self._unknown(track)
         self._frame = frame
-        if not within_gate or self._gate.refused_ns(track.t_ns) >= MIN_CONSISTENT_NS:
+        ceased = self._reckoned is None and self._gate.refused_ns(track.t_ns) >= MIN_CONSISTENT_NS
+        if not within_gate or ceased:
             self.reset_counter += 1
             self._drift.clear()
             self._navigation.reset()
@@ -215,8 +221,10 @@ class SmoothOdometry:
         uncertain to be of use. `standing` where the vehicle stands on the ground.
         """
         if standing and attitude is not None:
+            if self._ground.stood is None:
+                self._begin_stand(t_ns)
             self._ground.stand(attitude.t_ns, self._place_now())
-        else:
+        elif not standing:
             at_ns = t_ns if attitude is None else attitude.t_ns
             self._ground.fly(at_ns, float(self._place_now()[2]), self.wants_flow(t_ns))
         found = None if attitude is None else self._navigation.at(attitude.t_ns)
@@ -300,10 +308,7 @@ class SmoothOdometry:
         self._dead_reckoning = True
         georeference = self._georeference
         sigma_scale = 0.0 if georeference is None else georeference.sigma_scale
-        if self._last is not None and georeference is not None:
-            camera = self._frame.from_world.inverse() @ placed @ self._camera_from_body.inverse()
-            pose = georeference.world_from_map.inverse().apply_to_pose(camera)
-            self._last = (track.t_ns, pose, placed)
+        self._hold(track.t_ns, placed)
         drift = self._drift.add(track.t_ns, placed.translation, sigma_scale, self._frame.slewed_m)
         return Odometry(
             track.seq, track.t_ns, TrackState.DEAD_RECKONING, self.reset_counter, 1, placed,
@@ -332,6 +337,27 @@ class SmoothOdometry:
         """
         self._ground.take_flow(measured, delay_ns)
 
+    def _hold(self, t_ns: int, placed: Pose) -> None:
+        """Take a pose that the active map did not give: the next by the map has to fit it."""
+        if self._georeference is not None:
+            camera = self._frame.from_world.inverse() @ placed @ self._camera_from_body.inverse()
+            pose = self._georeference.world_from_map.inverse().apply_to_pose(camera)
+            self._last = (t_ns, pose, placed)
+
+    def _begin_stand(self, t_ns: int) -> None:
+        """Begin a stand where the body is; a reset where that is not known any more."""
+        reckoned, last, sigma_m = self._reckoned, self._last, float("inf")
+        if reckoned is not None:
+            sigma_m = reckoned.sigma_place_m
+        elif last is not None and t_ns - last[0] <= FRESH_NS:
+            sigma_m = 0.0
+        if self._given and sigma_m > MAX_SIGMA_STOOD_M:
+            self.reset_counter += 1
+            self._drift.clear()
+            self._navigation.reset()
+            sigma_m = 0.0
+        self._sigma_stood_m = sigma_m if self._given else 0.0
+
     def _place_now(self) -> Array:
         """Place (3,) of the body as far as it is known: where it begins, if not at all."""
         if self._reckoned is not None:
@@ -341,13 +367,16 @@ class SmoothOdometry:
     def _standing(self, track: Track) -> Odometry:
         """Odometry of a vehicle that stands on the ground: at a fixed place, as the attitude is."""
         attitude, fixed = self._attitude, self._ground.stood
-        assert attitude is not None
         assert fixed is not None
+        if attitude is None:
+            return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
         placed = Pose(fixed.world_from_attitude @ attitude.ned_from_body, fixed.place_m)
         self._velocity, self._dead_reckoning = np.zeros(3), True
+        self._hold(track.t_ns, placed)
         return Odometry(
             track.seq, track.t_ns, TrackState.STANDING, self.reset_counter, 100, placed,
-            np.zeros(3), FLOOR_M, SIGMA_STANDING_M_S, float(SIGMA_RECKONED_RAD),
+            np.zeros(3), float(np.hypot(FLOOR_M, self._sigma_stood_m)), SIGMA_STANDING_M_S,
+            float(SIGMA_RECKONED_RAD),
             self._sigma_yaw_rad(self._georeference, float(SIGMA_RECKONED_RAD)),
         )  # fmt: skip
 
@@ -437,19 +466,28 @@ class SmoothOdometry:
         self._drift.clear()
         self._navigation.reset()
 
+    def forget_reckoned(self) -> None:
+        """Forget inertial navigation, and where it had the body: the accelerations were wrong."""
+        self._navigation.forget()
+        self._reckoned = None
+        self._reckoned_world.clear()
+
     def discard_map(self, segment: int) -> None:
         """Handle a map that was found wrong: what aided inertial navigation was wrong, too."""
         if segment == self._segment:
             self._navigation.reset()
 
-    def correct_map(self, map_from_camera: Pose) -> None:
-        """Apply a correction of the map: `map_from_camera` of the last accepted frame now.
+    def correct_map(self, segment: int, t_ns: int, map_from_camera: Pose) -> None:
+        """Apply a correction of a map: `map_from_camera` of its last tracked frame now.
 
-        The output stays continuous; the difference is slewed.
+        The output stays continuous; the difference is slewed. A frame that the gate refused, or of
+        another map, says nothing of the pose that was given.
         """
         if self._last is None or self._georeference is None or self._dead_reckoning:
             return  # what dead reckoning is off by shows when the map is seen again
-        t_ns, _, placed = self._last
+        if segment != self._segment or t_ns != self._last[0]:
+            return
+        placed = self._last[2]
         self._last = (t_ns, map_from_camera, placed)
         self._update_georeference(self._georeference)
 

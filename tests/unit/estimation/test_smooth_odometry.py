@@ -52,7 +52,7 @@ def test_map_correction_is_slew_limited() -> None:
         before = give(odometry, track(k))
     last = track(9, off=1.5).map_from_camera
     assert last is not None
-    odometry.correct_map(last)
+    odometry.correct_map(0, track(9).t_ns, last)
     after = [give(odometry, track(k, off=1.5)) for k in range(10, 400)]
     steps = np.diff([north(before), *[north(o) for o in after]])
     assert np.abs(steps - 0.2).max() < 0.03
@@ -65,7 +65,7 @@ def test_slew_correction_adds_to_the_drift_sigma() -> None:
     before = [give(odometry, track(k)) for k in range(200)][-1].sigma_position_m
     last = track(199, off=1.5).map_from_camera
     assert last is not None
-    odometry.correct_map(last)
+    odometry.correct_map(0, track(199).t_ns, last)
     after = [give(odometry, track(k, off=1.5)).sigma_position_m for k in range(200, 600)]
     # three metres at 0.15 m/s: for twenty seconds each ten have 1.5 m of it
     assert max(after) == pytest.approx(np.hypot(before, 1.5 / np.sqrt(3)), rel=0.02)

@@ -1,0 +1,165 @@
+"""Stands and blind spans of the smooth odometry: nothing stale is stated as certain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_navigation import BodyAttitude, InertialNavigation
+from companion.estimation.smooth_odometry import SmoothOdometry
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array, Pose, Similarity
+from companion.messages import Georeference, Odometry, Track, TrackState
+from companion.telemetry import AttitudeSample, ImuSample
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+PLACED = Georeference(
+    Similarity(1.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "IMU", 0, 0.0, has_origin=False
+)
+HERE = np.array([3.0, 2.0, -10.0])
+STEP_NS = 100_000_000
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class Vehicle:
+    """It hovers, level, or stands; ten frames a second."""
+
+    def __init__(self, has_imu: bool = True) -> None:
+        self._integral = AccelerationIntegral()
+        self.odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(self._integral))
+        self._has_imu = has_imu
+        self.t_ns = 0
+
+    def frame(
+        self, at_m: Array | None = None, *, standing: bool = False, attitude: bool = True,
+        segment: int = 0, georeference: Georeference = PLACED, north_m_s2: float = 0.0,
+    ) -> Odometry:  # fmt: skip
+        """The next frame, tracked at a place (3,) in the map, or lost."""
+        self.t_ns += STEP_NS
+        for step in range(-9, 1) if self._has_imu else ():
+            t_ns = self.t_ns + step * 10_000_000
+            self._integral.take(ImuSample(t_ns, np.zeros(3), np.array([north_m_s2, 0.0, -9.80665])))
+            self._integral.take(AttitudeSample(t_ns, LEVEL))
+        known = BodyAttitude(self.t_ns, np.eye(3)) if attitude else None
+        self.odometry.begin(self.t_ns, known, standing)
+        track = Track(self.t_ns // STEP_NS, self.t_ns, TrackState.LOST)
+        if at_m is not None:
+            pose = Pose(np.eye(3), np.array(at_m))
+            track = replace(
+                track, state=TrackState.TRACKING, map_from_camera=pose, n_inliers=200,
+                n_matches=220, keypoints_px=np.zeros((200, 2), np.float32), sigma_position=0.01,
+                sigma_rotation_rad=0.001,
+            )  # fmt: skip
+        return self.odometry.step(track, segment, georeference, (np.zeros(3), 0.1))
+
+    def frames(self, n: int, at_m: Array | None = None, *, standing: bool = False) -> Odometry:
+        """So many frames alike; the last odometry."""
+        return [self.frame(at_m, standing=standing) for _ in range(n)][-1]
+
+
+def place(odometry: Odometry) -> Array:
+    assert odometry.world_from_body is not None
+    return odometry.world_from_body.translation
+
+
+def test_a_stand_where_it_was_tracked_goes_on() -> None:
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    stood = vehicle.frames(20, HERE, standing=True)
+    assert (stood.state, stood.reset_counter) == (TrackState.STANDING, 0)
+    np.testing.assert_allclose(place(stood), HERE, atol=0.05)
+
+
+def test_a_landing_without_sight_is_a_reset() -> None:
+    """Inertial navigation has become too uncertain, and poses have ceased."""
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    assert vehicle.frames(600).world_from_body is None
+    stood = vehicle.frames(20, standing=True)
+    assert (stood.state, stood.reset_counter) == (TrackState.STANDING, 1)
+
+
+def test_a_landing_of_which_the_place_is_uncertain_is_a_reset() -> None:
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    n_blind = 0
+    while vehicle.frame().sigma_position_m < 1.0:
+        n_blind += 1
+    assert n_blind > 10
+    stood = vehicle.frames(20, standing=True)
+    assert (stood.state, stood.reset_counter) == (TrackState.STANDING, 1)
+
+
+def test_what_it_does_not_know_of_where_it_landed_is_stated() -> None:
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    while (blind := vehicle.frame()).sigma_position_m < 0.15:
+        pass
+    stood = vehicle.frames(20, standing=True)
+    assert stood.reset_counter == 0
+    assert abs(stood.sigma_position_m - blind.sigma_position_m) < 0.05
+
+
+def test_a_frame_without_attitude_ends_no_stand() -> None:
+    """Before there is a map: it has come from where it stood first by accelerometers alone."""
+    vehicle = Vehicle()
+    vehicle.frames(20, standing=True)
+    for k in range(10):
+        vehicle.frame(north_m_s2=1.0 if k < 5 else -1.0)
+    there = place(vehicle.frames(20, standing=True))
+    assert 0.2 < there[0] < 0.3
+    assert vehicle.frame(standing=True, attitude=False).world_from_body is None
+    stood = vehicle.frame(standing=True)
+    np.testing.assert_allclose(place(stood), there, atol=0.05)
+    assert stood.reset_counter == 0
+
+
+def test_a_map_that_is_elsewhere_after_a_stand_is_a_reset() -> None:
+    vehicle = Vehicle(has_imu=False)
+    vehicle.frames(20, HERE)
+    vehicle.frames(100, HERE, standing=True)
+    after = [vehicle.frame(HERE + [40.0, 0.0, 0.0]) for _ in range(10)]
+    assert after[0].world_from_body is None
+    assert after[-1].reset_counter == 1
+
+
+def test_a_correction_of_the_map_moves_no_refused_frame_through_the_gate() -> None:
+    vehicle = Vehicle(has_imu=False)
+    vehicle.frames(20, HERE)
+    wrong = HERE + [10.0, 0.0, 0.0]
+    assert vehicle.frame(wrong).world_from_body is None
+    moved = Pose(np.eye(3), wrong + [0.0, 0.01, 0.0])
+    vehicle.odometry.correct_map(0, vehicle.t_ns, moved)
+    assert vehicle.frame(wrong).world_from_body is None
+    assert vehicle.frames(10, wrong).reset_counter == 1
+
+
+def test_a_correction_of_another_map_moves_nothing() -> None:
+    vehicle = Vehicle(has_imu=False)
+    before = vehicle.frames(20, HERE)
+    vehicle.odometry.correct_map(7, vehicle.t_ns, Pose(np.eye(3), np.zeros(3)))
+    np.testing.assert_allclose(place(vehicle.frame(HERE)), place(before), atol=1e-9)
+
+
+def test_a_map_without_a_scale_is_not_taken_up_by_a_frame_without_attitude() -> None:
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    young = replace(PLACED, sigma_scale=0.2)
+    vehicle.frame(np.zeros(3), segment=5, georeference=young)
+    vehicle.frame(np.zeros(3), segment=5, georeference=young, attitude=False)
+    found = vehicle.frame(np.zeros(3), segment=5, georeference=young)
+    assert found.inertial and found.reset_counter == 0
+    np.testing.assert_allclose(place(found), HERE, atol=0.1)
+
+
+def test_one_wrong_relocalisation_while_blind_is_no_reset_later() -> None:
+    vehicle = Vehicle()
+    vehicle.frames(20, HERE)
+    vehicle.frames(5)
+    np.testing.assert_allclose(place(vehicle.frame(HERE + [10.0, 0.0, 0.0])), HERE, atol=0.1)
+    vehicle.frames(10)
+    seen = vehicle.frame(HERE)
+    assert (seen.state, seen.reset_counter) == (TrackState.TRACKING, 0)
+    np.testing.assert_allclose(place(seen), HERE, atol=0.1)
