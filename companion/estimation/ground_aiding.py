@@ -47,12 +47,17 @@ class GroundAiding:
         """Since the last frame but one: flow is measured late, and all is to come in order."""
         self._stood_down_m = 0.0
         self._height_ns = self._flow_ns = self._frame_ns = 0
+        self._map_aided_ns: int | None = None
 
-    def wants_flow(self, map_aided_ns: int | None, t_ns: int) -> bool:
+    def map_aided(self, t_ns: int) -> None:
+        """Take that a map with a scale has placed the body of a frame."""
+        self._map_aided_ns = t_ns
+
+    def wants_flow(self, t_ns: int) -> bool:
         """True after a lift-off, where no map has placed the body lately."""
         if self.stood is not None or not self._navigation.knows_ground:
             return False
-        return map_aided_ns is None or t_ns - map_aided_ns > MAP_AIDED_NS
+        return self._map_aided_ns is None or t_ns - self._map_aided_ns > MAP_AIDED_NS
 
     def take_height(self, t_ns: int, height_m: float, rotors: bool) -> None:
         """Take a barometric height; where rotors turn on the ground, they press on the sensor."""

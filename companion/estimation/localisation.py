@@ -22,13 +22,11 @@ from companion.estimation.inertial.inertial_navigation import (
     Reckoned,
 )
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
+from companion.estimation.odometry_frame import MapView
 from companion.estimation.optical_flow import FlowMeter
 from companion.estimation.resumption import Resumption, Verdict
 from companion.estimation.segment_georeference import SegmentGeoreferences
-from companion.estimation.smooth_odometry import (
-    MapView,
-    SmoothOdometry,
-)
+from companion.estimation.smooth_odometry import SmoothOdometry
 from companion.estimation.standing import Standing
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
@@ -99,7 +97,7 @@ class LocalisationStage:
         self._resumption: Resumption | None = None
         """While a stored map is being verified."""
         self._tracker.atlas.loop_allowed = self._loop_allowed
-        self._georeferences.reckoned_world = self._odometry.reckoned_world
+        self._georeferences.reckoned_at = self._odometry.reckoned_path.at
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
 
     @property
@@ -143,7 +141,9 @@ class LocalisationStage:
             self._standing.take(sample)
             self._flow.take(sample)
             if isinstance(sample, HeightSample):
-                self._odometry.take_height(sample.t_ns, sample.height_m, self._standing.armed)
+                self._odometry.ground.take_height(
+                    sample.t_ns, sample.height_m, self._standing.armed
+                )
             if isinstance(sample, AttitudeSample | ImuSample):
                 self._imu.take(sample)
             if isinstance(sample, AttitudeSample):
@@ -240,13 +240,16 @@ class LocalisationStage:
 
     def _flow_of(self, frame: Frame) -> Iterator[Message]:
         """Optical flow for the autopilot, and for the way from a lift-off to a metric map."""
-        asked, wanted = self._config.feedback.flow != "off", self._odometry.wants_flow(frame.t_ns)
+        asked, wanted = (
+            self._config.feedback.flow != "off",
+            self._odometry.ground.wants_flow(frame.t_ns),
+        )
         if not asked and not wanted:
             return
         with self._times("optical flow"):
             flow = self._flow.step(frame, self._attitude)
         if wanted and self._flow.over_ground is not None:
-            self._odometry.take_flow(self._flow.over_ground, self._attitude.correction[1])
+            self._odometry.ground.take_flow(self._flow.over_ground, self._attitude.correction[1])
         if asked:
             yield flow
 

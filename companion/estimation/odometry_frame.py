@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,24 @@ from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
 
 MAX_SLEW_M_S = 0.15
 MAX_SLEW_RAD_S = np.radians(0.5)
+
+
+class MapView(NamedTuple):
+    """Time of a keyframe, and its pose in the map."""
+
+    t_ns: int
+    map_from_camera: Pose
+
+
+class OdometryState(NamedTuple):
+    """State to continue in the same frame: see `SmoothOdometry.resume`."""
+
+    odometry_from_world: Pose
+    anchored: bool
+    position_m: Array
+    """Position (3,) of the body in the odometry frame when last tracked."""
+    velocity_m_s: Array
+    """Velocity (3,) of the body in the odometry frame at that time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from companion.estimation.height_above_ground import HeightAboveGround
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_scale import InertialScale, settled
 from companion.estimation.inertial.judged_acceleration import ByAcceleration
-from companion.estimation.smooth_odometry import BodyPlace
+from companion.estimation.reckoned_path import BodyPlace
 from companion.estimation.trajectory_alignment import (
     DISAGREE,
     MAX_STEP_S,
@@ -66,7 +66,7 @@ class SegmentGeoreferences:
         """By first keyframe of a segment, as is:"""
         self._spaced: dict[int, list[tuple[int, int]]] = {}
         """Ids and times of the keyframes that the inertial scale takes."""
-        self.reckoned_world: Callable[[int], BodyPlace | None] = lambda _t_ns: None
+        self.reckoned_at: Callable[[int], BodyPlace | None] = lambda _t_ns: None
         """Place of the body by inertial navigation at a recent frame."""
         self._reckoned: dict[int, tuple[BodyPlace, Georeference | None]] = {}
         """Place at which a segment began by it, and the segment so placed, by first keyframe."""
@@ -306,7 +306,7 @@ class SegmentGeoreferences:
             if first.keyframe_id != key:
                 return None  # a later one that is left may have aided the navigation
             last = max(segment.keyframes.values(), key=lambda k: k.t_ns)
-            start, end = self.reckoned_world(first.t_ns), self.reckoned_world(last.t_ns)
+            start, end = self.reckoned_at(first.t_ns), self.reckoned_at(last.t_ns)
             if start is None or end is None or last is first:
                 return None
             samples = self._samples(segment, [first, last])

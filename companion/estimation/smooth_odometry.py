@@ -6,13 +6,9 @@ of a stationary camera. Here the pose is continuous, and corrections are slew-li
 
 from __future__ import annotations
 
-from collections import deque
-from typing import NamedTuple
-
 import numpy as np
 
 from companion.estimation.ground_aiding import SIGMA_STANDING_M_S, GroundAiding
-from companion.estimation.inertial.inertial_motion import InertialStart
 from companion.estimation.inertial.inertial_navigation import (
     AidedPlace,
     BodyAttitude,
@@ -21,8 +17,9 @@ from companion.estimation.inertial.inertial_navigation import (
 )
 from companion.estimation.innovation_gate import MIN_CONSISTENT_NS, InnovationGate
 from companion.estimation.odometry_drift import OdometryDrift
-from companion.estimation.odometry_frame import OdometryFrame
-from companion.estimation.optical_flow import GroundVelocity
+from companion.estimation.odometry_frame import MapView, OdometryFrame, OdometryState
+from companion.estimation.reckoned_path import BodyPlace, ReckonedPath
+from companion.estimation.tracking_quality import quality_of
 from companion.estimation.trajectory_alignment import SIGMA_YAW_RAD
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
@@ -32,8 +29,6 @@ SIGMA_DEAD_RECKONING_M_S = 0.3
 """Standard deviation of the velocity used in dead reckoning."""
 MAX_SIGMA_RECKONED_M = 5.0
 """By inertial navigation; beyond, it is of no use even to find the map again."""
-MAX_RECKONED_PLACES = 900
-"""By inertial navigation in a row, one a frame: half a minute at 30 a second."""
 MAX_SIGMA_SCALE_AIDING = 0.05
 """Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
 FRESH_NS, MAX_SIGMA_STOOD_M = 300_000_000, 0.3
@@ -43,34 +38,6 @@ SIGMA_RECKONED_RAD = np.radians(1.0)
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
 NOISE_INFLATION = 3.0
 """Inflation for correlated errors of the matches of one image."""
-FULL_COUNT = 150
-GRID = 4
-
-
-class MapView(NamedTuple):
-    """Time of a keyframe, and its pose in the map."""
-
-    t_ns: int
-    map_from_camera: Pose
-
-
-class BodyPlace(NamedTuple):
-    """Place (3,) of the body by inertial navigation, world NED, metres; its motion by the same."""
-
-    t_ns: int
-    place_world_m: Array
-    start: InertialStart
-
-
-class OdometryState(NamedTuple):
-    """State to continue in the same frame: see `SmoothOdometry.resume`."""
-
-    odometry_from_world: Pose
-    anchored: bool
-    position_m: Array
-    """Position (3,) of the body in the odometry frame when last tracked."""
-    velocity_m_s: Array
-    """Velocity (3,) of the body in the odometry frame at that time."""
 
 
 class SmoothOdometry:
@@ -89,7 +56,7 @@ class SmoothOdometry:
         self._attitude: BodyAttitude | None = None
         self._reckoned: Reckoned | None = None
         """Attitude of the frame that has begun, and where inertial navigation has the body."""
-        self._reckoned_world: deque[BodyPlace] = deque(maxlen=MAX_RECKONED_PLACES)
+        self.reckoned_path = ReckonedPath()
         self._segment: int | None = None
         self._georeference: Georeference | None = None
         self._frame = OdometryFrame()
@@ -99,8 +66,8 @@ class SmoothOdometry:
         self._dead_reckoning = False
         self._given = False
         """True once a pose was given out."""
-        self._ground = GroundAiding(navigation)
-        self._map_aided_ns: int | None = None
+        self.ground = GroundAiding(navigation)
+        """From a stand up to a metric map."""
         self._sigma_stood_m = 0.0
         """Of the place where it stands, since the last reset."""
         self.reset_counter = 0
@@ -121,7 +88,7 @@ class SmoothOdometry:
         """
         found = (
             self._standing(track)
-            if self._ground.stood is not None
+            if self.ground.stood is not None
             else self._of_map(track, segment, georeference, velocity_map, first)
         )
         self._given = self._given or found.world_from_body is not None
@@ -189,13 +156,13 @@ class SmoothOdometry:
         if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
             turned = placed.rotation @ attitude.ned_from_body.T
             self._navigation.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
-            self._map_aided_ns = track.t_ns
+            self.ground.map_aided(track.t_ns)
         drift = self._drift.add(
             track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m
         )
         return Odometry(
-            track.seq, track.t_ns, track.state, self.reset_counter, self._quality(track), placed,
-            self._velocity.copy(),
+            track.seq, track.t_ns, track.state, self.reset_counter,
+            quality_of(track, self._size), placed, self._velocity.copy(),
             float(np.linalg.norm([FLOOR_M, noise_m, *drift])),
             sigma_velocity,
             float(np.hypot(FLOOR_RAD, NOISE_INFLATION * track.sigma_rotation_rad)),
@@ -221,12 +188,12 @@ class SmoothOdometry:
         uncertain to be of use. `standing` where the vehicle stands on the ground.
         """
         if standing and attitude is not None:
-            if self._ground.stood is None:
+            if self.ground.stood is None:
                 self._begin_stand(t_ns)
-            self._ground.stand(attitude.t_ns, self._place_now())
+            self.ground.stand(attitude.t_ns, self._place_now())
         elif not standing:
             at_ns = t_ns if attitude is None else attitude.t_ns
-            self._ground.fly(at_ns, float(self._place_now()[2]), self.wants_flow(t_ns))
+            self.ground.fly(at_ns, float(self._place_now()[2]), self.ground.wants_flow(t_ns))
         found = None if attitude is None else self._navigation.at(attitude.t_ns)
         if found is not None and found.sigma_place_m > MAX_SIGMA_RECKONED_M:
             found = None
@@ -234,19 +201,15 @@ class SmoothOdometry:
         if found is not None:
             world_m = self._frame.from_world.inverse().apply(found.place_m)
             place = BodyPlace(t_ns, np.asarray(world_m), found.start._replace(t_ns=t_ns))
-            self._reckoned_world.append(place)
+            self.reckoned_path.add(place)
         return found
-
-    def reckoned_world(self, t_ns: int) -> BodyPlace | None:
-        """Place by inertial navigation at one of the latest frames; None if that had none."""
-        return next((each for each in self._reckoned_world if each.t_ns == t_ns), None)
 
     def without_frame(self, seq: int, t_ns: int, attitude: BodyAttitude | None) -> Odometry | None:
         """Odometry at a time without a frame; None where inertial navigation knows none.
 
         Nor at a stand: that it lasts takes a picture to say.
         """
-        if self._ground.stood is not None or not self._given:
+        if self.ground.stood is not None or not self._given:
             return None
         if self.begin(t_ns, attitude) is None:
             return None
@@ -319,24 +282,6 @@ class SmoothOdometry:
             sigma_scale=sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
 
-    def wants_flow(self, t_ns: int) -> bool:
-        """True at a frame from a lift-off until a map has a scale."""
-        return self._ground.wants_flow(self._map_aided_ns, t_ns)
-
-    def take_height(self, t_ns: int, height_m: float, rotors: bool) -> None:
-        """Take a barometric height, which aids from the ground until a map has a scale.
-
-        `rotors` where they may turn.
-        """
-        self._ground.take_height(t_ns, height_m, rotors)
-
-    def take_flow(self, measured: GroundVelocity, delay_ns: int) -> None:
-        """Aid inertial navigation by flow over the ground that the vehicle has lifted off.
-
-        Autopilot stamps are late by `delay_ns`.
-        """
-        self._ground.take_flow(measured, delay_ns)
-
     def _hold(self, t_ns: int, placed: Pose) -> None:
         """Take a pose that the active map did not give: the next by the map has to fit it."""
         if self._georeference is not None:
@@ -366,7 +311,7 @@ class SmoothOdometry:
 
     def _standing(self, track: Track) -> Odometry:
         """Odometry of a vehicle that stands on the ground: at a fixed place, as the attitude is."""
-        attitude, fixed = self._attitude, self._ground.stood
+        attitude, fixed = self._attitude, self.ground.stood
         assert fixed is not None
         if attitude is None:
             return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
@@ -393,7 +338,7 @@ class SmoothOdometry:
         view, else from the last known position; without a jump where that is close to where
         inertial navigation has the body now. All else is a reset: its poses are unrelated.
         """
-        began = None if first is None else self.reckoned_world(first.t_ns)
+        began = None if first is None else self.reckoned_path.at(first.t_ns)
         raw, before = self._raw(georeference, pose), self._frame
         turn, offset, owed_m, continuous = np.eye(3), np.zeros(3), np.zeros(3), False
         if not georeference.has_origin and first is not None and began is not None:
@@ -415,7 +360,7 @@ class SmoothOdometry:
         )
         if continuous:
             self._frame = self._frame.shifted(-owed_m)
-        self._reckoned_world.clear()
+        self.reckoned_path.clear()
         self._segment, self._georeference = segment, georeference
         self._last, self._dead_reckoning = None, False
         self._gate.clear()
@@ -470,7 +415,7 @@ class SmoothOdometry:
         """Forget inertial navigation, and where it had the body: the accelerations were wrong."""
         self._navigation.forget()
         self._reckoned = None
-        self._reckoned_world.clear()
+        self.reckoned_path.clear()
 
     def discard_map(self, segment: int) -> None:
         """Handle a map that was found wrong: what aided inertial navigation was wrong, too."""
@@ -490,13 +435,3 @@ class SmoothOdometry:
         placed = self._last[2]
         self._last = (t_ns, map_from_camera, placed)
         self._update_georeference(self._georeference)
-
-    def _quality(self, track: Track) -> int:
-        """1..100, from the number, image coverage and match ratio of inliers."""
-        if track.keypoints_px is None or not len(track.keypoints_px):
-            return 1
-        cells = np.clip((track.keypoints_px / self._size * GRID).astype(int), 0, GRID - 1)
-        spread = len(np.unique(cells @ [1, GRID])) / GRID**2
-        count = min(1.0, track.n_inliers / FULL_COUNT)
-        found = track.n_inliers / max(track.n_matches, 1)
-        return int(np.clip(round(100 * count * np.sqrt(spread) * np.sqrt(found)), 1, 100))

@@ -23,6 +23,7 @@ from companion.estimation.checkpoint import (
     read_arrays,
 )
 from companion.estimation.localisation import LocalisationStage
+from companion.estimation.odometry_frame import OdometryState
 from companion.estimation.resumption import (
     MAX_ABSENT_NS,
     MIN_FRAMES,
@@ -30,7 +31,6 @@ from companion.estimation.resumption import (
     Resumption,
     Verdict,
 )
-from companion.estimation.smooth_odometry import OdometryState
 from companion.geometry.transforms import Pose, Similarity
 from companion.messages import Frame, Georeference, Odometry, Track, TrackState, Warned
 from companion.runtime.stage_protocol import Finish, KeepMap, Setup

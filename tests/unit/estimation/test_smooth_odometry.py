@@ -9,8 +9,9 @@ import pytest
 
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_navigation import BodyAttitude, InertialNavigation
+from companion.estimation.odometry_frame import MapView
 from companion.estimation.optical_flow import GroundVelocity
-from companion.estimation.smooth_odometry import MapView, SmoothOdometry
+from companion.estimation.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity, yaw_rotation
 from companion.messages import Georeference, Odometry, Track, TrackState
@@ -247,18 +248,20 @@ def test_a_vehicle_that_lifts_off_is_carried_on_by_accelerometers(flow: bool) ->
         t_ns = k * 100_000_000
         standing = 10 <= k < 34
         if flow:
-            odometry.take_height(t_ns, 100.0 + 0.5 * max(k / 10 - lift_s, 0.0) ** 2, rotors=False)
+            odometry.ground.take_height(
+                t_ns, 100.0 + 0.5 * max(k / 10 - lift_s, 0.0) ** 2, rotors=False
+            )
         if k == 20:  # that it stands takes a picture to say
             assert odometry.without_frame(1000, t_ns, BodyAttitude(t_ns, np.eye(3))) is None
         odometry.begin(t_ns, BodyAttitude(t_ns, np.eye(3)), standing)
         waiting = Track(k, t_ns, TrackState.INITIALISING)
         found.append(odometry.step(waiting, 0, None, None))
-        assert odometry.wants_flow(t_ns) == (k >= 34)
+        assert odometry.ground.wants_flow(t_ns) == (k >= 34)
         if flow and k >= 34:
             climbed_s = k / 10 - 0.05 - lift_s
             flow_hz = np.array([0.0, 0.0, -climbed_s / (0.2 + 0.5 * climbed_s**2)])
             measured = GroundVelocity(t_ns - 50_000_000, flow_hz, 4e-4 * np.eye(3))
-            odometry.take_flow(measured, 0)
+            odometry.ground.take_flow(measured, 0)
     assert {each.quality for each in found[:10]} == {-1}
     stood = found[10:34]
     assert {each.state for each in stood} == {TrackState.STANDING}
