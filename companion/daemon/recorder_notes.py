@@ -17,7 +17,8 @@ EVERY_S = 1.0
 LEAD_NS = 10_000_000_000
 """A recording begins with the link bytes of this long before the flight."""
 MOST_IN_LEAD = 10_000
-"""Reads from the link; more than the fastest link gives in that time."""
+MOST_LEAD_BYTES = 2_000_000
+"""More than the fastest link gives in that time: a flood of reads, or of large ones, is cut."""
 
 
 class RecorderNotes:
@@ -27,7 +28,8 @@ class RecorderNotes:
         self, clock: FlightClock, flights: Flights, watch: HealthWatch, link: AutopilotLink | None
     ) -> None:
         self._clock, self._flights, self._watch, self._link = clock, flights, watch, link
-        self._lead: deque[LinkBytes] = deque(maxlen=MOST_IN_LEAD)
+        self._lead: deque[LinkBytes] = deque()
+        self._lead_bytes = 0
         if link is not None:
             link.port.set_tap(self._on_bytes)
 
@@ -42,9 +44,15 @@ class RecorderNotes:
             self._clock.from_monotonic_ns(monotonic_ns), monotonic_ns, outgoing, bytes(data)
         )
         self._lead.append(taken)
-        while taken.t_ns - self._lead[0].t_ns > LEAD_NS:
-            self._lead.popleft()
+        self._lead_bytes += len(taken.data)
+        while (
+            taken.t_ns - self._lead[0].t_ns > LEAD_NS
+            or len(self._lead) > MOST_IN_LEAD
+            or self._lead_bytes > MOST_LEAD_BYTES
+        ):
+            self._lead_bytes -= len(self._lead.popleft().data)
         if self._flights.current is not None:
+            self._lead_bytes = 0
             while self._lead:
                 self._flights.take(self._lead.popleft())
 

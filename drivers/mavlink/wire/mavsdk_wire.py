@@ -134,7 +134,7 @@ class MavsdkWire(Wire):
     def _deliver(self, end: WireEnd, data: bytes, monotonic_ns: int) -> None:
         self._heard_ns = monotonic_ns
         self.trouble = ""
-        self._search.heard(len(data), end.received(data, monotonic_ns), monotonic_ns)
+        self._search.heard(len(data), self._accept(end, data, monotonic_ns), monotonic_ns)
 
     def _write(self, data: bytes) -> int:
         assert self._carrier is not None

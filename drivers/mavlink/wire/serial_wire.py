@@ -108,7 +108,7 @@ class SerialWire(Wire):
 
     def _deliver(self, end: WireEnd, data: bytes, monotonic_ns: int) -> None:
         found = self.search.found
-        self.search.heard(len(data), end.received(data, monotonic_ns), monotonic_ns)
+        self.search.heard(len(data), self._accept(end, data, monotonic_ns), monotonic_ns)
         if self.search.garbled:
             self.trouble = f"{self.name}: bytes come, but no MAVLink at {self.search.baud} baud"
         elif self.search.found:

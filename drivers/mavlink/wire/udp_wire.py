@@ -113,7 +113,7 @@ class UdpWire(Wire):
     def _deliver(self, end: WireEnd, data: bytes, monotonic_ns: int) -> None:
         if self._sender == self.peer:
             self._heard_ns = monotonic_ns
-            end.received(data, monotonic_ns)
+            self._accept(end, data, monotonic_ns)
             return
         if not self._listens or (
             self.peer is not None and monotonic_ns - self._heard_ns < PEER_SILENT_NS
@@ -124,6 +124,8 @@ class UdpWire(Wire):
         before, self.peer = self.peer, self._sender  # so that it can be answered at once
         if end.received(data, monotonic_ns):
             self._heard_ns = monotonic_ns
+            if self.tap is not None:  # only now: until then it may have been anybody's
+                self.tap(False, data, monotonic_ns)
         else:
             self.peer = before
             self.n_strange += 1

@@ -73,7 +73,7 @@ class Wire(ABC):
         self.n_unsent = 0
         """Packets dropped while the wire was not open."""
         self.tap: Tap | None = None
-        """Called with all bytes read and written."""
+        """Called with all bytes written, and those read that are the other side's."""
         self._read_limit = read_limit
         self._fd = -1
         self._lost: asyncio.Future[str] | None = None
@@ -156,7 +156,13 @@ class Wire(ABC):
         """Some bytes and their arrival by CLOCK_MONOTONIC; OSError, EOFError."""
 
     def _deliver(self, end: WireEnd, data: bytes, monotonic_ns: int) -> None:
-        end.received(data, monotonic_ns)
+        self._accept(end, data, monotonic_ns)
+
+    def _accept(self, end: WireEnd, data: bytes, monotonic_ns: int) -> int:
+        """Give bytes of the other side to the tap and to `end`; packets as of `received`."""
+        if self.tap is not None:
+            self.tap(False, data, monotonic_ns)
+        return end.received(data, monotonic_ns)
 
     def _write(self, data: bytes) -> int:
         return os.write(self._fd, data)
@@ -177,8 +183,6 @@ class Wire(ABC):
             except OSError as error:
                 self.lose(error.strerror or str(error))
                 return
-            if self.tap is not None:
-                self.tap(False, data, monotonic_ns)
             must_pause = self._has_too_much(data, monotonic_ns, end)
             self._deliver(end, data, monotonic_ns)
             if must_pause or not self.connected:

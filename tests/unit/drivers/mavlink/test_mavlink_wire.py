@@ -132,6 +132,27 @@ def test_a_udp_listener_keeps_to_its_peer_until_that_is_silent() -> None:
     asyncio.run(scene())
 
 
+def test_the_tap_hears_the_peer_of_a_udp_wire_and_no_stranger() -> None:
+    async def scene() -> None:
+        tapped: list[tuple[bool, bytes]] = []
+        wire, speaker = listening(), Speaker(1)
+        wire.tap = lambda sent, data, _: tapped.append((sent, data))
+        first, second = speaker.attitude(1), speaker.attitude(2)
+        with udp_socket() as friend, udp_socket() as stranger:
+            async with running(wire.run(Ear())):
+                await until(lambda: wire.connected)
+                to = HOST, wire.port
+                stranger.sendto(b"no MAVLink at all, so no peer", to)
+                friend.sendto(first, to)
+                stranger.sendto(Speaker(2).attitude(1), to)
+                friend.sendto(second, to)
+                await until(lambda: len(tapped) >= 2 and wire.n_strange == 2)
+                wire.write(b"x")
+        assert tapped == [(False, first), (False, second), (True, b"x")]
+
+    asyncio.run(scene())
+
+
 def test_a_udp_caller_listens_to_whom_it_calls_only() -> None:
     async def scene() -> None:
         ear = Ear()
