@@ -18,7 +18,7 @@ from companion.daemon.component_state import POWEROFF
 from companion.daemon.control.armed_settings import NOT_KEPT
 from companion.daemon.control.ground_control import GroundControl
 from companion.daemon.control.settings_in_force import SettingsInForce
-from companion.daemon.flight_starts import FlightStarts
+from companion.daemon.flight_starts import NOT_BEGUN, FlightStarts
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.flights import Flights
@@ -126,8 +126,9 @@ class Daemon:
                 self._link, clock, watch, config.feedback.obstacle_distance
             )
         self._starts = starts = FlightStarts(
-            settings, self._feed, flights, self._sender, self._reports, watch, journal, self._stop
-        )
+            settings, self._feed, flights, self._sender, self._reports, watch, journal, self._stop,
+            lambda why: self._on_warned(Warned(clock.now_ns(), NOT_BEGUN, why)),
+        )  # fmt: skip
         if self._link is not None and self._reports is not None and config.control.enabled:
             self._ground = GroundControl(
                 starts, self._link, clock, journal, flights,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 
 from companion.config import Config
 from companion.daemon.control.settings_in_force import SettingsInForce
@@ -14,33 +15,36 @@ from companion.daemon.stop_request import BAD_INPUT, StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.errors import CompanionError
 from companion.geometry.camera import Camera
+from companion.runtime.processes import in_words
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.live_calibration import live_camera
 from drivers.system.journal import WARNING, Journal
 
 STANDBY_RETRY_S = 1.0
+NOT_BEGUN = "no flight can begin now, which is tried again"
 
 
 class FlightStarts:
     """Begins and ends flights, and prepares the standby one. Used in the event loop.
 
-    It is the daemon as `control.ground_control` sees it.
+    It is the daemon as `control.ground_control` sees it. `not_begun` takes the reason why the
+    processes of a flight cannot be started now.
     """
 
     def __init__(
         self, settings: SettingsInForce, feed: CameraFeed, flights: Flights,
         sender: PoseSender | None, reports: VehicleReports | None, watch: HealthWatch,
-        journal: Journal, stop: StopRequest,
+        journal: Journal, stop: StopRequest, not_begun: Callable[[str], None],
     ) -> None:  # fmt: skip
         self._loop = asyncio.get_running_loop()
         self._settings, self._feed, self._flights = settings, feed, flights
         self._sender, self._reports, self._watch = sender, reports, watch
-        self._journal, self._stop = journal, stop
+        self._journal, self._stop, self._not_begun = journal, stop, not_begun
         self.camera: Camera | None = None
         """Calibrated camera; None before its first frame."""
         self.reported_armed = False
         """Last state of the motors that this process has heard."""
-        self._standby_later: asyncio.TimerHandle | None = None
+        self._later: asyncio.TimerHandle | None = None
 
     @property
     def config(self) -> Config:
@@ -59,7 +63,10 @@ class FlightStarts:
     def prepare(self) -> None:
         """Start the processes of a standby flight."""
         if self.camera is not None:
-            self._flights.prepare(self.config, self.camera)
+            try:
+                self._flights.prepare(self.config, self.camera)
+            except (OSError, RuntimeError) as error:
+                self._try_again(error)
 
     def begin_flight(self) -> None:
         """Begin a flight with a map of its own, where one is due."""
@@ -109,9 +116,7 @@ class FlightStarts:
             flight.set_budget(config.stream.budget_kbit_s)
             return
         self._flights.discard_standby()
-        if self._standby_later is not None:
-            self._standby_later.cancel()
-        self._standby_later = self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
+        self._begin_later(STANDBY_RETRY_S)
 
     def localisation_died(self, flight: LiveFlight) -> None:
         """Begin another flight, or prepare another standby one, in place of `flight`."""
@@ -120,7 +125,7 @@ class FlightStarts:
             self._begin_if_due()
         elif self._flights.is_standby(flight):
             self._flights.discard_standby()
-            self._loop.call_later(STANDBY_RETRY_S, self._begin_if_due)
+            self._begin_later(STANDBY_RETRY_S)
 
     def stage_unusable(self, why: str) -> None:
         """On the ground exit with the error; in the air the pose goes on without the stage."""
@@ -134,14 +139,28 @@ class FlightStarts:
     def _begin_if_due(self, take_up: bool = True) -> None:
         if self.camera is None or self._flights.current is not None or self._stop.made:
             return
-        if self._always or self.reported_armed:
-            if self._sender is not None:
-                self._sender.restart()
-            if self._reports is not None:
-                self._reports.restart(self.camera)
-            self._watch.restart()
-            flight = self._flights.begin(self.config, self.camera, take_up)
-            if self._sender is not None:
-                self._sender.begin_flight(flight.believed)
-        else:
+        try:
             self._flights.prepare(self.config, self.camera)
+            if self._always or self.reported_armed:
+                self._begin(self.camera, take_up)
+        except (OSError, RuntimeError) as error:  # no process, thread or descriptor for it
+            self._try_again(error, take_up)
+
+    def _begin(self, camera: Camera, take_up: bool) -> None:
+        if self._sender is not None:
+            self._sender.restart()
+        if self._reports is not None:
+            self._reports.restart(camera)
+        self._watch.restart()
+        flight = self._flights.begin(self.config, camera, take_up)
+        if self._sender is not None:
+            self._sender.begin_flight(flight.believed)
+
+    def _try_again(self, error: OSError | RuntimeError, take_up: bool = True) -> None:
+        self._not_begun(in_words(error))
+        self._begin_later(STANDBY_RETRY_S, take_up)
+
+    def _begin_later(self, pause_s: float, take_up: bool = True) -> None:
+        if self._later is not None:
+            self._later.cancel()
+        self._later = self._loop.call_later(pause_s, self._begin_if_due, take_up)

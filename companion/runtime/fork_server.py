@@ -123,7 +123,11 @@ class _Forked:
         self._handle: int | None = None
         self._lock = threading.Lock()
         self._started, self._ended = threading.Event(), threading.Event()
-        threading.Thread(target=self._listen, name="forked", daemon=True).start()
+        try:
+            threading.Thread(target=self._listen, name="forked", daemon=True).start()
+        except RuntimeError:  # too many threads
+            answers.close()
+            raise
 
     @property
     def pid(self) -> int | None:

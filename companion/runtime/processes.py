@@ -68,10 +68,16 @@ class Processes:
         """Devices that were at work when a stage was ended for not answering."""
         self._added: set[str] = set()
         self.by_name: dict[str, StageProcess] = {}
-        for stage in self._rows.values():
-            self.by_name[stage.name] = self._start(stage)
-        for stage in self._rows.values():
-            self._set_up(stage)
+        try:
+            for stage in self._rows.values():
+                self.by_name[stage.name] = self._start(stage)
+            for stage in self._rows.values():
+                self._set_up(stage)
+        except BaseException:  # no process, thread or descriptor for one: nobody ends the others
+            self._over.set()
+            for process in self.by_name.values():
+                process.kill()
+            raise
 
     @property
     def over(self) -> bool:
@@ -218,14 +224,15 @@ class Processes:
         while not (n_before and self._over.wait(min(2.0 ** (n_before - 1), LONGEST_WAIT_S))):
             n_before += 1
             try:
-                return self._start_again(stage, gone)
-            except OSError as error:
-                self._supervisor.restarted(stage, NO_PROCESS.format(error.strerror))
+                return self._start_again(stage)
+            except (OSError, RuntimeError) as error:
+                self._supervisor.restarted(stage, NO_PROCESS.format(in_words(error)))
 
-    def _start_again(self, stage: Stage, gone: StageProcess) -> None:
+    def _start_again(self, stage: Stage) -> None:
         with self._lock:
             if self._over.is_set():
                 return
+            gone = self.by_name[stage.name]
             self.by_name[stage.name] = self._start(stage)
             self.n_restarted[stage.name] += 1
             gone.kill()
@@ -244,3 +251,8 @@ class Processes:
             self._interrupted_at.add(driver.identity)
             return
         self._failed_devices[driver.identity] = f"{driver.named}: {why}"
+
+
+def in_words(error: OSError | RuntimeError) -> str:
+    """Reason why a process or thread could not be started."""
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)

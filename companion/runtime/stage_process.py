@@ -75,13 +75,20 @@ class StageProcess:
         with theirs:
             try:
                 self._child = start(stage.name, theirs.fileno())
-            except OSError:
+            except BaseException:
                 self._socket.close()
                 raise
         self._writer = threading.Thread(target=self._write, name=f"to {stage.name}", daemon=True)
         self._reader = threading.Thread(target=self._read, name=f"from {stage.name}", daemon=True)
-        self._writer.start()
-        self._reader.start()
+        try:
+            self._writer.start()
+            self._reader.start()
+        except RuntimeError:  # too many threads
+            self._outbox.close()
+            self._end()
+            self._child.wait()
+            self._socket.close()
+            raise
 
     @property
     def pid(self) -> int | None:

@@ -69,11 +69,15 @@ class Flights:
         it relocalises.
         """
         self.prepare(config, camera)
+        folder = self._named(Path(config.daemon.flights))
         flight, self._standby = self._standby, None
         assert flight is not None and self.current is None
-        folder = self._named(Path(config.daemon.flights))
-        flight.begin(folder, KeepMap(kept_map_path(config.daemon.socket), take_up))
         self.current = flight
+        try:
+            flight.begin(folder, KeepMap(kept_map_path(config.daemon.socket), take_up))
+        except BaseException:  # no descriptor or thread for it: its stages are to end
+            self.end()
+            raise
         if self._armed is not None:  # the autopilot's word is told on change only
             flight.take(ArmedSample(self._clock.now_ns(), self._armed))
         self._journal.say(f"flight {folder.name} begins; its results go to {folder}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -272,6 +273,25 @@ def test_where_no_process_can_be_started_another_start_follows(fly: Fly) -> None
         "reader: ended with status 7", refused, refused
     ]  # fmt: skip
     assert flight.processes.n_restarted == {"reader": 1}
+
+
+@pytest.mark.parametrize(
+    "refusal",
+    [OSError(errno.EAGAIN, "Resource temporarily unavailable"),
+     RuntimeError("can't start new thread")],
+)  # fmt: skip
+def test_where_one_stage_cannot_be_started_none_is_left(refusal: Exception) -> None:
+    begun: list[Child] = []
+
+    def start(name: str, descriptor: int) -> Child:
+        if len(begun) == 2:
+            raise refusal
+        begun.append(start_alone(name, descriptor))
+        return begun[-1]
+
+    with pytest.raises(type(refusal)):
+        Flight(start=start)
+    assert [child.poll() for child in begun] == [-signal.SIGKILL] * 2
 
 
 def test_last_words_of_sources_reach_the_others_before_these_end() -> None:

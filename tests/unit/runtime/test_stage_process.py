@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from companion.runtime import stage_start
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, Progress, Setup
-from companion.runtime.stage_start import start_alone
+from companion.runtime.stage_start import Child, start_alone
 from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Stage
 from companion.timing.clock import monotonic_s
 from tests.support.flights.topic_flight import CAMERA
@@ -144,6 +145,27 @@ def test_what_dies_by_itself_says_why(start: Start, tmp_path: Path) -> None:
     assert "cannot be used" in refusing.why()
     assert refusing.stage.failed is not None and refusing.stage.failed.by_input
     assert refusing.stage.progress is None
+
+
+def test_a_process_without_its_threads_is_ended(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[Child] = []
+    start_thread = threading.Thread.start
+
+    def started(name: str, descriptor: int) -> Child:
+        begun.append(start_alone(name, descriptor))
+        return begun[-1]
+
+    def refuse(thread: threading.Thread) -> None:
+        if thread.name.startswith("from "):
+            raise RuntimeError("can't start new thread")
+        start_thread(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    with pytest.raises(RuntimeError):
+        StageProcess(READER, started, lambda parcel: None, lambda why: None)
+    assert [child.poll() for child in begun] == [-signal.SIGKILL]
 
 
 def test_how_long_it_has_hung_and_its_end_by_interruption(start: Start) -> None:

@@ -1,0 +1,164 @@
+"""Begin of flights: what follows where one cannot begin, or its localisation dies."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from companion.config import Config
+from companion.daemon.flight_starts import STANDBY_RETRY_S, FlightStarts
+from companion.daemon.flights import flights as flights_module
+from companion.daemon.flights.flight_dates import FlightDates
+from companion.daemon.flights.flights import Flights
+from companion.timing.clock import FlightClock
+from drivers.system.journal import Journal
+from tests.support.flights.topic_flight import CAMERA
+
+NO_PROCESS = OSError(errno.EAGAIN, "Resource temporarily unavailable")
+NO_THREAD = RuntimeError("can't start new thread")
+
+
+class Later:
+    """An event loop in which time passes by hand."""
+
+    def __init__(self) -> None:
+        self.due: list[tuple[float, Callable[..., None], tuple[Any, ...]]] = []
+
+    def call_later(self, pause_s: float, call: Callable[..., None], *arguments: Any) -> Any:
+        entry = pause_s, call, arguments
+        self.due.append(entry)
+
+        def cancel() -> None:
+            if entry in self.due:
+                self.due.remove(entry)
+
+        return SimpleNamespace(cancel=cancel)
+
+    def pass_on(self) -> float:
+        """Call what is due next; the pause before it."""
+        pause_s, call, arguments = self.due.pop(0)
+        call(*arguments)
+        return pause_s
+
+
+class Begun:
+    """Flights that can begin as long as nothing is refused."""
+
+    def __init__(self) -> None:
+        self.current: Any = None
+        self.standby: Any = None
+        self.refused: dict[str, list[Exception]] = {"prepare": [], "begin": []}
+        self.taken_up: list[bool] = []
+
+    def prepare(self, *_: Any) -> None:
+        self._refuse("prepare")
+        self.standby = self.standby or SimpleNamespace(believed=(), duration_s=0.0)
+
+    def begin(self, _config: Config, _camera: Any, take_up: bool) -> Any:
+        self.taken_up.append(take_up)
+        self._refuse("begin")
+        self.current, self.standby = self.standby, None
+        return self.current
+
+    def end(self) -> None:
+        self.current = None
+
+    def discard_standby(self) -> None:
+        self.standby = None
+
+    def _refuse(self, what: str) -> None:
+        if self.refused[what]:
+            raise self.refused[what].pop(0)
+
+
+class Scene:
+    """The starts of flights, at once unless `by_arming`."""
+
+    def __init__(self, by_arming: bool = False) -> None:
+        self.flights, self.later, self.said = Begun(), Later(), list[str]()
+        settings = SimpleNamespace(config=Config(), armed=False, set_armed=lambda armed: None)
+        sender = SimpleNamespace(restart=lambda: None, begin_flight=lambda use: None)
+        parts: tuple[Any, ...] = (
+            settings, None, self.flights, sender if by_arming else None, None,
+            SimpleNamespace(restart=lambda: None), Journal({}), SimpleNamespace(made=False),
+            self.said.append,
+        )  # fmt: skip
+        self.starts = FlightStarts(*parts)
+        loop: Any = self.later
+        self.starts._loop, self.starts.camera = loop, CAMERA
+
+
+@pytest.fixture
+def scene() -> Iterator[Callable[..., Scene]]:
+    async def made(by_arming: bool) -> Scene:
+        return Scene(by_arming)
+
+    yield lambda by_arming=False: asyncio.run(made(by_arming))
+
+
+@pytest.mark.parametrize("what", ["prepare", "begin"])
+def test_a_flight_that_cannot_begin_is_tried_again(scene: Callable[..., Scene], what: str) -> None:
+    made = scene()
+    made.flights.refused[what] = [NO_PROCESS, NO_THREAD]
+    made.starts.begin_flight()
+    assert made.flights.current is None
+    assert made.later.pass_on() == STANDBY_RETRY_S
+    assert made.flights.current is None
+    made.later.pass_on()
+    assert made.flights.current is not None and not made.later.due
+    assert made.said == ["Resource temporarily unavailable", "can't start new thread"]
+    assert not any(made.flights.taken_up), "it has a map of its own"
+
+
+def test_a_standby_flight_that_cannot_be_prepared_is_tried_again(
+    scene: Callable[..., Scene],
+) -> None:
+    made = scene(by_arming=True)
+    made.flights.refused["prepare"] = [NO_PROCESS]
+    made.starts.prepare()
+    assert made.flights.standby is None
+    made.later.pass_on()
+    assert made.flights.standby is not None and made.flights.current is None
+    made.starts.set_armed(True)
+    assert made.flights.current is not None
+
+
+def test_a_flight_that_fails_as_it_begins_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended: list[Any] = []
+
+    class Failing:
+        """A flight whose last thread is refused."""
+
+        def __init__(self, *_: Any) -> None:
+            self.folder, self.n_frames = None, 0
+
+        def begin(self, *_: Any) -> None:
+            raise NO_THREAD
+
+        def finish(self, _facts: Any) -> None:
+            ended.append(self)
+
+    def never(*_: Any) -> Any:
+        raise AssertionError
+
+    monkeypatch.setattr(flights_module, "LiveFlight", Failing)
+    clock, config = FlightClock(), Config()
+    config = replace(config, daemon=replace(config.daemon, flights=str(tmp_path)))
+    dates = FlightDates(clock, lambda: None, lambda: True)
+    flights = Flights(clock, Journal({}), never, never, dates, never)
+    with pytest.raises(RuntimeError):
+        flights.begin(config, CAMERA)
+    for thread in list(flights._ending.values()):
+        thread.join()
+    assert len(ended) == 1 and flights.current is None and flights.standby is None
+    assert flights._counter is not None
+    flights._counter.close(5.0)
