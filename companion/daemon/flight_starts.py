@@ -21,6 +21,8 @@ from drivers.camera.live_calibration import live_camera
 from drivers.system.journal import WARNING, Journal
 
 STANDBY_RETRY_S = 1.0
+SHORT_S, LONGEST_PAUSE_S = 10.0, 10.0
+"""Time before which the death of localisation is one of several, and the longest pause then."""
 NOT_BEGUN = "no flight can begin now, which is tried again"
 
 
@@ -45,6 +47,8 @@ class FlightStarts:
         self.reported_armed = False
         """Last state of the motors that this process has heard."""
         self._later: asyncio.TimerHandle | None = None
+        self._n_short = 0
+        """Flights in a row whose localisation died early."""
 
     @property
     def config(self) -> Config:
@@ -119,10 +123,18 @@ class FlightStarts:
         self._begin_later(STANDBY_RETRY_S)
 
     def localisation_died(self, flight: LiveFlight) -> None:
-        """Begin another flight, or prepare another standby one, in place of `flight`."""
+        """Begin another flight, or prepare another standby one, in place of `flight`.
+
+        The first time at once; where it dies soon again, after a pause: each flight has processes,
+        a folder and a recording.
+        """
         if self._flights.current is flight:
+            self._n_short = self._n_short + 1 if flight.duration_s < SHORT_S else 0
             self._flights.end()
-            self._begin_if_due()
+            if self._n_short < 2:
+                self._begin_if_due()
+            else:
+                self._begin_later(min(2.0 ** min(self._n_short - 1, 10), LONGEST_PAUSE_S))
         elif self._flights.is_standby(flight):
             self._flights.discard_standby()
             self._begin_later(STANDBY_RETRY_S)

@@ -211,15 +211,18 @@ class Processes:
                 return
             if stage.death is Death.ENDS_FLIGHT:
                 self._over.set()
+        name = stage.name
+        gone, n_before = self.by_name[name], self.n_restarted[name]
+        never_up = not n_before and gone.progress is None and name not in self._added
+        is_unusable = gone.failed is not None and gone.failed.by_input and never_up
         if stage.death is Death.ENDS_FLIGHT:
+            if is_unusable:  # told first: on the ground no other flight is to begin then
+                self._supervisor.unusable(why)
             self._supervisor.over(why)
             return
-        name = stage.name
         self._supervisor.restarted(stage, why)
-        gone, n_before = self.by_name[name], self.n_restarted[name]
         self._blame_driver(gone, why)
-        never_up = not n_before and gone.progress is None and name not in self._added
-        if gone.failed is not None and gone.failed.by_input and never_up:
+        if is_unusable:
             self._supervisor.unusable(why)
         while not (n_before and self._over.wait(min(2.0 ** (n_before - 1), LONGEST_WAIT_S))):
             n_before += 1

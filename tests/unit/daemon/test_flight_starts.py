@@ -13,7 +13,12 @@ from typing import Any
 import pytest
 
 from companion.config import Config
-from companion.daemon.flight_starts import STANDBY_RETRY_S, FlightStarts
+from companion.daemon.flight_starts import (
+    LONGEST_PAUSE_S,
+    SHORT_S,
+    STANDBY_RETRY_S,
+    FlightStarts,
+)
 from companion.daemon.flights import flights as flights_module
 from companion.daemon.flights.flight_dates import FlightDates
 from companion.daemon.flights.flights import Flights
@@ -128,6 +133,38 @@ def test_a_standby_flight_that_cannot_be_prepared_is_tried_again(
     assert made.flights.standby is not None and made.flights.current is None
     made.starts.set_armed(True)
     assert made.flights.current is not None
+
+
+def test_flights_that_die_soon_one_after_the_other_have_pauses(
+    scene: Callable[..., Scene],
+) -> None:
+    made = scene()
+    made.starts.begin_flight()
+    pauses = []
+    for _ in range(1200):
+        made.starts.localisation_died(made.flights.current)
+        pauses.append(0.0 if made.flights.current is not None else made.later.pass_on())
+        assert made.flights.current is not None and not made.later.due
+    assert pauses[:6] == [0.0, 2.0, 4.0, 8.0, 10.0, 10.0]
+    assert max(pauses) == LONGEST_PAUSE_S
+    made.flights.current.duration_s = SHORT_S
+    for _ in range(2):  # after a longer one all is as at first
+        made.starts.localisation_died(made.flights.current)
+        assert made.flights.current is not None and not made.later.due
+
+
+def test_arming_does_not_wait_for_a_pause(scene: Callable[..., Scene]) -> None:
+    made = scene(by_arming=True)
+    made.starts.set_armed(True)
+    made.starts.localisation_died(made.flights.current)
+    made.starts.localisation_died(made.flights.current)
+    assert made.flights.current is None
+    made.starts.set_armed(False)
+    made.starts.set_armed(True)
+    again = made.flights.current
+    assert again is not None
+    made.later.pass_on()
+    assert made.flights.current is again
 
 
 def test_a_flight_that_fails_as_it_begins_is_ended(

@@ -253,6 +253,15 @@ def test_what_cannot_start_because_of_the_user_is_told(fly: Fly, tmp_path: Path)
     assert len(flight.began("reader")) == 2
 
 
+def test_a_source_that_cannot_start_because_of_the_user_is_told_before_the_end(
+    fly: Fly, tmp_path: Path
+) -> None:
+    flight = fly(SOURCE, folder=tmp_path / UNUSABLE)
+    flight.heard.until(lambda: any(each.how == "over" for each in endings(flight)))
+    assert [each.how for each in endings(flight)] == ["unusable", "over"]
+    assert str(tmp_path / UNUSABLE) in endings(flight)[0].why
+
+
 def test_where_no_process_can_be_started_another_start_follows(fly: Fly) -> None:
     n_refused = 0
 
