@@ -13,7 +13,7 @@ from typing import Any
 
 from companion.runtime.parcel import Parcel, allow_descriptors
 from companion.runtime.stage_process import FRAME, StageProcess
-from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_protocol import Finish, SetLoadLevel, Setup
 from companion.runtime.stage_start import Start
 from companion.runtime.stages import START_S, Death, Stage
 from companion.timing.clock import monotonic_s
@@ -63,6 +63,8 @@ class Processes:
         self._flies = False
         self._hurry_s: float | None = None
         self._newest_map: Parcel | None = None
+        self._load_levels: dict[str, SetLoadLevel] = {}
+        """Newest by stage, also of one that is yet to start."""
         self._failed_devices: dict[str, str] = {}
         self._interrupted_at: set[str] = set()
         """Devices that were at work when a stage was ended for not answering."""
@@ -123,7 +125,12 @@ class Processes:
                 process.offer(parcel)
 
     def order(self, name: str, control: Any) -> None:
-        """Send a control message to a stage, if there is one of that name."""
+        """Send a control message to a stage, if there is one of that name.
+
+        A load level also holds for the process that takes its place.
+        """
+        if isinstance(control, SetLoadLevel):
+            self._load_levels[name] = control
         if name in self.by_name:
             self.by_name[name].order(control)
 
@@ -240,6 +247,8 @@ class Processes:
             self.n_restarted[stage.name] += 1
             gone.kill()
             self._set_up(stage)
+            if stage.name in self._load_levels:
+                self.by_name[stage.name].order(self._load_levels[stage.name])
         self.bring_up_to_date(stage.name)
 
     def _blame_driver(self, gone: StageProcess, why: str) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from companion.errors import CompanionError, InputError
 from companion.messages import Frame, MapUpdate
-from companion.runtime.stage_protocol import DriverAtWork, Finish, Setup
+from companion.runtime.stage_protocol import DriverAtWork, Finish, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.runtime.stages import Death, Frames, Stage
 
@@ -69,6 +69,8 @@ class TinyWork(Work):
             yield from self._do(message)
         elif isinstance(message, Frame):
             yield Said(message.t_ns, "frame", str(message.seq))
+        elif isinstance(message, SetLoadLevel):
+            yield Said(0, "load", str(message.level))
         elif isinstance(message, MapUpdate):
             yield Said(message.t_ns, "map", str(message.revision))
         elif message.who != "heard":  # by itself

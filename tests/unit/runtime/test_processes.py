@@ -21,7 +21,7 @@ from companion.runtime import stage_start
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor
 from companion.runtime.stage_process import StageProcess
-from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_protocol import Finish, SetLoadLevel, Setup
 from companion.runtime.stage_start import Child, Start, start_alone
 from companion.runtime.stages import Stage
 from tests.support.flights.topic_flight import CAMERA
@@ -199,6 +199,17 @@ def test_a_stage_that_dies_begins_again_with_the_newest_map(flying: Flight) -> N
     assert flying.processes.n_restarted["reader"] == 1
     assert flying.process("source") is source and source.alive
     assert not flying.processes.over and flying.processes.up
+
+
+@pytest.mark.continues
+def test_a_stage_that_begins_again_has_its_load_level(flying: Flight) -> None:
+    flying.processes.order("reader", SetLoadLevel(0.5))
+    flying.processes.order("reader", SetLoadLevel(0.0))
+    flying.heard.until_said("load", "0.0")
+    n_restarted = flying.processes.n_restarted["reader"]
+    flying.do("reader", "exit", "5")
+    flying.heard.until(lambda: flying.heard.texts("load") == ["0.5", "0.0", "0.0"])
+    assert flying.processes.n_restarted["reader"] == n_restarted + 1
 
 
 @pytest.mark.continues
