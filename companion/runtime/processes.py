@@ -231,7 +231,7 @@ class Processes:
         self._blame_driver(gone, why)
         if is_unusable:
             self._supervisor.unusable(why)
-        while not (n_before and self._over.wait(min(2.0 ** (n_before - 1), LONGEST_WAIT_S))):
+        while not (n_before and self._over.wait(pause_s(n_before))):
             n_before += 1
             try:
                 return self._start_again(stage)
@@ -263,6 +263,11 @@ class Processes:
             self._interrupted_at.add(driver.identity)
             return
         self._failed_devices[driver.identity] = f"{driver.named}: {why}"
+
+
+def pause_s(n_before: int) -> float:
+    """Pause before a start that so many others came before."""
+    return min(2.0 ** min(n_before - 1, 10), LONGEST_WAIT_S)  # a float has no 2.0**1024
 
 
 def in_words(error: OSError | RuntimeError) -> str:

@@ -19,7 +19,7 @@ from companion.config import Config
 from companion.messages import MapUpdate
 from companion.runtime import stage_start
 from companion.runtime.parcel import Parcel
-from companion.runtime.processes import Processes, Supervisor
+from companion.runtime.processes import LONGEST_WAIT_S, Processes, Supervisor, pause_s
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, SetLoadLevel, Setup
 from companion.runtime.stage_start import Child, Start, start_alone
@@ -312,6 +312,11 @@ def test_where_one_stage_cannot_be_started_none_is_left(refusal: Exception) -> N
     with pytest.raises(type(refusal)):
         Flight(start=start)
     assert [child.poll() for child in begun] == [-signal.SIGKILL] * 2
+
+
+def test_pauses_between_starts_grow_to_half_a_minute() -> None:
+    assert [pause_s(n) for n in (1, 2, 5, 6, 7)] == [1.0, 2.0, 16.0, LONGEST_WAIT_S, LONGEST_WAIT_S]
+    assert pause_s(5000) == LONGEST_WAIT_S
 
 
 def test_last_words_of_sources_reach_the_others_before_these_end() -> None:
