@@ -28,7 +28,7 @@ ANSWER = struct.Struct("<q")
 NAME_BYTES = 256
 END_S = 1.0
 ANSWER_S = 5.0
-"""Longest wait for a server that is stopped; one that has died is known at once."""
+"""Longest wait for a status from a server that is stopped; one that has died is known at once."""
 
 
 class ForkServer:
@@ -114,15 +114,18 @@ class _Copy:
 
 
 class _Forked:
-    """A child of the server, whose handle tells its end, and the server its status."""
+    """A child of the server, whose handle tells its end, and the server its status.
+
+    It never waits for the server but in its own thread, and in `wait`.
+    """
 
     def __init__(self, answers: socket.socket) -> None:
         self._answers = answers
         self._pid: int | None = None
         self._status: int | None = None
         self._handle: int | None = None
-        self._lock = threading.Lock()
-        self._started, self._ended = threading.Event(), threading.Event()
+        self._is_unwanted = False
+        self._lock, self._ended = threading.Lock(), threading.Event()
         try:
             threading.Thread(target=self._listen, name="forked", daemon=True).start()
         except RuntimeError:  # too many threads
@@ -142,25 +145,32 @@ class _Forked:
         return self._status
 
     def kill(self) -> None:
-        if not self._started.wait(ANSWER_S):
-            with contextlib.suppress(OSError):  # it counts as not started; if it ever is, it finds
-                self._answers.shutdown(socket.SHUT_RDWR)  # its socket closed, and ends
-        with self._lock, contextlib.suppress(ProcessLookupError):
+        with self._lock:
+            self._is_unwanted = True
             if self._handle is not None:
-                signal.pidfd_send_signal(self._handle, signal.SIGKILL)
+                self._signal()
+            else:
+                with contextlib.suppress(OSError):  # it counts as not started; the server ends one
+                    self._answers.shutdown(socket.SHUT_RDWR)  # of which it cannot tell any more
+
+    def _signal(self) -> None:
+        assert self._handle is not None
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._handle, signal.SIGKILL)
 
     def _listen(self) -> None:
         status: int | None = NOT_STARTED
-        with self._answers:
-            pid, handle = self._answer()
-            if handle is not None:
+        pid, handle = self._answer()
+        if handle is not None:
+            with self._lock:
                 self._pid, self._handle = pid, handle
-            self._started.set()
-            if handle is not None:
-                _is_readable(handle)  # which is its end
-                told = _is_readable(self._answers.fileno(), ANSWER_S)
-                status = self._answer()[0] if told else None
+                if self._is_unwanted:  # the answer was on its way
+                    self._signal()
+            _is_readable(handle)  # which is its end
+            told = _is_readable(self._answers.fileno(), ANSWER_S)
+            status = self._answer()[0] if told else None
         with self._lock:
+            self._answers.close()
             self._handle = None
             if handle is not None:
                 os.close(handle)

@@ -74,7 +74,8 @@ class _Server:
         handle = os.pidfd_open(pid)
         self._children[handle] = pid, answers
         self._poll.register(handle, select.POLLIN)
-        _send(answers, pid, [handle])
+        if not _send(answers, pid, [handle]):
+            os.kill(pid, SIGKILL)  # nobody waits for it any more
 
     def _become(self, answers: socket.socket, name: str, descriptor: int) -> NoReturn:
         """Be a stage from here on: nothing of the server's stays open."""
@@ -102,11 +103,13 @@ class _Server:
         answers.close()
 
 
-def _send(answers: socket.socket, number: int, descriptors: list[int]) -> None:
+def _send(answers: socket.socket, number: int, descriptors: list[int]) -> bool:
+    """Tell the daemon; False where it is gone, or has given the child up."""
     try:
         socket.send_fds(answers, [ANSWER.pack(number)], descriptors)
     except OSError:
-        pass  # the daemon is gone, which the control socket tells
+        return False
+    return True
 
 
 def serve(control: socket.socket) -> NoReturn:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -128,8 +129,13 @@ def test_the_end_of_a_stage_is_told_where_the_server_is_stopped(
     try:
         child.kill()
         assert first.end() == "ended, and the fork server does not say how"
+        monkeypatch.setattr(fork_server, "ANSWER_S", 1e6)
         second = Viewers(server)  # for which it forks nothing
-        second.stage.interrupt()
+        second.stage.begin(Setup(Config(), CAMERA, Path("flight")))
+        ending = threading.Thread(target=second.stage.interrupt, daemon=True)
+        ending.start()
+        ending.join(PATIENCE_S)
+        assert not ending.is_alive(), "the event loop, which calls it, is not to wait"
         assert second.end() == "its process could not be started"
     finally:
         os.kill(server.pid, signal.SIGCONT)
