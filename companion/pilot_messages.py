@@ -222,6 +222,7 @@ JOURNAL_ONLY = frozenset({
     "the autopilot is not asked for its IMU", "the autopilot's IMU is asked for less often",
     "the flight can be seen", "the viewer cannot be shown", "the viewer has gone",
     "the viewer does not keep up", "viewers cannot connect",
+    "recordings that were cut short cannot be looked for now",
 })  # fmt: skip
 """Kinds of `Warned` that do not concern a pilot."""
 

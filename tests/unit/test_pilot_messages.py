@@ -131,7 +131,7 @@ def test_every_warning_has_its_words() -> None:
         live_flight.NOT_FINISHED,
         imu_verdict.NOT_USED, imu_verdict.USED_AGAIN,
         viewing.SHOWN, viewing.NO_VIEWER, viewing.GONE, viewing.BEHIND, viewing.CLOSED,
-        recording_recovery.CUT_SHORT, ground_requests.TOO_MANY,
+        recording_recovery.CUT_SHORT, recording_recovery.NOT_REPAIRED, ground_requests.TOO_MANY,
         topics_work.MALFORMED, topics_work.TAKEN,
         topics_work.NOT_TAKEN, flight_result.GIVEN_UP, armed_settings.NOT_KEPT,
         localisation.MAP_RESUMED, localisation.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,

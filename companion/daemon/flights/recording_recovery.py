@@ -20,6 +20,7 @@ AFTER_S = 10.0
 """Delay after the start, or the end of a flight, when other work has priority."""
 LOOK_S = 0.2
 CUT_SHORT = "an earlier recording was cut short"
+NOT_REPAIRED = "recordings that were cut short cannot be looked for now"
 
 
 class RecordingRecovery:
@@ -40,11 +41,15 @@ class RecordingRecovery:
                     await asyncio.sleep(LOOK_S)
 
     async def _repaired(self) -> bool:
-        """Run one repair; False where arming has cut it short."""
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "companion", "flights", "repair", "--gently",
-            "--flights", str(self._flights), stdin=DEVNULL, stdout=PIPE, stderr=DEVNULL,
-        )  # fmt: skip
+        """Run one repair; False where arming has cut it short, or it could not begin."""
+        try:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "companion", "flights", "repair", "--gently",
+                "--flights", str(self._flights), stdin=DEVNULL, stdout=PIPE, stderr=DEVNULL,
+            )  # fmt: skip
+        except OSError as error:  # no memory, process or descriptor for it: later there may be
+            self._warn(Warned(self._clock.now_ns(), NOT_REPAIRED, error.strerror or str(error)))
+            return False
         give_way(process.pid)
         reading = asyncio.ensure_future(self._read(process))
         try:

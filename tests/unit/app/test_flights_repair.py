@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import fcntl
 import os
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
 from companion.app.cli import main
 from companion.daemon.flights import recording_recovery
-from companion.daemon.flights.recording_recovery import CUT_SHORT, RecordingRecovery
+from companion.daemon.flights.recording_recovery import (
+    CUT_SHORT,
+    NOT_REPAIRED,
+    RecordingRecovery,
+)
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
 from drivers.recording.flight_summary import summarise
@@ -92,6 +98,29 @@ def test_arming_breaks_it_off(cut: Path) -> None:
     assert asyncio.run(over._repaired()) is False
     assert not warned and not psutil.Process().children()
     assert unfinished(cut)
+
+
+def test_where_no_process_can_be_started_another_try_follows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warned: list[Warned] = []
+
+    async def refuse(*_: Any, **__: Any) -> Any:
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    async def scene() -> None:
+        over = RecordingRecovery(tmp_path, FlightClock(), warned.append, lambda: False)
+        running = asyncio.ensure_future(over.run())
+        while len(warned) < 2:
+            await asyncio.sleep(0)
+            assert not running.done()
+        running.cancel()
+        await asyncio.wait([running])
+
+    monkeypatch.setattr(recording_recovery, "AFTER_S", 0.0)
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", refuse)
+    asyncio.run(scene())
+    assert (warned[0].what, warned[0].detail) == (NOT_REPAIRED, "Cannot allocate memory")
 
 
 def test_a_process_gives_way_to_all_others() -> None:
