@@ -125,7 +125,7 @@ class Viewing:
             self._onboard = OnboardViewer(
                 self._where, self._port, self._config.viewer.colours, self._config.stream.web_bind
             )
-        except InputError as error:
+        except (InputError, OSError) as error:
             self._tell(NO_VIEWER, str(error))
             return AGAIN_S
         self._last_warning = ""

@@ -1,0 +1,45 @@
+"""Keeping the viewer on board open."""
+
+from __future__ import annotations
+
+import errno
+import threading
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from companion.config import Config
+from companion.daemon.flights import viewing
+from companion.daemon.flights.viewing import NO_VIEWER, SHOWN, Viewing
+
+SOON_S = 30.0
+
+
+def test_a_viewer_without_a_process_is_opened_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals = [OSError(errno.ENOMEM, "Cannot allocate memory")] * 2
+
+    def open_viewer(*_: Any) -> Any:
+        if refusals:
+            raise refusals.pop()
+        return SimpleNamespace(is_shown=True, page="http://here", close=lambda patience_s: None)
+
+    monkeypatch.setattr(viewing, "OnboardViewer", open_viewer)
+    monkeypatch.setattr(viewing, "AGAIN_S", 0.0)
+    config, warned, shown = Config(), list[tuple[str, str]](), threading.Event()
+    exporter: Any = SimpleNamespace(progress=None, n_dropped=0)
+
+    def warn(what: str, detail: str, _good: bool) -> None:
+        warned.append((what, detail))
+        if what == SHOWN:
+            shown.set()
+
+    config = replace(config, daemon=replace(config.daemon, viewer="web"))
+    opened = Viewing(config, lambda: exporter, warn)
+    opened.take_port(1)
+    assert shown.wait(SOON_S), warned
+    opened.close(hurry=True)
+    assert warned == [
+        (NO_VIEWER, "[Errno 12] Cannot allocate memory"), (SHOWN, "open http://here")
+    ]  # fmt: skip
