@@ -46,6 +46,7 @@ class PeriodicChecks:
         self._missing = MissingDevices(settings.config.daemon.missing_device_s)
         self._is_ready = False
         self._progress = True
+        self._dating: asyncio.Future[object] | None = None
 
     async def run(self) -> None:
         """Check until cancelled."""
@@ -62,8 +63,7 @@ class PeriodicChecks:
             self._report()
             if self._feed.fault is not None:
                 self._stop.fail(str(self._feed.fault), BAD_INPUT)
-            if self._dates.step():
-                asyncio.get_running_loop().run_in_executor(None, self._dates.write)
+            self._step_dates()
             self._settings.step()
             gone = self._missing.step(
                 health, (now_ns - began_ns) * 1e-9, self._starts.reported_armed
@@ -109,6 +109,11 @@ class PeriodicChecks:
         self._progress = progress
         if progress:
             self._service.alive()
+
+    def _step_dates(self) -> None:
+        """Have due dates written, unless they still are: a disk may hang for long."""
+        if self._dates.step() and (self._dating is None or self._dating.done()):
+            self._dating = asyncio.get_running_loop().run_in_executor(None, self._dates.write)
 
     def _report(self) -> None:
         line = self._watch.line_due()
