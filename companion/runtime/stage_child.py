@@ -121,6 +121,10 @@ class _Loop:
             if not self._work.outlives_daemon:
                 os._exit(0)  # the daemon is gone, and nobody waits for results
             self._inbox.put(Parcel.of(Finish(hurry=True)))
+        except BaseException:  # it would live on and hear nothing, not even that it is to end
+            sys.excepthook(*sys.exc_info())
+            sys.stderr.flush()
+            os._exit(1)
 
     def progress(self) -> Progress:
         """Progress now."""

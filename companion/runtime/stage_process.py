@@ -53,6 +53,8 @@ class StageProcess:
         self.finished: Finished | None = None
         self.failed: Failed | None = None
         self._interrupted: str | None = None
+        self._not_sent = ""
+        """Reason why it gets nothing more, which is not its own end."""
         self._begun_s: float | None = None
         self._busy_since_s: float | None = None
         """By its last report."""
@@ -174,6 +176,8 @@ class StageProcess:
         status = self._child.poll()
         if status is None or self.failed is not None or not self._driver.identity:
             return None
+        if self._not_sent and not self.was_interrupted:
+            return None
         by_itself = status >= 0 or -status in BY_DRIVER
         return self._driver if by_itself or self.was_interrupted else None
 
@@ -190,7 +194,10 @@ class StageProcess:
 
     def _end(self) -> None:
         self._child.kill()
-        with contextlib.suppress(OSError):  # nobody else closes the socket of one never started
+        self._hang_up()  # nobody else closes the socket of one never started
+
+    def _hang_up(self) -> None:
+        with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
 
     def _write(self) -> None:
@@ -199,8 +206,11 @@ class StageProcess:
                 if parcel.is_shared and not self._has_room(parcel.n_bytes):
                     return
                 parcel.send(self._socket)
-        except OSError:
+        except ConnectionError:
             pass  # it is gone, which the reader tells
+        except OSError as error:  # no memory in the kernel, or too many descriptors on their way
+            self._not_sent = f"nothing can be sent to it: {error.strerror}"
+            self._hang_up()  # it would live on and get nothing
 
     def _has_room(self, n_bytes: int) -> bool:
         """Wait until little is on its way; False where it is gone."""
@@ -223,7 +233,7 @@ class StageProcess:
             self._was_taken.notify()
         status = self._child.wait()
         why = self.failed.why if self.failed is not None else self._interrupted
-        why = why or _in_words(status)
+        why = why or self._not_sent or _in_words(status)
         self._ended("" if self.asked_to_end else why)
 
     def _take(self, parcel: Parcel) -> None:

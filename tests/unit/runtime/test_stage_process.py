@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import signal
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -166,6 +168,40 @@ def test_a_process_without_its_threads_is_ended(
     with pytest.raises(RuntimeError):
         StageProcess(READER, started, lambda parcel: None, lambda why: None)
     assert [child.poll() for child in begun] == [-signal.SIGKILL]
+
+
+def test_a_process_that_can_be_sent_nothing_more_is_told_of(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send = Parcel.send
+
+    def refuse(parcel: Parcel, to: socket.socket) -> None:
+        if not refused:
+            return send(parcel, to)
+        raise OSError(errno.ENOBUFS, "No buffer space available")
+
+    refused = False
+    monkeypatch.setattr(Parcel, "send", refuse)
+    tiny = start(READER)
+    tiny.stage.begin(SETUP)
+    tiny.do("drive", "gpu")
+    tiny.until_up()
+    refused = True
+    tiny.do("say", "lost")
+    assert tiny.why() == "nothing can be sent to it: No buffer space available"
+    assert not tiny.process.alive
+    assert tiny.process.driver is None, "it ended because it was hung up on"
+
+
+def test_a_process_that_cannot_read_a_packet_ends(
+    start: Start, capfd: pytest.CaptureFixture[str]
+) -> None:
+    tiny = start(READER)
+    tiny.stage.begin(SETUP)
+    tiny.until_up()
+    tiny.process._socket.send(b"no parcel")
+    assert tiny.why() == "ended with status 1"
+    assert "struct.error" in capfd.readouterr().err
 
 
 def test_how_long_it_has_hung_and_its_end_by_interruption(start: Start) -> None:
