@@ -178,7 +178,7 @@ class StageProcess:
             return None
         if self._not_sent and not self.was_interrupted:
             return None
-        by_itself = status >= 0 or -status in BY_DRIVER
+        by_itself = 0 <= status < UNKNOWN_STATUS or -status in BY_DRIVER
         return self._driver if by_itself or self.was_interrupted else None
 
     def kill(self) -> None:

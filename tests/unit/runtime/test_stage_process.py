@@ -8,6 +8,8 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import psutil
@@ -18,8 +20,8 @@ from companion.messages import DepthMap, Frame
 from companion.runtime import stage_start
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
-from companion.runtime.stage_protocol import Finish, Progress, Setup
-from companion.runtime.stage_start import Child, start_alone
+from companion.runtime.stage_protocol import DriverAtWork, Finish, Progress, Setup
+from companion.runtime.stage_start import NOT_STARTED, UNKNOWN_STATUS, Child, start_alone
 from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Stage
 from companion.timing.clock import monotonic_s
 from tests.support.flights.topic_flight import CAMERA
@@ -202,6 +204,25 @@ def test_a_process_that_cannot_read_a_packet_ends(
     tiny.process._socket.send(b"no parcel")
     assert tiny.why() == "ended with status 1"
     assert "struct.error" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("status", "is_blamed"),
+    [
+        (0, True), (3, True), (-signal.SIGSEGV, True), (-signal.SIGKILL, False),
+        (UNKNOWN_STATUS, False), (NOT_STARTED, False),
+    ],
+)  # fmt: skip
+def test_a_driver_is_blamed_for_an_end_that_is_known(status: int, is_blamed: bool) -> None:
+    child: Any = SimpleNamespace(
+        pid=None, poll=lambda: status, wait=lambda: status, kill=lambda: None
+    )
+    ended = Heard()
+    process = StageProcess(READER, lambda name, descriptor: child, lambda parcel: None, ended.note)
+    process._driver = DriverAtWork("gpu", "the gpu")
+    ended.until(lambda: ended.all)
+    assert (process.driver is not None) is is_blamed
+    process.kill()
 
 
 def test_how_long_it_has_hung_and_its_end_by_interruption(start: Start) -> None:
