@@ -223,9 +223,9 @@ class HealthWatch:
                 level.feature_share, level.dense_share, level.viewer
             )
 
-    def line_due(self) -> str | None:
-        """Status line for the journal, if due."""
-        return self._lines.step(self.health())
+    def line_due(self, health: Health) -> str | None:
+        """Status line for the journal, by the health now, if due."""
+        return self._lines.step(health)
 
     def document(self) -> dict[str, Any]:
         """Status document of `companion status`."""
@@ -237,16 +237,17 @@ class HealthWatch:
         """Health now."""
         now_ns, flight = self._clock.now_ns(), self._flights.current
         odometry = self._odometry if flight is not None else None
+        pose = self._pose.health(now_ns)
         sources = [self._feed.health] + ([self._link.health] if self._link is not None else [])
         return Health(
             t_ns=now_ns,
             uptime_s=(now_ns - self._began_ns) * 1e-9,
             sources=tuple(sources),
-            stages=self._stages(now_ns),
+            stages=self._stages(now_ns, pose),
             tracker=self._tracker(),
             quality=odometry.quality if odometry is not None else -1,
             scale=self._scale,
-            pose_latency_p95_ms=self._pose.health(now_ns).latency_p95_ms,
+            pose_latency_p95_ms=pose.latency_p95_ms,
             feedback=self._sender.health() if self._sender is not None else FeedbackHealth(),
             flow=self._flow_sender.health() if self._flow_sender is not None else FlowHealth(),
             flight=flight.folder.name if flight is not None and flight.folder is not None else "",
@@ -267,15 +268,18 @@ class HealthWatch:
             return "starting"
         return IN_WORDS[self._odometry.state]
 
-    def _stages(self, now_ns: int) -> tuple[StageHealth, ...]:
+    def _stages(self, now_ns: int, pose: StageHealth) -> tuple[StageHealth, ...]:
         flight = self._flights.current
         if flight is None:
             return ()
         out = []
         now_s = monotonic_s()
         for kind, stage in flight.stages.items():
-            meter = {"localisation": self._pose, "depth": self._depth}.get(kind)
-            measured = meter.health(now_ns) if meter is not None else StageHealth(kind)
+            measured = StageHealth(kind)
+            if kind == "localisation":
+                measured = pose
+            elif kind == "depth":
+                measured = self._depth.health(now_ns)
             said = stage.progress
             detail = said.device if said is not None else "starting"
             no_sign_s = stage.stalled_s(now_s)

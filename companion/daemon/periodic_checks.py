@@ -60,7 +60,7 @@ class PeriodicChecks:
             self._publish(health)
             self._check_start(health)
             self._check_stages()
-            self._report()
+            self._report(health)
             if self._feed.fault is not None:
                 self._stop.fail(str(self._feed.fault), BAD_INPUT)
             self._step_dates()
@@ -115,8 +115,8 @@ class PeriodicChecks:
         if self._dates.step() and (self._dating is None or self._dating.done()):
             self._dating = asyncio.get_running_loop().run_in_executor(None, self._dates.write)
 
-    def _report(self) -> None:
-        line = self._watch.line_due()
+    def _report(self, health: Health) -> None:
+        line = self._watch.line_due(health)
         if line:
             self._journal.say(line)
             self._service.status(line)

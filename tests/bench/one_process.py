@@ -236,10 +236,11 @@ def fly(arguments: argparse.Namespace, config: Config, seen: Seen, rows_file: Pa
         if message.t_ns >= second_ns:
             second_ns += SECOND_NS
             flown.watch.document()
-            line = flown.watch.line_due()
+            health = flown.watch.health()
+            line = flown.watch.line_due(health)
             if line:
                 flown.journal.say(line)
-            flown.flight.publish_health(flown.watch.health(), None)
+            flown.flight.publish_health(health, None)
         if message.t_ns >= row_ns:
             row_ns += ROW_NS
             seen.rows.append(row_of(flown, seen, (message.t_ns - start_ns) * 1e-9))

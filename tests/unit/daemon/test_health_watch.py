@@ -1,0 +1,61 @@
+"""Health of the daemon: what it costs to build."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from companion.config import Config
+from companion.daemon.health_watch import HealthWatch
+from companion.health import LatencyMeter, SourceHealth
+from companion.messages import Odometry, TrackState
+from companion.timing.clock import FlightClock
+from drivers.system.journal import Journal
+
+
+def watch_of(flight: Any, folder: Path) -> HealthWatch:
+    config, clock = Config(), FlightClock()
+    config = replace(config, daemon=replace(config.daemon, flights=str(folder)))
+    parts: tuple[Any, ...] = (
+        config, clock, Journal({}), SimpleNamespace(health=SourceHealth("camera")), None, None,
+        None, SimpleNamespace(current=flight), LatencyMeter(),
+    )  # fmt: skip
+    return HealthWatch(*parts)
+
+
+def test_latencies_are_sorted_once_for_a_health(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = SimpleNamespace(
+        progress=None, stalled_s=lambda now_s: 0.0, n_dropped=0, waiting_bytes=0, alive=True
+    )
+    flight = SimpleNamespace(
+        stages={"localisation": stage, "depth": stage}, dense=True, viewing=None, n_restarted={},
+        folder=None,
+    )  # fmt: skip
+    watch = watch_of(flight, tmp_path)
+    pose: Any = SimpleNamespace(
+        t_ns=watch._clock.now_ns() - 20_000_000, state=TrackState.TRACKING, quality=80
+    )
+    odometry: Odometry = pose
+    watch.take_odometry(odometry)
+    asked: list[tuple[LatencyMeter, float]] = []
+    percentile_ms = LatencyMeter.percentile_ms
+
+    def count(meter: LatencyMeter, percent: float, now_ns: int) -> float | None:
+        asked.append((meter, percent))
+        return percentile_ms(meter, percent, now_ns)
+
+    monkeypatch.setattr(LatencyMeter, "percentile_ms", count)
+    health = watch.health()
+    assert len(asked) == len(set(asked))
+    (localisation, _) = health.stages
+    assert health.pose_latency_p95_ms == localisation.latency_p95_ms
+    assert localisation.latency_p95_ms is not None and localisation.latency_p95_ms >= 20.0
+    asked.clear()
+    assert watch.line_due(health) == health.line()
+    assert not asked, "the health that there is will do"
