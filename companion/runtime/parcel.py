@@ -110,8 +110,10 @@ class Parcel:
         kind = self.kind.encode()
         header = _HEADER.pack(self.t_ns, self.n_bytes, len(kind))
         packet: list[bytes | bytearray] = [header, kind, self._inline]
-        descriptors = [self._memory.descriptor] if self._memory is not None else []
-        socket.send_fds(to, packet, descriptors)
+        if self._memory is None:
+            to.sendmsg(packet)
+        else:
+            socket.send_fds(to, packet, [self._memory.descriptor])
 
     @classmethod
     def receive(cls, source: socket.socket) -> Parcel:

@@ -54,6 +54,17 @@ def test_small_and_large_messages_come_in_their_order(ends: Ends, rng: np.random
     assert [p.open().seq for p in got] == [1, 7, 2, 7]
 
 
+def test_a_small_message_is_sent_without_descriptors(
+    ends: Ends, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[list[int]] = []
+    monkeypatch.setattr(socket, "send_fds", lambda to, packet, handles: sent.append(handles))
+    Parcel.of(frame(rng, 16)).send(ends[0])
+    assert not sent and Parcel.receive(ends[1]).open().seq == 7
+    Parcel.of(frame(rng)).send(ends[0])
+    assert [len(handles) for handles in sent] == [1]
+
+
 def test_a_map_of_many_small_arrays_crosses_whole(ends: Ends) -> None:
     poses = {n: Pose(np.eye(3), np.array([n, 0.5, -1.0])) for n in range(2000)}
     parcel = Parcel.of(MapUpdate(3, 4, poses, np.ones((5000, 3)), None))
