@@ -135,7 +135,7 @@ class FlightStarts:
                 self._begin_if_due()
             else:
                 self._begin_later(min(2.0 ** min(self._n_short - 1, 10), LONGEST_PAUSE_S))
-        elif self._flights.is_standby(flight):
+        elif self._flights.standby is flight:
             self._flights.discard_standby()
             self._begin_later(STANDBY_RETRY_S)
 

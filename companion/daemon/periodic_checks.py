@@ -18,7 +18,7 @@ from companion.health import Health
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_feed import CameraFeed
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.system.journal import ERROR, Journal
+from drivers.system.journal import ERROR, WARNING, Journal
 from drivers.system.service_manager import ServiceManager
 
 EVERY_S = 0.2
@@ -46,6 +46,8 @@ class PeriodicChecks:
         self._missing = MissingDevices(settings.config.daemon.missing_device_s)
         self._is_ready = False
         self._progress = True
+        self._told = ""
+        """Last problem with the service manager in the journal."""
         self._dating: asyncio.Future[object] | None = None
 
     async def run(self) -> None:
@@ -120,3 +122,7 @@ class PeriodicChecks:
         if line:
             self._journal.say(line)
             self._service.status(line)
+        problem = self._service.problem
+        if problem != self._told:
+            self._told = problem
+            self._journal.say(f"warning: {problem}", WARNING)

@@ -54,10 +54,6 @@ class Mailbox(Generic[T]):
         self.n_overflowed = 0
         """Other messages dropped on overflow."""
 
-    def __len__(self) -> int:
-        with self._changed:
-            return sum(map(len, self._waiting.values()))
-
     def put(self, message: T) -> None:
         """Add a message; never waits. Counted as dropped once it is closed."""
         policy, size = self._policy_of(message), self._bytes_of(message)

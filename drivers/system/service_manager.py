@@ -18,8 +18,6 @@ class ServiceManager:
     """The service manager that started this process, where there is one."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
-        self.n_lost = 0
-        """Notifications that could not be sent."""
         self.problem = ""
         """Reason why nothing can be sent although it should, in words."""
         self._address = ""
@@ -34,11 +32,6 @@ class ServiceManager:
         self._address = "\0" + address[1:] if address[0] == "@" else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.setblocking(False)
-
-    @property
-    def present(self) -> bool:
-        """True if the process was started by a service manager that listens."""
-        return self._socket is not None
 
     def ready(self, status: str = "") -> None:
         """READY=1; also at the end of a reload."""
@@ -77,7 +70,6 @@ class ServiceManager:
         try:
             self._socket.sendto(notice, self._address)
         except OSError as error:
-            self.n_lost += 1
             self.problem = f"the service manager cannot be told: {error.strerror}"
 
 

@@ -92,10 +92,6 @@ class Flights:
         self._ending[flight] = thread
         thread.start()
 
-    def is_standby(self, flight: LiveFlight) -> bool:
-        """True if a flight is the one on standby."""
-        return self._standby is flight
-
     def discard_standby(self) -> None:
         """End the standby flight; the next one is prepared anew."""
         standby, self._standby = self._standby, None

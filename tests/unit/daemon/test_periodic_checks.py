@@ -9,6 +9,8 @@ from typing import Any
 
 from companion.config import Config
 from companion.daemon.periodic_checks import PeriodicChecks
+from drivers.system.journal import WARNING
+from drivers.system.service_manager import ServiceManager
 
 SOON_S = 30.0
 
@@ -36,6 +38,22 @@ def checks_with(**parts: Any) -> PeriodicChecks:
     )  # fmt: skip
     there: dict[str, Any] = dict.fromkeys(names)
     return PeriodicChecks(**there | {"settings": SimpleNamespace(config=Config()), **parts})
+
+
+def test_a_service_manager_that_is_not_told_is_named_once() -> None:
+    said: list[tuple[str, int]] = []
+    watch: Any = SimpleNamespace(line_due=lambda health: None)
+    journal: Any = SimpleNamespace(say=lambda text, priority: said.append((text, priority)))
+    service = ServiceManager({"NOTIFY_SOCKET": "vsock:2:1234"})
+    health: Any = None
+
+    async def scene() -> None:
+        checks = checks_with(watch=watch, journal=journal, service=service)
+        for _ in range(3):
+            checks._report(health)
+
+    asyncio.run(scene())
+    assert said == [(f"warning: {service.problem}", WARNING)] and "vsock" in service.problem
 
 
 def test_a_disk_that_hangs_holds_one_thread() -> None:
