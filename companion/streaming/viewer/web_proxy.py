@@ -7,6 +7,7 @@ Behind this proxy it is given no more than the browsers take: drawing waits for 
 from __future__ import annotations
 
 import contextlib
+import errno
 import select
 import selectors
 import socket
@@ -23,7 +24,12 @@ LAG_S = 0.3
 LONGEST_WAIT_S = 2.0
 """Longest wait for a browser that takes nothing at all."""
 LOOK_S = 0.02
+MOST_CONNECTIONS = 64
+"""Far more than some browsers with a few connections each; others are closed at once."""
+PAUSE_S = 0.5
+"""Pause of a listener for which there was no descriptor."""
 LOOPBACK = "127.0.0.1"
+NO_ROOM = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 @dataclass(eq=False)
@@ -48,6 +54,8 @@ class WebProxy:
     def __init__(self, listeners: Mapping[tuple[str, int], int], watched: int) -> None:
         self._selector = selectors.DefaultSelector()
         self._directions: dict[socket.socket, tuple[_Direction, _Direction]] = {}
+        self._paused: dict[socket.socket, tuple[tuple[int, bool], float]] = {}
+        """Listeners that accept nothing until a time, and what they are registered with."""
         self._stop = threading.Event()
         for (host, port), inner in listeners.items():
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -79,6 +87,7 @@ class WebProxy:
 
     def _work(self) -> None:
         while not self._stop.is_set():
+            self._resume()
             for key, events in self._selector.select(0.1):
                 assert isinstance(key.fileobj, socket.socket)
                 if isinstance(key.data, tuple):
@@ -88,12 +97,26 @@ class WebProxy:
         for opened in list(self._selector.get_map().values()):
             assert isinstance(opened.fileobj, socket.socket)
             opened.fileobj.close()
+        for listener in self._paused:
+            listener.close()
         self._selector.close()
+
+    def _resume(self) -> None:
+        for listener, (data, until_s) in list(self._paused.items()):
+            if monotonic_s() > until_s:
+                del self._paused[listener]
+                self._selector.register(listener, selectors.EVENT_READ, data)
 
     def _open(self, listener: socket.socket, inner: int, is_watched: bool) -> None:
         try:
             browser, _ = listener.accept()
-        except OSError:  # it is gone already
+        except OSError as error:
+            if error.errno in NO_ROOM:  # it still waits, and would be reported all the time
+                self._selector.unregister(listener)
+                self._paused[listener] = (inner, is_watched), monotonic_s() + PAUSE_S
+            return  # else it is gone already
+        if len(self._directions) >= 2 * MOST_CONNECTIONS:
+            browser.close()
             return
         try:
             server = socket.create_connection((LOOPBACK, inner), timeout=1.0)
@@ -118,7 +141,7 @@ class WebProxy:
                     data = direction.source.recv(CAPACITY_BYTES)
                     direction.ended |= not data
                     direction.held += data
-                if direction.held and select.select([], [direction.sink], [], 0)[1]:
+                if direction.held and _has_room(direction.sink):
                     # else the kernel would take, and keep, far more than the network does
                     del direction.held[: direction.sink.send(direction.held)]
                 if not direction.held:
@@ -155,6 +178,13 @@ class WebProxy:
     def _forget(self, each: socket.socket) -> None:
         with contextlib.suppress(KeyError):
             self._selector.unregister(each)
+
+
+def _has_room(sink: socket.socket) -> bool:
+    """True if a socket takes something now; select(2) knows no descriptors above 1023."""
+    waiting = select.poll()
+    waiting.register(sink, select.POLLOUT)
+    return bool(waiting.poll(0))
 
 
 def free_ports(n: int) -> list[int]:
