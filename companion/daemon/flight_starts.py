@@ -134,6 +134,7 @@ class FlightStarts:
             if self._n_short < 2:
                 self._begin_if_due()
             else:
+                self._watch.flight_due = True
                 self._begin_later(min(2.0 ** min(self._n_short - 1, 10), LONGEST_PAUSE_S))
         elif self._flights.standby is flight:
             self._flights.discard_standby()
@@ -151,9 +152,10 @@ class FlightStarts:
     def _begin_if_due(self, take_up: bool = True) -> None:
         if self.camera is None or self._flights.current is not None or self._stop.made:
             return
+        self._watch.flight_due = self._always or self.reported_armed
         try:
             self._flights.prepare(self.config, self.camera)
-            if self._always or self.reported_armed:
+            if self._watch.flight_due:
                 self._begin(self.camera, take_up)
         except (OSError, RuntimeError) as error:  # no process, thread or descriptor for it
             self._try_again(error, take_up)
@@ -165,6 +167,7 @@ class FlightStarts:
             self._reports.restart(camera)
         self._watch.restart()
         flight = self._flights.begin(self.config, camera, take_up)
+        self._watch.flight_due = False
         if self._sender is not None:
             self._sender.begin_flight(flight.believed)
 

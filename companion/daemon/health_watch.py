@@ -90,6 +90,8 @@ class HealthWatch:
         self._odometry: Odometry | None = None
         self._odometry_ns = 0
         self._progress_ns = self._began_ns
+        self.flight_due = False
+        """True while a flight is to begin and cannot yet: then it is missed that no pose comes."""
         self._scale = ""
         self._recent = LatencyMeter(1.0)
         self.set_by_ground: Mapping[str, Any] = {}
@@ -150,10 +152,11 @@ class HealthWatch:
 
     @property
     def progress(self) -> bool:
-        """False where frames come but no pose has for long; to be asked often."""
+        """False where frames come but no pose has for long, though one is due; ask often."""
         now_ns = self._clock.now_ns()
         frames_come = now_ns - self._last_frame_ns < GOVERN_NS
-        if self._flights.current is None or not frames_come:
+        is_wanted = self._flights.current is not None or self.flight_due
+        if not is_wanted or not frames_come:
             self._progress_ns = now_ns
         return now_ns - self._progress_ns < PATIENCE_NS
 

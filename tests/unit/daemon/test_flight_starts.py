@@ -88,11 +88,12 @@ class Scene:
 
     def __init__(self, by_arming: bool = False) -> None:
         self.flights, self.later, self.said = Begun(), Later(), list[str]()
+        self.watch = SimpleNamespace(restart=lambda: None, flight_due=False)
         settings = SimpleNamespace(config=Config(), armed=False, set_armed=lambda armed: None)
         sender = SimpleNamespace(restart=lambda: None, begin_flight=lambda use: None)
         parts: tuple[Any, ...] = (
             settings, None, self.flights, sender if by_arming else None, None,
-            SimpleNamespace(restart=lambda: None), Journal({}), SimpleNamespace(made=False),
+            self.watch, Journal({}), SimpleNamespace(made=False),
             self.said.append,
         )  # fmt: skip
         self.starts = FlightStarts(*parts)
@@ -115,8 +116,9 @@ def test_a_flight_that_cannot_begin_is_tried_again(scene: Callable[..., Scene], 
     made.starts.begin_flight()
     assert made.flights.current is None
     assert made.later.pass_on() == STANDBY_RETRY_S
-    assert made.flights.current is None
+    assert made.flights.current is None and made.watch.flight_due
     made.later.pass_on()
+    assert not made.watch.flight_due
     assert made.flights.current is not None and not made.later.due
     assert made.said == ["Resource temporarily unavailable", "can't start new thread"]
     assert not any(made.flights.taken_up), "it has a map of its own"
@@ -128,7 +130,7 @@ def test_a_standby_flight_that_cannot_be_prepared_is_tried_again(
     made = scene(by_arming=True)
     made.flights.refused["prepare"] = [NO_PROCESS]
     made.starts.prepare()
-    assert made.flights.standby is None
+    assert made.flights.standby is None and not made.watch.flight_due
     made.later.pass_on()
     assert made.flights.standby is not None and made.flights.current is None
     made.starts.set_armed(True)
@@ -158,8 +160,9 @@ def test_arming_does_not_wait_for_a_pause(scene: Callable[..., Scene]) -> None:
     made.starts.set_armed(True)
     made.starts.localisation_died(made.flights.current)
     made.starts.localisation_died(made.flights.current)
-    assert made.flights.current is None
+    assert made.flights.current is None and made.watch.flight_due
     made.starts.set_armed(False)
+    assert not made.watch.flight_due
     made.starts.set_armed(True)
     again = made.flights.current
     assert again is not None

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from companion.config import Config
-from companion.daemon.health_watch import HealthWatch
+from companion.daemon.health_watch import PATIENCE_NS, HealthWatch
 from companion.health import LatencyMeter, SourceHealth
 from companion.messages import Odometry, TrackState
 from companion.timing.clock import FlightClock
@@ -59,3 +59,20 @@ def test_latencies_are_sorted_once_for_a_health(
     asked.clear()
     assert watch.line_due(health) == health.line()
     assert not asked, "the health that there is will do"
+
+
+@pytest.mark.parametrize("is_due", [True, False])
+def test_no_pose_for_long_is_no_progress_where_a_flight_is_due(
+    is_due: bool, tmp_path: Path
+) -> None:
+    """Also while another flight waits for its begin, after one that died."""
+    watch, clock = watch_of(None, tmp_path), FlightClock()
+    times_ns = [PATIENCE_NS // 40 * n for n in range(41)]
+    watch._clock, watch._progress_ns, watch.flight_due = clock, 0, is_due
+    seen = []
+    for now_ns in times_ns:
+        clock.now_ns = lambda now_ns=now_ns: now_ns  # type: ignore[method-assign,misc]
+        watch.frame_came()
+        seen.append(watch.progress)
+    assert all(seen[:-1])
+    assert seen[-1] is not is_due
