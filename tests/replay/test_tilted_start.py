@@ -111,12 +111,12 @@ def test_poses_are_level_two_seconds_after_a_tilted_start(
     assert flown.worst_deg(max(LEVEL_AFTER_S, late_s + 2.0)) < MAX_TILT_DEG
 
 
-@pytest.mark.parametrize("tilt_deg", [10.0, 20.0, 40.0])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "tilt_deg"), zip(KINDS, [10.0, 20.0, 40.0], strict=True))
 @pytest.mark.alone
 def test_poses_of_the_live_stage_are_level_two_seconds_after_a_tilted_start(
     sample: tuple[Flight, list[Frame], list[Telemetry]], kind: str, tilt_deg: float
 ) -> None:
+    """At the pace of flight; each kind and each tilt once, all of them above."""
     with tilted_starts(kind, tilt_deg) as begun:
         flown = fly(*sample, live=True)
     assert begun
