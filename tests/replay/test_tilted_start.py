@@ -111,7 +111,7 @@ def test_poses_are_level_two_seconds_after_a_tilted_start(
     assert flown.worst_deg(max(LEVEL_AFTER_S, late_s + 2.0)) < MAX_TILT_DEG
 
 
-@pytest.mark.parametrize(("kind", "tilt_deg"), zip(KINDS, [10.0, 20.0, 40.0], strict=True))
+@pytest.mark.parametrize(("kind", "tilt_deg"), [("axes", 10.0), ("turn", 20.0), ("depth", 40.0)])
 @pytest.mark.alone
 def test_poses_of_the_live_stage_are_level_two_seconds_after_a_tilted_start(
     sample: tuple[Flight, list[Frame], list[Telemetry]], kind: str, tilt_deg: float
