@@ -39,10 +39,12 @@ def load() -> Iterator[None]:
             process.wait()
 
 
-def flown(folder: Path, codec: str, use: tuple[str, ...] = MEASUREMENTS) -> Path:
+def flown(
+    folder: Path, codec: str, use: tuple[str, ...] = MEASUREMENTS, has_imu: bool = False
+) -> Path:
     """A flight with load, and with a stage killed; its folder."""
     codecs = f"recorder.codec={codec}", "recorder.jpeg_quality=90"
-    with Flying(folder, *codecs, f"telemetry.use={list(use)}") as flying:
+    with Flying(folder, *codecs, f"telemetry.use={list(use)}", has_imu=has_imu) as flying:
         flying.take_off()
         assert flying.daemon.status()["believed"] == list(use)
         assert bool(flying.daemon.said("is believed (telemetry.use)")) == (use != MEASUREMENTS)
@@ -56,7 +58,7 @@ def flown(folder: Path, codec: str, use: tuple[str, ...] = MEASUREMENTS) -> Path
         time.sleep(FLY_S)
         flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
         flying.autopilot.disarm()
-        flying.daemon.line("flight over", 60.0)
+        flying.daemon.line("results so far", 60.0)
         (path,) = flying.daemon.flown()
         flying.daemon.stop()
     return path
@@ -72,13 +74,15 @@ def again(path: Path, out: Path) -> tuple[Run, dict[str, Any]]:
 @pytest.mark.alone
 def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> None:
     """Of what was believed: what was not is in the recording as well."""
-    path = flown(tmp_path, "png", ("attitude", "satellites"))
+    path = flown(tmp_path, "png", ("attitude", "imu", "satellites"), has_imu=True)
     done, found = again(path, tmp_path / "again")
     recorded = open_recording(path / "flight.mcap", CameraConfig(), TelemetryConfig())
     with closing(recorded.recording):
         told = decisions_of(recorded.recording)
-    assert told.config.telemetry.use == ("attitude", "satellites")
-    assert {"attitude", "position", "satellites", "height"} <= {
+    assert told.config.telemetry.use == ("attitude", "imu", "satellites")
+    without_frame = [step for step in told.frames if not step.has_picture]
+    assert any(step.seq in told.odometry for step in without_frame), "poses by dead reckoning"
+    assert {"attitude", "imu", "position", "satellites", "height"} <= {
         MEASURED[s.source if isinstance(s, PositionSample) else type(s)] for s in told.samples
     }
     assert found["tracked_again"]
