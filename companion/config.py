@@ -180,7 +180,8 @@ class DaemonConfig:
     flights: str = "flights"
     """Folder of the flights' folders."""
     flight: Literal["armed", "always"] = "armed"
-    """A flight lasts from arming to disarming, or as long as the daemon runs."""
+    """A flight is kept once the motors were armed; or always, from the first frame until the daemon
+    ends."""
     viewer: str = "none"
     """none, web, native, or the rerun+http://… of a running viewer."""
     hot_c: Annotated[float, Meta(ge=30, le=120)] = 85.0

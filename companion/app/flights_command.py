@@ -22,6 +22,7 @@ from drivers.recording.flights_folder import (
     FlightPlace,
     delete,
     flights_in,
+    flown_in,
     free_bytes,
     may_go,
     recordings_in,
@@ -46,7 +47,7 @@ def found_recording(given: str, folder: Path) -> Path:
 def recordings_meant(given: Sequence[str], folder: Path) -> list[Path]:
     """Recordings of these flights; of all in `folder` where none is named."""
     if not given:
-        return [path for flight in flights_in(folder) for path in recordings_in(flight.path)]
+        return [path for flight in flown_in(folder) for path in recordings_in(flight.path)]
     return [found_recording(each, folder) for each in given]
 
 
@@ -75,7 +76,7 @@ def list_flights(folder: Path, as_json: bool) -> str:
             "mb": round(flight.n_bytes / MB, 1),
             "state": summary.state + (", kept" if flight.kept else ""),
         }
-        for flight, path, part, summary in _summaries(flights_in(folder))
+        for flight, path, part, summary in _summaries(flown_in(folder))
     ]
     if as_json:
         return json.dumps(rows, indent=2)

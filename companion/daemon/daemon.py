@@ -39,7 +39,7 @@ from companion.health import LatencyMeter
 from companion.messages import NO_PICTURE, Frame, Odometry, OpticalFlow, Warned
 from companion.pilot_messages import PilotText, of_warning
 from companion.products.flight_result import RunFacts
-from companion.runtime.stage_protocol import Snapshot
+from companion.runtime.stage_protocol import ResultsWritten, Snapshot
 from companion.runtime.stage_start import Start
 from companion.telemetry import ArmedSample, AttitudeSample, Telemetry, belief_in_words
 from companion.timing.clock import FlightClock
@@ -57,6 +57,7 @@ from drivers.system.service_manager import ServiceManager
 from drivers.system.status_socket import StatusSocket, own_socket_path
 
 LEAST_WAIT_S = 0.005
+NOT_WRITTEN = "the results so far could not be written"
 WRITE_S = 0.2
 """Time to write the armed settings at the end."""
 END_S = 2.6
@@ -266,6 +267,7 @@ class Daemon:
             localisation_died=lambda: self._soon(self._starts.localisation_died, flight),
             unusable=lambda why: self._soon(self._starts.stage_unusable, why),
             snapshot=current(self._on_snapshot),
+            results_written=self._on_results_written,
             points_made=current(self._watch.points_made),
             mapped=current(reports.take) if reports is not None else None,
         )
@@ -283,6 +285,12 @@ class Daemon:
     def _on_snapshot(self, snapshot: Snapshot) -> None:
         if self._ground is not None:
             self._ground.snapshot_told(snapshot)
+
+    def _on_results_written(self, written: ResultsWritten) -> None:
+        if written.why_not:
+            self._on_warned(Warned(self._clock.now_ns(), NOT_WRITTEN, written.why_not))
+        else:
+            self._journal.say(f"results so far: {written.folder}")
 
     def _reconfigured(self, old: Config, config: Config) -> None:
         self._checks.reconfigure(old, config)

@@ -1,11 +1,16 @@
-"""Begin and end of flights: by arming or at once, by the ground, and after failures."""
+"""Begin and end of flights: at once or by the autopilot's first word, by the ground, on failures.
+
+Localisation runs from power-on, so that poses are there before the motors are armed. Arming marks
+the flight to be kept; after disarming it goes on, so that another take-off has the same map.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 
-from companion.config import Config
+from companion.config import Config, DaemonConfig, FeedbackConfig
 from companion.daemon.control.settings_in_force import SettingsInForce
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.live_flight import LiveFlight, makes_depth
@@ -23,6 +28,10 @@ from drivers.system.journal import WARNING, Journal
 STANDBY_RETRY_S = 1.0
 SHORT_S, LONGEST_PAUSE_S = 10.0, 10.0
 """Time before which the death of localisation is one of several, and the longest pause then."""
+REST_S, PREPARE_S, CHANGED_S = 300.0, 15.0, 1.0
+"""Time on the ground after which a flight gives way to another: bounds what is recorded of a
+vehicle that only stands there. The other's stages start so much earlier. After a change of settings
+it comes soon: a ground station sets several, one after the other."""
 NOT_BEGUN = "no flight can begin now, which is tried again"
 
 
@@ -46,7 +55,11 @@ class FlightStarts:
         """Calibrated camera; None before its first frame."""
         self.reported_armed = False
         """Last state of the motors that this process has heard."""
+        self._is_heard = False
+        """True once the autopilot has said whether its motors are armed."""
         self._later: asyncio.TimerHandle | None = None
+        self._rest: asyncio.TimerHandle | None = None
+        """Until a flight on the ground gives way to another."""
         self._n_short = 0
         """Flights in a row whose localisation died early."""
 
@@ -96,12 +109,11 @@ class FlightStarts:
     def set_armed(self, armed: bool) -> None:
         """Take the state of the motors from the autopilot."""
         self._settings.set_armed(armed)
-        if armed == self.reported_armed:
-            return
-        self.reported_armed = armed
-        self._journal.say("armed" if armed else "disarmed")
-        if not armed and not self._always:
-            self._flights.end()
+        self._is_heard = True
+        if armed != self.reported_armed:
+            self.reported_armed = armed
+            self._journal.say("armed" if armed else "disarmed")
+            self._step_flight(armed)
         self._begin_if_due()
 
     def reconfigure(self, old: Config, config: Config) -> None:
@@ -115,12 +127,14 @@ class FlightStarts:
             self._flights.end()  # its localisation measures no flow
             self._begin_if_due(take_up=False)
             return
-        if flight is not None:
+        if flight is None:
+            self._flights.discard_standby()
+            self._begin_later(STANDBY_RETRY_S)
+        elif self._on_ground and _of_stages(old) != _of_stages(config):
+            self._rest_for(CHANGED_S, self._give_way)
+        else:
             flight.set_dense(makes_depth(config))
             flight.set_budget(config.stream.budget_kbit_s)
-            return
-        self._flights.discard_standby()
-        self._begin_later(STANDBY_RETRY_S)
 
     def localisation_died(self, flight: LiveFlight) -> None:
         """Begin another flight, or prepare another standby one, in place of `flight`.
@@ -149,10 +163,47 @@ class FlightStarts:
     def _always(self) -> bool:
         return self.config.daemon.flight == "always" or self._sender is None
 
+    @property
+    def _on_ground(self) -> bool:
+        """True where nobody minds that another map begins."""
+        return not (self._always or self.reported_armed)
+
+    def _step_flight(self, armed: bool) -> None:
+        """Keep the current flight from arming on; at disarming write what there is of it."""
+        if self._always:
+            return
+        if armed:
+            self._flights.keep()
+            if self._flights.current is not None:
+                self._flights.discard_standby()
+        else:
+            self._flights.write_results()
+        self._begin_rest()
+
+    def _begin_rest(self) -> None:
+        """Have the current flight give way to another in a while, unless armed by then."""
+        if self._on_ground:
+            self._rest_for(REST_S - PREPARE_S, self._end_rest)
+        elif self._rest is not None:
+            self._rest.cancel()
+
+    def _end_rest(self) -> None:
+        self.prepare()
+        self._rest_for(PREPARE_S, self._give_way)
+
+    def _rest_for(self, pause_s: float, then: Callable[[], None]) -> None:
+        if self._rest is not None:
+            self._rest.cancel()
+        self._rest = self._loop.call_later(pause_s, then)
+
+    def _give_way(self) -> None:
+        self._flights.end()
+        self._begin_if_due(take_up=False)
+
     def _begin_if_due(self, take_up: bool = True) -> None:
         if self.camera is None or self._flights.current is not None or self._stop.made:
             return
-        self._watch.flight_due = self._always or self.reported_armed
+        self._watch.flight_due = self._always or self._is_heard
         try:
             self._flights.prepare(self.config, self.camera)
             if self._watch.flight_due:
@@ -166,8 +217,9 @@ class FlightStarts:
         if self._reports is not None:
             self._reports.restart(camera)
         self._watch.restart()
-        flight = self._flights.begin(self.config, camera, take_up)
+        flight = self._flights.begin(self.config, camera, take_up, keep=not self._on_ground)
         self._watch.flight_due = False
+        self._begin_rest()
         if self._sender is not None:
             self._sender.begin_flight(flight.believed)
 
@@ -179,3 +231,14 @@ class FlightStarts:
         if self._later is not None:
             self._later.cancel()
         self._later = self._loop.call_later(pause_s, self._begin_if_due, take_up)
+
+
+def _of_stages(config: Config) -> Config:
+    """The part of a configuration with which a flight's stages begin, and stay."""
+    return replace(
+        config,
+        feedback=FeedbackConfig(max_jump_m=config.feedback.max_jump_m),
+        daemon=DaemonConfig(),
+        depth=replace(config.depth, enabled=True),
+        stream=replace(config.stream, budget_kbit_s=0.0),
+    )

@@ -253,7 +253,7 @@ class HealthWatch:
             pose_latency_p95_ms=pose.latency_p95_ms,
             feedback=self._sender.health() if self._sender is not None else FeedbackHealth(),
             flow=self._flow_sender.health() if self._flow_sender is not None else FlowHealth(),
-            flight=flight.folder.name if flight is not None and flight.folder is not None else "",
+            flight=flight.folder.name if flight and flight.folder and flight.kept else "",
             load=self.load,
             degradation=self._governor.level.number,
             degraded=self._governor.degraded,
@@ -266,7 +266,7 @@ class HealthWatch:
         flight = self._flights.current
         if flight is None:
             there = self._feed.health.state in ("running", "frozen", "silent", "ended")
-            return "waiting for arming" if there else "waiting for the camera"
+            return "waiting for the autopilot" if there else "waiting for the camera"
         if self._odometry is None:
             return "starting"
         return IN_WORDS[self._odometry.state]

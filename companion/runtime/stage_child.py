@@ -154,8 +154,8 @@ class _Loop:
                 for out in work.finish(message):
                     send(out)
                 return
-            for out in work.step(message):
-                send(out)
+            for given in work.step(message):
+                send(given)
             self._n_done += isinstance(message, Frame)
 
 

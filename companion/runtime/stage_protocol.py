@@ -89,6 +89,21 @@ class Snapshot:
 
 
 @dataclass(frozen=True, slots=True)
+class WriteResults:
+    """Write the results of the flight so far, which goes on. For `results`."""
+
+    facts: RunFacts
+
+
+@dataclass(frozen=True, slots=True)
+class ResultsWritten:
+    """The results so far lie in `folder`, or could not be written: `why_not`."""
+
+    folder: str
+    why_not: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Progress:
     """Periodic report of a stage's process.
 

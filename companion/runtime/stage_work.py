@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 from companion.messages import Message
-from companion.runtime.stage_protocol import Finish, Setup, Snapshot
+from companion.runtime.stage_protocol import Finish, ResultsWritten, Setup, Snapshot
 from companion.timing.clock import StageTimes
 
 
@@ -35,7 +35,7 @@ class Work(ABC):
         """Called before the first message; `tell` sends a message to the daemon at once."""
 
     @abstractmethod
-    def step(self, message: Any) -> Iterable[Message | Snapshot]:
+    def step(self, message: Any) -> Iterable[Message | Snapshot | ResultsWritten]:
         """Take one message."""
 
     @abstractmethod

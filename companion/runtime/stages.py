@@ -113,7 +113,7 @@ STAGES = (
             Frame, *TELEMETRY, Warned, Health, GeoOrigin, Track, KeyframeAdded, LoopClosed,
             MapUpdate, DepthMap, PointChunk,
         ),
-        nice=10, answer_s=60.0, finish_s=180.0, hurried_s=1.6, with_flight=True, in_folder=True,
+        nice=10, answer_s=180.0, finish_s=180.0, hurried_s=1.6, with_flight=True, in_folder=True,
     ),
 )  # fmt: skip
 START_S = 300.0
@@ -130,6 +130,7 @@ DROPPED = {
     PointChunk.__name__: DropPolicy.MAP, MapUpdate.__name__: DropPolicy.MAP,
     "Setup": DropPolicy.ALWAYS, "Finish": DropPolicy.ALWAYS, "SetLoadLevel": DropPolicy.ALWAYS,
     "TakeSnapshot": DropPolicy.ALWAYS, "SetBudget": DropPolicy.ALWAYS, "KeepMap": DropPolicy.ALWAYS,
+    "WriteResults": DropPolicy.ALWAYS,
 }  # fmt: skip
 """Policy of messages where a queue is full, by kind; all others are LOSSLESS."""
 

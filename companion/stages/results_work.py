@@ -9,8 +9,15 @@ from typing import Any
 
 from companion.errors import StageError
 from companion.messages import Message, PointChunk
-from companion.products.flight_result import FlightResult
-from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from companion.products.flight_result import FlightResult, RunFacts
+from companion.runtime.stage_protocol import (
+    Finish,
+    ResultsWritten,
+    Setup,
+    Snapshot,
+    TakeSnapshot,
+    WriteResults,
+)
 from companion.runtime.stage_work import Work
 from companion.stages.cloud_snapshots import CloudSnapshots
 from companion.streaming.viewer import FileViewer
@@ -39,7 +46,9 @@ class _Results(Work):
         if setup.is_live:  # in a process of its own
             give_back_library_pages()
 
-    def step(self, message: Any) -> Iterable[Message | Snapshot]:
+    def step(self, message: Any) -> Iterable[Message | Snapshot | ResultsWritten]:
+        if isinstance(message, WriteResults):
+            return [self._written_so_far(message.facts)]
         if isinstance(message, TakeSnapshot):
             self._snapshots.begin(message)
             return self._snapshots.step()
@@ -50,18 +59,26 @@ class _Results(Work):
         return self._snapshots.step()
 
     def finish(self, finish: Finish) -> Iterable[Message]:
-        # plots are made at the end only: until then their library need not be in memory
-        from companion.products.report.write_results import write_results
-
         try:
             self._open.close()
         finally:  # a viewer file that cannot be written is no reason to lose the results
             if finish.facts is not None:
-                write_results(
-                    self._folder, self._result, finish.facts, self._voxel_m, page=not finish.hurry
-                )
+                self._write(finish.facts, page=not finish.hurry)
         self._result.close()
         return []
+
+    def _written_so_far(self, facts: RunFacts) -> ResultsWritten:
+        try:
+            self._write(facts, page=True)
+        except OSError as error:  # the flight goes on, and what was gathered is not to be lost
+            return ResultsWritten(str(self._folder), error.strerror or str(error))
+        return ResultsWritten(str(self._folder))
+
+    def _write(self, facts: RunFacts, page: bool) -> None:
+        # plots are made on the ground only: until then their library need not be in memory
+        from companion.products.report.write_results import write_results
+
+        write_results(self._folder, self._result, facts, self._voxel_m, page)
 
 
 def kept(chunk: PointChunk) -> PointChunk:

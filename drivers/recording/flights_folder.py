@@ -20,6 +20,9 @@ from drivers.recording.growing_file import is_growing
 RECORDING, TLOG = "flight.mcap", "flight.tlog"
 KEEP = "keep"
 """A file of this name in a flight's folder protects it from deletion."""
+UNARMED = "not-armed"
+"""Marks a flight whose motors were not armed yet; its folder goes when it ends. One that is left,
+as the power was cut, is not listed, and is the first to be deleted."""
 COUNTER = ".last-number"
 """Holds the number of the newest flight, which may have been deleted or moved since."""
 STAMPED = re.compile(r"(?:(\d{5,})-)?(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-\d+)?")
@@ -37,13 +40,15 @@ class FlightPlace(NamedTuple):
     kept: bool
     growing: bool
     """True while it is being recorded."""
+    unarmed: bool = False
+    """True as long as its motors were never armed."""
     not_before_s: float | None = None
     """Lower bound of its begin, Unix time, by its name and those before it in order; None where no
     clock was ever right."""
 
 
 def flights_in(folder: Path) -> list[FlightPlace]:
-    """All flights, the oldest first; FlightError where the folder cannot be read."""
+    """All folders of flights, the oldest first; FlightError where the folder cannot be read."""
     try:
         names = in_order(each.name for each in os.scandir(folder) if each.is_dir())
     except FileNotFoundError as error:
@@ -59,6 +64,11 @@ def flights_in(folder: Path) -> list[FlightPlace]:
         newest_s = max(filter(None, (newest_s, began_unix_s(name))), default=None)
         out.append(_place(folder / name, newest_s))
     return out
+
+
+def flown_in(folder: Path) -> list[FlightPlace]:
+    """The same without those whose motors were not armed."""
+    return [flight for flight in flights_in(folder) if not flight.unarmed]
 
 
 def flight_name(number: int, unix_s: float) -> str:
@@ -117,8 +127,12 @@ def free_bytes(folder: Path) -> int:
 
 
 def may_go(flights: list[FlightPlace], but: Path | None = None) -> Iterator[FlightPlace]:
-    """Flights that may be deleted, the oldest first: finished, not kept, and not `but`."""
-    return (f for f in flights if not (f.kept or f.growing) and f.path.name != (but and but.name))
+    """Flights that may be deleted: finished, not kept, and not `but`.
+
+    Those that were never armed come first, then the oldest.
+    """
+    in_turn = sorted(flights, key=lambda flight: not flight.unarmed)
+    return (f for f in in_turn if not (f.kept or f.growing) and f.path.name != (but and but.name))
 
 
 def delete(flight: FlightPlace) -> None:
@@ -139,7 +153,10 @@ def _place(path: Path, not_before_s: float | None) -> FlightPlace:
                 n_bytes += os.stat(os.path.join(folder, name)).st_blocks * 512
             except OSError:
                 continue  # gone meanwhile
-    return FlightPlace(path, n_bytes, (path / KEEP).exists(), is_recorded_now(path), not_before_s)
+    return FlightPlace(
+        path, n_bytes, (path / KEEP).exists(), is_recorded_now(path), (path / UNARMED).exists(),
+        not_before_s,
+    )  # fmt: skip
 
 
 def _is_growing(path: Path) -> bool:

@@ -3,8 +3,8 @@
     python -m tests.bench.soak [--flight sample/survey] [--seconds 3600] [--out soak] [--set …]
 
 Lap after lap a pretended autopilot arms, flies what was recorded and disarms, while the flight's
-pictures are played as a camera; each lap is a flight with its recording, which is verified and
-deleted. Once a second all processes of the daemon are looked at.
+pictures are played as a camera; each lap is a flight with its recording, as a new map is asked for
+after it, which is verified and deleted. Once a second all processes of the daemon are looked at.
 
 Written are soak.csv (a row a second), laps.csv (a row a lap), journal.txt, soak.svg, and at the end
 a few lines: rates, latency, and how fast memory, file handles and threads have grown once the
@@ -20,6 +20,7 @@ import csv
 import json
 import shutil
 import signal
+import socket
 import sys
 import time
 from dataclasses import dataclass, field
@@ -31,12 +32,14 @@ import psutil
 from matplotlib.figure import Figure
 
 from companion.config import CameraConfig
+from companion.daemon.control.ground_control import NEW_MAP
 from companion.errors import CompanionError
 from drivers.open_flight import open_flight
 from drivers.recording.recording import Recording
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import RecordedFlight
 from tests.support.autopilot.fake_wire import free_port
+from tests.support.autopilot.ground_station import GroundStation
 from tests.support.autopilot.received_poses import poses_of
 from tests.support.processes.daemon_process import Daemon
 
@@ -130,10 +133,11 @@ def fly(arguments: argparse.Namespace) -> Soak:
     flight = open_flight(arguments.flight, CameraConfig())
     n, span_ns = flight.n_frames, flight.times_ns[-1] - flight.times_ns[0]
     lap_s = (span_ns + span_ns // max(1, n - 1)) * 1e-9
-    port = free_port()
+    port, ground_port = free_port(), free_port(socket.SOCK_STREAM)
     begins_s = time.time() + LEAD_S
     settings = [
         "camera.source=file", f"camera.path={arguments.flight.absolute()}",
+        f'router.clients=["tcpin:127.0.0.1:{ground_port}"]',
         "expert.camera.repeat=true", f"expert.camera.starts_at_unix_s={begins_s}",
         f"link.url=udpin:127.0.0.1:{port}", "feedback.mode=odometry", *arguments.set,
     ]  # fmt: skip
@@ -179,7 +183,8 @@ def fly(arguments: argparse.Namespace) -> Soak:
                             laps_file.flush()
                     time.sleep(max(0.05, 1.0 - (time.monotonic() - began_s) % 1.0))
                 autopilot.disarm()  # should the machine have been too busy before
-                time.sleep(0.3)
+                with GroundStation(ground_port) as ground:  # else the flight would go on
+                    ground.command(NEW_MAP, timeout_s=60)
                 lap += 1
         except KeyboardInterrupt:
             pass  # what was seen so far is told all the same

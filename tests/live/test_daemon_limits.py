@@ -111,7 +111,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
         flying.assert_went_on(went_on_ns)
         flying.assert_true_poses()
         flying.autopilot.disarm()
-        flying.daemon.line("flight over", 30)
+        flying.daemon.line("disarmed", 10)
         flying.assert_stops()
         assert not flying.daemon.said("Traceback")
 

@@ -119,7 +119,7 @@ def test_nothing_is_kept_once_the_flight_is_over(flying: Flying) -> None:
     assert 10_000 < kept.stat().st_size < 5_000_000
     disarmed_ns = time.monotonic_ns()
     flying.autopilot.disarm()
-    flying.daemon.line("flight over", 60, disarmed_ns)
-    assert not kept.exists()
+    flying.daemon.line("disarmed", 60, disarmed_ns)
     flying.assert_stops()
+    assert not kept.exists()
     assert not flying.daemon.said("Traceback")

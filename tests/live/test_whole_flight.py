@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig
 from drivers.open_flight import open_flight
+from drivers.recording.flights_folder import UNARMED
 from tests.support.autopilot.fake_autopilot import FakeAutopilot, Received
 from tests.support.autopilot.fake_flight import RecordedFlight
 from tests.support.autopilot.fake_wire import free_port
@@ -40,8 +41,11 @@ class Flown:
     """When its first picture was due."""
     armed_ns: int = 0
     disarmed_ns: int = 0
-    folders_before_arming: list[Path] = field(default_factory=list)
+    before_arming: list[tuple[Path, bool]] = field(default_factory=list)
+    """Folders, and whether they are marked as not armed."""
     folder: Path = Path()
+    written: set[str] = field(default_factory=set)
+    """Its files after disarming."""
     second: Run | None = None
     health: dict[str, Any] = field(default_factory=dict)
     health_after: dict[str, Any] = field(default_factory=dict)
@@ -86,7 +90,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
         with autopilot:  # it is switched on after the daemon, and before there are pictures
             autopilot.fly(first_ns, begins_ns, arm=False)
             wait_until(ARMS_S)
-            out.folders_before_arming = daemon.flown()
+            out.before_arming = [(each, (each / UNARMED).exists()) for each in daemon.flown()]
             autopilot.arm()
             out.armed_ns = time.monotonic_ns()
             wait_until(30)
@@ -101,8 +105,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
             wait_until(DISARMS_S)
             autopilot.disarm()
             out.disarmed_ns = time.monotonic_ns()
-            daemon.line("flight over", 40)
+            daemon.line("results so far", 40)
             (out.folder,) = daemon.flown()
+            out.written = {path.name for path in out.folder.iterdir()}
             out.health_after = daemon.status()
             out.stop_s = daemon.stop()
             out.received = list(autopilot.received)
@@ -111,17 +116,18 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
     yield out
 
 
-def test_arming_begins_the_flight_and_disarming_ends_it(flown: Flown) -> None:
-    assert flown.folders_before_arming == []
+def test_arming_keeps_the_flight_and_disarming_stops_nothing(flown: Flown) -> None:
+    assert flown.before_arming == [(flown.folder, True)]
+    assert not (flown.folder / UNARMED).exists()
     assert "companion: armed" in flown.lines
     assert "companion: disarmed" in flown.lines
     (began,) = (line for line in flown.lines if "begins; its results go to" in line)
     assert flown.folder.name in began
     assert flown.health["flight"] == flown.folder.name
-    assert flown.health_after["flight"] == ""
-    assert flown.health_after["tracker"] == "waiting for arming"
+    assert flown.health_after["flight"] == flown.folder.name
+    assert {"report.json", "report.html", "trajectory.tum", "cloud.ply"} <= flown.written
     n_after = len(flown.poses.between(flown.disarmed_ns + 300_000_000, 2**62))
-    assert n_after == 0, f"{n_after} poses after the flight"
+    assert n_after > 10, "poses go on after disarming"
 
 
 def test_odometry_is_as_autopilots_want_it(flown: Flown) -> None:

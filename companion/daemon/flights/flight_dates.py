@@ -70,6 +70,11 @@ class FlightDates:
             flight.over = True
         return self.write().get(folder, folder)
 
+    def deleted(self, folder: Path) -> None:
+        """A flight's folder is gone."""
+        with self._lock:
+            self._flights.pop(folder, None)
+
     def step(self) -> bool:
         """Check the clock, once a second; True if there is something to `write`."""
         now_ns = self._clock.now_ns()

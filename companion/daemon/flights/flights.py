@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -20,8 +21,11 @@ from companion.runtime.stage_protocol import KeepMap
 from companion.runtime.stage_start import Start
 from companion.telemetry import ArmedSample, Telemetry
 from companion.timing.clock import FlightClock
-from drivers.recording.flights_folder import COUNTER, flight_name, next_number
+from drivers.recording.flights_folder import COUNTER, UNARMED, flight_name, next_number
 from drivers.system.journal import WARNING, Journal
+
+MARKED_S = 1.0
+"""Longest wait for the disk to take the mark of a flight."""
 
 
 class Flights:
@@ -41,6 +45,8 @@ class Flights:
         self._last_number = 0
         self._clock, self._journal, self._listener, self._facts = clock, journal, listener, facts
         self.current: LiveFlight | None = None
+        self._mark: NewestFile | None = None
+        """Marks the current flight's folder as long as it is not kept."""
         self._standby: LiveFlight | None = None
         self._armed: bool | None = None
         """State of the motors; None as long as the autopilot was not heard."""
@@ -62,11 +68,13 @@ class Flights:
         if self._standby is None:
             self._standby = LiveFlight(config, camera, self._clock, self._listener, self._start)
 
-    def begin(self, config: Config, camera: Camera, take_up: bool = True) -> LiveFlight:
+    def begin(
+        self, config: Config, camera: Camera, take_up: bool = True, keep: bool = True
+    ) -> LiveFlight:
         """Begin a flight; the one before must have been ended.
 
         With `take_up` it continues the map of a process that died in the air, if there is one and
-        it relocalises.
+        it relocalises. Unless `keep`, its folder goes when it ends, if `keep` was not called.
         """
         self.prepare(config, camera)
         folder = self._named(Path(config.daemon.flights))
@@ -80,15 +88,38 @@ class Flights:
             raise
         if self._armed is not None:  # the autopilot's word is told on change only
             flight.take(ArmedSample(self._clock.now_ns(), self._armed))
-        self._journal.say(f"flight {folder.name} begins; its results go to {folder}")
+        if keep:
+            self.keep()
+        else:
+            self._mark = NewestFile(folder / UNARMED, self._not_marked)
+            self._mark.put(b"")
+            self._journal.say("localisation begins; the flight is kept once the motors are armed")
         return flight
+
+    def keep(self) -> None:
+        """Keep the current flight's folder: the motors are armed."""
+        flight = self.current
+        if flight is None or flight.kept or flight.folder is None:
+            return
+        flight.kept = True
+        if self._mark is not None:
+            self._mark.put(None)
+        self._journal.say(f"flight {flight.folder.name} begins; its results go to {flight.folder}")
+
+    def write_results(self) -> None:
+        """Write the results of the current flight so far."""
+        if self.current is not None:
+            self.current.write_results(self._facts(self.current))
 
     def end(self) -> None:
         """End the current flight; its results are written in the background."""
         flight, self.current = self.current, None
+        mark, self._mark = self._mark, None
         if flight is None:
             return
-        thread = threading.Thread(target=self._finish, args=(flight,), name="end", daemon=True)
+        if not flight.kept:
+            flight.hurry()
+        thread = threading.Thread(target=self._finish, args=(flight, mark), name="end", daemon=True)
         self._ending[flight] = thread
         thread.start()
 
@@ -124,11 +155,17 @@ class Flights:
             await asyncio.sleep(0.02)
             rounds -= 1
 
-    def _finish(self, flight: LiveFlight) -> None:
+    def _finish(self, flight: LiveFlight, mark: NewestFile | None) -> None:
         flight.finish(self._facts)
-        folder = self._dates.ended(flight.folder) if flight.folder is not None else None
+        if mark is not None:
+            mark.close(MARKED_S)
+        if flight.kept and flight.folder is not None:
+            folder = self._dates.ended(flight.folder)
+            self._journal.say(f"flight over: {folder} ({flight.n_frames} frames)")
+        elif flight.folder is not None:
+            shutil.rmtree(flight.folder, ignore_errors=True)  # what is left stays marked
+            self._dates.deleted(flight.folder)
         self._ending.pop(flight, None)
-        self._journal.say(f"flight over: {folder} ({flight.n_frames} frames)")
 
     def _named(self, parent: Path) -> Path:
         """Folder of the next flight: a number never used before, and the time, UTC."""
@@ -142,6 +179,9 @@ class Flights:
         folder = parent / flight_name(self._last_number, self._dates.unix_s(t_ns))
         self._dates.begun(folder, t_ns)
         return folder
+
+    def _not_marked(self, why: str) -> None:
+        self._journal.say(f"warning: a flight is not marked as not armed: {why}", WARNING)
 
     def _not_counted(self, why: str) -> None:
         self._journal.say(f"warning: the number of the flight is not kept: {why}", WARNING)

@@ -35,11 +35,13 @@ from companion.runtime.stage_protocol import (
     Finish,
     KeepMap,
     Listening,
+    ResultsWritten,
     SetBudget,
     SetLoadLevel,
     Setup,
     Snapshot,
     TakeSnapshot,
+    WriteResults,
 )
 from companion.runtime.stage_start import Start
 from companion.runtime.stages import STAGES, Stage, stage_named
@@ -65,6 +67,7 @@ class Listener:
     """A stage could never start because of the user's input."""
     flow: Callable[[OpticalFlow], None] = lambda _: None
     snapshot: Callable[[Snapshot], None] = lambda _: None
+    results_written: Callable[[ResultsWritten], None] = lambda _: None
     points_made: Callable[[int], None] = lambda _: None
     """Time of the keyframe whose points they are."""
     mapped: Callable[[Track | MapUpdate | PointChunk], None] | None = None
@@ -89,6 +92,8 @@ class LiveFlight:
         """Folder of the results; None before the begin."""
         self.keep_map = False
         """True at the end of a process in the air: the next process may continue the map."""
+        self.kept = False
+        """True once the motors were armed: its folder stays when it ends."""
         self.n_frames = 0
         self._flies = False
         """True once the stages take messages: none gets any before the recorder does."""
@@ -212,6 +217,10 @@ class LiveFlight:
         """Write the cloud as it is now; progress goes to the listener."""
         self._processes.order("results", TakeSnapshot(number, origin))
 
+    def write_results(self, facts: RunFacts) -> None:
+        """Write the results so far, while it goes on; the listener is told when they are."""
+        self._processes.order("results", WriteResults(facts))
+
     @property
     def duration_s(self) -> float:
         """Seconds since it began."""
@@ -272,6 +281,8 @@ class LiveFlight:
             self._listener.flow(parcel.open())
         elif parcel.kind == Snapshot.__name__:
             self._listener.snapshot(parcel.open())
+        elif parcel.kind == ResultsWritten.__name__:
+            self._listener.results_written(parcel.open())
         elif parcel.kind == Georeferenced.__name__:
             told: Georeferenced = parcel.open()
             self.has_origin = told.georeference is not None and told.georeference.has_origin

@@ -14,7 +14,10 @@ import pytest
 
 from companion.config import Config
 from companion.daemon.flight_starts import (
+    CHANGED_S,
     LONGEST_PAUSE_S,
+    PREPARE_S,
+    REST_S,
     SHORT_S,
     STANDBY_RETRY_S,
     FlightStarts,
@@ -61,16 +64,25 @@ class Begun:
         self.standby: Any = None
         self.refused: dict[str, list[Exception]] = {"prepare": [], "begin": []}
         self.taken_up: list[bool] = []
+        self.n_written = 0
 
     def prepare(self, *_: Any) -> None:
         self._refuse("prepare")
         self.standby = self.standby or SimpleNamespace(believed=(), duration_s=0.0)
 
-    def begin(self, _config: Config, _camera: Any, take_up: bool) -> Any:
+    def begin(self, _config: Config, _camera: Any, take_up: bool, keep: bool) -> Any:
         self.taken_up.append(take_up)
         self._refuse("begin")
         self.current, self.standby = self.standby, None
+        self.current.kept = keep
         return self.current
+
+    def keep(self) -> None:
+        if self.current is not None:
+            self.current.kept = True
+
+    def write_results(self) -> None:
+        self.n_written += 1
 
     def end(self) -> None:
         self.current = None
@@ -162,12 +174,75 @@ def test_arming_does_not_wait_for_a_pause(scene: Callable[..., Scene]) -> None:
     made.starts.localisation_died(made.flights.current)
     assert made.flights.current is None and made.watch.flight_due
     made.starts.set_armed(False)
-    assert not made.watch.flight_due
     made.starts.set_armed(True)
     again = made.flights.current
     assert again is not None
     made.later.pass_on()
     assert made.flights.current is again
+
+
+def test_localisation_runs_from_the_autopilots_first_word_and_arming_keeps_the_flight(
+    scene: Callable[..., Scene],
+) -> None:
+    made = scene(by_arming=True)
+    made.starts.prepare()
+    assert made.flights.current is None
+    made.starts.set_armed(False)
+    flight = made.flights.current
+    assert flight is not None and not flight.kept
+    made.starts.set_armed(True)
+    assert made.flights.current is flight and flight.kept
+    assert not made.later.due, "a flight in the air gives way to nothing"
+    made.starts.set_armed(False)
+    assert made.flights.current is flight and made.flights.n_written == 1
+    made.starts.set_armed(True)
+    made.starts.set_armed(False)
+    assert made.flights.current is flight and made.flights.n_written == 2
+
+
+def test_a_flight_on_the_ground_gives_way_to_another(scene: Callable[..., Scene]) -> None:
+    made = scene(by_arming=True)
+    made.starts.set_armed(False)
+    first = made.flights.current
+    assert made.later.pass_on() == REST_S - PREPARE_S
+    assert made.flights.standby is not None and made.flights.current is first
+    assert made.later.pass_on() == PREPARE_S
+    second = made.flights.current
+    assert second is not first and not second.kept and made.flights.taken_up == [True, False]
+    assert made.later.pass_on() == REST_S - PREPARE_S
+    made.starts.set_armed(True)
+    assert made.flights.current is second and second.kept
+    assert made.flights.standby is None and not made.later.due
+
+
+def test_a_process_restarted_in_the_air_keeps_its_flight(scene: Callable[..., Scene]) -> None:
+    made = scene(by_arming=True)
+    made.starts.set_armed(True)
+    assert made.flights.current.kept and made.flights.taken_up == [True] and not made.later.due
+
+
+def test_changed_settings_of_stages_begin_another_map_on_the_ground_only(
+    scene: Callable[..., Scene],
+) -> None:
+    made = scene(by_arming=True)
+    old = Config()
+    other = replace(old, features=replace(old.features, n_features=old.features.n_features + 100))
+    limits = replace(old, feedback=replace(old.feedback, max_sigma_m=0.5))
+    made.starts.set_armed(False)
+    flight = made.flights.current
+    flight.set_dense = flight.set_budget = lambda _: None
+    made.starts.reconfigure(old, limits)
+    assert made.flights.current is flight
+    for _ in range(3):
+        made.starts.reconfigure(old, other)
+    assert made.flights.current is flight
+    assert made.later.pass_on() == CHANGED_S
+    second = made.flights.current
+    assert second is not None and second is not flight
+    second.set_dense = second.set_budget = lambda _: None
+    made.starts.set_armed(True)
+    made.starts.reconfigure(old, other)
+    assert made.flights.current is second and not made.later.due
 
 
 def test_a_flight_that_fails_as_it_begins_is_ended(
@@ -179,10 +254,13 @@ def test_a_flight_that_fails_as_it_begins_is_ended(
         """A flight whose last thread is refused."""
 
         def __init__(self, *_: Any) -> None:
-            self.folder, self.n_frames = None, 0
+            self.folder, self.n_frames, self.kept = None, 0, False
 
         def begin(self, *_: Any) -> None:
             raise NO_THREAD
+
+        def hurry(self) -> None:
+            pass
 
         def finish(self, _facts: Any) -> None:
             ended.append(self)

@@ -223,7 +223,7 @@ def test_a_kept_file_that_no_ground_has_written_is_refused(tmp_path: Path, text:
     ("camera", "flight", "tracker", "localisation", "state"),
     [
         ("missing", "", "waiting for the camera", True, BOOT),
-        ("running", "", "waiting for arming", True, STANDBY),
+        ("running", "", "waiting for the autopilot", True, STANDBY),
         ("running", "f", "starting", True, CALIBRATING),
         ("running", "f", "initialising", True, CALIBRATING),
         ("running", "f", "tracking", True, ACTIVE),

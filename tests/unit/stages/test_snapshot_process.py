@@ -1,4 +1,4 @@
-"""The results stage writes the cloud in mid-flight, and goes on."""
+"""The results stage writes the cloud, or all results, in mid-flight, and goes on."""
 
 from __future__ import annotations
 
@@ -14,9 +14,17 @@ from companion.geometry.transforms import Pose
 from companion.messages import MapUpdate, PointChunk
 from companion.runtime.parcel import Parcel
 from companion.runtime.stage_process import StageProcess
-from companion.runtime.stage_protocol import Finish, Setup, Snapshot, TakeSnapshot
+from companion.runtime.stage_protocol import (
+    Finish,
+    ResultsWritten,
+    Setup,
+    Snapshot,
+    TakeSnapshot,
+    WriteResults,
+)
 from companion.runtime.stage_start import start_alone
 from companion.runtime.stages import stage_named
+from tests.support.flights.flown import facts
 from tests.support.reference.scoring import read_ply
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -56,6 +64,17 @@ def test_a_snapshot_and_another(tmp_path: Path, rng: np.random.Generator) -> Non
                 percents.append(last.percent)
             assert percents == sorted(percents) and len(percents) > 2
             assert len(read_ply(tmp_path / f"snapshot-{number:03d}.ply")) == last.n_points > 1000
+        for written in (True, False, True):
+            blocked = tmp_path / "report.json"
+            blocked.unlink(missing_ok=True)
+            if not written:
+                blocked.mkdir()
+            stage.order(WriteResults(facts()))
+            so_far = told.get(timeout=PATIENCE_S)
+            assert isinstance(so_far, ResultsWritten) and bool(so_far.why_not) != written
+            assert (tmp_path / "report.html").exists()
+            if not written:
+                blocked.rmdir()
         stage.ask_to_finish(Finish(hurry=True))
         assert stage.wait(PATIENCE_S)
         assert stage.finished is not None

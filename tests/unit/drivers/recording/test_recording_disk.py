@@ -11,7 +11,7 @@ from companion.config import CameraConfig, Config, RecorderConfig, TelemetryConf
 from companion.flight_notes import LinkBytes
 from companion.messages import Frame, Warned
 from drivers.recording.disk_writer import CHUNK_BYTES, FULL, PRUNED, RESERVE_BYTES, SLOW
-from drivers.recording.flights_folder import flights_in, may_go
+from drivers.recording.flights_folder import UNARMED, flights_in, flown_in, may_go
 from drivers.recording.recorded_flight import RecordedFlight, open_recording
 from drivers.recording.recorder import Recorder
 from tests.support.flights.recorded import SIZE, START_NS, STEP_NS, camera, record
@@ -130,6 +130,14 @@ def test_a_slow_disk_makes_nobody_wait_and_costs_pictures_first(
     flight = opened(tmp_path / "2026-01-01T00-00-00Z")
     assert flight.n_frames == 150 - recorder.n_dropped["pictures"]
     assert flight.recording.counts["/mavlink/received"] == 150
+
+
+def test_what_was_never_armed_goes_first(tmp_path: Path) -> None:
+    old = old_flight(tmp_path, "00001-2026-01-01T00-00-00Z", 1)
+    (old_flight(tmp_path, "00002-2026-01-02T00-00-00Z", 1) / UNARMED).touch()
+    flights = flights_in(tmp_path)
+    assert [f.unarmed for f in may_go(flights)] == [True, False]
+    assert [f.path for f in flown_in(tmp_path)] == [old]
 
 
 def test_what_is_recorded_now_is_never_deleted(tmp_path: Path) -> None:
