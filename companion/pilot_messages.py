@@ -136,6 +136,7 @@ REASONS: Mapping[str, str] = {
     "initialising": "map starting",
     "lost": "tracking lost",
     "no metric scale": "no scale",
+    "IMU being checked": "IMU being checked",
     "position too uncertain": "uncertain",
     "scale too uncertain": "scale uncertain",
     "quality too low": "low quality",

@@ -42,6 +42,7 @@ INITIALISING = "initialising"
 LOST = "lost"
 NO_SCALE = "no metric scale"
 SCALE_UNCERTAIN = "scale too uncertain"
+UNPROVED_IMU = "IMU being checked"
 UNCERTAIN = "position too uncertain"
 POOR = "quality too low"
 TILTED = "tilt differs from the autopilot's"
@@ -257,6 +258,8 @@ class PoseGate:
         seen = odometry.state in (TrackState.TRACKING, TrackState.STANDING)
         if not seen and not bridging:
             return LOST
+        if pose is None and odometry.state is TrackState.STANDING:
+            return UNPROVED_IMU
         if pose is None or velocity is None:
             return NO_SCALE if self._accepted is None else LOST
         numbers = np.r_[pose.rotation.ravel(), pose.translation, velocity]

@@ -310,11 +310,17 @@ class SmoothOdometry:
         return np.zeros(3) if self._last is None else self._last[2].translation
 
     def _standing(self, track: Track) -> Odometry:
-        """Odometry of a vehicle that stands on the ground: at a fixed place, as the attitude is."""
+        """Odometry of a vehicle that stands on the ground: at a fixed place, as the attitude is.
+
+        The first waits until inertial navigation could carry it on: an autopilot that arms on it
+        would lose it at lift-off.
+        """
         attitude, fixed = self._attitude, self.ground.stood
         assert fixed is not None
         if attitude is None:
             return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
+        if not self._given and self._navigation.at(track.t_ns) is None:
+            return Odometry(track.seq, track.t_ns, TrackState.STANDING, self.reset_counter)
         placed = Pose(fixed.world_from_attitude @ attitude.ned_from_body, fixed.place_m)
         self._velocity, self._dead_reckoning = np.zeros(3), True
         self._hold(track.t_ns, placed)

@@ -72,6 +72,16 @@ def test_a_stand_where_it_was_tracked_goes_on() -> None:
     np.testing.assert_allclose(place(stood), HERE, atol=0.05)
 
 
+def test_the_first_stand_has_a_pose_once_accelerometers_could_carry_it_on() -> None:
+    vehicle = Vehicle()
+    first = vehicle.frame(standing=True)
+    assert first.state is TrackState.STANDING and first.world_from_body is None
+    np.testing.assert_allclose(place(vehicle.frames(10, standing=True)), 0.0, atol=1e-9)
+    without = Vehicle(has_imu=False)
+    stood = without.frames(100, standing=True)
+    assert stood.state is TrackState.STANDING and stood.world_from_body is None
+
+
 def test_a_landing_without_sight_is_a_reset() -> None:
     """Inertial navigation has become too uncertain, and poses have ceased."""
     vehicle = Vehicle()
