@@ -103,15 +103,16 @@ class Processes:
                 self._set_up(stage)
 
     def add(self, stage: Stage) -> None:
-        """Start a stage during the flight."""
+        """Start a stage during the flight; OSError or RuntimeError where no process can begin."""
         with self._lock:
             if self._over.is_set() or stage.name in self.by_name:
                 return
+            process = self._start(stage)
             self._added.add(stage.name)
             self._rows[stage.name] = stage
             self._listens[stage.name] = {kind.__name__ for kind in stage.listens}
             self.n_restarted.setdefault(stage.name, 0)
-            self.by_name[stage.name] = self._start(stage)
+            self.by_name[stage.name] = process
             self._set_up(stage)
 
     def publish(self, parcel: Parcel) -> None:

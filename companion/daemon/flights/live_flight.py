@@ -29,7 +29,7 @@ from companion.messages import (
 )
 from companion.products.flight_result import RunFacts
 from companion.runtime.parcel import Parcel
-from companion.runtime.processes import Processes, Supervisor
+from companion.runtime.processes import Processes, Supervisor, in_words
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import (
     Finish,
@@ -50,6 +50,7 @@ from companion.timing.clock import FlightClock, monotonic_s
 
 RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
+NOT_DENSE = "the dense map cannot be begun now; switch it off and on to try again"
 NOT_FINISHED = "a stage did not give its last results in time"
 HEALTH_EVERY_NS = 1_000_000_000
 MAPPED = {kind.__name__ for kind in (Track, MapUpdate, PointChunk)}
@@ -198,12 +199,17 @@ class LiveFlight:
         """Start or stop dense mapping; the dense map so far stays."""
         if dense == self._dense or self._processes.over:
             return
-        self._dense = dense
         if not dense:
+            self._dense = False
             self._processes.muted.add("depth")
             return
+        try:
+            self._processes.add(stage_named("depth"))
+        except (OSError, RuntimeError) as error:  # no memory, process or descriptor for it
+            self._warn(NOT_DENSE, in_words(error))
+            return
+        self._dense = True
         self._processes.muted.discard("depth")
-        self._processes.add(stage_named("depth"))
         self._processes.order("depth", SetLoadLevel(self._dense_share))
         self._processes.bring_up_to_date("depth")
 

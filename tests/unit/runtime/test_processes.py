@@ -314,6 +314,26 @@ def test_where_one_stage_cannot_be_started_none_is_left(refusal: Exception) -> N
     assert [child.poll() for child in begun] == [-signal.SIGKILL] * 2
 
 
+def test_a_stage_that_cannot_be_added_now_can_be_later(fly: Fly) -> None:
+    refused = False
+
+    def start(name: str, descriptor: int) -> Child:
+        nonlocal refused
+        if name == WRITER.name and not refused:
+            refused = True
+            raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+        return start_alone(name, descriptor)
+
+    flight = fly(SOURCE, READER, start=start)
+    flight.until_up("source", "reader")
+    with pytest.raises(OSError, match="unavailable"):
+        flight.processes.add(WRITER)
+    assert set(flight.processes.by_name) == {"source", "reader"}
+    flight.until_up("source", "reader")  # which is passed on to all that listen
+    flight.processes.add(WRITER)
+    flight.until_up("writer")
+
+
 def test_pauses_between_starts_grow_to_half_a_minute() -> None:
     assert [pause_s(n) for n in (1, 2, 5, 6, 7)] == [1.0, 2.0, 16.0, LONGEST_WAIT_S, LONGEST_WAIT_S]
     assert pause_s(5000) == LONGEST_WAIT_S
