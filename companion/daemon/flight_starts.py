@@ -28,7 +28,7 @@ from drivers.system.journal import WARNING, Journal
 STANDBY_RETRY_S = 1.0
 SHORT_S, LONGEST_PAUSE_S = 10.0, 10.0
 """Time before which the death of localisation is one of several, and the longest pause then."""
-REST_S, PREPARE_S, CHANGED_S = 300.0, 15.0, 1.0
+REST_S, PREPARE_S, CHANGED_S = 600.0, 15.0, 1.0
 """Time on the ground after which a flight gives way to another: bounds what is recorded of a
 vehicle that only stands there. The other's stages start so much earlier. After a change of settings
 it comes soon: a ground station sets several, one after the other."""
