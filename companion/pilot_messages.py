@@ -63,6 +63,8 @@ MAP_NOT_SAVED = PilotMessage(NOTICE, "map not saved for a restart")
 MOUNT_CORRECTED = PilotMessage(NOTICE, "camera mount angle corrected")
 IMU_NOT_USED = PilotMessage(NOTICE, "autopilot IMU data not used")
 IMU_USED = PilotMessage(INFO, "autopilot IMU data used again")
+VELOCITY_NOT_USED = PilotMessage(NOTICE, "autopilot velocity not used")
+VELOCITY_USED = PilotMessage(INFO, "autopilot velocity used again")
 
 # -- camera and autopilot -----------------------------------------------------------------
 
@@ -176,6 +178,8 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "camera and autopilot were found to disagree, corrected": MOUNT_CORRECTED,
     "the autopilot's IMU is not used: no scale and no dead reckoning by it": IMU_NOT_USED,
     "the autopilot's IMU is used again": IMU_USED,
+    "the autopilot's velocity contradicts its positions and is not used": VELOCITY_NOT_USED,
+    "the autopilot's velocity agrees with its positions again": VELOCITY_USED,
     "settings cannot be kept": SETTINGS_NOT_SAVED,
     "reset counter is not kept": SETTINGS_NOT_SAVED,
     "dense map on another OpenCL device": MAP_OTHER_DEVICE,

@@ -8,7 +8,7 @@ does; without positions a rangefinder or barometer gives the scale.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -23,8 +23,9 @@ from companion.estimation.trajectory_alignment import (
     fit_map,
     reconciled,
 )
+from companion.estimation.velocity_verdict import VelocityVerdict
 from companion.geometry.transforms import Array, Pose, Similarity
-from companion.messages import Georeference
+from companion.messages import Georeference, Warned
 from companion.telemetry import HeightSample, PositionSample, PositionSource, RangeSample, Telemetry
 
 MIN_RANGES = 4
@@ -72,6 +73,8 @@ class Georeferencer:
         self._body_from_camera = body_from_camera
         self._positions = {source: SampleSeries() for source in PositionSource}
         self._velocity_integral = {source: SampleSeries() for source in PositionSource}
+        self._velocity = {source: VelocityVerdict() for source in PositionSource}
+        self._warnings: list[Warned] = []
         self._height = SampleSeries()
         self._range = SampleSeries()
 
@@ -80,13 +83,19 @@ class Georeferencer:
         if isinstance(sample, PositionSample):
             self._positions[sample.source].add(sample.t_ns, sample.position_ned_m)
             if sample.velocity_ned_m_s is not None:
-                self._integrate(
-                    self._velocity_integral[sample.source], sample.t_ns, sample.velocity_ned_m_s
-                )
+                integral = self._velocity_integral[sample.source]
+                self._integrate(integral, sample.t_ns, sample.velocity_ned_m_s)
+                if integral.newest is not None and integral.newest[0] == sample.t_ns:
+                    self._judge(sample, integral.newest[1][1])
         elif isinstance(sample, HeightSample):
             self._height.add(sample.t_ns, np.array([-sample.height_m]))
         elif isinstance(sample, RangeSample):
             self._range.add(sample.t_ns, np.array([sample.distance_m]))
+
+    def warnings(self) -> list[Warned]:
+        """Changes of the verdict on a velocity since the last call."""
+        out, self._warnings = self._warnings, []
+        return out
 
     def prune(self, before_ns: int, keyframes_ns: Array) -> None:
         """Drop samples before a time, except at the times of keyframes (N,), sorted."""
@@ -118,6 +127,16 @@ class Georeferencer:
         integrated_velocity = travelled_m + 0.5 * (previous + velocity) * dt
         series.add(t_ns, np.stack([velocity, integrated_velocity]), horizontal_only=True)
 
+    def _judge(self, sample: PositionSample, travelled_m: Array) -> None:
+        verdict = self._velocity[sample.source]
+        change = verdict.take(sample.t_ns, sample.position_ned_m, travelled_m)
+        if change is not None and sample.source in self._sources:
+            self._warnings.append(replace(change, detail=f"{sample.source.value}: {change.detail}"))
+
+    def _integral_of(self, source: PositionSource) -> SampleSeries | None:
+        """Integrated velocity of a source; None where it is not believed."""
+        return self._velocity_integral[source] if self._velocity[source].believed else None
+
     def displacement_between(self, from_ns: int, to_ns: int) -> Array | None:
         """Measured displacement (3,), NED metres, between two times; None where unknown."""
         for source in self._sources:
@@ -133,8 +152,8 @@ class Georeferencer:
         From one source; nan where missing. None where no source has any.
         """
         for source in self._sources:
-            series = self._velocity_integral[source]
-            if len(series) >= 4:
+            series = self._integral_of(source)
+            if series is not None and len(series) >= 4:
                 value, ok = series.at(t_ns)
                 if np.count_nonzero(ok) > 1:
                     return np.where(ok[:, None], value[:, 1], np.nan)
@@ -153,8 +172,8 @@ class Georeferencer:
         Beyond the newest sample the last velocity is held for a while.
         """
         for source in self._sources:
-            series = self._velocity_integral[source]
-            if len(series) < 2 or series.newest is None:
+            series = self._integral_of(source)
+            if series is None or len(series) < 2 or series.newest is None:
                 continue
             newest_ns, _ = series.newest
             end_ns = min(to_ns, newest_ns)
@@ -215,8 +234,9 @@ class Georeferencer:
         t_ns = np.array([p.t_ns for p in samples])
         measured, ok = self._positions[source].at(t_ns)
         travelled_m = np.full((len(samples), 3), np.nan)
-        if len(self._velocity_integral[source]) >= 4:
-            integrated_velocity, near = self._velocity_integral[source].at(t_ns)
+        series = self._integral_of(source)
+        if series is not None and len(series) >= 4:
+            integrated_velocity, near = series.at(t_ns)
             travelled_m[near] = integrated_velocity[near, 1]
         if ok.sum() < 4:
             return None

@@ -305,6 +305,7 @@ class LocalisationStage:
         if self._resumption is not None:
             yield from self._check_resumption(self._resumption, frame.t_ns)
         yield from self._imu.warnings()
+        yield from self._georeferencer.warnings()
         yield from self._check_attitude(frame.t_ns)
         self._prune(frame.t_ns)
 
