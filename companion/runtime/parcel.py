@@ -17,11 +17,12 @@ import pickle
 import resource
 import socket
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 INLINE_BYTES = 32 << 10
-"""Larger messages are shared; below, mapping costs more than a copy. A packet with one and its
-header fits into a socket's buffer, of 208 KiB in Linux, several times."""
+"""Larger messages are shared; below, mapping costs more than a copy. A packet of those together and
+their headers fits into a socket's buffer, of 208 KiB in Linux, several times."""
 APART_BYTES = 4 << 10
 """Smaller arrays are pickled with the rest: the mappings of a map hold thousands."""
 ALIGNMENT = 64
@@ -105,19 +106,28 @@ class Parcel:
             at += length
         return pickle.loads(parts[0], buffers=parts[1:])
 
-    def send(self, to: socket.socket) -> None:
+    def send(self, to: socket.socket, flags: int = 0) -> None:
         """Send through a socket of packets; waits for room in it. OSError where nobody reads."""
-        kind = self.kind.encode()
-        header = _HEADER.pack(self.t_ns, self.n_bytes, len(kind))
-        packet: list[bytes | bytearray] = [header, kind, self._inline]
         if self._memory is None:
-            to.sendmsg(packet)
+            to.sendmsg(self._packet(), (), flags)
         else:
-            socket.send_fds(to, packet, [self._memory.descriptor])
+            socket.send_fds(to, self._packet(), [self._memory.descriptor], flags)
 
     @classmethod
-    def receive(cls, source: socket.socket) -> Parcel:
-        """Wait for the next one; EOFError where nobody sends any more."""
+    def send_together(cls, parcels: Sequence[Parcel], to: socket.socket) -> None:
+        """As `send`: one that is shared, or others of INLINE_BYTES together in one packet."""
+        if len(parcels) == 1:
+            parcels[0].send(to)
+        else:
+            to.send(b"".join(part for parcel in parcels for part in parcel._packet()))
+
+    def _packet(self) -> list[bytes | bytearray]:
+        kind = self.kind.encode()
+        return [_HEADER.pack(self.t_ns, self.n_bytes, len(kind)), kind, self._inline]
+
+    @classmethod
+    def receive(cls, source: socket.socket) -> list[Parcel]:
+        """Wait for the next packet; its parcels. EOFError where nobody sends any more."""
         try:
             packet, descriptors, _flags, _address = socket.recv_fds(source, MOST_BYTES, 1)
         except ConnectionResetError:
@@ -126,10 +136,14 @@ class Parcel:
         if not packet:
             raise EOFError
         memory = _Memory(descriptors[0]) if descriptors else None
-        t_ns, n_bytes, n_kind = _HEADER.unpack_from(packet)
-        at = _HEADER.size + n_kind
-        kind = packet[_HEADER.size : at].decode()
-        return cls(kind, t_ns, n_bytes, bytearray(packet[at:]), memory)
+        parcels, at = [], 0
+        while at < len(packet):
+            t_ns, n_bytes, n_kind = _HEADER.unpack_from(packet, at)
+            begin = at + _HEADER.size + n_kind
+            kind = packet[at + _HEADER.size : begin].decode()
+            at = begin + (n_bytes if memory is None else 0)
+            parcels.append(cls(kind, t_ns, n_bytes, bytearray(packet[begin:at]), memory))
+        return parcels
 
 
 def allow_descriptors() -> None:

@@ -69,7 +69,8 @@ def run(name: str, descriptor: int) -> int:
     daemon = socket.socket(fileno=descriptor)
     module = module_of(stage.name)  # which takes a second, and may be long before there is a flight
     try:
-        setup: Setup = Parcel.receive(daemon).open()
+        (first,) = Parcel.receive(daemon)  # it comes by itself
+        setup: Setup = first.open()
     except EOFError:
         return 0
     send = _sender(daemon)
@@ -112,11 +113,11 @@ class _Loop:
         n_taken = 0
         try:
             while True:
-                parcel = Parcel.receive(daemon)
-                if parcel.is_shared:
-                    n_taken += parcel.n_bytes
-                    send(Taken(n_taken))
-                self._inbox.put(parcel)
+                for parcel in Parcel.receive(daemon):
+                    if parcel.is_shared:
+                        n_taken += parcel.n_bytes
+                        send(Taken(n_taken))
+                    self._inbox.put(parcel)
         except (OSError, EOFError):
             if not self._work.outlives_daemon:
                 os._exit(0)  # the daemon is gone, and nobody waits for results

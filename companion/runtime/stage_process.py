@@ -15,7 +15,7 @@ from typing import Any
 
 from companion.messages import Frame
 from companion.runtime.mailbox import Mailbox
-from companion.runtime.parcel import Parcel
+from companion.runtime.parcel import INLINE_BYTES, Parcel
 from companion.runtime.stage_protocol import (
     DriverAtWork,
     Failed,
@@ -26,10 +26,12 @@ from companion.runtime.stage_protocol import (
     Taken,
 )
 from companion.runtime.stage_start import NOT_STARTED, UNKNOWN_STATUS, Start
-from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Stage, drop_policy
+from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Frames, Stage, drop_policy
 from companion.timing.clock import monotonic_s
 
 FRAME = Frame.__name__
+GATHER_S = 0.05
+"""Small messages gather for this long, or until a frame; localisation gets each at once."""
 BY_DRIVER = (
     signal.SIGABRT, signal.SIGALRM, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV,
 )  # fmt: skip
@@ -73,6 +75,9 @@ class StageProcess:
             lambda parcel: drop_policy(stage, parcel.kind, in_daemon=True),
             lambda parcel: parcel.n_bytes, QUEUE_BYTES,
         )  # fmt: skip
+        self._is_prompt = stage.frames is Frames.NEWEST
+        self._puts = threading.Lock()
+        """Keeps what is sent at once in order with what waits."""
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             try:
@@ -127,7 +132,8 @@ class StageProcess:
 
     def begin(self, setup: Setup) -> None:
         """Send the setup; earlier messages are ignored."""
-        self._outbox.put(Parcel.of(setup))
+        with self._puts:
+            self._outbox.put(Parcel.of(setup))
         self._begun_s = monotonic_s()
 
     def offer(self, parcel: Parcel) -> None:
@@ -141,7 +147,7 @@ class StageProcess:
             if parcel.t_ns - self._frame_ns < self.stage.frame_every_ns:
                 return
             self._frame_ns = parcel.t_ns
-        self._outbox.put(parcel)
+        self._put(parcel)
         if self._offered_s is None:
             self._offered_s = monotonic_s()
 
@@ -152,8 +158,9 @@ class StageProcess:
     def ask_to_finish(self, finish: Finish) -> None:
         """Ask it for its last results and its end."""
         self.asked_to_end = True
-        self._outbox.put(Parcel.of(finish))
-        self._outbox.close()
+        with self._puts:
+            self._outbox.put(Parcel.of(finish))
+            self._outbox.close()
 
     def wait(self, seconds: float) -> bool:
         """Wait until it has ended, at most this long; whether it has."""
@@ -200,12 +207,37 @@ class StageProcess:
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
 
+    def _put(self, parcel: Parcel) -> None:
+        """Send a message now where nothing waits and the socket takes it, else let it wait.
+
+        Handing it over to the thread that sends costs more than sending it.
+        """
+        with self._puts:
+            if not (self._is_prompt and self._outbox.is_idle and self._is_sent(parcel)):
+                self._outbox.put(parcel)
+
+    def _is_sent(self, parcel: Parcel) -> bool:
+        """Send a message without waiting; whether it could be."""
+        with self._was_taken:
+            n_shared = parcel.n_bytes if parcel.is_shared else 0
+            if n_shared and self._n_sent - self._n_taken > UNREAD_BYTES:
+                return False
+            self._n_sent += n_shared
+        try:
+            parcel.send(self._socket, socket.MSG_DONTWAIT)
+        except OSError:  # full, or gone, of which the thread that sends will learn
+            with self._was_taken:
+                self._n_sent -= n_shared
+            return False
+        return True
+
     def _write(self) -> None:
         try:
-            while (parcel := self._outbox.get()) is not None:
-                if parcel.is_shared and not self._has_room(parcel.n_bytes):
+            pause_s = 0.0 if self._is_prompt else GATHER_S
+            while parcels := self._outbox.collect(INLINE_BYTES, pause_s):
+                if parcels[0].is_shared and not self._has_room(parcels[0].n_bytes):
                     return
-                parcel.send(self._socket)
+                Parcel.send_together(parcels, self._socket)
         except ConnectionError:
             pass  # it is gone, which the reader tells
         except OSError as error:  # no memory in the kernel, or too many descriptors on their way
@@ -224,7 +256,8 @@ class StageProcess:
     def _read(self) -> None:
         try:
             while True:
-                self._take(Parcel.receive(self._socket))
+                for parcel in Parcel.receive(self._socket):
+                    self._take(parcel)
         except (OSError, EOFError):
             pass
         self._outbox.close()

@@ -23,6 +23,12 @@ def ends() -> Iterator[Ends]:
         yield ours, theirs
 
 
+def received(end: socket.socket) -> Parcel:
+    """The only parcel of the next packet."""
+    (parcel,) = Parcel.receive(end)
+    return parcel
+
+
 def frame(rng: np.random.Generator, width: int = 640, height: int = 480) -> Frame:
     def pixels(*shape: int) -> Bytes:
         return rng.integers(0, 256, shape, dtype=np.uint8)
@@ -38,7 +44,7 @@ def n_descriptors() -> int:
 def test_a_frame_crosses_whole(ends: Ends, rng: np.random.Generator, width: int) -> None:
     sent = frame(rng, width)
     Parcel.of(sent).send(ends[0])
-    parcel = Parcel.receive(ends[1])
+    parcel = received(ends[1])
     assert (parcel.kind, parcel.t_ns) == ("Frame", 123_456)
     got = parcel.open()
     assert (got.seq, got.t_ns) == (7, 123_456)
@@ -49,7 +55,7 @@ def test_small_and_large_messages_come_in_their_order(ends: Ends, rng: np.random
     given = [Track(1, 1, TrackState.LOST), frame(rng), Track(2, 2, TrackState.LOST), frame(rng)]
     for message in given:
         Parcel.of(message).send(ends[0])
-    got = [Parcel.receive(ends[1]) for _ in given]
+    got = [received(ends[1]) for _ in given]
     assert [p.kind for p in got] == ["Track", "Frame", "Track", "Frame"]
     assert [p.open().seq for p in got] == [1, 7, 2, 7]
 
@@ -58,11 +64,27 @@ def test_a_small_message_is_sent_without_descriptors(
     ends: Ends, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[list[int]] = []
-    monkeypatch.setattr(socket, "send_fds", lambda to, packet, handles: sent.append(handles))
+    monkeypatch.setattr(socket, "send_fds", lambda to, packet, handles, flags: sent.append(handles))
     Parcel.of(frame(rng, 16)).send(ends[0])
-    assert not sent and Parcel.receive(ends[1]).open().seq == 7
+    assert not sent and received(ends[1]).open().seq == 7
     Parcel.of(frame(rng)).send(ends[0])
     assert [len(handles) for handles in sent] == [1]
+
+
+def test_small_messages_cross_together_in_one_packet(ends: Ends, rng: np.random.Generator) -> None:
+    small = [Track(n, 10 * n, TrackState.LOST) for n in range(3)]
+    Parcel.send_together([Parcel.of(each) for each in small], ends[0])
+    Parcel.send_together([Parcel.of(frame(rng))], ends[0])
+    got = Parcel.receive(ends[1])
+    assert [(parcel.kind, parcel.t_ns) for parcel in got] == [("Track", 10 * n) for n in range(3)]
+    assert [parcel.open().seq for parcel in got] == [0, 1, 2]
+    assert received(ends[1]).open().seq == 7
+
+
+def test_as_many_small_messages_as_may_go_together_fit_into_a_packet(ends: Ends) -> None:
+    parcel = Parcel.of(None)  # there is no smaller one
+    Parcel.send_together([parcel] * (INLINE_BYTES // parcel.n_bytes), ends[0])
+    assert len(Parcel.receive(ends[1])) == INLINE_BYTES // parcel.n_bytes
 
 
 def test_a_map_of_many_small_arrays_crosses_whole(ends: Ends) -> None:
@@ -70,7 +92,7 @@ def test_a_map_of_many_small_arrays_crosses_whole(ends: Ends) -> None:
     parcel = Parcel.of(MapUpdate(3, 4, poses, np.ones((5000, 3)), None))
     assert parcel.n_bytes > INLINE_BYTES
     parcel.send(ends[0])
-    got = Parcel.receive(ends[1]).open()
+    got = received(ends[1]).open()
     assert got.map_from_camera[1999].translation.tolist() == [1999, 0.5, -1.0]
     assert got.points_map.shape == (5000, 3)
 
@@ -93,7 +115,7 @@ def test_memory_is_freed_with_its_last_reader(ends: Ends, rng: np.random.Generat
     before = n_descriptors()
     for _ in range(50):
         Parcel.of(frame(rng)).send(ends[0])
-        got = Parcel.receive(ends[1]).open()
+        got = received(ends[1]).open()
     assert n_descriptors() <= before + 2
     del got
     assert n_descriptors() == before
@@ -108,7 +130,7 @@ def test_an_array_outlives_its_parcel(rng: np.random.Generator) -> None:
 def test_the_end_of_the_sender_is_told(ends: Ends) -> None:
     Parcel.of(Track(1, 1, TrackState.LOST)).send(ends[0])
     ends[0].close()
-    assert Parcel.receive(ends[1]).kind == "Track"
+    assert received(ends[1]).kind == "Track"
     with pytest.raises(EOFError):
         Parcel.receive(ends[1])
 
@@ -118,7 +140,7 @@ def test_last_words_come_also_from_one_that_left_something_unread(ends: Ends) ->
     Parcel.of(Track(1, 1, TrackState.LOST)).send(ends[0])
     Parcel.of(Track(2, 2, TrackState.LOST)).send(ends[1])
     ends[1].close()
-    assert Parcel.receive(ends[0]).open().seq == 2
+    assert received(ends[0]).open().seq == 2
     with pytest.raises(EOFError):
         Parcel.receive(ends[0])
 

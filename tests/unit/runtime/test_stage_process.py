@@ -6,7 +6,7 @@ import errno
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -280,6 +280,48 @@ def test_frames_are_dropped_for_newer_ones_and_nothing_else_is(start: Start) -> 
     assert seen == sorted(seen) and seen[-1] == n - 1
     assert tiny.heard.texts("told") == ["up", *map(str, range(n))]
     assert 0 < len(seen) <= n - n_dropped
+
+
+def test_small_messages_are_sent_together(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    packets: list[int] = []
+    together = Parcel.send_together
+
+    def counted(parcels: Sequence[Parcel], to: socket.socket) -> None:
+        packets.append(len(parcels))
+        together(parcels, to)
+
+    tiny = start(READER)
+    tiny.stage.begin(SETUP)
+    tiny.until_up()
+    monkeypatch.setattr(Parcel, "send_together", counted)
+    for n in range(100):
+        tiny.do("say", str(n))
+    tiny.heard.until_said("told", "99")
+    assert tiny.heard.texts("told") == ["up", *map(str, range(100))]
+    assert sum(packets) == 100 and len(packets) < 50
+
+
+def test_whoever_has_a_message_for_localisation_sends_it(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiny = start(SOURCE)
+    tiny.stage.begin(SETUP)
+    tiny.until_up()
+    while not tiny.process._outbox.is_idle:
+        threading.Event().wait(0.001)
+    senders: list[threading.Thread] = []
+    send = Parcel.send
+
+    def noted(parcel: Parcel, to: socket.socket, flags: int = 0) -> None:
+        senders.append(threading.current_thread())
+        send(parcel, to, flags)
+
+    monkeypatch.setattr(Parcel, "send", noted)
+    tiny.do("say", "hello")
+    tiny.stage.offer(frame(7))
+    assert senders == [threading.current_thread()] * 2
+    tiny.heard.until_said("frame", "7")
+    assert tiny.stage.waiting_bytes == 0
 
 
 def test_what_waits_for_a_process_that_takes_nothing_is_bounded(start: Start) -> None:
