@@ -21,6 +21,14 @@ class LinkBytes:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkReads:
+    """Bytes of the link in a row, in one message; `t_ns` is the time of the first."""
+
+    t_ns: int
+    parts: tuple[LinkBytes, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class GateStep:
     """One call of the pose gate, with its inputs; see `estimation.gate_journal`.
 

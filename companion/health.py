@@ -10,7 +10,7 @@ import dataclasses
 import math
 import threading
 from collections import deque
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -269,12 +269,15 @@ class RateMeter:
 
     def hz(self, now_ns: int) -> float:
         """Rate; falls to 0 within the window after the last event."""
+        times_ns, begin_ns = self._times_ns, now_ns - self._window_ns
         with self._lock:
-            times = [t for t in self._times_ns if now_ns - t <= self._window_ns]
-            n_kept = len(self._times_ns)
-        if len(times) == n_kept and n_kept > 1:  # what is kept is younger than the window
-            return (n_kept - 1) * 1e9 / max(now_ns - times[0], 1)
-        return len(times) * 1e9 / self._window_ns
+            while len(times_ns) > 1 and times_ns[1] < begin_ns:
+                times_ns.popleft()
+            n_old = bool(times_ns) and times_ns[0] < begin_ns
+            n_kept = len(times_ns)
+            if not n_old and n_kept > 1:  # what is kept is younger than the window
+                return (n_kept - 1) * 1e9 / max(now_ns - times_ns[0], 1)
+        return (n_kept - n_old) * 1e9 / self._window_ns
 
 
 class SourceMeter:
@@ -300,15 +303,10 @@ class SourceMeter:
         """Health now."""
         last_ns = self._last_ns
         return SourceHealth(
-            name=self.name,
-            state=self.state,
-            rate_hz=self._rate.hz(now_ns),
-            n=self.n,
-            n_dropped=self.n_dropped,
-            n_reopened=self.n_reopened,
-            age_s=None if last_ns is None else (now_ns - last_ns) * 1e-9,
-            detail=self.detail,
-        )
+            name=self.name, state=self.state, rate_hz=self._rate.hz(now_ns), n=self.n,
+            n_dropped=self.n_dropped, n_reopened=self.n_reopened,
+            age_s=None if last_ns is None else (now_ns - last_ns) * 1e-9, detail=self.detail,
+        )  # fmt: skip
 
 
 class StageMeter:
@@ -333,18 +331,12 @@ class StageMeter:
 
     def health(self, now_ns: int) -> StageHealth:
         """Health now."""
+        p50_ms, p95_ms, p99_ms = self._latency.percentiles_ms((50, 95, 99), now_ns)
         return StageHealth(
-            name=self.name,
-            alive=self.alive,
-            rate_hz=self._rate.hz(now_ns),
-            latency_p50_ms=self._latency.percentile_ms(50, now_ns),
-            latency_p95_ms=self._latency.percentile_ms(95, now_ns),
-            n=self.n,
-            n_dropped=self.n_dropped,
-            n_restarted=self.n_restarted,
-            detail=self.detail,
-            latency_p99_ms=self._latency.percentile_ms(99, now_ns),
-        )
+            name=self.name, alive=self.alive, rate_hz=self._rate.hz(now_ns), latency_p50_ms=p50_ms,
+            latency_p95_ms=p95_ms, latency_p99_ms=p99_ms, n=self.n, n_dropped=self.n_dropped,
+            n_restarted=self.n_restarted, detail=self.detail,
+        )  # fmt: skip
 
 
 class LatencyMeter:
@@ -362,11 +354,18 @@ class LatencyMeter:
 
     def percentile_ms(self, percent: float, now_ns: int) -> float | None:
         """Percentile of the durations; None without any."""
+        return self.percentiles_ms((percent,), now_ns)[0]
+
+    def percentiles_ms(self, percents: Sequence[float], now_ns: int) -> list[float | None]:
+        """Percentiles of the durations; None without any."""
         with self._lock:
-            recent = sorted(ms for t, ms in self._events if now_ns - t <= self._window_ns)
+            while self._events and now_ns - self._events[0][0] > self._window_ns:
+                self._events.popleft()
+            recent = sorted([ms for _, ms in self._events])
         if not recent:
-            return None
-        return recent[max(0, math.ceil(percent / 100 * len(recent)) - 1)]
+            return [None] * len(percents)
+        n = len(recent)
+        return [recent[max(0, math.ceil(percent / 100 * n) - 1)] for percent in percents]
 
 
 def _source(source: SourceHealth) -> str:

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from enum import Enum
+from statistics import median
 
 import numpy as np
 
@@ -245,7 +246,7 @@ class PoseGate:
     def _period_ns(self) -> int:
         if not self._periods_ns:
             return int(1e9 / self._config.rate_hz)
-        return int(np.median(self._periods_ns))
+        return int(median(self._periods_ns))
 
     def _rejection_reason(self, odometry: Odometry, now_ns: int) -> str:
         """Reason why a pose is rejected; "" if accepted."""
@@ -262,8 +263,11 @@ class PoseGate:
             return UNPROVED_IMU
         if pose is None or velocity is None:
             return NO_SCALE if self._accepted is None else LOST
-        numbers = np.r_[pose.rotation.ravel(), pose.translation, velocity]
-        if not np.isfinite(numbers).all() or np.abs(pose.translation).max() > MAX_EXTENT_M:
+        parts = pose.rotation, pose.translation, velocity
+        if (
+            not all(np.isfinite(part).all() for part in parts)
+            or np.abs(pose.translation).max() > MAX_EXTENT_M
+        ):
             return UNCERTAIN
         hysteresis = 1.0 if self.sending else HYSTERESIS
         if not _sigma_place_m(odometry) <= hysteresis * self._config.max_sigma_m:

@@ -76,7 +76,7 @@ class Mailbox(Generic[T]):
             self.n_bytes += size
             while self.n_bytes > self._capacity_bytes and self._drop_lowest():
                 self.n_overflowed += 1
-            if not self._pauses or self._is_urgent():
+            if not self._pauses or policy is not GATHERED or self.n_bytes > self._gather_bytes:
                 self._changed.notify()
 
     def get(self) -> T | None:

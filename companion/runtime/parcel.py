@@ -11,6 +11,7 @@ A mapping keeps its whole message, and a descriptor: who keeps an array for long
 
 from __future__ import annotations
 
+import io
 import mmap
 import os
 import pickle
@@ -19,6 +20,8 @@ import socket
 import struct
 from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 INLINE_BYTES = 32 << 10
 """Larger messages are shared; below, mapping costs more than a copy. A packet of those together and
@@ -31,6 +34,20 @@ MOST_BYTES = 2 * INLINE_BYTES
 """Largest packet."""
 _HEADER = struct.Struct("<qQB")
 _LENGTH = struct.Struct("<Q")
+_ALONE = struct.Struct(f"<QQ{ALIGNMENT - 16}x")
+"""Head of a message without parts apart: how many parts, their length, padding."""
+
+
+def _array_parts(array: np.ndarray[Any, Any]) -> Any:
+    """Parts of an array for the pickler: of small ones in half the time that numpy's own take."""
+    small = array.nbytes < APART_BYTES and array.flags.c_contiguous
+    if small and array.dtype.isbuiltin == 1 and not array.dtype.hasobject:
+        return np.ndarray, (array.shape, array.dtype.char, bytearray(array))
+    return array.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+
+
+class _Pickler(pickle.Pickler):
+    dispatch_table = {np.ndarray: _array_parts}  # noqa: RUF012
 
 
 class _Memory:
@@ -66,15 +83,20 @@ class Parcel:
             buffers.append(raw)
             return False
 
-        pickled = pickle.dumps(message, pickle.HIGHEST_PROTOCOL, buffer_callback=keep)
+        file = io.BytesIO()
+        _Pickler(file, pickle.HIGHEST_PROTOCOL, buffer_callback=keep).dump(message)
+        pickled = file.getbuffer()
+        kind, t_ns = type(message).__name__, getattr(message, "t_ns", 0)
+        if not buffers and _ALONE.size + len(pickled) <= INLINE_BYTES:  # most of all
+            inline = bytearray(_ALONE.pack(1, len(pickled))) + pickled
+            return cls(kind, t_ns, len(inline), inline, None)
         lengths = [len(pickled), *(each.nbytes for each in buffers)]
         head = b"".join(map(_LENGTH.pack, [len(lengths), *lengths]))
         parts, n_bytes = [memoryview(head)], len(head)
-        for part in (memoryview(pickled), *buffers):
+        for part in (pickled, *buffers):
             padding = -n_bytes % ALIGNMENT
             parts += [memoryview(bytes(padding)), part]
             n_bytes += padding + part.nbytes
-        kind, t_ns = type(message).__name__, getattr(message, "t_ns", 0)
         if n_bytes <= INLINE_BYTES:
             return cls(kind, t_ns, n_bytes, bytearray().join(parts), None)
         memory = _Memory(os.memfd_create(kind, os.MFD_CLOEXEC))

@@ -11,6 +11,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from companion.messages import Frame
@@ -71,10 +72,10 @@ class StageProcess:
         """Bytes of shared memory, so far."""
         self._was_taken = threading.Condition()
         self._gone = False
+        policy = cache(lambda kind: drop_policy(stage, kind, in_daemon=True))
         self._outbox: Mailbox[Parcel] = Mailbox(
-            lambda parcel: drop_policy(stage, parcel.kind, in_daemon=True),
-            lambda parcel: parcel.n_bytes, QUEUE_BYTES,
-        )  # fmt: skip
+            lambda parcel: policy(parcel.kind), lambda parcel: parcel.n_bytes, QUEUE_BYTES
+        )
         self._is_prompt = stage.frames is Frames.NEWEST
         self._puts = threading.Lock()
         """Keeps what is sent at once in order with what waits."""
@@ -212,8 +213,11 @@ class StageProcess:
 
         Handing it over to the thread that sends costs more than sending it.
         """
+        if not self._is_prompt:
+            self._outbox.put(parcel)
+            return
         with self._puts:
-            if not (self._is_prompt and self._outbox.is_idle and self._is_sent(parcel)):
+            if not (self._outbox.is_idle and self._is_sent(parcel)):
                 self._outbox.put(parcel)
 
     def _is_sent(self, parcel: Parcel) -> bool:

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from companion.flight_notes import GateStep, HealthNote, LinkBytes
+from companion.flight_notes import GateStep, HealthNote, LinkReads
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import (
@@ -89,7 +89,7 @@ STAGES = (
     Stage(
         "recorder",
         (
-            Frame, *TELEMETRY, LinkBytes, HealthNote, Warned, FrameTracked, GateStep, Odometry,
+            Frame, *TELEMETRY, LinkReads, HealthNote, Warned, FrameTracked, GateStep, Odometry,
             MapUpdate, PointChunk,
         ),
         nice=5, frames=Frames.EVERY, answer_s=60.0, hurried_s=0.3, with_flight=True, in_folder=True,

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from companion.errors import StageError
+from companion.flight_notes import LinkReads
 from companion.messages import Message
 from companion.products.surroundings import versions
 from companion.runtime.stage_protocol import Finish, Setup
@@ -32,7 +33,8 @@ class _Recorder(Work):
         return self._recorder.n_dropped.total()
 
     def step(self, message: Any) -> Iterable[Message]:
-        self._recorder.take(message)
+        for each in message.parts if isinstance(message, LinkReads) else (message,):
+            self._recorder.take(each)
         return self._recorder.warnings()
 
     def finish(self, finish: Finish) -> Iterable[Message]:

@@ -319,17 +319,18 @@ def _scatter(t_s: Array, value_s: Array, sigma_s: Array) -> float:
 
 
 def _robust_line(t_s: Array, value_s: Array, sigma_s: Array) -> tuple[float, float, float]:
-    weight = sigma_s**-2
+    weight = by_sigma = sigma_s**-2
+    squared_s2 = t_s**2
     offset, slope, spread = 0.0, 0.0, 0.0
     for _ in range(3):
         # a line with a prior on its slope, solved about time 0
         total, first = float(weight.sum()), float(weight @ t_s)
-        second = float(weight @ t_s**2) + PRIOR_DRIFT**-2
+        second = float(weight @ squared_s2) + PRIOR_DRIFT**-2
         right = float(weight @ value_s), float((weight * t_s) @ value_s)
         determinant = total * second - first**2
         offset = (second * right[0] - first * right[1]) / determinant
         slope = (total * right[1] - first * right[0]) / determinant
         residual = np.abs(value_s - offset - slope * t_s) / sigma_s
         spread = math.sqrt(second / determinant)
-        weight = sigma_s**-2 / np.maximum(1.0, residual / HUBER)
+        weight = by_sigma / np.maximum(1.0, residual / HUBER)
     return offset, slope, spread

@@ -7,6 +7,7 @@ A reader collects samples on the autopilot's clock and positions as given;
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -159,16 +160,21 @@ def is_finite(content: Telemetry | GeodeticFix) -> bool:
     """True if all its numbers are finite."""
     # written out, since this runs for every sample of a flight
     if isinstance(content, AttitudeSample):
-        return bool(np.isfinite(content.ned_from_body).all())
+        return _are_finite(content.ned_from_body)
     if isinstance(content, ImuSample):
-        return bool(np.isfinite(content.gyro_rad_s).all() and np.isfinite(content.accel_m_s2).all())
+        return _are_finite(content.gyro_rad_s) and _are_finite(content.accel_m_s2)
     if isinstance(content, PositionSample):
-        return bool(np.isfinite(content.position_ned_m).all())
+        return _are_finite(content.position_ned_m)
     return all(
         np.isfinite(value)
         for name in content.__slots__
         if isinstance(value := getattr(content, name), float)
     )
+
+
+def _are_finite(few: Array) -> bool:
+    """True if all of a few numbers are; numpy's own takes three times as long for these."""
+    return all(map(math.isfinite, few.tolist()))
 
 
 def _origins_by_pairs(stamped: Sequence[tuple[int, int, Any]]) -> dict[int, GeoOrigin]:

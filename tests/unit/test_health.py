@@ -64,6 +64,7 @@ def test_rate_falls_to_nothing_when_nothing_comes() -> None:
     for i in range(300):
         meter.add(at(i / 30))
     assert meter.hz(at(12.5)) == pytest.approx(15, abs=0.5)
+    assert meter.hz(at(14.9)) == pytest.approx(0.8, abs=0.5), "the last ones still count"
     assert meter.hz(at(16)) == 0
 
 
@@ -92,7 +93,9 @@ def test_latency_percentiles_are_of_the_last_seconds() -> None:
     assert meter.percentile_ms(50, at(11)) == 50
     assert meter.percentile_ms(95, at(11)) == 95
     assert meter.percentile_ms(99, at(11)) == 99
+    assert meter.percentiles_ms((50, 95, 99), at(11)) == [50, 95, 99]
     assert meter.percentile_ms(95, at(17)) is None
+    assert meter.percentiles_ms((50, 95), at(17)) == [None, None]
 
 
 def test_meters_are_read_while_another_thread_counts() -> None:

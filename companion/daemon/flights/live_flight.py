@@ -12,7 +12,7 @@ from pathlib import Path
 
 from companion.config import Config, Measurement
 from companion.daemon.flights.viewing import NOWHERE, VIEWERS, Viewing
-from companion.flight_notes import FlightNote
+from companion.flight_notes import FlightNote, LinkBytes, LinkReads
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
@@ -30,7 +30,7 @@ from companion.messages import (
 from companion.products.flight_result import RunFacts
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor, in_words
-from companion.runtime.stage_process import StageProcess
+from companion.runtime.stage_process import GATHER_S, StageProcess
 from companion.runtime.stage_protocol import (
     Finish,
     KeepMap,
@@ -53,6 +53,7 @@ LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 NOT_DENSE = "the dense map cannot be begun now; switch it off and on to try again"
 NOT_FINISHED = "a stage did not give its last results in time"
 HEALTH_EVERY_NS = 1_000_000_000
+GATHER_NS = round(GATHER_S * 1e9)
 MAPPED = {kind.__name__ for kind in (Track, MapUpdate, PointChunk)}
 
 
@@ -100,6 +101,8 @@ class LiveFlight:
         """True once the stages take messages: none gets any before the recorder does."""
         self._viewing: Viewing | None = None
         self._health_ns = 0
+        self._reads: list[LinkBytes] = []
+        """Bytes of the link that gather for the recorder."""
         self._origin: GeoOrigin | None = None
         self.has_origin = False
         """True once the map is georeferenced to the autopilot's origin."""
@@ -157,11 +160,19 @@ class LiveFlight:
 
     def take(self, message: Telemetry | Warned | FrameOverdue | FlightNote) -> None:
         """Take telemetry, a warning, a missing frame or a note for the recorder; never waits."""
-        if self._takes:
+        if not self._takes:
+            return
+        if not isinstance(message, LinkBytes):
             self._processes.publish(Parcel.of(message))
+            return
+        self._reads.append(message)
+        if message.t_ns - self._reads[0].t_ns >= GATHER_NS:
+            self._publish_reads()
 
     def publish_health(self, health: Health, origin: GeoOrigin | None) -> None:
         """Send health to viewers and results once a second, and a changed world's origin."""
+        if self._takes:
+            self._publish_reads()  # where the link has fallen silent
         if not self._takes or health.t_ns - self._health_ns < HEALTH_EVERY_NS:
             return
         self._health_ns = health.t_ns
@@ -253,6 +264,7 @@ class LiveFlight:
             is_shown = self._viewing is not None and self._viewing.is_shown
             return Finish(hurried, of_flight, self.keep_map, n_viewers=int(is_shown))
 
+        self._publish_reads()
         for name, why in self._processes.finish(finish_of).items():
             if name != VIEWERS:  # of what they did not see all is in the results
                 self._warn(NOT_FINISHED, f"{name}: {why}" if why else name)
@@ -269,6 +281,12 @@ class LiveFlight:
     @property
     def _takes(self) -> bool:
         return self._flies and not self._processes.over
+
+    def _publish_reads(self) -> None:
+        """Send the bytes of the link that have gathered, in one message for all."""
+        if self._reads:
+            reads, self._reads = self._reads, []
+            self._processes.publish(Parcel.of(LinkReads(reads[0].t_ns, tuple(reads))))
 
     def _setup(self, stage: Stage, n_restarted: int, failed_devices: dict[str, str]) -> Setup:
         folder = self.folder

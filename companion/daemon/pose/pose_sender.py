@@ -118,14 +118,14 @@ class PoseSender:
         if self._config.mode == "off":
             return FeedbackHealth(n_resets=self._gate.n_resets)
         now_ns = self._clock.now_ns()
-        p95_ms = self._latency.percentile_ms(95, now_ns)
+        p50_ms, p95_ms = self._latency.percentiles_ms((50, 95), now_ns)
         return FeedbackHealth(
             mode=self._config.mode,
             sending=self._gate.sending and self._link.alive,
             bridging=self._gate.state is Sending.BRIDGING,
             why_not=self._gate.why_not or ("" if self._link.alive else UNHEARD),
             rate_hz=self._rate.hz(now_ns),
-            latency_p50_ms=self._latency.percentile_ms(50, now_ns),
+            latency_p50_ms=p50_ms,
             latency_p95_ms=p95_ms,
             n_sent=self._n_sent,
             n_resets=self._gate.n_resets,

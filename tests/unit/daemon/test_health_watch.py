@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,14 +44,14 @@ def test_latencies_are_sorted_once_for_a_health(
     )
     odometry: Odometry = pose
     watch.take_odometry(odometry)
-    asked: list[tuple[LatencyMeter, float]] = []
-    percentile_ms = LatencyMeter.percentile_ms
+    asked: list[LatencyMeter] = []
+    percentiles_ms = LatencyMeter.percentiles_ms
 
-    def count(meter: LatencyMeter, percent: float, now_ns: int) -> float | None:
-        asked.append((meter, percent))
-        return percentile_ms(meter, percent, now_ns)
+    def count(meter: LatencyMeter, percents: Sequence[float], now_ns: int) -> list[float | None]:
+        asked.append(meter)
+        return percentiles_ms(meter, percents, now_ns)
 
-    monkeypatch.setattr(LatencyMeter, "percentile_ms", count)
+    monkeypatch.setattr(LatencyMeter, "percentiles_ms", count)
     health = watch.health()
     assert len(asked) == len(set(asked))
     (localisation, _) = health.stages

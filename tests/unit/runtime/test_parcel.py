@@ -103,6 +103,18 @@ def test_arrays_in_another_order_of_memory_cross_whole(rng: np.random.Generator)
         assert np.array_equal(Parcel.of(array).open(), array)
 
 
+def test_arrays_of_any_kind_cross_whole_and_may_be_written_to() -> None:
+    arrays = [
+        np.array([1.0, np.nan]), np.array(3.5), np.zeros((0, 3)), np.eye(3, dtype=np.float32).T,
+        np.array([[True], [False]]), np.array(["a", "bc"]), np.array([1], ">i4"),
+        np.array([1, None], object), np.arange(3, dtype=np.uint16), np.ones((2, 3), order="F"),
+    ]  # fmt: skip
+    for array, got in zip(arrays, Parcel.of(arrays).open(), strict=True):
+        assert (got.dtype, got.shape) == (array.dtype, array.shape)
+        assert got.tolist() == array.tolist() or np.isnan(array[1])
+        got[...] = got.copy()
+
+
 def test_what_one_reader_writes_no_other_sees(rng: np.random.Generator) -> None:
     parcel = Parcel.of(frame(rng))
     first = parcel.open()
