@@ -43,6 +43,9 @@ class RecorderNotes:
         taken = LinkBytes(
             self._clock.from_monotonic_ns(monotonic_ns), monotonic_ns, outgoing, bytes(data)
         )
+        if self._flights.current is not None and not self._lead:
+            self._flights.take(taken)
+            return
         self._lead.append(taken)
         self._lead_bytes += len(taken.data)
         while (

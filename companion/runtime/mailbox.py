@@ -115,9 +115,11 @@ class Mailbox(Generic[T]):
 
     @property
     def is_idle(self) -> bool:
-        """True if nothing waits here, and whoever took the last message is ready for another."""
-        with self._changed:
-            return self._waits and not self._closed and not self._has_any()
+        """True if nothing waits here, and whoever took the last message is ready for another.
+
+        It remains so as long as nothing is put.
+        """
+        return self._waits and not self._closed and not self._has_any()
 
     def close(self) -> None:
         """End input; waiting messages can still be taken out."""

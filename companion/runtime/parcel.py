@@ -18,10 +18,14 @@ import pickle
 import resource
 import socket
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
+
+from companion.telemetry import TELEMETRY, Telemetry
 
 INLINE_BYTES = 32 << 10
 """Larger messages are shared; below, mapping costs more than a copy. A packet of those together and
@@ -46,8 +50,18 @@ def _array_parts(array: np.ndarray[Any, Any]) -> Any:
     return array.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
 
 
-class _Pickler(pickle.Pickler):
-    dispatch_table = {np.ndarray: _array_parts}  # noqa: RUF012
+def _sample_parts(sample: Telemetry) -> Any:
+    """Parts of a sample for the pickler: those that it is made of, and no list of its fields."""
+    kind = type(sample)
+    return kind, _VALUES_OF[kind](sample)
+
+
+_VALUES_OF = {kind: attrgetter(*(each.name for each in fields(kind))) for kind in TELEMETRY}
+
+
+_PARTS_OF: dict[type, Callable[[Any], Any]] = {
+    np.ndarray: _array_parts, **dict.fromkeys(TELEMETRY, _sample_parts),
+}  # fmt: skip
 
 
 class _Memory:
@@ -84,7 +98,9 @@ class Parcel:
             return False
 
         file = io.BytesIO()
-        _Pickler(file, pickle.HIGHEST_PROTOCOL, buffer_callback=keep).dump(message)
+        pickler = pickle.Pickler(file, pickle.HIGHEST_PROTOCOL, buffer_callback=keep)
+        pickler.dispatch_table = _PARTS_OF
+        pickler.dump(message)
         pickled = file.getbuffer()
         kind, t_ns = type(message).__name__, getattr(message, "t_ns", 0)
         if not buffers and _ALONE.size + len(pickled) <= INLINE_BYTES:  # most of all

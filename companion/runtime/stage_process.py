@@ -222,17 +222,14 @@ class StageProcess:
 
     def _is_sent(self, parcel: Parcel) -> bool:
         """Send a message without waiting; whether it could be."""
-        with self._was_taken:
-            n_shared = parcel.n_bytes if parcel.is_shared else 0
-            if n_shared and self._n_sent - self._n_taken > UNREAD_BYTES:
-                return False
-            self._n_sent += n_shared
+        if parcel.is_shared and self._n_sent - self._n_taken > UNREAD_BYTES:
+            return False
         try:
             parcel.send(self._socket, socket.MSG_DONTWAIT)
         except OSError:  # full, or gone, of which the thread that sends will learn
-            with self._was_taken:
-                self._n_sent -= n_shared
             return False
+        if parcel.is_shared:
+            self._n_sent += parcel.n_bytes  # the thread that counts them else waits for a message
         return True
 
     def _write(self) -> None:

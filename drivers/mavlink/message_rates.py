@@ -63,7 +63,7 @@ class MessageRates:
     def came(self, message_id: int) -> None:
         """Count a message."""
         for stream in self._streams:
-            if message_id == stream.message_id:
+            if message_id in stream.want.ids and message_id == stream.message_id:
                 stream.n += 1
 
     def shares(self) -> dict[int, float] | None:

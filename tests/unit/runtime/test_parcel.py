@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,14 @@ import pytest
 from companion.geometry.transforms import Pose
 from companion.messages import Bytes, Frame, MapUpdate, Track, TrackState
 from companion.runtime.parcel import INLINE_BYTES, Parcel
+from companion.telemetry import (
+    ArmedSample,
+    AttitudeSample,
+    ImuSample,
+    PositionSample,
+    PositionSource,
+    Telemetry,
+)
 
 Ends = tuple[socket.socket, socket.socket]
 
@@ -113,6 +122,20 @@ def test_arrays_of_any_kind_cross_whole_and_may_be_written_to() -> None:
         assert (got.dtype, got.shape) == (array.dtype, array.shape)
         assert got.tolist() == array.tolist() or np.isnan(array[1])
         got[...] = got.copy()
+
+
+def test_samples_of_telemetry_cross_whole() -> None:
+    samples: list[Telemetry] = [
+        AttitudeSample(1, np.array([1.0, 0, 0, 0]), None),
+        ImuSample(2, np.array([0.1, 0.2, 0.3]), np.array([0.0, 0.0, -9.8])),
+        PositionSample(3, PositionSource.GPS, np.zeros(3), np.ones(3), 0.5),
+        ArmedSample(4, True),
+    ]
+    for sample in samples:
+        got = Parcel.of(sample).open()
+        assert type(got) is type(sample)
+        for each in fields(sample):
+            assert np.array_equal(getattr(got, each.name), getattr(sample, each.name)), each.name
 
 
 def test_what_one_reader_writes_no_other_sees(rng: np.random.Generator) -> None:
