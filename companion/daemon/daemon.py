@@ -61,7 +61,7 @@ NOT_WRITTEN = "the results so far could not be written"
 WRITE_S = 0.2
 """Time to write the armed settings at the end."""
 END_S = 2.6
-"""Longest stop, whatever hangs."""
+"""Longest stop once in a hurry, whatever hangs."""
 
 
 class Daemon:
@@ -147,8 +147,8 @@ class Daemon:
     async def run(self) -> int:
         """Run until stopped or unable to continue; the exit status."""
         loop, config = self._loop, self._settings.config
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, self._stop.stop)
+        loop.add_signal_handler(signal.SIGINT, self._stop.interrupt)
+        loop.add_signal_handler(signal.SIGTERM, self._stop.stop)
         loop.add_signal_handler(signal.SIGHUP, self._checks.reload)
         socket = StatusSocket(
             own_socket_path(config.daemon.socket), self._watch.document, self._problem
@@ -172,7 +172,9 @@ class Daemon:
                 self._link.send(self._link.heartbeat())
             tasks[0].cancel()  # what is checked is being taken apart
             feed_closed = loop.run_in_executor(None, self._feed.stop)
-            await self._flights.close(END_S, keep_map=self._settings.armed)
+            await self._flights.close(
+                END_S, lambda: self._stop.hurried, keep_map=self._settings.armed
+            )
             for task in (stopped, *tasks):
                 task.cancel()
             await asyncio.gather(stopped, *tasks, return_exceptions=True)

@@ -17,6 +17,8 @@ class StopRequest:
         self._journal = journal
         self._event = asyncio.Event()
         self.status = 0
+        self.hurried = False
+        """True unless a person asked once: then results are waited for."""
 
     @property
     def made(self) -> bool:
@@ -24,7 +26,13 @@ class StopRequest:
         return self._event.is_set()
 
     def stop(self) -> None:
-        """End the daemon."""
+        """End the daemon soon: the service manager waits for some seconds only."""
+        self.hurried = True
+        self._event.set()
+
+    def interrupt(self) -> None:
+        """End the daemon with all results, or soon where that was asked before: Ctrl-C."""
+        self.hurried = self.made
         self._event.set()
 
     def fail(self, why: str, status: int = FAULT) -> None:
@@ -32,7 +40,7 @@ class StopRequest:
         if self.status == 0:
             self._journal.say(f"error: {why}", ERROR)
             self.status = status
-        self._event.set()
+        self.stop()
 
     async def wait(self) -> None:
         """Wait for the request."""

@@ -24,6 +24,7 @@ from companion.timing.clock import FlightClock
 from drivers.recording.flights_folder import COUNTER, UNARMED, flight_name, next_number
 from drivers.system.journal import WARNING, Journal
 
+LOOK_S = 0.02
 MARKED_S = 1.0
 """Longest wait for the disk to take the mark of a flight."""
 
@@ -142,18 +143,29 @@ class Flights:
         if self.current is not None:
             self.current.take(message)
 
-    async def close(self, patience_s: float, keep_map: bool) -> None:
-        """End all flights quickly; with `keep_map` the next daemon may continue the map."""
+    async def close(self, patience_s: float, hurried: Callable[[], bool], keep_map: bool) -> None:
+        """End all flights, once `hurried` within `patience_s`.
+
+        With `keep_map` the next daemon may continue the map.
+        """
         if self.current is not None:
             self.current.keep_map = keep_map
         self.end()
+        self.discard_standby()
+        if not hurried() and any(flight.kept for flight in self._ending):
+            self._journal.say("results are written; Ctrl-C again ends at once")
+        while self._is_ending and not hurried():
+            await asyncio.sleep(LOOK_S)
         for flight in list(self._ending):
             flight.hurry()
-        self.discard_standby()
-        rounds = round(patience_s / 0.02)
-        while rounds and any(thread.is_alive() for thread in self._ending.values()):
-            await asyncio.sleep(0.02)
+        rounds = round(patience_s / LOOK_S)
+        while rounds and self._is_ending:
+            await asyncio.sleep(LOOK_S)
             rounds -= 1
+
+    @property
+    def _is_ending(self) -> bool:
+        return any(thread.is_alive() for thread in list(self._ending.values()))
 
     def _finish(self, flight: LiveFlight, mark: NewestFile | None) -> None:
         flight.finish(self._facts)

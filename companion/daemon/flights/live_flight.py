@@ -267,7 +267,8 @@ class LiveFlight:
         self._publish_reads()
         for name, why in self._processes.finish(finish_of).items():
             if name != VIEWERS:  # of what they did not see all is in the results
-                self._warn(NOT_FINISHED, f"{name}: {why}" if why else name)
+                made_by = " (`companion replay` makes them of the recording)" * (name == "results")
+                self._warn(NOT_FINISHED, (f"{name}: {why}" if why else name) + made_by)
         if self._viewing is not None:
             self._viewing.close(self._processes.hurried)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -87,5 +89,39 @@ def test_a_flight_that_was_never_armed_leaves_nothing(
     for thread in list(flights._ending.values()):
         thread.join(10.0)
     assert flight.folder.exists() == armed
+    assert flights._counter is not None
+    flights._counter.close(10.0)
+
+
+@pytest.mark.parametrize("in_a_hurry", [False, True])
+def test_results_are_waited_for_unless_in_a_hurry(
+    in_a_hurry: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A person who presses Ctrl-C once waits, whom the service manager's signal does not."""
+    flights, _ = without_processes(monkeypatch)
+    config = Config(daemon=DaemonConfig(flights=str(tmp_path)))
+    flight: Any = flights.begin(config, CAMERA)
+    written = threading.Event()
+    said: list[str] = []
+    asked = 0
+
+    def hurry() -> None:
+        said.append("hurry")
+        written.set()
+
+    def finish(_: Any) -> None:
+        said.append("results" if written.wait(10.0) else "none")
+
+    flight.hurry, flight.finish = hurry, finish
+
+    def hurried() -> bool:
+        nonlocal asked
+        asked += 1
+        if asked == 5 and not in_a_hurry:
+            written.set()
+        return in_a_hurry
+
+    asyncio.run(flights.close(5.0, hurried, keep_map=False))
+    assert said[:2] == (["hurry", "results"] if in_a_hurry else ["results"])
     assert flights._counter is not None
     flights._counter.close(10.0)
