@@ -18,6 +18,11 @@ from companion.products.trajectory_error import align
 
 MOST_POINTS = 200_000
 """Most points of a cloud looked up in the other; evenly sampled beyond it."""
+AT_ONCE = 2000
+"""Between two of them a signal is heard."""
+NEAR, ROUGH = 0.02, 0.1
+"""Further apart than this share of the cloud's extent, distances are up to a tenth too large: of
+two sheets beside each other, each point would be compared with thousands."""
 COUNTS = ("frames", "tracked", "segments", "keyframes", "depth_maps", "points", "path_length")
 """Numbers of the reports that are compared."""
 
@@ -148,8 +153,16 @@ def _distances(cloud: Cloud, other: Cloud) -> Array:
     if not len(cloud) or not len(other):
         return np.zeros(0)
     step = -(-len(cloud) // MOST_POINTS)
-    found, _ = cKDTree(other.points.astype(np.float64)).query(cloud.points[::step], workers=1)
-    out: Array = np.asarray(found, np.float64)
+    points, tree = cloud.points[::step], cKDTree(other.points.astype(np.float64))
+    near = NEAR * float(np.linalg.norm(np.ptp(other.points, axis=0)))
+    parts = []
+    for begin in range(0, len(points), AT_ONCE):
+        part = points[begin : begin + AT_ONCE]
+        found, _ = tree.query(part, distance_upper_bound=near)
+        far = np.isinf(found)
+        found[far], _ = tree.query(part[far], eps=ROUGH)
+        parts.append(found)
+    out: Array = np.concatenate(parts)
     return out
 
 
