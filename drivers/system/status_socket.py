@@ -165,8 +165,8 @@ def ask_status(path: Path, timeout_s: float = 3.0) -> dict[str, Any]:
                     raise SourceError(f"{path}: what answers there is no companion")
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise SourceError(
-            f"no daemon runs (nothing answers at {path}); `companion run` starts one, --socket"
-            " names another place"
+            f"no daemon runs (nothing answers at {path}); `companion run` starts one, --set"
+            " expert.daemon.socket=PATH names another place"
         ) from error
     except PermissionError as error:
         raise SourceError(

@@ -51,6 +51,8 @@ def logs_asked_for(config: TelemetryConfig, beside: Sequence[Path]) -> list[Path
     if not config.log:
         return list(beside)
     path = Path(config.log)
+    if not path.exists():
+        raise FlightError(f"{path}: there is no such telemetry log")
     if not path.is_file() or path.suffix.lower() not in READERS:
         kinds = ", ".join(READERS)
         raise FlightError(f"{path}: no telemetry log; wanted is a file with one of {kinds}")

@@ -7,7 +7,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import Command, configuration, depths, frames, json_option
+from companion.app.cli.options import (
+    Command,
+    configuration,
+    depths,
+    frames,
+    json_option,
+    made_folder,
+)
 from companion.app.progress import progress_on
 from companion.app.stopping import StopSignals
 from companion.config_file import load_config
@@ -20,6 +27,7 @@ def _depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
     if arguments.device is not None:
         sets.append(f"opencl.device={arguments.device}")
     wanted = Wanted(arguments.reference, arguments.frames, arguments.range)
+    made_folder(arguments.out)
     maps = reconstruct(
         arguments.dataset, arguments.out, load_config(arguments.config, sets), wanted,
         signals.between_frames(progress_on(sys.stderr)),
@@ -33,6 +41,7 @@ def _bench_slam(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.bench.bench_slam import bench_slam
     from companion.app.bench.slam_tables import as_json, table
 
+    made_folder(arguments.out)
     rows = bench_slam(
         arguments.flights, load_config(arguments.config, arguments.set), arguments.out,
         faults=arguments.faults, above_m=arguments.above,
@@ -46,6 +55,7 @@ def _bench_depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.bench.bench_depth import bench_depth
     from companion.app.bench.depth_tables import as_json, tables
 
+    made_folder(arguments.out)
     bench = bench_depth(
         arguments.dataset, load_config(arguments.config, arguments.set), arguments.out,
         reference=arguments.reference, frames=arguments.frames, serial=arguments.serial,

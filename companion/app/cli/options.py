@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 from companion.app.stopping import StopSignals
+from companion.errors import InputError
 
 Command = Callable[[argparse.Namespace, StopSignals], int]
 """Implementation of a command: arguments in, exit status out."""
@@ -31,6 +33,19 @@ def json_option() -> argparse.ArgumentParser:
     options = argparse.ArgumentParser(add_help=False)
     options.add_argument("--json", action="store_true", help="as JSON, for programs")
     return options
+
+
+def made_folder(path: Path | None) -> None:
+    """Make the folder that --out names, before any work; InputError where it cannot be written."""
+    if path is None:
+        return
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        why = error.strerror or error
+        raise InputError(f"{path}: cannot be written: {why}; --out wants a folder") from error
 
 
 def names(text: str) -> tuple[str, ...]:

@@ -8,7 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import Command, amount, configuration, json_option, number, seconds
+from companion.app.cli.options import (
+    Command,
+    amount,
+    configuration,
+    json_option,
+    made_folder,
+    number,
+    seconds,
+)
 from companion.app.progress import Progress, progress_on
 from companion.app.stopping import StopSignals
 from companion.config_file import load_config
@@ -78,6 +86,7 @@ def _compare(arguments: argparse.Namespace, signals: StopSignals) -> int:
     """Compare two runs; 1 where a limit is not kept."""
     from companion.app.compare_command import beyond, compare, in_words
 
+    made_folder(arguments.out)
     found = compare(arguments.run_a, arguments.run_b, arguments.out)
     print(in_words(found))
     if arguments.out is not None:
@@ -92,6 +101,7 @@ def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
     """Replay many; 1 where one has failed."""
     from companion.app.batch_command import INDEX, batch
 
+    made_folder(arguments.out)
     results = batch(
         arguments.flights, arguments.out, load_config(arguments.config, arguments.set),
         scheduler=arguments.scheduler, n_workers=arguments.workers,

@@ -8,7 +8,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import Command, configuration, names, seconds, shift, viewer
+from companion.app.cli.options import (
+    Command,
+    configuration,
+    made_folder,
+    names,
+    seconds,
+    shift,
+    viewer,
+)
 from companion.app.progress import progress_on
 from companion.app.stopping import StopSignals
 from companion.config import Config, ExportConfig
@@ -46,6 +54,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
             raise InputError("--as-flown replays a whole flight, in the order in which it came")
         from companion.app.as_flown import replay_as_flown
 
+        made_folder(arguments.out)
         replay_as_flown(arguments.flight, arguments.out, config, progress, print)
         signals.take()
         return 0
@@ -60,6 +69,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     belief = belief_in_words(config.telemetry.use)
     if belief:
         print(f"telemetry: {belief}")
+    made_folder(arguments.out)
     replay(given, arguments.out, config, arguments.viewer, progress, print)
     if config.export.formats:
         _export_into(arguments.out, arguments.out, config.export)
@@ -118,7 +128,8 @@ def add_parsers(commands: Any) -> None:
     )  # fmt: skip
     replay.add_argument(
         "flight", type=Path, metavar="FLIGHT",
-        help="a folder with video or images, a video, or a data set (EuRoC, KITTI, TUM RGB-D)",
+        help="a recording, a flight's folder, a folder with video or images, a video, photographs, "
+        "a bag, or a data set (EuRoC, KITTI, TUM RGB-D)",
     )  # fmt: skip
     replay.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder for the results"

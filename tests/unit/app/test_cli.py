@@ -13,6 +13,8 @@ from companion.config import Config
 from companion.config_file import load_config
 from tests.support.processes.closed_pipe import into_closed_pipe
 
+SAMPLE = Path(__file__).parents[3] / "sample" / "survey"
+
 
 def companion(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "companion", *map(str, arguments)]
@@ -73,6 +75,15 @@ def test_out_that_is_a_file(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.write_text("")
     assert str(out) in refused(companion("replay", tmp_path, "--out", out))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("replay", SAMPLE), ("depth", SAMPLE), ("compare", SAMPLE, SAMPLE), ("bench", "slam", SAMPLE)],
+)
+def test_out_that_cannot_be_written(command: tuple[str | Path, ...]) -> None:
+    line = refused(companion(*command, "--out", "/proc/nowhere"))
+    assert "/proc/nowhere: cannot be written: " in line and "--out" in line
 
 
 @pytest.mark.parametrize(
