@@ -6,7 +6,7 @@ A process of its own sends ATTITUDE_QUATERNION at 100 Hz and RAW_IMU at 200 Hz o
 with the time of sending (CLOCK_MONOTONIC) in each; another listens:
 
     pymavlink  PymavlinkPort       our wire, stamps of the kernel
-    mavsdk     MavsdkPort          MAVSDK's wire, packets taken as they are
+    mavsdk     PymavlinkPort       MAVSDK's wire, packets taken as they are
     json       MavlinkDirectAsync  MAVSDK's own way to give out messages, as JSON
 
 `stamp` is how much later than its sending a message is stamped, `callback` how much later it is
@@ -105,14 +105,9 @@ async def by_port(way: Any, port: int, measured: Measured) -> None:
     def take(message: Any, t_ns: int) -> None:
         measured.take(message.get_type(), sent_in(message), t_ns - clock.epoch_ns)
 
-    if way == "mavsdk":
-        from drivers.mavlink.wire.mavsdk_port import MavsdkPort
+    from drivers.mavlink.wire.link_port import link_port
 
-        await MavsdkPort(config, RouterConfig(), clock).run(take)
-    else:
-        from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
-
-        await PymavlinkPort(config, RouterConfig(), clock).run(take)
+    await link_port(config, RouterConfig(), clock).run(take)
 
 
 async def by_json(port: int, measured: Measured) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import socket
-import threading
 
 from companion.errors import SourceError
+from drivers.mavlink.wire.thread_call import in_thread
 
 RESOLVE_S = 5.0
 Address = tuple[socket.AddressFamily, tuple[str, int]]
@@ -23,27 +23,15 @@ async def resolve(host: str, port: int) -> Address:
 
 
 async def _ask(host: str, port: int) -> Address:
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[Address | str] = loop.create_future()
-
-    def settle(found: Address | str) -> None:
-        if not answer.done():
-            answer.set_result(found)
-
-    def look_up() -> None:
-        found: Address | str
+    def look_up() -> Address | str:
         try:
             places = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-            family, *_, address = min(places, key=lambda place: place[0] != socket.AF_INET)
-            found = family, (str(address[0]), int(address[1]))
-        except OSError as error:
-            found = error.strerror or str(error)
-        try:
-            loop.call_soon_threadsafe(settle, found)
-        except RuntimeError:
-            pass  # the loop has ended meanwhile: nobody asks any more
+        except (OSError, UnicodeError) as error:
+            return getattr(error, "strerror", None) or str(error)
+        family, *_, address = min(places, key=lambda place: place[0] != socket.AF_INET)
+        return family, (str(address[0]), int(address[1]))
 
-    threading.Thread(target=look_up, name="resolver", daemon=True).start()
+    answer = in_thread(look_up, "resolver")
     # not wait_for: up to Python 3.11 it swallows a cancellation that comes with the answer
     await asyncio.wait({answer}, timeout=RESOLVE_S)
     found = answer.result() if answer.done() else "no answer from the name server"

@@ -10,9 +10,7 @@ import asyncio
 import os
 import socket
 import struct
-import threading
 import time
-from collections.abc import Callable
 
 import mavsdk
 
@@ -21,6 +19,7 @@ from drivers.mavlink.wire.baud import BAUDS, BaudSearch
 from drivers.mavlink.wire.link_url import Endpoint
 from drivers.mavlink.wire.mavsdk_carrier import Carrier, complaints
 from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
+from drivers.mavlink.wire.thread_call import in_thread
 from drivers.mavlink.wire.wire import Wire, WireEnd
 
 KIND_OF = {"serial": "serial", "udpin": "udpin", "udpout": "udpout", "tcp": "tcpout"}
@@ -30,7 +29,6 @@ QUEUE_BYTES = 64_000
 STAMP = struct.Struct("=q")
 LONGEST = 512
 PAIR_BYTES = 1 << 20
-LOOK_S = 0.1
 SILENT_NS = 5_000_000_000
 """A serial line that was heard and is silent for this long is reopened."""
 END_S = 1.5
@@ -59,8 +57,7 @@ class MavsdkWire(Wire):
         self._pair: tuple[socket.socket, socket.socket] | None = None
         self._device: tuple[int, int, int] | None = None
         self._heard_ns = 0
-        self._looking: asyncio.TimerHandle | None = None
-        self._ending: asyncio.Task[None] | None = None
+        self._ending: asyncio.Future[None] | None = None
 
     async def run(self, end: WireEnd) -> None:
         """Keep the wire open until cancelled; then MAVSDK has ended, or is abandoned."""
@@ -71,12 +68,8 @@ class MavsdkWire(Wire):
 
     async def serve(self, fd: int, end: WireEnd) -> None:
         """See `Wire`."""
-        self._look_later()
-        try:
-            await super().serve(fd, end)
-        finally:
-            if self._looking is not None:
-                self._looking.cancel()
+        self._look_later(self._look)
+        await super().serve(fd, end)
 
     async def _open(self) -> int:
         await self._ended()
@@ -102,7 +95,7 @@ class MavsdkWire(Wire):
 
         self._carrier = Carrier(self._mavsdk_url(), take)
         try:
-            await _in_thread(self._carrier.start, "mavsdk start")
+            await in_thread(self._carrier.start, "mavsdk start")
         except mavsdk.MavsdkError as error:
             self._close()
             raise SourceError(f"{self.name}: {complaints.newest or error}") from error
@@ -120,7 +113,7 @@ class MavsdkWire(Wire):
             for each in pair or ():
                 each.close()
 
-        self._ending = asyncio.ensure_future(_in_thread(end, "mavsdk end"))
+        self._ending = in_thread(end, "mavsdk end")
 
     async def _ended(self) -> None:
         if self._ending is not None:
@@ -147,12 +140,9 @@ class MavsdkWire(Wire):
         self._pace.refill(time.monotonic_ns())
         return self._pace.wait_s() if self._pace.left < 0 else 0.0
 
-    def _look_later(self) -> None:
-        self._looking = asyncio.get_running_loop().call_later(LOOK_S, self._look)
-
     def _look(self) -> None:
         """Reopen a serial line: MAVSDK does not see it go, nor reopen it; a network's it does."""
-        self._look_later()
+        self._look_later(self._look)
         now_ns = time.monotonic_ns()
         if not self._heard_ns and complaints.newest:
             self.trouble = f"{self.name}: {complaints.newest}"
@@ -178,29 +168,3 @@ class MavsdkWire(Wire):
         if self.is_line:
             return f"{kind}://{self._endpoint.device}:{self._search.baud}"
         return f"{kind}://{self._endpoint.host}:{self._endpoint.port}"
-
-
-async def _in_thread(call: Callable[[], None], name: str) -> None:
-    """Call a function that may hang, without blocking the event loop or the program's end."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[Exception | None] = loop.create_future()
-
-    def settle(error: Exception | None) -> None:
-        if not done.done():
-            done.set_result(error)
-
-    def work() -> None:
-        failed: Exception | None = None
-        try:
-            call()
-        except Exception as error:
-            failed = error
-        try:
-            loop.call_soon_threadsafe(settle, failed)
-        except RuntimeError:
-            pass  # the loop has ended meanwhile: nobody asks any more
-
-    threading.Thread(target=work, name=name, daemon=True).start()
-    error = await done
-    if error is not None:
-        raise error

@@ -62,7 +62,7 @@ class Packet(NamedTuple):
     @property
     def target(self) -> tuple[int, int] | None:
         """Target system and component, 0 for any; None where the message has none."""
-        places = _target_places(self.message_id) if self.known else None
+        places = TARGET_PLACES.get(self.message_id) if self.known else None
         if places is None:
             return None
         payload = self.payload
@@ -217,8 +217,4 @@ def _places_of_targets() -> dict[int, tuple[int, int | None]]:
     return places
 
 
-_TARGET_PLACES = _places_of_targets()
-
-
-def _target_places(message_id: int) -> tuple[int, int | None] | None:
-    return _TARGET_PLACES.get(message_id)
+TARGET_PLACES = _places_of_targets()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import fcntl
 import os
 import struct
@@ -22,7 +21,6 @@ QUEUE_S, LEAST_QUEUE_BYTES = 0.25, 2000
 KERNEL_S, LEAST_KERNEL_BYTES = 0.05, 300
 """Limit of the kernel's buffer, which would take seconds of packets at a slow rate: a late pose is
 worse than none."""
-LOOK_S = 0.1
 VMIN = 6
 
 
@@ -36,16 +34,11 @@ class SerialWire(Wire):
         self.search = BaudSearch((endpoint.baud,) if endpoint.baud else BAUDS)
         self._device = endpoint.device
         self._serial: serial.Serial | None = None
-        self._looking: asyncio.TimerHandle | None = None
 
     async def serve(self, fd: int, end: WireEnd) -> None:
         """See `Wire`."""
-        self._look_later(end)
-        try:
-            await super().serve(fd, end)
-        finally:
-            if self._looking is not None:
-                self._looking.cancel()
+        self._look_later(self._look, end)
+        await super().serve(fd, end)
 
     async def _open(self) -> int:
         self.search.begin(time.monotonic_ns())
@@ -114,18 +107,14 @@ class SerialWire(Wire):
         elif self.search.found:
             self.trouble = ""
         if found and not self.search.found:
-            self._look_later(end)
-
-    def _look_later(self, end: WireEnd) -> None:
-        self._looking = asyncio.get_running_loop().call_later(LOOK_S, self._look, end)
+            self._look_later(self._look, end)
 
     def _look(self, end: WireEnd) -> None:
-        self._looking = None
         if self._serial is None or self.search.found:
             return
         if self.search.look(time.monotonic_ns()):
             self._change_baud(end)
-        self._look_later(end)
+        self._look_later(self._look, end)
 
     def _change_baud(self, end: WireEnd) -> None:
         assert self._serial is not None

@@ -14,6 +14,7 @@ from drivers.mavlink.wire.send_queue import PacketQueue, RateLimit
 
 FIRST_RETRY_S, MOST_RETRY_S = 0.1, 0.5
 STALLED_NS = 30_000_000_000
+LOOK_S = 0.1
 
 
 async def run_together(*parts: Coroutine[Any, Any, None]) -> None:
@@ -79,6 +80,7 @@ class Wire(ABC):
         self._lost: asyncio.Future[str] | None = None
         self._paused: asyncio.TimerHandle | None = None
         self._delayed: asyncio.TimerHandle | None = None
+        self._looking: asyncio.TimerHandle | None = None
         self._waiting = False
         self._progress_ns = 0
 
@@ -117,7 +119,7 @@ class Wire(ABC):
             self.connected = False
             loop.remove_reader(fd)
             loop.remove_writer(fd)
-            for timer in (self._paused, self._delayed):
+            for timer in (self._paused, self._delayed, self._looking):
                 if timer is not None:
                     timer.cancel()
             self._paused = self._delayed = None
@@ -166,6 +168,10 @@ class Wire(ABC):
 
     def _write(self, data: bytes) -> int:
         return os.write(self._fd, data)
+
+    def _look_later(self, look: Callable[..., None], *arguments: object) -> None:
+        """Call soon, unless the wire is closed before."""
+        self._looking = asyncio.get_running_loop().call_later(LOOK_S, look, *arguments)
 
     def _room(self) -> float:
         """Seconds to wait before more may be written; 0 for now."""

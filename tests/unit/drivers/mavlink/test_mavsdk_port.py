@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -17,8 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import LinkConfig, RouterConfig
 from companion.errors import ConfigError
 from companion.timing.clock import FlightClock
+from drivers.mavlink.wire.link_port import link_port
 from drivers.mavlink.wire.mavsdk_carrier import ITSELF
-from drivers.mavlink.wire.mavsdk_port import MavsdkPort
 from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 from drivers.telemetry.mavlink_samples import samples_of
 from tests.support.autopilot.fake_autopilot import FakeAutopilot
@@ -51,8 +51,8 @@ async def until(true: Callable[[], Any], timeout_s: float = 5.0) -> None:
         await asyncio.sleep(0.005)
 
 
-def port_of(url: str, clients: tuple[str, ...] = (), **link: Any) -> MavsdkPort:
-    return MavsdkPort(LinkConfig(url=url, backend="mavsdk", **link), RouterConfig(clients), CLOCK)
+def port_of(url: str, clients: tuple[str, ...] = (), **link: Any) -> PymavlinkPort:
+    return link_port(LinkConfig(url=url, backend="mavsdk", **link), RouterConfig(clients), CLOCK)
 
 
 def kinds(heard: Heard) -> list[str]:
@@ -98,7 +98,7 @@ class Peer:
 
 
 @asynccontextmanager
-async def linked(**link: Any) -> AsyncIterator[tuple[Peer, MavsdkPort, Heard]]:
+async def linked(**link: Any) -> AsyncIterator[tuple[Peer, PymavlinkPort, Heard]]:
     peer = Peer()
     port = port_of(peer.url, **link)
     try:
@@ -202,10 +202,10 @@ def test_rates_of_100_and_200_hz() -> None:
 def test_both_backends_give_the_same_of_a_recorded_flight() -> None:
     packets = [each.packet for each in islice(read_tlog(SAMPLE / "telemetry.tlog"), 600)]
 
-    async def heard_by(kind: type[PymavlinkPort]) -> list[str]:
+    async def heard_by(backend: Literal["pymavlink", "mavsdk"]) -> list[str]:
         place = free_port()
-        config = LinkConfig(url=f"udpin:127.0.0.1:{place}")
-        port = kind(config, RouterConfig(), CLOCK)
+        config = LinkConfig(url=f"udpin:127.0.0.1:{place}", backend=backend)
+        port = link_port(config, RouterConfig(), CLOCK)
         async with running(port) as heard:
             await until(lambda: port.connected)
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
@@ -216,7 +216,7 @@ def test_both_backends_give_the_same_of_a_recorded_flight() -> None:
             return [f"{m.get_header().seq} {m.get_srcSystem()} {m}" for m, _ in heard]
 
     async def compare() -> None:
-        assert await heard_by(MavsdkPort) == await heard_by(PymavlinkPort)
+        assert await heard_by("mavsdk") == await heard_by("pymavlink")
 
     asyncio.run(compare())
 
