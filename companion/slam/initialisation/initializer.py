@@ -36,8 +36,30 @@ class TwoViewGeometry:
     points_a: Array
     features_a: Ints
     features_b: Ints
-    parallax_rad: float
-    planar: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Matches:
+    """Ideal coordinates (N, 2) of matched features, their whitening (N, 2, 2), and the prior.
+
+    `rotation_prior` is the rotation `b_from_a` by the autopilot, where measured.
+    """
+
+    xa: Array
+    xb: Array
+    whitening_a: Array
+    whitening_b: Array
+    rotation_prior: Array | None
+
+    def triangulated(self, pose: Pose) -> tuple[Array, Array]:
+        """Points in a, and the cosine of each parallax."""
+        return triangulate(self.xa, self.xb, pose)
+
+    def consistent(self, points: Array, pose: Pose, max_chi2: float) -> Bools:
+        """Mask of points that agree with both views."""
+        return consistent(
+            points, pose, self.xa, self.xb, self.whitening_a, self.whitening_b, max_chi2
+        )
 
 
 def initialise(
@@ -56,38 +78,37 @@ def initialise(
     """
     if len(index_a) < MIN_POINTS:
         return None
-    xa, xb = a.normalised[index_a], b.normalised[index_b]
     rotation_prior = None if attitudes is None else attitudes[1].T @ attitudes[0]
-    rotation_only = _explained_by_rotation(xa, xb, focal_px, rotation_prior)
+    matches = _Matches(
+        a.normalised[index_a], b.normalised[index_b], a.whitening[index_a], b.whitening[index_b],
+        rotation_prior,
+    )  # fmt: skip
+    rotation_only = _explained_by_rotation(matches, focal_px)
     if np.mean(rotation_only) > MAX_PURE_ROTATION_RATIO:
         return None
-    candidates, planar = motion_hypotheses(xa, xb, focal_px, seed, attitudes)
-    best = _best(candidates, a, b, index_a, index_b, rotation_prior)
+    candidates = motion_hypotheses(matches.xa, matches.xb, focal_px, seed, attitudes)
+    best = _best(candidates, matches)
     if best is None:
         return None
-    found = _refined(best, a, b, index_a, index_b, rotation_prior, min_parallax_rad)
+    found = _refined(best, matches, min_parallax_rad)
     if found is None:
         return None
-    pose, points, agree, shown, parallax_rad = found
+    pose, points, agree, shown = found
     # outliers fit no rotation either, but are known only now; with no prior the hypotheses competed
     if rotation_prior is not None and np.sum(rotation_only) > MAX_PURE_ROTATION_RATIO * np.sum(
         rotation_only | agree
     ):
         return None
-    return TwoViewGeometry(
-        pose, points[shown], index_a[shown], index_b[shown], parallax_rad, planar
-    )
+    return TwoViewGeometry(pose, points[shown], index_a[shown], index_b[shown])
 
 
-def _explained_by_rotation(
-    xa: Array, xb: Array, focal_px: float, rotation_prior: Array | None
-) -> Bools:
+def _explained_by_rotation(matches: _Matches, focal_px: float) -> Bools:
     """Mask (N,) of matches explained by rotation alone, which carry no baseline.
 
     None if that rotation contradicts `rotation_prior`: a short translation over a plane resembles a
     rotation.
     """
-    rays_a, rays_b = _unit_rays(xa), _unit_rays(xb)
+    rays_a, rays_b = _unit_rays(matches.xa), _unit_rays(matches.xb)
     weight = np.ones(len(rays_a))
     error_px = np.zeros(len(rays_a))
     rotation = np.eye(3)
@@ -96,12 +117,13 @@ def _explained_by_rotation(
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         error_px = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1) * focal_px
         weight = 1.0 / (1.0 + (error_px / PURE_ROTATION_PX) ** 2) ** 2
+    rotation_prior = matches.rotation_prior
     if rotation_prior is not None:
         off_rad = float(PRIOR_ROTATION_RAD) + PRIOR_ROTATION_RATIO * angle_between(
             rotation_prior, np.eye(3)
         )
         if angle_between(rotation, rotation_prior) >= off_rad:
-            return np.zeros(len(xa), bool)
+            return np.zeros(len(rays_a), bool)
     return np.asarray(error_px < PURE_ROTATION_PX, bool)
 
 
@@ -111,17 +133,11 @@ def _unit_rays(normalised: Array) -> Array:
     return out
 
 
-def _best(
-    candidates: list[Pose], a: Features, b: Features, index_a: Ints, index_b: Ints,
-    rotation_prior: Array | None,
-) -> Pose | None:  # fmt: skip
+def _best(candidates: list[Pose], matches: _Matches) -> Pose | None:
     scored = []
     for pose in candidates:
-        points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
-        ok = consistent(
-            points, pose, a.normalised[index_a], b.normalised[index_b],
-            a.whitening[index_a], b.whitening[index_b], 9.0,
-        )  # fmt: skip
+        points, _ = matches.triangulated(pose)
+        ok = matches.consistent(points, pose, 9.0)
         scored.append((int(ok.sum()), pose))
     if not scored:
         return None
@@ -129,34 +145,29 @@ def _best(
     top, pose = scored[0]
     if top < MIN_POINTS // 2:
         return None
-    if rotation_prior is not None:
-        factor = RelativeRotationFactor.with_typical_errors(
-            np.array([1]), np.array([0]), rotation_prior[None]
-        )
+    competing = [p for n, p in scored if n > HYPOTHESIS_INLIER_RATIO * top]
+    if matches.rotation_prior is not None:
+        factor = _rotation_factor(matches.rotation_prior)
 
         def cost(pose: Pose) -> float:
             _, off = factor.errors(np.stack([np.eye(3), pose.rotation]))
-            return _unexplained(pose, a, b, index_a, index_b) + float(off[0]) ** 2
+            return _unexplained(pose, matches) + float(off[0]) ** 2
 
-        return min((p for n, p in scored if n > HYPOTHESIS_INLIER_RATIO * top), key=cost)
-    return _most_likely(
-        [p for n, p in scored if n > HYPOTHESIS_INLIER_RATIO * top], a, b, index_a, index_b
-    )
+        return min(competing, key=cost)
+    return _most_likely(competing, matches)
 
 
-def _most_likely(
-    poses: list[Pose], a: Features, b: Features, index_a: Ints, index_b: Ints
-) -> Pose | None:
+def _most_likely(poses: list[Pose], matches: _Matches) -> Pose | None:
     """The pose of least cost, each refined first; None if another is nearly as good."""
     best: list[tuple[float, Pose]] = []
     for start in poses:
         pose: Pose | None = start
         for limit in (16.0, 9.0):
             if pose is not None:
-                pose = _adjusted(pose, a, b, index_a, index_b, limit)
+                pose = _adjusted(pose, matches, limit)
         if pose is None:
             continue
-        best.append((_unexplained(pose, a, b, index_a, index_b), pose))
+        best.append((_unexplained(pose, matches), pose))
     if not best:
         return None
     best.sort(key=lambda c: c[0])
@@ -171,15 +182,21 @@ def _most_likely(
     return pose
 
 
-def _unexplained(pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints) -> float:
+def _rotation_factor(rotation_prior: Array) -> RelativeRotationFactor:
+    """Factor between camera 1, which is a, and camera 0."""
+    return RelativeRotationFactor.with_typical_errors(
+        np.array([1]), np.array([0]), rotation_prior[None]
+    )
+
+
+def _unexplained(pose: Pose, matches: _Matches) -> float:
     """Sum of squared errors of all matches in both views, truncated at the outlier threshold."""
-    xa, xb = a.normalised[index_a], b.normalised[index_b]
-    points, _ = triangulate(xa, xb, pose)
+    points, _ = matches.triangulated(pose)
     in_b = pose.apply(points)
     total = np.zeros(len(points))
     with np.errstate(invalid="ignore", divide="ignore"):
         for p, seen, white in (
-            (points, xa, a.whitening[index_a]), (in_b, xb, b.whitening[index_b])
+            (points, matches.xa, matches.whitening_a), (in_b, matches.xb, matches.whitening_b)
         ):  # fmt: skip
             error = np.matmul(white, (p[:, :2] / p[:, 2:] - seen)[..., None])[..., 0]
             total += (error * error).sum(1)
@@ -187,32 +204,20 @@ def _unexplained(pose: Pose, a: Features, b: Features, index_a: Ints, index_b: I
     return float(np.where(before & (total < 2 * GAMMA), total, 2 * GAMMA).sum())
 
 
-def _adjusted(
-    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints, limit: float,
-    rotation_prior: Array | None = None,
-) -> Pose | None:  # fmt: skip
-    """Pose with a unit baseline, bundle-adjusted on its inliers and on `rotation_prior`."""
-    points, _ = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
-    ok = consistent(
-        points, pose, a.normalised[index_a], b.normalised[index_b],
-        a.whitening[index_a], b.whitening[index_b], limit,
-    )  # fmt: skip
-    ia, ib, pts = index_a[ok], index_b[ok], points[ok]
-    n = len(ia)
+def _adjusted(pose: Pose, matches: _Matches, limit: float) -> Pose | None:
+    """Pose with a unit baseline, bundle-adjusted on its inliers and on the prior."""
+    points, _ = matches.triangulated(pose)
+    ok = matches.consistent(points, pose, limit)
+    n = int(np.count_nonzero(ok))
     if n < MIN_POINTS // 2:
         return None
-    factor = (
-        None
-        if rotation_prior is None
-        else RelativeRotationFactor.with_typical_errors(
-            np.array([1]), np.array([0]), rotation_prior[None]
-        )
-    )
+    prior = matches.rotation_prior
     bundle = Bundle(
-        [pose, Pose.identity()], 1, pts,
+        [pose, Pose.identity()], 1, points[ok],
         np.repeat(np.array([0, 1]), n), np.tile(np.arange(n), 2),
-        np.r_[b.normalised[ib], a.normalised[ia]], np.r_[b.whitening[ib], a.whitening[ia]],
-        () if factor is None else (factor,),
+        np.r_[matches.xb[ok], matches.xa[ok]],
+        np.r_[matches.whitening_b[ok], matches.whitening_a[ok]],
+        () if prior is None else (_rotation_factor(prior),),
     )  # fmt: skip
     adjusted = adjust(bundle, 12)
     scale = 1.0 / max(float(np.linalg.norm(adjusted.poses[0].translation)), 1e-12)
@@ -220,24 +225,20 @@ def _adjusted(
 
 
 def _refined(
-    pose: Pose, a: Features, b: Features, index_a: Ints, index_b: Ints,
-    rotation_prior: Array | None, min_parallax_rad: float,
-) -> tuple[Pose, Array, Bools, Bools, float] | None:  # fmt: skip
-    """Pose, points (N, 3), masks of inliers and of those with parallax, and the parallax in rad."""
+    pose: Pose, matches: _Matches, min_parallax_rad: float
+) -> tuple[Pose, Array, Bools, Bools] | None:
+    """Pose, points (N, 3), masks of inliers and of those with parallax."""
     for limit in (16.0, 5.991):
-        adjusted = _adjusted(pose, a, b, index_a, index_b, limit, rotation_prior)
+        adjusted = _adjusted(pose, matches, limit)
         if adjusted is None:
             return None
         pose = adjusted
-    points, cosine = triangulate(a.normalised[index_a], b.normalised[index_b], pose)
-    ok = consistent(
-        points, pose, a.normalised[index_a], b.normalised[index_b],
-        a.whitening[index_a], b.whitening[index_b],
-    )  # fmt: skip
-    if ok.sum() < MIN_POINTS or ok.sum() < 0.5 * len(index_a):
+    points, cosine = matches.triangulated(pose)
+    ok = matches.consistent(points, pose, GAMMA)
+    if ok.sum() < MIN_POINTS or ok.sum() < 0.5 * len(ok):
         return None
     parallax = float(np.arccos(np.clip(np.quantile(cosine[ok], 0.3), -1, 1)))
     if parallax < min_parallax_rad:
         return None
     shown = ok & (cosine < np.cos(min(0.3 * min_parallax_rad, np.radians(0.3))))
-    return pose, points, ok, shown, parallax
+    return pose, points, ok, shown

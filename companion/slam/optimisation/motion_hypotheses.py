@@ -20,8 +20,8 @@ UPRIGHT_PX = 2.0
 
 def motion_hypotheses(
     xa: Array, xb: Array, focal_px: float, seed: int, attitudes: tuple[Array, Array] | None
-) -> tuple[list[Pose], bool]:
-    """Hypotheses `b_from_a` with unit baselines, and whether a plane explains most matches.
+) -> list[Pose]:
+    """Hypotheses `b_from_a` with unit baselines.
 
     `xa` and `xb` (N, 2) are normalised; `attitudes` are `ned_from_camera` of both, where measured.
     """
@@ -54,7 +54,7 @@ def motion_hypotheses(
             for m in motions
             if angle_between(m.rotation, rotation_prior) < MAX_PRIOR_DISAGREEMENT_RAD
         ]
-    return motions, planar
+    return motions
 
 
 def _models(pa: Array, pb: Array, focal_px: float, seed: int) -> tuple[Array | None, Array | None]:
