@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.board_views import View
-from companion.geometry.camera import Camera, Distortion
+from companion.geometry.camera import COEFFICIENTS, Camera, Distortion
 from companion.geometry.transforms import Array
 
 N_CURVATURE = 3
 """Coefficients of the board depth a x^2 + b x y + c y^2."""
-N_COEFFICIENTS = {Distortion.RADTAN: 5, Distortion.EQUIDISTANT: 4}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +32,7 @@ class LensModel:
     @property
     def n_lens(self) -> int:
         """Number of lens parameters fx fy cx cy k...; those of the board follow."""
-        return 4 + N_COEFFICIENTS[self.distortion]
+        return 4 + len(COEFFICIENTS[self.distortion])
 
     @property
     def free(self) -> NDArray[np.int64]:

@@ -30,6 +30,14 @@ class Distortion(Enum):
     """Kannala-Brandt fisheye, coefficients k1 k2 k3 k4."""
 
 
+COEFFICIENTS: dict[Distortion, tuple[str, ...]] = {
+    Distortion.NONE: (),
+    Distortion.RADTAN: ("k1", "k2", "p1", "p2", "k3"),
+    Distortion.EQUIDISTANT: ("k1", "k2", "k3", "k4"),
+}
+"""Names of the coefficients of each model, in their order."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """Intrinsics and mount of a camera.

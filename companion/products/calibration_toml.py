@@ -6,13 +6,7 @@ from collections.abc import Mapping
 
 from companion.calibration.lens_calibration import Calibration
 from companion.config_file import toml_value
-from companion.geometry.camera import Distortion
-
-COEFFICIENTS = {
-    Distortion.NONE: (),
-    Distortion.RADTAN: ("k1", "k2", "p1", "p2", "k3"),
-    Distortion.EQUIDISTANT: ("k1", "k2", "k3", "k4"),
-}
+from companion.geometry.camera import COEFFICIENTS
 
 
 def calibration_toml(calibration: Calibration, name: str, board: str, source: str) -> bytes:

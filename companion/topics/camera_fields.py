@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from companion.errors import StreamError
-from companion.geometry.camera import Camera, Distortion
+from companion.geometry.camera import COEFFICIENTS, Camera, Distortion
 from companion.topics.envelope import Envelope
 from companion.topics.pose_rows import POSE_NUMBERS, pose_of, pose_row
 
 LEAST_SIDE, MOST_SIDE = 16, 8192
 MOST_PIXELS = 20_000_000
 MOST_FOCAL_PX = 1e6
-N_COEFFICIENTS = {Distortion.NONE: 0, Distortion.RADTAN: 5, Distortion.EQUIDISTANT: 4}
 
 
 def camera_fields(camera: Camera) -> dict[str, Any]:
@@ -39,7 +38,7 @@ def camera_of(part: Envelope) -> Camera:
         distortion = Distortion(part.text("distortion"))
     except ValueError as error:
         raise StreamError(f"{part.kind}: {error}") from error
-    coefficients = part.numbers("coefficients", N_COEFFICIENTS[distortion], MOST_FOCAL_PX)
+    coefficients = part.numbers("coefficients", len(COEFFICIENTS[distortion]), MOST_FOCAL_PX)
     body = None
     if part.known("body_from_camera"):
         body = pose_of(part.numbers("body_from_camera", POSE_NUMBERS, MOST_FOCAL_PX))

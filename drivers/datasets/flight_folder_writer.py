@@ -11,11 +11,10 @@ from pathlib import Path
 import cv2
 
 from companion.errors import FlightError
-from companion.geometry.camera import Camera
+from companion.geometry.camera import COEFFICIENTS, Camera
 from companion.geometry.transforms import quaternion_from_rotation
 from companion.messages import Frame
 from drivers.flight import Flight
-from drivers.images.calibration_file import KEYS
 from drivers.images.frame_source import ImageFolder, Video
 from drivers.images.frame_times import HEADER
 from drivers.telemetry.telemetry_csv import NAME, telemetry_csv
@@ -76,7 +75,7 @@ def camera_json(camera: Camera) -> dict[str, object]:
     said: dict[str, object] = {
         "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
         "cx": camera.cx, "cy": camera.cy, "distortion_model": camera.distortion.value,
-        **dict(zip(KEYS[camera.distortion], camera.coefficients, strict=True)),
+        **dict(zip(COEFFICIENTS[camera.distortion], camera.coefficients, strict=True)),
     }  # fmt: skip
     if camera.body_from_camera is not None:
         said["body_from_camera"] = camera.body_from_camera.matrix().tolist()

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from companion.errors import FlightError
-from companion.geometry.camera import Camera, Distortion
+from companion.geometry.camera import COEFFICIENTS, Camera, Distortion
 from companion.geometry.transforms import Array, Pose
 from drivers.images.text_table import numbers_of, read_rows
 
@@ -28,11 +28,6 @@ MODELS = {
     "plumb_bob": Distortion.RADTAN,
     "equidistant": Distortion.EQUIDISTANT,
     "fisheye": Distortion.EQUIDISTANT,
-}
-KEYS = {
-    Distortion.NONE: (),
-    Distortion.RADTAN: ("k1", "k2", "p1", "p2", "k3"),
-    Distortion.EQUIDISTANT: ("k1", "k2", "k3", "k4"),
 }
 MAX_TURN_ERROR = 1e-3
 FORWARD_UPRIGHT: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -120,7 +115,7 @@ def _model(path: Path, content: Mapping[str, Any]) -> Distortion:
 
 
 def _coefficients(path: Path, content: Mapping[str, Any], model: Distortion) -> tuple[float, ...]:
-    keys = KEYS[model]
+    keys = COEFFICIENTS[model]
     given = content.get("D")
     if given is None:
         # k3 is zero in many calibrations, and then often not written

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
-from companion.geometry.camera import Camera, Distortion
+from companion.geometry.camera import COEFFICIENTS, Camera, Distortion
 from companion.geometry.transforms import Pose
 from drivers.recording.recorded_content import serialised, set_time
 
@@ -49,8 +49,7 @@ def camera_of(document: bytes) -> Camera:
         assumed = bool(given["assumed"])
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise ValueError(f"not a camera: {error}") from error
-    wanted = {Distortion.NONE: 0, Distortion.RADTAN: 5, Distortion.EQUIDISTANT: 4}[model]
-    if len(coefficients) != wanted or min(width, height, fx, fy) <= 0:
+    if len(coefficients) != len(COEFFICIENTS[model]) or min(width, height, fx, fy) <= 0:
         raise ValueError("not a camera: numbers are missing")
     return Camera(width, height, fx, fy, cx, cy, model, coefficients, mount, assumed)
 
