@@ -95,10 +95,6 @@ class BagPictures:
         """Header stamps of the images."""
         return list(self._stamps_ns)
 
-    def epoch(self) -> tuple[int, str]:
-        """Unix epoch."""
-        return 0, "the stamps in the bag"
-
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
         """Number and RGB image of images first..last; None for a damaged or odd-sized one."""
         number = first

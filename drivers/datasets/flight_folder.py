@@ -15,6 +15,7 @@ from drivers.images.frame_source import (
     IMAGE_SUFFIXES,
     VIDEO_SUFFIXES,
     FrameSource,
+    ImageFolder,
     Video,
     find_frames,
 )
@@ -82,15 +83,19 @@ def camera_of(
     return assumed_camera(source.width, source.height, config.assumed_hfov_deg), [warned]
 
 
-def _times(path: Path, source: FrameSource) -> tuple[list[int], list[int], list[Warned]]:
+def own_times(source: Video | ImageFolder) -> tuple[list[int], list[int], list[Warned]]:
+    """Numbers and times of all frames by the file itself, with a warning."""
+    epoch_ns, epoch = source.epoch()
+    times_ns = [epoch_ns + t_ns for t_ns in source.own_times_ns()]
+    what = "no frames.csv: times are the file's own"
+    warned = Warned(times_ns[0], what, f"counted from {epoch}")
+    return list(range(len(times_ns))), times_ns, [warned]
+
+
+def _times(path: Path, source: Video | ImageFolder) -> tuple[list[int], list[int], list[Warned]]:
     listed = path / "frames.csv"
     if not listed.exists():
-        epoch_ns, epoch = source.epoch()
-        times_ns = [epoch_ns + t_ns for t_ns in source.own_times_ns()]
-        warned = Warned(
-            times_ns[0], "no frames.csv: times are the file's own", f"counted from {epoch}"
-        )
-        return list(range(len(times_ns))), times_ns, [warned]
+        return own_times(source)
     numbers, times_ns, warnings = read_frame_times(listed)
     n_there = bisect_left(numbers, source.n_frames)
     if n_there == 0:

@@ -58,10 +58,6 @@ class PosedPictures:
         """Ten images a second."""
         return [number * STEP_NS for number in range(self.n_frames)]
 
-    def epoch(self) -> tuple[int, str]:
-        """Zero."""
-        return 0, "zero, at 10 images/s"
-
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
         """Number and RGB image of images first..last; None for a damaged or odd-sized one."""
         for number in range(first, last + 1):

@@ -21,6 +21,7 @@ from drivers.datasets.flight_folder import open_flight_folder
 from drivers.datasets.posed_images import PosedImages, pictures_of, read_depth, read_rgb
 from drivers.images.calibration_file import read_calibration
 from drivers.images.frame_source import IMAGE_SUFFIXES
+from drivers.images.text_table import numbers_of, read_rows
 
 REMODE_FOCAL_PX = (481.2, 480.0)
 """Camera of the test set, whose images are 640 x 480."""
@@ -57,10 +58,10 @@ def open_posed_images(path: Path) -> PosedImages:
 def _remode(path: Path, sequence: Path) -> PosedImages:
     files, poses = [], []
     flip = np.diag([1.0, -1.0, 1.0])  # the set's y axis points up, in the world and the camera
-    for words in _rows(sequence, 8):
+    for words in read_rows(sequence, 8):
         file = path / "Images" / words[0]
         files.append(file if file.exists() else path / "images" / words[0])
-        x, y, z, *turn = _numbers(sequence, words[1:8])
+        x, y, z, *turn = numbers_of(sequence, words[1:8])
         rotation = rotation_from_quaternion(np.array([turn[3], *turn[:3]]))
         poses.append(Pose(flip @ rotation @ flip, flip @ np.array([x, y, z])))
     height, width = _size(sequence, files)
@@ -82,9 +83,9 @@ def _remode(path: Path, sequence: Path) -> PosedImages:
 
 def _tum(path: Path) -> PosedImages:
     listing = path / "rgb.txt"
-    listed = [(_numbers(listing, words[:1])[0], path / words[1]) for words in _rows(listing, 2)]
-    stamps = np.array([stamp for stamp, _ in listed])
-    files = [file for _, file in listed]
+    listed = read_rows(listing, 2)
+    stamps = np.array([numbers_of(listing, words[:1])[0] for words in listed])
+    files = [path / words[1] for words in listed]
     pose_s, known = _tum_poses(path / "groundtruth.txt")
     height, width = _size(listing, files)
     named = next((v for k, v in TUM_CAMERAS.items() if k in path.resolve().name), TUM_CAMERA)
@@ -98,8 +99,8 @@ def _tum(path: Path) -> PosedImages:
         known[i] if abs(pose_s[i] - stamp) <= TUM_TIME_DIFFERENCE_S else None
         for stamp, i in zip(stamps, nearest, strict=True)
     )
-    depth_rows = list(_rows(path / "depth.txt", 2)) if (path / "depth.txt").exists() else []
-    depth_s = np.array([_numbers(path / "depth.txt", words[:1])[0] for words in depth_rows])
+    depth_rows = read_rows(path / "depth.txt", 2) if (path / "depth.txt").exists() else []
+    depth_s = np.array([numbers_of(path / "depth.txt", words[:1])[0] for words in depth_rows])
 
     def truth(position: int) -> Floats | None:
         if len(depth_s) == 0:
@@ -172,36 +173,10 @@ def _pose_at(pose_s: Array, poses: list[Pose], t_s: float) -> Pose | None:
 
 
 def _tum_poses(path: Path) -> tuple[Array, list[Pose]]:
-    rows = [_numbers(path, words[:8]) for words in _rows(path, 8)]
+    rows = [numbers_of(path, words[:8]) for words in read_rows(path, 8)]
     table = np.array(sorted(rows))
     poses = [Pose(rotation_from_quaternion(r[[7, 4, 5, 6]]), r[1:4].copy()) for r in table]
     return table[:, 0], poses
-
-
-def _rows(path: Path, n_words: int) -> Iterator[list[str]]:
-    """Rows of a table, split, without comments; FlightError for a short row or none."""
-    try:
-        lines = path.read_text("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FlightError(f"{path}: cannot be read as text: {error}") from error
-    n = 0
-    for number, line in enumerate(lines, 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) < n_words:
-            raise FlightError(f"{path}: line {number} has {len(words)} words, wanted {n_words}")
-        n += 1
-        yield words
-    if n == 0:
-        raise FlightError(f"{path}: there is nothing in it")
-
-
-def _numbers(path: Path, words: list[str]) -> list[float]:
-    try:
-        return [float(word) for word in words]
-    except ValueError as error:
-        raise FlightError(f"{path}: {' '.join(words)!r} are not numbers") from error
 
 
 def _stated(path: Path, width: int, height: int) -> Camera | None:

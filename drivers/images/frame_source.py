@@ -37,14 +37,11 @@ class FrameSource(Protocol):
     def own_times_ns(self) -> list[int]:
         """Times of the images in their file, which begin about zero."""
 
-    def epoch(self) -> tuple[int, str]:
-        """Unix time in ns of zero of these, as far as the file knows, and its source in words."""
-
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
         """Number and RGB image (H, W, 3) of images first..last, both included."""
 
 
-def find_frames(folder: Path) -> FrameSource:
+def find_frames(folder: Path) -> Video | ImageFolder:
     """The video or the images of a flight folder; FlightError unless there is one set."""
     videos = sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
     named = [p for p in videos if p.stem == "camera"]
@@ -99,7 +96,7 @@ class Video:
         return [round(pts * unit_ns) for pts in self._pts]
 
     def epoch(self) -> tuple[int, str]:
-        """Creation time of the file, else zero."""
+        """Unix time in ns of zero of these, as far as the file knows, and its source in words."""
         return self._created_ns, "the file's time of creation" if self._created_ns else "zero"
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
@@ -120,14 +117,10 @@ class Video:
                     expected += 1
                 if number > last:
                     return
-                usable = not frame.is_corrupt and (frame.width, frame.height) == (
-                    self.width,
-                    self.height,
-                )
-                yield (
-                    number,
-                    np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) if usable else None,
-                )
+                right = (frame.width, frame.height) == (self.width, self.height)
+                usable = right and not frame.is_corrupt
+                rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) if usable else None
+                yield number, rgb
                 expected = number + 1
         for number in range(expected, last + 1):
             yield number, None

@@ -6,6 +6,8 @@ import fcntl
 import os
 from pathlib import Path
 
+from companion.products.atomic_file import sync
+
 
 class GrowingFile:
     """A new file; OSError where it exists or cannot be made.
@@ -19,7 +21,7 @@ class GrowingFile:
         fcntl.flock(self._fd, fcntl.LOCK_EX)  # a check by `is_growing` holds it for a moment only
         self._size = 0
         for folder in (path.parent, path.parent.parent):
-            _sync_folder(folder)  # else a power cut could leave a file without a name
+            sync(folder)  # else a power cut could leave a file without a name
 
     def append(self, data: bytes) -> None:
         """Append all of it; OSError, and none of it stays, where there is no space."""
@@ -47,14 +49,6 @@ class GrowingFile:
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
-
-
-def _sync_folder(folder: Path) -> None:
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def is_growing(fd: int) -> bool:

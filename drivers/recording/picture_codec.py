@@ -61,7 +61,18 @@ def picture_encoder(config: RecorderConfig, width: int, height: int, rate_hz: fl
     return Raw()
 
 
-class Stills:
+class _EachAlone:
+    """Part of encoders whose images need no others."""
+
+    def request_intra(self) -> None:
+        """See `PictureEncoder`."""
+
+    def finish(self) -> list[EncodedPicture]:
+        """See `PictureEncoder`."""
+        return []
+
+
+class Stills(_EachAlone):
     """Each image by itself: as JPEG, or lossless as PNG, with a separate grey image if needed."""
 
     def __init__(self, form: str, parameters: list[int]) -> None:
@@ -77,15 +88,8 @@ class Stills:
         out = [EncodedPicture(IMAGE, frame.seq, frame.t_ns, serialised(image))]
         return out + _lossless_grey(frame) if self.name == "png" else out
 
-    def request_intra(self) -> None:
-        """See `PictureEncoder`."""
 
-    def finish(self) -> list[EncodedPicture]:
-        """See `PictureEncoder`."""
-        return []
-
-
-class Raw:
+class Raw(_EachAlone):
     """Uncompressed images; the chunk's compression makes them a little smaller."""
 
     name = "raw"
@@ -93,13 +97,6 @@ class Raw:
     def encode(self, frame: Frame) -> list[EncodedPicture]:
         """See `PictureEncoder`."""
         return [_raw(RAW, frame, frame.rgb, "rgb8"), *_lossless_grey(frame)]
-
-    def request_intra(self) -> None:
-        """See `PictureEncoder`."""
-
-    def finish(self) -> list[EncodedPicture]:
-        """See `PictureEncoder`."""
-        return []
 
 
 def still(topic: str, data: bytes | memoryview) -> Bytes | None:

@@ -76,11 +76,8 @@ def read_dataflash(path: Path) -> LogContent:
                 utc.append((boot_ns, fix_ns))
             for sample in _samples(name, values, chosen) if name != "EV" or not has_arm else ():
                 collected.add(boot_ns, 0, sample)
-        except (
-            KeyError,
-            TypeError,
-            ValueError,
-        ):  # another version's fields, or a damaged description
+        except (KeyError, TypeError, ValueError):
+            # another version's fields, or a damaged description
             collected.count("records of unknown form left out")
     found = clock_from_utc(utc)
     return LogContent(
