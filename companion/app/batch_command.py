@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from companion import __version__
-from companion.app.progress import NoProgress, Progress
+from companion.app.progress import Progress
 from companion.app.replay_command import RecordedInput, replay
 from companion.app.thumbnail import thumbnail
 from companion.config import Config
@@ -26,7 +26,7 @@ from companion.errors import CompanionError, InputError
 from companion.products.atomic_file import write_atomically
 from companion.products.report.batch_page import BatchResult, batch_page
 
-DONE, INDEX, THUMBNAIL = "batch.json", "index.html", "thumbnail.jpg"
+DONE, INDEX, REPORT, THUMBNAIL = "batch.json", "index.html", "report.json", "thumbnail.jpg"
 MOST_FILES = 1000
 """Files of a flight's folder checked for changes; a flight of images has its list besides."""
 
@@ -76,14 +76,14 @@ def replay_one(name: str, flight: Path, out: Path, config: Config, mark: str) ->
     folder = out / name
     try:
         given = RecordedInput(flight, config)
-        replay(given, folder, config, "none", NoProgress(), lambda remark: None)
+        replay(given, folder, config, "none", Progress(), lambda remark: None)
         write_atomically(folder / THUMBNAIL, thumbnail(flight, config.camera))
     except (CompanionError, OSError) as error:
         return BatchResult(name, flight, str(error), {})
     except Exception as error:  # a bug that one flight brings out must not cost the others
         return BatchResult(name, flight, f"{type(error).__name__}: {error}", {})
     write_atomically(folder / DONE, json.dumps({"mark": mark}).encode())
-    return BatchResult(name, flight, "", _report(folder) or {})
+    return BatchResult(name, flight, "", _object(folder / REPORT) or {})
 
 
 @contextmanager
@@ -116,7 +116,7 @@ def _cluster(scheduler: str | None, n_wanted: int) -> Iterator[Any]:
         with client:
             yield run
         return
-    n_workers = min(n_wanted, _n_cores())
+    n_workers = min(n_wanted, len(os.sched_getaffinity(0)))
     with (
         dask.LocalCluster(
             n_workers=n_workers, threads_per_worker=1, processes=True, memory_limit=0,
@@ -125,10 +125,6 @@ def _cluster(scheduler: str | None, n_wanted: int) -> Iterator[Any]:
         dask.Client(cluster) as client,
     ):  # fmt: skip
         yield run
-
-
-def _n_cores() -> int:
-    return max(1, len(os.sched_getaffinity(0)))
 
 
 def _named(flights: Sequence[Path]) -> dict[str, Path]:
@@ -161,19 +157,16 @@ def _mark(flight: Path, config: Config) -> str:
 
 def _done(folder: Path, mark: str) -> dict[str, Any] | None:
     """Report of a flight that was done with the same mark, or None."""
-    try:
-        said = json.loads((folder / DONE).read_bytes())
-    except (OSError, ValueError):
-        return None
-    return _report(folder) if isinstance(said, dict) and said.get("mark") == mark else None
+    said = _object(folder / DONE) or {}
+    return _object(folder / REPORT) if said.get("mark") == mark else None
 
 
-def _report(folder: Path) -> dict[str, Any] | None:
+def _object(path: Path) -> dict[str, Any] | None:
     try:
-        report = json.loads((folder / "report.json").read_bytes())
+        found = json.loads(path.read_bytes())
     except (OSError, ValueError):
         return None
-    return report if isinstance(report, dict) else None
+    return found if isinstance(found, dict) else None
 
 
 def _bytes(path: Path) -> bytes:

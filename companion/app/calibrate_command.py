@@ -104,12 +104,10 @@ def calibrate(
         raise InputError(f"--name {name}: wanted a name for a file, without folders")
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; --out wants a folder")
-    gathered = _Gathered(chart)
+    gathered, called = _Gathered(chart), source.name
     if isinstance(source, Path):
-        called = source.name
         _search(_frames(source), gathered, progress)
     else:
-        called = source.name
         _watch(source, gathered, model, progress)
     calibration = _judged(gathered, called, model)
     try:

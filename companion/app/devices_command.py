@@ -18,8 +18,8 @@ def devices(as_json: bool, verbose: bool = False) -> str:
     found_cameras, found_ports, compute = cameras(), serial_devices(), remeasured_devices()
     if as_json:
         document = {
-            "cameras": [_plain(each) for each in found_cameras],
-            "serial_ports": [_plain(each) for each in found_ports],
+            "cameras": [dataclasses.asdict(each) for each in found_cameras],
+            "serial_ports": [dataclasses.asdict(each) for each in found_ports],
             **_as_document(compute),
         }
         return _as_json(document)
@@ -76,10 +76,6 @@ def opencl_lines(compute: list[MeasuredDevice], verbose: bool) -> list[str]:
         why = why_taken(taken[0], compute).partition(": ")[0]
         lines.append(f"  auto takes {taken[0].number}: {why}")
     return lines
-
-
-def _plain(device: CameraDevice | SerialDevice) -> dict[str, Any]:
-    return dataclasses.asdict(device)
 
 
 def _camera(camera: CameraDevice) -> list[str]:

@@ -27,7 +27,7 @@ from drivers.recording.flights_folder import (
     may_go,
     recordings_in,
 )
-from drivers.recording.recording import Recording
+from drivers.recording.recording import with_pictures
 from drivers.recording.trimming import trim
 
 MB = 1 << 20
@@ -148,7 +148,7 @@ def trim_flight(
     path: Path, start_s: float | None, stop_s: float | None, out: Path, progress: Progress
 ) -> str:
     """Write a time span, in seconds from the first image, to a recording of its own."""
-    recording = _opened(path)
+    recording = with_pictures(path)
     try:
         first_ns, last_ns = recording.pictures[0].t_ns, recording.pictures[-1].t_ns
         start_ns = first_ns + round((start_s or 0.0) * 1e9)
@@ -167,7 +167,7 @@ def trim_flight(
 
 def export_flight(path: Path, out: Path, progress: Progress) -> str:
     """Write a recording as a flight folder."""
-    recording = _opened(path)
+    recording = with_pictures(path)
     try:
         progress.start(len(recording.pictures))
         export(recording, out, lambda n: progress.update(n, "written", 0))
@@ -208,14 +208,6 @@ def prune_flights(
     note = f", {kept} kept by a file named {KEEP}" if kept else ""
     lines.append(f"{len(going)} of {len(flights)} flights, {mb:.0f} MB{note}")
     return "\n".join(lines)
-
-
-def _opened(path: Path) -> Recording:
-    recording = Recording(path)
-    if not recording.pictures:
-        recording.close()
-        raise FlightError(f"{path}: there are no pictures in it")
-    return recording
 
 
 def _summaries(

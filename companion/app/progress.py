@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, TextIO
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn
@@ -11,8 +11,8 @@ from rich.progress import TimeRemainingColumn as RemainingColumn
 from rich.text import Text
 
 
-class Progress(Protocol):
-    """Receives updates between frames."""
+class Progress:
+    """Receives updates between frames; this one shows nothing."""
 
     def start(self, total_frames: int) -> None:
         """Called before the first frame; `total_frames` is 0 where unknown."""
@@ -24,20 +24,7 @@ class Progress(Protocol):
         """Called after the last frame."""
 
 
-class NoProgress:
-    """Null object."""
-
-    def start(self, total_frames: int) -> None:
-        """Show nothing."""
-
-    def update(self, done: int, state: str, n_points: int) -> None:
-        """Show nothing."""
-
-    def finish(self) -> None:
-        """Show nothing."""
-
-
-class TerminalProgress:
+class TerminalProgress(Progress):
     """Progress bar: frames (or `unit`) done, their rate, state, points."""
 
     def __init__(self, stream: TextIO, counted: str = "points", unit: str = "frames") -> None:
@@ -80,5 +67,5 @@ class _PerSecond(ProgressColumn):
 
 
 def progress_on(stream: TextIO, counted: str = "points", unit: str = "frames") -> Progress:
-    """Bar on a terminal, null object elsewhere."""
-    return TerminalProgress(stream, counted, unit) if stream.isatty() else NoProgress()
+    """Bar on a terminal, nothing elsewhere."""
+    return TerminalProgress(stream, counted, unit) if stream.isatty() else Progress()

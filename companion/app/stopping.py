@@ -55,7 +55,7 @@ class StopSignals:
             raise KeyboardInterrupt
 
 
-class _StoppableProgress:
+class _StoppableProgress(Progress):
     def __init__(self, inner: Progress, signals: StopSignals) -> None:
         self._inner = inner
         self._signals = signals

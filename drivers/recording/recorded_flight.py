@@ -20,7 +20,7 @@ from drivers.recording.flights_folder import RECORDING
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.picture_codec import grey_of, still
 from drivers.recording.recorder import CAMERA_JSON
-from drivers.recording.recording import PicturePlace, Recording
+from drivers.recording.recording import PicturePlace, Recording, with_pictures
 from drivers.recording.recording_topics import PROFILE, VIDEO
 from drivers.recording.video_codec import VideoDecoder
 from drivers.telemetry.telemetry_log import TelemetryLog, rates_hz
@@ -45,10 +45,6 @@ class RecordedPictures:
     def own_times_ns(self) -> list[int]:
         """Times of the flight."""
         return [place.t_ns for place in self.recording.pictures]
-
-    def epoch(self) -> tuple[int, str]:
-        """Zero: the times are the flight's."""
-        return 0, "the flight's own clock"
 
     def pictures(self, first: int, last: int) -> Iterator[tuple[int, Bytes | None]]:
         """Number and RGB image of images first..last; None where one cannot be decoded."""
@@ -119,10 +115,7 @@ def is_recording(path: Path) -> bool:
 
 def open_recording(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> RecordedFlight:
     """Open a recording, repaired if needed; FlightError where there is no flight in it."""
-    recording = Recording(path)
-    if not recording.pictures:
-        recording.close()
-        raise FlightError(f"{path}: there are no pictures in it")
+    recording = with_pictures(path)
     start_ns = recording.pictures[0].t_ns
     camera, missing = _camera(recording, config, start_ns)
     return RecordedFlight(recording, camera, telemetry_of(recording, telemetry, missing))

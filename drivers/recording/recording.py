@@ -137,6 +137,15 @@ class Recording:
         return self.found.chunks[number].after_loss or number - 1 in self._bad
 
 
+def with_pictures(path: Path) -> Recording:
+    """Open a recording; FlightError where it is invalid, or has no images."""
+    recording = Recording(path)
+    if not recording.pictures:
+        recording.close()
+        raise FlightError(f"{path}: there are no pictures in it")
+    return recording
+
+
 def _once_in_order(pictures: list[PicturePlace]) -> list[PicturePlace]:
     """Images whose number and time are both larger than those of the one before."""
     out: list[PicturePlace] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from companion.app.bench.bench_slam import bench_slam
-from companion.app.progress import NoProgress
+from companion.app.progress import Progress
 from companion.config import Config
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
@@ -17,7 +17,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     An autopilot that is told of a smaller error than there is will trust a wrong pose: not above
     1.5. Below 0.1 the pose would be worth less to it than it is.
     """
-    (row,) = bench_slam([SAMPLE], Config(), None, faults=False, above_m=None, progress=NoProgress())
+    (row,) = bench_slam([SAMPLE], Config(), None, faults=False, above_m=None, progress=Progress())
     assert row.nees is not None
     assert 0.1 < row.nees < 1.5
     # the heading's error hardly changes in a flight: within two standard deviations, and not said

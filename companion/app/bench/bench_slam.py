@@ -202,7 +202,6 @@ def _longest_gap_s(due_ns: Array, known: NDArray[np.bool_]) -> float:
 
 def _nees(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
     """NEES of the displacement over ten seconds, in the true attitude's frame at its start."""
-    body_from_camera = stage.camera_from_body.inverse()
     known = [o for o in odometry if o.world_from_body is not None]
     times = np.array([o.t_ns for o in known])
     ratios = []
@@ -210,15 +209,9 @@ def _nees(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> fl
         j = int(np.searchsorted(times, start.t_ns + NEES_NS))
         if j >= len(known) or known[j].reset_counter != start.reset_counter:
             continue
-        poses = []
-        for o in (start, known[j]):
-            assert o.world_from_body is not None
-            poses.append(o.world_from_body @ body_from_camera)
-        m, n = (int(np.abs(truth.t_ns - o.t_ns).argmin()) for o in (start, known[j]))
-        way = poses[0].rotation.T @ (poses[1].translation - poses[0].translation)
-        true = truth.rotations[m].T @ (truth.centres[n] - truth.centres[m])
+        error = _step_error(start, known[j], truth, stage)
         variance = known[j].sigma_position_m ** 2
-        ratios.append(float(((way - true) ** 2).sum()) / (3.0 * variance))
+        ratios.append(float((error**2).sum()) / (3.0 * variance))
     return round(float(np.mean(ratios)), 2) if ratios else None
 
 
@@ -235,23 +228,28 @@ def _nees_yaw(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -
     return round(float(np.mean(ratios)), 3) if ratios else None
 
 
+def _step_error(start: Odometry, end: Odometry, truth: Path, stage: LocalisationStage) -> Array:
+    """Error (3,) of the camera's displacement, in its attitude at the start."""
+    assert start.world_from_body is not None and end.world_from_body is not None
+    body_from_camera = stage.camera_from_body.inverse()
+    a, b = start.world_from_body @ body_from_camera, end.world_from_body @ body_from_camera
+    i, j = (int(np.abs(truth.t_ns - o.t_ns).argmin()) for o in (start, end))
+    step = a.rotation.T @ (b.translation - a.translation)
+    true = truth.rotations[i].T @ (truth.centres[j] - truth.centres[i])
+    return np.asarray(step - true, np.float64)
+
+
 def _worst_step(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
     """Largest RPE between consecutive odometry poses without a reset between them, metres."""
-    camera = stage.camera_from_body
     worst: float | None = None
     before: Odometry | None = None
     for now in odometry:
         if now.world_from_body is None:
             continue
         if (
-            before is not None and before.world_from_body is not None
-            and now.reset_counter == before.reset_counter and now.t_ns - before.t_ns < STEP_NS
+            before is not None and now.reset_counter == before.reset_counter
+            and now.t_ns - before.t_ns < STEP_NS
         ):  # fmt: skip
-            i, j = (int(np.abs(truth.t_ns - o.t_ns).argmin()) for o in (before, now))
-            a = before.world_from_body @ camera.inverse()
-            b = now.world_from_body @ camera.inverse()
-            step = a.rotation.T @ (b.translation - a.translation)
-            true = truth.rotations[i].T @ (truth.centres[j] - truth.centres[i])
-            worst = max(worst or 0.0, float(np.linalg.norm(step - true)))
+            worst = max(worst or 0.0, float(np.linalg.norm(_step_error(before, now, truth, stage))))
         before = now
     return worst

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from companion.app.calibrate_command import calibrate, print_board
-from companion.app.progress import NoProgress
+from companion.app.progress import Progress
 from companion.errors import InputError
 from companion.messages import Bytes
 from drivers.camera.camera_source import EndOfPictures, Picture
@@ -61,7 +61,7 @@ def video_of(pictures: Sequence[Bytes], path: Path) -> Path:
     return path
 
 
-class Ended(NoProgress):
+class Ended(Progress):
     """Its user presses Ctrl-C after so many updates, and reads what is said until then."""
 
     def __init__(self, after: int) -> None:
@@ -186,7 +186,7 @@ def test_bad_views_are_refused(shown, board: str, said: str, tmp_path: Path) -> 
     source = folder_of(shown(), tmp_path / "views")
     out = tmp_path / "cameras"
     with pytest.raises(InputError) as refused:
-        calibrate(source, board, "front", out, "radtan", NoProgress())
+        calibrate(source, board, "front", out, "radtan", Progress())
     assert said in str(refused.value) and "\n" not in str(refused.value)
     assert not out.exists()
 
@@ -203,7 +203,7 @@ def test_bad_views_are_refused(shown, board: str, said: str, tmp_path: Path) -> 
 )
 def test_usage(name: str, board: str, model: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=said):
-        calibrate(tmp_path / "none.mp4", board, name, tmp_path / "out", model, NoProgress())
+        calibrate(tmp_path / "none.mp4", board, name, tmp_path / "out", model, Progress())
 
 
 def test_out_that_is_a_file(tmp_path: Path) -> None:
@@ -211,7 +211,7 @@ def test_out_that_is_a_file(tmp_path: Path) -> None:
     out.write_text("")
     camera = BoardBeforeCamera([])
     with pytest.raises(InputError, match="is a file"):
-        calibrate(camera, CHARUCO, "front", out, "radtan", NoProgress())
+        calibrate(camera, CHARUCO, "front", out, "radtan", Progress())
     assert not camera.opened  # nobody holds a board before a camera for nothing
 
 
@@ -239,7 +239,7 @@ def test_live_camera_stopped_before_there_is_enough(tmp_path: Path) -> None:
 def test_live_camera_at_its_end(tmp_path: Path) -> None:
     camera = BoardBeforeCamera(well_shown(RADTAN, CHARUCO, 0.0)[:1])
     with pytest.raises(InputError, match="only 1 view"):
-        calibrate(camera, CHARUCO, "front", tmp_path / "out", "radtan", NoProgress())
+        calibrate(camera, CHARUCO, "front", tmp_path / "out", "radtan", Progress())
     assert camera.closed
 
 
@@ -247,5 +247,5 @@ def test_live_camera_that_changes_its_size(tmp_path: Path) -> None:
     first, second, third, *_ = well_shown(RADTAN, CHARUCO, 0.0)
     camera = BoardBeforeCamera([first, second, third[:240]])
     with pytest.raises(InputError, match="640 x 240, those before were 640 x 480"):
-        calibrate(camera, CHARUCO, "front", tmp_path / "out", "radtan", NoProgress())
+        calibrate(camera, CHARUCO, "front", tmp_path / "out", "radtan", Progress())
     assert camera.closed

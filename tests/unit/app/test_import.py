@@ -10,7 +10,7 @@ import pytest
 
 from companion.app.cli import main
 from companion.app.import_command import import_flight
-from companion.app.progress import NoProgress
+from companion.app.progress import Progress
 from companion.config import CameraConfig, Config
 from companion.errors import FlightError, InputError
 from companion.geometry.camera import Camera
@@ -41,7 +41,7 @@ def flown() -> Piece:
 
 def imported(source: Path, out: Path) -> tuple[Flight, list[str]]:
     told: list[str] = []
-    n = import_flight(source, out, Config(), NoProgress(), told.append)
+    n = import_flight(source, out, Config(), Progress(), told.append)
     flight = open_flight(out, CameraConfig())
     assert format_of(out).name == "flight folder"
     assert flight.n_frames == n
@@ -107,7 +107,7 @@ def test_euroc_with_a_hole(tmp_path: Path, flown: Piece) -> None:
 @pytest.mark.parametrize("origin", [None, GeoOrigin(-35.36, 149.17, 584.0)])
 def test_as_a_recording(tmp_path: Path, flown: Piece, origin: GeoOrigin | None) -> None:
     write_bag(tmp_path / "bag", "mcap", flown, origin=origin)
-    n = import_flight(tmp_path / "bag", tmp_path / "a.mcap", Config(), NoProgress(), print)
+    n = import_flight(tmp_path / "bag", tmp_path / "a.mcap", Config(), Progress(), print)
     flight = open_flight(tmp_path / "a.mcap", CameraConfig())
     assert format_of(tmp_path / "a.mcap").name == "recording"
     assert flight.n_frames == n
@@ -115,7 +115,7 @@ def test_as_a_recording(tmp_path: Path, flown: Piece, origin: GeoOrigin | None) 
     assert len(heights) == (origin is not None)
     assert_same(flight, open_flight(tmp_path / "bag", CameraConfig()))
     with pytest.raises(FlightError, match="is there already"):
-        import_flight(tmp_path / "bag", tmp_path / "a.mcap", Config(), NoProgress(), print)
+        import_flight(tmp_path / "bag", tmp_path / "a.mcap", Config(), Progress(), print)
 
 
 def test_warning_lines_may_be_damaged(tmp_path: Path) -> None:
@@ -130,9 +130,7 @@ def test_recording_that_cannot_be_written(tmp_path: Path, flown: Piece) -> None:
     write_remode(tmp_path / "flown", flown)
     (tmp_path / "file").write_text("")
     with pytest.raises(FlightError, match="cannot be written"):
-        import_flight(
-            tmp_path / "flown", tmp_path / "file" / "a.mcap", Config(), NoProgress(), print
-        )
+        import_flight(tmp_path / "flown", tmp_path / "file" / "a.mcap", Config(), Progress(), print)
 
 
 def test_sample(tmp_path: Path) -> None:
@@ -175,7 +173,7 @@ def test_nothing_is_overwritten(tmp_path: Path, flown: Piece) -> None:
 def test_nothing_is_left_of_an_import_that_fails(tmp_path: Path, flown: Piece) -> None:
     write_remode(tmp_path / "flown", flown)
 
-    class Stopped(NoProgress):
+    class Stopped(Progress):
         def update(self, done: int, state: str, n_points: int) -> None:
             raise KeyboardInterrupt
 

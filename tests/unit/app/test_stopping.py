@@ -6,13 +6,13 @@ import signal
 
 import pytest
 
-from companion.app.progress import NoProgress, TerminalProgress, progress_on
+from companion.app.progress import Progress, TerminalProgress, progress_on
 from companion.app.stopping import StopSignals
 
 
 def test_signal_while_frames_run_waits_for_the_end_of_the_frame() -> None:
     with StopSignals() as signals:
-        progress = signals.between_frames(NoProgress())
+        progress = signals.between_frames(Progress())
         progress.start(3)
         progress.update(1, "tracking", 0)
         os.kill(os.getpid(), signal.SIGTERM)
@@ -23,7 +23,7 @@ def test_signal_while_frames_run_waits_for_the_end_of_the_frame() -> None:
 
 def test_second_signal_does_not_wait() -> None:
     with StopSignals() as signals:
-        signals.between_frames(NoProgress()).start(3)
+        signals.between_frames(Progress()).start(3)
         os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
@@ -32,7 +32,7 @@ def test_second_signal_does_not_wait() -> None:
 
 def test_signal_outside_the_frames_stops_at_once() -> None:
     with StopSignals() as signals:
-        progress = signals.between_frames(NoProgress())
+        progress = signals.between_frames(Progress())
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
         progress.start(1)
@@ -41,7 +41,7 @@ def test_signal_outside_the_frames_stops_at_once() -> None:
 
 def test_signal_after_the_last_frame_lets_the_results_be_written() -> None:
     with StopSignals() as signals:
-        progress = signals.between_frames(NoProgress())
+        progress = signals.between_frames(Progress())
         progress.start(1)
         progress.update(1, "tracking", 0)
         progress.finish()
@@ -53,7 +53,7 @@ def test_signal_after_the_last_frame_lets_the_results_be_written() -> None:
 
 def test_progress_can_be_finished_after_a_stop() -> None:
     with StopSignals() as signals:
-        progress = signals.between_frames(NoProgress())
+        progress = signals.between_frames(Progress())
         progress.start(3)
         os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
