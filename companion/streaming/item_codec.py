@@ -88,7 +88,7 @@ LENS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 def encode(item: Item) -> bytes:
-    """Bytes of an item; a raw image has none."""
+    """Bytes of an item; a raw image has none, and of places each has its own, `encode_place`."""
     if isinstance(item, FlightItem):
         return _flight(item)
     if isinstance(item, PoseItem):
@@ -97,11 +97,6 @@ def encode(item: Item) -> bytes:
         return TIME.pack(item.t_ns) + zlib.compress(json.dumps(dict(item.facts)).encode())
     if isinstance(item, LogItem):
         return TIME.pack(item.t_ns) + bytes([item.is_warning]) + item.text.encode()
-    if isinstance(item, PlacesItem):
-        head = TIME.pack(item.t_ns)
-        if item.world_from_map is not None:
-            head += encode_place(WORLD, item.world_from_map)
-        return head + b"".join(encode_place(k, place) for k, place in item.places.items())
     if isinstance(item, PathItem):
         return PIECE.pack(item.t_ns, item.piece, item.keyframe_id) + _floats(item.strip)
     if isinstance(item, AutopilotPathItem):

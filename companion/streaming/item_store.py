@@ -12,7 +12,7 @@ from typing import Protocol
 
 from companion.streaming.item_codec import Kind
 from companion.streaming.items import FlightItem, ImageItem, Item, StatusItem
-from companion.streaming.parts import NEWEST, Part, parts_of
+from companion.streaming.parts import NEWEST, Part
 
 MOST_LOG_LINES = 200
 MOST_PIECES = 20_000
@@ -59,12 +59,8 @@ class ItemStore:
         """Payload of an item; None where it was evicted."""
         return self._held[kind].get(key)
 
-    def take(self, item: Item) -> None:
-        """Keep an item; replaces an older one with the same key."""
-        self.put(item, parts_of(item))
-
     def put(self, item: Item, parts: Iterable[Part]) -> None:
-        """The same, with the parts encoded already: encoding takes time."""
+        """Keep an item, encoded already as `parts`; replaces an older one with the same key."""
         if isinstance(item, ImageItem):
             self.image = item
             self._tell(Kind.PICTURE, NEWEST)

@@ -29,6 +29,9 @@ COARSE_CELLS = 60
 COARSE_MOST = 1500
 NEWEST = 0
 """Key of items of which there is only one."""
+SINGLE: dict[type[Item], Kind] = {
+    PoseItem: Kind.POSE, FlightItem: Kind.FLIGHT, DepthItem: Kind.DEPTH, LogItem: Kind.LOG,
+}  # fmt: skip
 
 
 class Part(NamedTuple):
@@ -48,18 +51,11 @@ def parts_of(item: Item) -> list[Part]:
         if item.world_from_map is not None:
             parts.append(Part(Kind.PLACES, WORLD, encode_place(WORLD, item.world_from_map)))
         return parts
-    if isinstance(item, PoseItem):
-        return [Part(Kind.POSE, NEWEST, encode(item))]
-    if isinstance(item, FlightItem):
-        return [Part(Kind.FLIGHT, NEWEST, encode(item))]
-    if isinstance(item, DepthItem):
-        return [Part(Kind.DEPTH, NEWEST, encode(item))]
-    if isinstance(item, LogItem):
-        return [Part(Kind.LOG, NEWEST, encode(item))]
-    if isinstance(item, PathItem):
-        return [Part(Kind.PATH, item.piece, encode(item))]
-    if isinstance(item, AutopilotPathItem):
-        return [Part(Kind.AUTOPILOT, item.piece, encode(item))]
+    if isinstance(item, PathItem | AutopilotPathItem):
+        kind = Kind.PATH if isinstance(item, PathItem) else Kind.AUTOPILOT
+        return [Part(kind, item.piece, encode(item))]
+    if type(item) in SINGLE:
+        return [Part(SINGLE[type(item)], NEWEST, encode(item))]
     return []
 
 

@@ -13,6 +13,7 @@ from companion.streaming.items import (
     FINE,
     FlightItem,
     ImageItem,
+    Item,
     LogItem,
     PathItem,
     PictureItem,
@@ -43,10 +44,14 @@ CHUNKS = [points(k) for k in range(12)]
 PARTS = [parts_of(chunk) for chunk in CHUNKS]
 
 
+def take(store: ItemStore, item: Item) -> None:
+    store.put(item, parts_of(item))
+
+
 def filled(n_keyframes: int) -> ItemStore:
     """A store with a map of so many keyframes."""
     store = ItemStore(ROOM)
-    store.take(FlightItem("a", "flight", CAMERA))
+    take(store, FlightItem("a", "flight", CAMERA))
     for k in range(n_keyframes):
         place(store, k)
         add_points(store, k)
@@ -64,7 +69,7 @@ def add_points(store: ItemStore, k: int) -> None:
 
 def place(store: ItemStore, k: int, shift: float = 0.0) -> None:
     where = Similarity(1.0, np.eye(3), np.array([k + shift, 0.0, 0.0]))
-    store.take(PlacesItem(k, {k: where}))
+    take(store, PlacesItem(k, {k: where}))
 
 
 def flying(store: ItemStore) -> Callable[[float], None]:
@@ -81,11 +86,11 @@ def flying(store: ItemStore) -> Callable[[float], None]:
 
         t_ns = int(now_s * 1e9)
         if is_due("pose", POSE_EVERY_S):
-            store.take(PoseItem(t_ns, Shown.TRACKING, Pose.identity(), 100, 80, 12.0, 3.0))
+            take(store, PoseItem(t_ns, Shown.TRACKING, Pose.identity(), 100, 80, 12.0, 3.0))
         if is_due("image", IMAGE_EVERY_S):
-            store.take(ImageItem(t_ns, SMOOTH))
+            take(store, ImageItem(t_ns, SMOOTH))
         if is_due("status", 1.0):
-            store.take(StatusItem(t_ns, {"state": "Tracking", "rate_hz": 30.0}))
+            take(store, StatusItem(t_ns, {"state": "Tracking", "rate_hz": 30.0}))
         if is_due("points", CHUNK_EVERY_S):
             n[0] += 1
             place(store, n[0])
@@ -217,12 +222,12 @@ def test_a_viewer_that_takes_nothing_is_sent_little_and_makes_nothing_grow() -> 
 
 def test_the_store_is_bounded_and_gives_up_the_finest_of_the_oldest() -> None:
     one = ItemStore(ROOM)
-    one.take(CHUNKS[0])
+    take(one, CHUNKS[0])
     store = ItemStore(16 * one.points_bytes)
     for k in range(30):
         add_points(store, k)
     for n in range(500):
-        store.take(LogItem(n, "said"))
+        take(store, LogItem(n, "said"))
     assert store.points_bytes <= 16 * one.points_bytes
     assert store.n_evicted["fine"] > 15 and store.n_evicted["coarse"] == 0
     assert store.n_evicted["log"] == 300
@@ -249,7 +254,7 @@ def test_a_viewer_learns_what_its_link_does() -> None:
 def test_levels_together_are_all_points_and_a_path_is_what_it_was() -> None:
     store = filled(1)
     strip = np.array([[0, 0, 0], [1, 2, 3.5]], np.float32)
-    store.take(PathItem(5, 7, 0, strip))
+    take(store, PathItem(5, 7, 0, strip))
     link = ThinLink(Session(store), 2_500_000, 0.01)
     link.run(2.0)
     items = [i for _, i in link.arrived]
