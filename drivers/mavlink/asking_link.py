@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import defaultdict
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from typing import Any
@@ -51,10 +51,9 @@ class AskingLink:
         """Send a message as our component; never waits, never fails."""
         self.port.send(message)
 
-    def listen(self, message_id: int, take: OnMessage) -> Callable[[], None]:
-        """Call back with every message of a type from the autopilot; call the result to stop."""
+    def listen(self, message_id: int, take: OnMessage) -> None:
+        """Call back with every message of a type from the autopilot."""
         self._takers[message_id].append(take)
-        return lambda: self._takers[message_id].remove(take)
 
     async def found(self, patience_s: float) -> Vehicle:
         """The vehicle, once a heartbeat has come. SourceError if none comes in time."""

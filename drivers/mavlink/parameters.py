@@ -55,8 +55,8 @@ class VehicleLink(Protocol):
     def send(self, message: Any) -> None:
         """Send a message as our component."""
 
-    def listen(self, message_id: int, take: OnMessage) -> Callable[[], None]:
-        """Call back with every message of a type from the autopilot; call the result to stop."""
+    def listen(self, message_id: int, take: OnMessage) -> object:
+        """Call back with every message of a type from the autopilot."""
 
 
 class Parameters:
@@ -73,15 +73,8 @@ class Parameters:
         self._unknown: set[str] = set()
         self._came = asyncio.Event()
         self._slowest_s: float | None = None
-        self._ends = (
-            link.listen(mavlink.MAVLINK_MSG_ID_PARAM_VALUE, self._take_value),
-            link.listen(mavlink.MAVLINK_MSG_ID_PARAM_ERROR, self._take_error),
-        )
-
-    def close(self) -> None:
-        """Stop listening."""
-        for end in self._ends:
-            end()
+        link.listen(mavlink.MAVLINK_MSG_ID_PARAM_VALUE, self._take_value)
+        link.listen(mavlink.MAVLINK_MSG_ID_PARAM_ERROR, self._take_error)
 
     async def read(self, names: Iterable[str]) -> dict[str, Parameter]:
         """Read those of the named that exist. SourceError if the autopilot answers for none."""

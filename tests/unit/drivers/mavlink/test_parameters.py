@@ -19,7 +19,6 @@ def asking(autopilot: FakeAutopilot, ask: Callable[[Parameters], Awaitable[None]
         async with asking_link(LinkConfig(url=autopilot.url), 3.0) as (link, _, _):
             parameters = Parameters(link)
             await ask(parameters)
-            parameters.close()
 
     with autopilot:
         asyncio.run(run())
