@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.config import DepthConfig
-from companion.dense.fusion import points_of
+from companion.dense.fusion import pixels_of, points_of
 from companion.dense.normals import MAX_STEP
 from companion.geometry.transforms import Array, Pose
 from companion.messages import DepthMap, Floats, PixelState
@@ -211,7 +211,7 @@ def _measured_at(
 
     nan where it has none.
     """
-    row, column, z, inside = _pixels(other_from_here.apply(points), other)
+    row, column, z, inside = pixels_of(other_from_here.apply(points), other)
     known = inside & measured[row, column] & (other.depth[row, column] > 0)
     seen = np.where(known, other.depth[row, column], np.nan)
     sure = known & (other.state[row, column] == PixelState.CONVERGED.value)
@@ -227,7 +227,7 @@ def _projected(
     """
     known = (other.state == PixelState.CONVERGED.value) & (other.depth > 0)
     rows, columns = np.nonzero(known)
-    row, column, z, inside = _pixels(here_from_other.apply(points_of(other, rows, columns)), here)
+    row, column, z, inside = pixels_of(here_from_other.apply(points_of(other, rows, columns)), here)
     source = np.flatnonzero(inside)
     width = here.depth.shape[1]
     # positive floats order as their bits: one minimum gives the nearest depth and its index
@@ -242,20 +242,6 @@ def _projected(
         return np.full(len(points), np.nan), np.full(len(points), np.nan)
     sigma = (other.sigma[rows, columns] / other.depth[rows, columns])[nearest]
     return np.where(hit, z[nearest] / points[:, 2] - 1.0, np.nan), np.where(hit, sigma, np.nan)
-
-
-def _pixels(
-    points: Array, depth_map: DepthMap
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Mask]:
-    """Row, column and depth of points (N, 3) in the image of a map, and which are inside."""
-    fx, fy, cx, cy = depth_map.intrinsics
-    height, width = depth_map.depth.shape
-    front = points[:, 2] > 1e-6
-    z = np.where(front, points[:, 2], 1.0)
-    u, v = np.rint(fx * points[:, 0] / z + cx), np.rint(fy * points[:, 1] / z + cy)
-    inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    row, column = (np.where(inside, x, 0).astype(np.int64) for x in (v, u))
-    return row, column, z, inside
 
 
 def _mean(difference: Array, sigma: Array, near: Mask) -> tuple[Array, Array]:

@@ -132,15 +132,7 @@ class Fusion:
         self, points: Array, other_from_here: Similarity, other: _RecentMap, local_scale: float
     ) -> _Agreement:
         """Agreement of another map, its depths scaled by `local_scale`, with points (N, 3)."""
-        p = other_from_here.apply(points)
-        fx, fy, cx, cy = other.map.intrinsics
-        height, width = other.map.depth.shape
-        front = p[:, 2] > 1e-6
-        z = np.where(front, p[:, 2], 1.0)
-        u = np.rint(fx * p[:, 0] / z + cx)
-        v = np.rint(fy * p[:, 1] / z + cy)
-        inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        row, column = (np.where(inside, x, 0).astype(np.int64) for x in (v, u))
+        row, column, z, inside = pixels_of(other_from_here.apply(points), other.map)
         seen = np.where(inside, other.map.depth[row, column], 0.0)
         difference: Array = local_scale * seen / z - 1.0
         agrees: Mask = (seen > 0) & (np.abs(difference) < self._config.agreement)
@@ -156,6 +148,18 @@ def points_of(depth_map: DepthMap, rows: Indices, columns: Indices) -> Array:
     fx, fy, cx, cy = depth_map.intrinsics
     z = depth_map.depth[rows, columns].astype(np.float64)
     return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], 1)
+
+
+def pixels_of(points: Array, depth_map: DepthMap) -> tuple[Indices, Indices, Array, Mask]:
+    """Row, column and depth of points (N, 3) in the image of a map, and which are inside."""
+    fx, fy, cx, cy = depth_map.intrinsics
+    height, width = depth_map.depth.shape
+    front = points[:, 2] > 1e-6
+    z = np.where(front, points[:, 2], 1.0)
+    u, v = np.rint(fx * points[:, 0] / z + cx), np.rint(fy * points[:, 1] / z + cy)
+    inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    row, column = (np.where(inside, x, 0).astype(np.int64) for x in (v, u))
+    return row, column, z, inside
 
 
 def chunk_alone(depth_map: DepthMap) -> PointChunk:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ def report(
         "path_length": round(path_length(poses), 3),
         **_scale(result),
         "clock": _clock(facts),
-        "origin": _origin(facts),
+        "origin": None if facts.origin is None else asdict(facts.origin),
         "camera": _camera(facts),
         "speed": {
             "wall_s": round(facts.wall_s, 3),
@@ -126,16 +127,6 @@ def _clock(facts: RunFacts) -> dict[str, Any] | None:
         "drift_ppm": round(facts.clock.drift_ppm, 3),
         "sigma_ms": _finite(facts.clock.sigma_ms),
         "reboots": facts.clock.n_reboots,
-    }
-
-
-def _origin(facts: RunFacts) -> dict[str, float] | None:
-    if facts.origin is None:
-        return None
-    return {
-        "latitude_deg": facts.origin.latitude_deg,
-        "longitude_deg": facts.origin.longitude_deg,
-        "altitude_m": facts.origin.altitude_m,
     }
 
 
