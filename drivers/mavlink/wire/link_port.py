@@ -10,11 +10,14 @@ from __future__ import annotations
 from companion.config import LinkConfig, RouterConfig
 from companion.timing.clock import FlightClock
 from drivers.mavlink.wire.link_url import link_endpoint
-from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
+from drivers.mavlink.wire.message_port import MavlinkPort
 
 
-def link_port(config: LinkConfig, router: RouterConfig, clock: FlightClock) -> PymavlinkPort:
-    """Port of `link.url`; ConfigError where invalid. MAVSDK is imported only where it is chosen."""
+def link_port(config: LinkConfig, router: RouterConfig, clock: FlightClock) -> MavlinkPort:
+    """Port of `link.url`; ConfigError where invalid. Imports the chosen library only."""
+    # the daemon imports this file; a run without a link needs neither library
+    from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
+
     if config.backend == "mavsdk":
         from drivers.mavlink.wire.mavsdk_wire import MavsdkWire
 

@@ -52,7 +52,10 @@ async def until(true: Callable[[], Any], timeout_s: float = 5.0) -> None:
 
 
 def port_of(url: str, clients: tuple[str, ...] = (), **link: Any) -> PymavlinkPort:
-    return link_port(LinkConfig(url=url, backend="mavsdk", **link), RouterConfig(clients), CLOCK)
+    config = LinkConfig(url=url, **{"backend": "mavsdk", **link})
+    port = link_port(config, RouterConfig(clients), CLOCK)
+    assert isinstance(port, PymavlinkPort)
+    return port
 
 
 def kinds(heard: Heard) -> list[str]:
@@ -204,8 +207,7 @@ def test_both_backends_give_the_same_of_a_recorded_flight() -> None:
 
     async def heard_by(backend: Literal["pymavlink", "mavsdk"]) -> list[str]:
         place = free_port()
-        config = LinkConfig(url=f"udpin:127.0.0.1:{place}", backend=backend)
-        port = link_port(config, RouterConfig(), CLOCK)
+        port = port_of(f"udpin:127.0.0.1:{place}", backend=backend)
         async with running(port) as heard:
             await until(lambda: port.connected)
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
