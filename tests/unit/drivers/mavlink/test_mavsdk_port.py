@@ -331,11 +331,18 @@ def test_clients_share_the_link() -> None:
                 async with running(port):
                     await until(lambda: port.connected)
                     port.send(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
-                    await until(lambda: client.listen() and client.got[-1].get_srcComponent() == 1)
+                    await until(
+                        lambda: (
+                            client.listen() and any(g.get_srcComponent() == 1 for g in client.got)
+                        )
+                    )
                     client.codec.srcSystem, client.codec.srcComponent = 255, 190
                     client.send(mavlink.MAVLink_param_request_read_message(1, 1, b"EKF2_EN", -1))
                     await until(
-                        lambda: client.listen() and client.got[-1].get_type() == "PARAM_VALUE"
+                        lambda: (
+                            client.listen()
+                            and any(g.get_type() == "PARAM_VALUE" for g in client.got)
+                        )
                     )
         finally:
             client.close()
