@@ -91,7 +91,7 @@ def _cluster(scheduler: str | None, n_wanted: int) -> Iterator[Any]:
     try:
         import distributed
     except ImportError as error:
-        raise InputError("companion batch needs Dask: pip install distributed") from error
+        raise InputError("companion batch needs Dask: pip install '.[batch]' in a clone") from error
     dask: Any = distributed  # whose calls carry no types
 
     def run(out: Path, todo: dict[str, tuple[Path, str]], config: Config) -> Iterator[BatchResult]:

@@ -129,7 +129,7 @@ def _library() -> Any:
     try:
         import zenoh
     except ImportError as error:
-        raise InputError("[distributed] needs Zenoh: pip install eclipse-zenoh") from error
+        raise InputError("[distributed] needs Zenoh: pip install '.[distributed]' in a clone") from error
     return zenoh
 
 

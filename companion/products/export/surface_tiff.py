@@ -36,7 +36,7 @@ def _tiff(bands: NDArray[Any], surface: Surface, frame: MapFrame, **options: obj
         from rasterio import Affine
         from rasterio.io import MemoryFile
     except ImportError as error:
-        raise InputError("GeoTIFF wants rasterio: pip install rasterio") from error
+        raise InputError("GeoTIFF needs rasterio: pip install '.[survey]' in a clone") from error
     count, height, width = bands.shape
     transform = Affine(surface.cell_m, 0, surface.west, 0, -surface.cell_m, surface.north)
     with MemoryFile() as memory:

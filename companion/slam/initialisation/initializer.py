@@ -105,8 +105,8 @@ def initialise(
 def _explained_by_rotation(matches: _Matches, focal_px: float) -> Bools:
     """Mask (N,) of matches explained by rotation alone, which carry no baseline.
 
-    None if that rotation contradicts `rotation_prior`: a short translation over a plane resembles a
-    rotation.
+    All False if that rotation contradicts `rotation_prior`: a short translation over a plane
+    resembles a rotation.
     """
     rays_a, rays_b = _unit_rays(matches.xa), _unit_rays(matches.xb)
     weight = np.ones(len(rays_a))

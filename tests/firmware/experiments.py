@@ -1,0 +1,180 @@
+"""The table of experiments: each is one flight, or one try on the ground."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from tests.firmware import manoeuvres
+from tests.firmware.faults import FAULTS, suffer
+from tests.firmware.figures import Figures
+from tests.firmware.trial import Conditions, Trial
+
+Flown = Callable[[Trial, Figures], None]
+HOLD_S, READY_S = 60.0, 30.0
+SET_EKF_SOURCE_SET = 42007
+GLITCH_DEG = 50.0 / 111319.0
+SECOND_SOURCE = {
+    "VISO_TYPE": 1, "VISO_DELAY_MS": 80, "EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 3,
+    "EK3_SRC1_VELZ": 3, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6, "EK3_SRC2_VELZ": 6,
+    "EK3_SRC2_POSZ": 1, "EK3_SRC2_YAW": 1,
+}  # fmt: skip
+
+
+def _up(trial: Trial, figures: Figures) -> bool:
+    trial.start_daemon()
+    return manoeuvres.get_ready(trial, figures) and manoeuvres.take_off(trial, figures)
+
+
+def take_off(trial: Trial, figures: Figures) -> None:
+    """No GPS from power-on; up, hold, down."""
+    stood = trial.ground.place_m
+    if _up(trial, figures):
+        manoeuvres.keep_place(trial, figures, "hold after take-off", 15.0)
+        manoeuvres.land(trial, figures, stood)
+
+
+def tour(trial: Trial, figures: Figures) -> None:
+    """No GPS from power-on; hold, squares, circle, climb, full turn, landing where it took off."""
+    stood = trial.ground.place_m
+    if not _up(trial, figures):
+        return
+    trial.mark(f"holds in {trial.pilot.holds_in}: {trial.pilot.set_mode(trial.pilot.holds_in)}")
+    time.sleep(manoeuvres.SETTLE_S)
+    manoeuvres.keep_place(trial, figures, "hold", HOLD_S)
+    manoeuvres.ready_to_go(trial)
+    home, yaw_rad = trial.ground.believed_m, manoeuvres.believed_yaw(trial)
+    manoeuvres.fly_square(trial, figures, 4.0, 0.15)
+    manoeuvres.fly_square(trial, figures, 20.0, 0.3)
+    manoeuvres.fly_circle(trial, figures)
+    manoeuvres.climb(trial, figures)
+    manoeuvres.turn(trial, figures)
+    trial.pilot.go_to(np.array([*home[:2], trial.ground.believed_m[2]]), yaw_rad)
+    time.sleep(manoeuvres.SETTLE_S)
+    manoeuvres.land(trial, figures, stood)
+
+
+def wander(trial: Trial, figures: Figures) -> None:
+    """Five minutes about, and back over known ground."""
+    if not _up(trial, figures):
+        return
+    manoeuvres.ready_to_go(trial)
+    start, true_start = trial.ground.believed_m, manoeuvres.mean_place(trial)
+    yaw_rad, rng = manoeuvres.believed_yaw(trial), np.random.default_rng(trial.conditions.seed)
+    end_s = time.time() + 300.0
+    while time.time() < end_s and trial.ground.armed:
+        way = np.append(rng.uniform(-12, 12, 2), rng.uniform(-4, 0))
+        trial.pilot.go_to(start + way, yaw_rad + rng.uniform(-1, 1), within_m=1.0)
+    trial.pilot.go_to(start, yaw_rad)
+    time.sleep(manoeuvres.SETTLE_S)
+    off = manoeuvres.mean_place(trial) - true_start
+    figures.add("drift after five minutes", float(np.linalg.norm(off)), "m", 0.3)
+    trial.pilot.land()
+
+
+def faults(trial: Trial, figures: Figures) -> None:
+    """Camera, cable and companion fail in the air, one after the other."""
+    if not _up(trial, figures):
+        return
+    trial.pilot.set_mode(trial.pilot.holds_in)
+    time.sleep(manoeuvres.SETTLE_S)
+    wanted = [w.removeprefix("fault=") for w in trial.words if w.startswith("fault=")]
+    for fault in FAULTS:
+        if wanted and not any(each in fault.name for each in wanted):
+            continue
+        if not suffer(trial, figures, fault):
+            figures.add_true(f"goes on after {fault.name}", False)
+            break
+    trial.pilot.land()
+
+
+def second_flight(trial: Trial, figures: Figures) -> None:
+    """Two flights after one power-on; the autopilot restarts on the ground between a third."""
+    stood = trial.ground.place_m
+    if not _up(trial, figures):
+        return
+    manoeuvres.land(trial, figures, stood)
+    time.sleep(manoeuvres.SETTLE_S)
+    figures.add_true("poses go on after landing", trial.sending, str(trial.feedback))
+    if manoeuvres.take_off(trial, figures):
+        manoeuvres.land(trial, figures, trial.ground.place_m)
+    trial.firmware.restart()
+    trial.mark("autopilot restarted")
+    time.sleep(manoeuvres.SETTLE_S)
+    trial.ground.until(lambda: time.time() - trial.ground.came_s["HEARTBEAT"] < 1.0, 30.0)
+    trial.ground.ask_for_messages()
+    began_s = time.time()
+    if manoeuvres.take_off(trial, figures):
+        figures.add("flies again after a restart", time.time() - began_s, "s")
+        manoeuvres.land(trial, figures, trial.ground.place_m)
+
+
+def gps_lost(trial: Trial, figures: Figures) -> None:
+    """Up by GPS; over to our pose by source set; GPS goes, and comes back 50 m off."""
+    trial.start_daemon()
+    figures.add_true("armed by GPS", _armed_by_gps(trial, figures))
+    if not trial.ground.armed or not trial.pilot.take_off(manoeuvres.TAKE_OFF_M):
+        return
+    manoeuvres.ready_to_go(trial)
+    start, yaw_rad = trial.ground.believed_m, manoeuvres.believed_yaw(trial)
+    for way in ((6, 0), (6, 6), (0, 6), (0, 0)):
+        trial.pilot.go_to(start + np.array([*way, 0.0]), yaw_rad, within_m=0.7)
+    sending = trial.until("poses", lambda: trial.sending, 20.0)
+    figures.add_true("poses beside GPS", sending is not None, str(trial.feedback))
+    if sending is None:
+        trial.pilot.land()
+        return
+    for name, change in (
+        ("over to our pose", {}),
+        ("GPS goes", {"SIM_GPS1_ENABLE": 0.0}),
+        ("GPS comes back 50 m off", {"SIM_GPS1_ENABLE": 1.0, "SIM_GPS1_GLTCH_X": GLITCH_DEG}),
+    ):
+        before = manoeuvres.mean_place(trial)
+        if not change:
+            trial.ground.command(SET_EKF_SOURCE_SET, 2.0)
+        trial.pilot.set_parameters(change)
+        trial.mark(name)
+        began_s = time.time()
+        time.sleep(20.0)
+        moved = trial.ground.window(began_s, time.time()) - before
+        figures.add(f"{name}: moved", float(np.linalg.norm(moved, axis=1).max()), "m", 0.3)
+    manoeuvres.fly_square(trial, figures, 4.0, 0.15)
+    trial.pilot.land()
+
+
+def _armed_by_gps(trial: Trial, figures: Figures) -> bool:
+    began_s = time.time()
+    trial.pilot.hold_sticks()
+    armed = trial.pilot.set_mode(trial.pilot.modes_to_arm_in[-1], 60.0) and trial.pilot.arm(60.0)
+    texts = dict.fromkeys(trial.ground.texts_since(began_s)[-6:])
+    trial.mark(f"armed {armed}: {' / '.join(texts)}")
+    return armed
+
+
+def doctor(trial: Trial, figures: Figures) -> None:
+    """From the firmware's own defaults by `companion doctor --write` alone; then take-off."""
+    trial.start_daemon()
+    trial.until("the link", lambda: trial.status.get("sources"), READY_S)
+    time.sleep(5.0)
+    said = trial.run_companion("doctor", "--write", "--yes")
+    figures.add_true("doctor writes", said.returncode == 0, said.stdout[-300:])
+    trial.firmware.restart()
+    time.sleep(manoeuvres.SETTLE_S)
+    trial.ground.ask_for_messages()
+    stood = trial.ground.place_m
+    if manoeuvres.get_ready(trial, figures) and manoeuvres.take_off(trial, figures):
+        manoeuvres.land(trial, figures, stood)
+
+
+EXPERIMENTS: dict[str, tuple[Flown, Conditions]] = {
+    "take_off": (take_off, Conditions()),
+    "tour": (tour, Conditions()),
+    "wander": (wander, Conditions()),
+    "faults": (faults, Conditions()),
+    "second_flight": (second_flight, Conditions()),
+    "doctor": (doctor, Conditions(by_doctor=True)),
+    "gps_lost": (gps_lost, Conditions(has_gps=True, parameters=SECOND_SOURCE)),
+    **{look: (take_off, Conditions(look=look)) for look in ("dusk", "lawn", "water", "shadow")},
+}

@@ -1,0 +1,311 @@
+"""One trial: a firmware in its simulator, a camera drawn live, the line between, and the daemon.
+
+    with Trial(firmware, folder, Conditions(wind_m_s=3.0)) as trial:
+        trial.start_daemon()
+        trial.pilot.arm()
+
+Everything that happened is left in the folder: truth.csv, ground.tlog (what a ground station
+hears), cable.tlog (what passes between autopilot and companion), journal.txt, status.jsonl,
+flights/, the firmware's own logs, and the camera's stamps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from companion.errors import SourceError
+from tests.firmware.ground import Ground
+from tests.firmware.pilots import PILOTS, Pilot
+from tests.firmware.simulators import ArduCopter, Ports, Px4, Simulator
+from tests.support.autopilot.fake_wire import free_port
+from tests.support.processes.daemon_process import PROGRAM, Daemon
+
+CAMERA_HZ = 20.0
+LATENCY_MS = 40.0
+HEARD_S, READY_S, END_S = 30.0, 60.0, 20.0
+RESTART_S = 2.0
+"""RestartSec of the service."""
+WITHOUT_GPS: dict[str, dict[str, float]] = {
+    "ArduCopter": {"GPS1_TYPE": 0, "SIM_GPS1_ENABLE": 0},
+    "PX4": {"SENS_EN_GPSSIM": 0, "SYS_HAS_GPS": 0, "EKF2_GPS_CTRL": 0},
+}
+ON_OUR_POSE: dict[str, dict[str, float]] = {
+    "ArduCopter": {
+        "VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6,
+        "EK3_SRC1_POSZ": 1, "EK3_SRC1_YAW": 1, "VISO_DELAY_MS": 80,
+    },
+    "PX4": {
+        "EKF2_EV_CTRL": 7, "EKF2_HGT_REF": 0, "EKF2_EV_DELAY": 0, "EKF2_EV_NOISE_MD": 0,
+        "COM_ARM_WO_GPS": 1,
+    },
+}  # fmt: skip
+"""What docs/autopilots.md asks for."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What differs from trial to trial."""
+
+    seed: int = 1
+    wind_m_s: float = 3.0
+    pitch_deg: float = -45.0
+    mount_roll_deg: float = 0.0
+    """How the camera really sits, where that is not as it is said to."""
+    look: str = "day"
+    has_gps: bool = False
+    has_range: bool = True
+    by_doctor: bool = False
+    """Parameters of the pose are left as the firmware has them."""
+    backend: str = "pymavlink"
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    settings: tuple[str, ...] = ()
+    camera_words: tuple[str, ...] = ()
+    nice: int = -5
+    """Of everything that a real vehicle has a processor of its own for."""
+
+
+class Trial:
+    """See above. `with` powers the autopilot and the camera on; the daemon is started by hand."""
+
+    def __init__(
+        self, firmware: Path, folder: Path, conditions: Conditions, words: Sequence[str] = ()
+    ) -> None:
+        folder.mkdir(parents=True)
+        self.folder, self.conditions, self.words = folder.resolve(), conditions, words
+        kind = Px4 if firmware.name == "px4" else ArduCopter
+        ground, cable = kind.FIXED if kind is Px4 else (free_port(), free_port())
+        self._companion_port, self._camera_port = free_port(), free_port()
+        ports = Ports(ground, cable, self._camera_port)
+        self.firmware: Simulator = kind(firmware, self.folder, ports, self._parameters(kind))
+        self.ground = Ground(ground, kind.home, self.folder / "ground.tlog")
+        self.pilot: Pilot = PILOTS[kind.name](self.ground, self.firmware)
+        self.daemon: Daemon | None = None
+        self.status: dict[str, Any] = {}
+        self.events: list[tuple[float, str]] = []
+        self.began_s = time.time()
+        self._video_port = free_port()
+        self._over = threading.Event()
+        self._open = ExitStack()
+
+    def _parameters(self, kind: type[Simulator]) -> dict[str, float]:
+        c = self.conditions
+        own: dict[str, float]
+        if kind is ArduCopter:
+            own = {
+                "SIM_WIND_SPD": c.wind_m_s, "SIM_WIND_DIR": 120, "SIM_WIND_TURB": 0.3,
+                "FS_GCS_ENABLE": 0, "LOG_DISARMED": 1,
+            }  # fmt: skip
+            if c.has_range:
+                own |= {"RNGFND1_TYPE": 100, "RNGFND1_MIN": 0.1, "RNGFND1_MAX": 40}
+                own |= {"RNGFND1_ORIENT": 25}
+        else:
+            own = {
+                "SIH_WIND_E": 0.87 * c.wind_m_s, "SIH_WIND_N": -0.5 * c.wind_m_s,
+                "COM_RC_IN_MODE": 1, "NAV_DLL_ACT": 0, "COM_DL_LOSS_T": 60,
+            }  # fmt: skip
+        if not c.has_gps:
+            own |= WITHOUT_GPS[kind.name]
+        if not c.by_doctor:
+            own |= ON_OUR_POSE[kind.name]
+        return own | dict(c.parameters)
+
+    def __enter__(self) -> Trial:
+        with ExitStack() as entering:
+            entering.callback(self._write)
+            entering.enter_context(self.ground)
+            self._cable = entering.enter_context(self._child(
+                "faulty_cable", self.firmware.ports.companion, self._companion_port,
+                self.folder / "cable.tlog",
+            ))  # fmt: skip
+            self._camera = entering.enter_context(self._drawn_camera())
+            entering.enter_context(self.firmware)
+            entering.callback(self._stop_daemon)
+            assert self.ground.until(lambda: self.ground.mode, HEARD_S), "no heartbeat"
+            self.mark("power on")
+            self.ground.ask_for_messages()
+            assert self.ground.until(lambda: self.ground.true, HEARD_S), "no truth"
+            self._open = entering.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        if error is not None:
+            self.mark(f"failed: {error!r}")
+        self._over.set()
+        self._open.close()
+
+    # -- its parts -------------------------------------------------------------------------------
+
+    def start_daemon(self) -> None:
+        """As its service does."""
+        home, c = self.firmware.home, self.conditions
+        self.daemon = Daemon(
+            self.folder,
+            "camera.source=network", f"camera.url=tcp://127.0.0.1:{self._video_port}",
+            f"camera.rate_hz={CAMERA_HZ:g}", f"camera.stamp_offset_ms={-LATENCY_MS - 1:g}",
+            f"camera.calibration={self.folder / 'lens.toml'}",
+            "mount.known=true", f"mount.pitch_deg={c.pitch_deg:g}",
+            f"link.url=udpin:127.0.0.1:{self._companion_port}", f"expert.link.backend={c.backend}",
+            "feedback.mode=odometry", f"feedback.origin_latitude_deg={home.latitude_deg}",
+            f"feedback.origin_longitude_deg={home.longitude_deg}",
+            f"feedback.origin_altitude_m={home.altitude_m}", "depth.enabled=false", *c.settings,
+            program=(*PROGRAM,),
+        )  # fmt: skip
+        self.daemon.__enter__()
+        self.mark("companion started")
+        threading.Thread(target=self._ask, args=(self.daemon,), daemon=True).start()
+
+    def kill_daemon(self) -> None:
+        """SIGKILL to all of its processes; started again as the service would be."""
+        self._end_daemon()
+        self.mark("companion killed")
+        time.sleep(RESTART_S)
+        self.start_daemon()
+
+    def run_companion(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Another of its commands, with the daemon's settings; kept in commands.txt."""
+        assert self.daemon is not None
+        settings = [word for each in self.daemon.settings for word in ("--set", each)]
+        done = subprocess.run(
+            [sys.executable, *PROGRAM, *words, *settings], cwd=self.folder, check=False,
+            capture_output=True, text=True, timeout=READY_S, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+        with (self.folder / "commands.txt").open("a") as out:
+            out.write(f"$ companion {' '.join(words)}\n{done.stdout}{done.stderr}")
+            out.write(f"(status {done.returncode})\n")
+        return done
+
+    def tell_camera(self, order: str) -> None:
+        """See `drawn_camera`."""
+        self._tell(self._camera, order)
+
+    def tell_cable(self, order: str) -> None:
+        """See `faulty_cable`."""
+        self._tell(self._cable, order)
+
+    # -- what is known ---------------------------------------------------------------------------
+
+    def mark(self, text: str) -> None:
+        """Note something that happened."""
+        place = self.ground.place_m.round(2).tolist() if self.ground.true else ""
+        self.events.append((time.time(), f"{text} {place}"))
+        print(f"{time.time() - self.began_s:7.2f} {text} {place}", flush=True)
+
+    @property
+    def feedback(self) -> dict[str, Any]:
+        """The daemon's word on its poses."""
+        return dict(self.status.get("feedback") or {})
+
+    @property
+    def sending(self) -> bool:
+        """Whether poses are sent."""
+        return bool(self.feedback.get("sending"))
+
+    def until(self, what: str, such: Callable[[], Any], timeout_s: float) -> float | None:
+        """Wait; after how many seconds it was so, None if it did not become so."""
+        began_s = time.time()
+        while time.time() - began_s < timeout_s:
+            if such():
+                return round(time.time() - began_s, 2)
+            time.sleep(0.05)
+        self.mark(f"in vain: {what}")
+        return None
+
+    def last_pose_s(self) -> float:
+        """When the autopilot last passed one of our poses on to the ground, else was sent one."""
+        return self.ground.came_s.get("COMPANION/ODOMETRY", 0.0)
+
+    # -- within ----------------------------------------------------------------------------------
+
+    def _child(self, module: str, *words: object) -> contextlib.AbstractContextManager[Any]:
+        command = [
+            "nice", "-n", str(self.conditions.nice), sys.executable, "-m",
+            f"tests.firmware.{module}", *map(str, words),
+        ]  # fmt: skip
+
+        @contextlib.contextmanager
+        def running() -> Any:
+            with (self.folder / f"{module}.txt").open("wb") as said:
+                process = subprocess.Popen(
+                    command, stdin=subprocess.PIPE, stdout=said, stderr=subprocess.STDOUT
+                )
+                try:
+                    yield process
+                finally:
+                    with contextlib.suppress(OSError):
+                        process.communicate(timeout=END_S)
+                    if process.poll() is None:
+                        process.kill()
+
+        return running()
+
+    def _drawn_camera(self) -> contextlib.AbstractContextManager[Any]:
+        c = self.conditions
+        origin = ",".join(str(each) for each in self.firmware.home)
+        return self._child(
+            "drawn_camera", "--state-port", self._camera_port, "--serve-port", self._video_port,
+            "--rate-hz", CAMERA_HZ, "--latency-ms", LATENCY_MS, f"--pitch-deg={c.pitch_deg}",
+            f"--roll-deg={c.mount_roll_deg}", "--look", c.look, "--seed", c.seed,
+            f"--origin={origin}", "--out", self.folder, *c.camera_words,
+        )  # fmt: skip
+
+    def _tell(self, process: subprocess.Popen[bytes], order: str) -> None:
+        assert process.stdin is not None
+        process.stdin.write(f"{order}\n".encode())
+        process.stdin.flush()
+        self.mark(order)
+
+    def _ask(self, daemon: Daemon) -> None:
+        with (self.folder / "status.jsonl").open("a") as log:
+            while not self._over.wait(0.5) and daemon is self.daemon:
+                try:
+                    self.status = daemon.status()
+                except SourceError:
+                    self.status = {}
+                log.write(json.dumps({"t_s": time.time(), **self.status}) + "\n")
+
+    def _stop_daemon(self) -> None:
+        if self.daemon is None:
+            return
+        with contextlib.suppress(Exception):
+            self.daemon.stop(END_S)
+        self._end_daemon()
+
+    def _end_daemon(self) -> None:
+        assert self.daemon is not None
+        daemon, self.daemon, self.status = self.daemon, None, {}
+        with contextlib.redirect_stdout(io.StringIO()):
+            daemon.__exit__(None, None, None)
+        with (self.folder / "journal.txt").open("a") as journal:
+            for line in daemon.lines:
+                at_s = (line.monotonic_ns - time.monotonic_ns()) * 1e-9 + time.time()
+                journal.write(f"{at_s - self.began_s:8.2f} {line.text}\n")
+
+    def _write(self) -> None:
+        with (self.folder / "truth.csv").open("w", newline="") as out:
+            rows = csv.writer(out)
+            rows.writerow("t_s n e d vn ve vd qw qx qy qz".split())
+            for each in self.ground.true:
+                row = (each.t_s, *each.place_m, *each.velocity_m_s, *each.quaternion)
+                rows.writerow([round(value, 6) for value in row])
+        said = [(t_s, "event", text) for t_s, text in self.events]
+        said += [(t_s, "pilot reads", text) for t_s, text in self.ground.texts]
+        said += [(t_s, "mode", mode) for t_s, mode in self.ground.modes]
+        with (self.folder / "events.txt").open("w") as out:
+            for t_s, kind, text in sorted(said):
+                out.write(f"{t_s - self.began_s:8.2f} {kind:12} {text}\n")
