@@ -113,6 +113,15 @@ class Georeferencer:
         return any(len(self._positions[source]) for source in self._sources)
 
     @property
+    def newest_place(self) -> Array | None:
+        """Newest position (3,), NED metres, that may place a map; None before there is one."""
+        for source in self._sources:
+            newest = self._positions[source].newest
+            if newest is not None:
+                return np.asarray(newest[1])
+        return None
+
+    @property
     def has_ranges(self) -> bool:
         """True if there are enough ranges to compare with a map."""
         return len(self._range) >= MIN_RANGES

@@ -258,10 +258,13 @@ class LocalisationStage:
         self._take_samples()
         attitude = self._attitude.at(frame.t_ns)
         self._apply_map_correction()
-        stands = not self._georeferencer.has_positions and self._standing.at(frame.t_ns, frame.grey)
+        stands = self._standing.at(frame.t_ns, frame.grey)
         if stands and self.state is TrackState.INITIALISING:
             self._tracker.stand()
-        reckoned = self._odometry.begin(frame.t_ns, self._body_attitude(frame.t_ns), stands)
+        stands_at = self._georeferencer.newest_place if stands else None
+        reckoned = self._odometry.begin(
+            frame.t_ns, self._body_attitude(frame.t_ns), stands, stands_at
+        )
         predicted = self._predicted(frame.t_ns, attitude, reckoned)
         before = self._tracker.map
         aligned = predicted is not None and attitude is not None and self._motion.filter.aligned

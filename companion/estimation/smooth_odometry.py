@@ -70,6 +70,10 @@ class SmoothOdometry:
         """From a stand up to a metric map."""
         self._sigma_stood_m = 0.0
         """Of the place where it stands, since the last reset."""
+        self._begins_m: Array = np.zeros(3)
+        """Place (3,) of a stand before any other is known."""
+        self._in_world = False
+        """True once satellites have placed the body, or its map."""
         self.reset_counter = 0
 
     def step(
@@ -180,14 +184,18 @@ class SmoothOdometry:
         return float(np.linalg.norm([FLOOR_RAD, noise_rad, sigma_rad, self._frame.yaw_rad]))
 
     def begin(
-        self, t_ns: int, attitude: BodyAttitude | None, standing: bool = False
-    ) -> Reckoned | None:
+        self, t_ns: int, attitude: BodyAttitude | None, standing: bool = False,
+        world_m: Array | None = None,
+    ) -> Reckoned | None:  # fmt: skip
         """Go on by inertial navigation to the next frame, with its attitude where that is known.
 
         Where the body should be then, in the frame of the odometry; None where unknown, or too
-        uncertain to be of use. `standing` where the vehicle stands on the ground.
+        uncertain to be of use. `standing` where the vehicle stands on the ground, and `world_m`
+        (3,) its place by satellites, where there are any.
         """
         if standing and attitude is not None:
+            if world_m is not None and not self._in_world:
+                self._stand_in_world(world_m)
             if self.ground.stood is None:
                 self._begin_stand(t_ns)
             self.ground.stand(attitude.t_ns, self._place_now())
@@ -303,11 +311,20 @@ class SmoothOdometry:
             sigma_m = 0.0
         self._sigma_stood_m = sigma_m if self._given else 0.0
 
+    def _stand_in_world(self, world_m: Array) -> None:
+        """Stand where satellites have the body (3,), so that their map goes on from there.
+
+        A reset, if it stood elsewhere before.
+        """
+        self._begins_m, self._in_world = world_m, True
+        self._reckoned = self._last = self.ground.stood = None
+        self._navigation.reset()
+
     def _place_now(self) -> Array:
         """Place (3,) of the body as far as it is known: where it begins, if not at all."""
         if self._reckoned is not None:
             return self._reckoned.place_m
-        return np.zeros(3) if self._last is None else self._last[2].translation
+        return self._begins_m if self._last is None else self._last[2].translation
 
     def _standing(self, track: Track) -> Odometry:
         """Odometry of a vehicle that stands on the ground: at a fixed place, as the attitude is.
@@ -341,22 +358,27 @@ class SmoothOdometry:
         """Start in another map, or the first one.
 
         A map without an origin goes on from where inertial navigation had the body at its first
-        view, else from the last known position; without a jump where that is close to where
-        inertial navigation has the body now. All else is a reset: its poses are unrelated.
+        view, else from the last known position. There is no jump where that, or the place in a map
+        with an origin, is close to where inertial navigation has the body now. All else is a reset:
+        its poses are unrelated.
         """
         began = None if first is None else self.reckoned_path.at(first.t_ns)
         raw, before = self._raw(georeference, pose), self._frame
-        turn, offset, owed_m, continuous = np.eye(3), np.zeros(3), np.zeros(3), False
-        if not georeference.has_origin and first is not None and began is not None:
+        turn, offset, owed_m = np.eye(3), np.zeros(3), None
+        if georeference.has_origin and self._reckoned is not None:
+            owed_m = raw.translation - self._reckoned.place_m
+        elif not georeference.has_origin and first is not None and began is not None:
             turn = self._heading_reckoned(raw)
             raw_first = self._raw(georeference, first.map_from_camera)
             offset = before.from_world.apply(began.place_world_m) - turn @ raw_first.translation
             if self._reckoned is not None:
                 owed_m = turn @ raw.translation + offset - self._reckoned.place_m
-                continuous = float(np.linalg.norm(owed_m)) < self._gate.max_jump_m
         elif not georeference.has_origin and self._last is not None:
             offset = self._last[2].translation - raw.translation
-        if not continuous:
+        if owed_m is not None and float(np.linalg.norm(owed_m)) >= self._gate.max_jump_m:
+            owed_m = None
+        self._in_world |= georeference.has_origin
+        if owed_m is None:
             self.reset_counter += self._given
             self._drift.clear()
             if self._last is not None and georeference.has_origin:
@@ -364,7 +386,7 @@ class SmoothOdometry:
         self._frame = OdometryFrame(
             Pose(turn, offset), georeference.has_origin, slewed_m=before.slewed_m
         )
-        if continuous:
+        if owed_m is not None:
             self._frame = self._frame.shifted(-owed_m)
         self.reckoned_path.clear()
         self._segment, self._georeference = segment, georeference

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_navigation import BodyAttitude, InertialNavigation
@@ -35,15 +36,16 @@ class Vehicle:
     def frame(
         self, at_m: Array | None = None, *, standing: bool = False, attitude: bool = True,
         segment: int = 0, georeference: Georeference = PLACED, north_m_s2: float = 0.0,
+        world_m: Array | None = None,
     ) -> Odometry:  # fmt: skip
-        """The next frame, tracked at a place (3,) in the map, or lost."""
+        """The next frame, tracked at a place (3,) in the map, or lost; `world_m` by satellites."""
         self.t_ns += STEP_NS
         for step in range(-9, 1) if self._has_imu else ():
             t_ns = self.t_ns + step * 10_000_000
             self._integral.take(ImuSample(t_ns, np.zeros(3), np.array([north_m_s2, 0.0, -9.80665])))
             self._integral.take(AttitudeSample(t_ns, LEVEL))
         known = BodyAttitude(self.t_ns, np.eye(3)) if attitude else None
-        self.odometry.begin(self.t_ns, known, standing)
+        self.odometry.begin(self.t_ns, known, standing, world_m)
         track = Track(self.t_ns // STEP_NS, self.t_ns, TrackState.LOST)
         if at_m is not None:
             pose = Pose(np.eye(3), np.array(at_m))
@@ -80,6 +82,40 @@ def test_the_first_stand_has_a_pose_once_accelerometers_could_carry_it_on() -> N
     without = Vehicle(has_imu=False)
     stood = without.frames(100, standing=True)
     assert stood.state is TrackState.STANDING and stood.world_from_body is None
+
+
+BY_SATELLITES = np.array([12.0, -7.0, -3.0])
+IN_WORLD = replace(PLACED, method="GPS", has_origin=True)
+
+
+@pytest.mark.parametrize(("away_m", "n_resets"), [(0.6, 0), (3.0, 1)])
+def test_a_map_that_satellites_place_goes_on_from_a_stand_there(
+    away_m: float, n_resets: int
+) -> None:
+    vehicle = Vehicle()
+    for _ in range(20):
+        stood = vehicle.frame(standing=True, world_m=BY_SATELLITES)
+    np.testing.assert_allclose(place(stood), BY_SATELLITES, atol=1e-6)
+    vehicle.frames(10)
+    seen_m = BY_SATELLITES + [away_m, 0.0, 0.0]
+    first = vehicle.frame(seen_m, georeference=IN_WORLD)
+    assert first.reset_counter == n_resets
+    begun_m = seen_m if n_resets else BY_SATELLITES
+    np.testing.assert_allclose(place(first), begun_m, atol=0.05)
+    for _ in range(80):
+        last = vehicle.frame(seen_m, georeference=IN_WORLD)
+    assert last.reset_counter == n_resets
+    np.testing.assert_allclose(place(last), seen_m, atol=0.05)
+
+
+def test_satellites_that_come_while_it_stands_move_it_once_with_a_reset() -> None:
+    vehicle = Vehicle()
+    assert vehicle.frames(20, standing=True).world_from_body is not None
+    for k in range(20):
+        moved_m = BY_SATELLITES + [0.1 * k, 0.0, 0.0]
+        stood = vehicle.frame(standing=True, world_m=moved_m)
+    assert stood.reset_counter == 1
+    np.testing.assert_allclose(place(stood), BY_SATELLITES, atol=1e-6)
 
 
 def test_a_landing_without_sight_is_a_reset() -> None:
