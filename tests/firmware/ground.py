@@ -1,7 +1,7 @@
 """The ground station of a trial: hears everything, knows the truth, gives commands, holds sticks.
 
     with Ground(port, home) as ground:
-        ground.truth(), ground.latest["LOCAL_POSITION_NED"], ground.texts
+        ground.true[-1], ground.latest["LOCAL_POSITION_NED"], ground.texts
 
 Times are seconds since the epoch. Truth is the simulator's own state about `home`, local NED.
 """
@@ -16,13 +16,14 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array
-from tests.firmware.simulators import Home
+from tests.firmware.true_state import State, TrueState
 
 RATES_HZ = {
     "SIM_STATE": 100.0, "HIL_STATE_QUATERNION": 100.0, "LOCAL_POSITION_NED": 20.0,
@@ -30,8 +31,6 @@ RATES_HZ = {
     "EXTENDED_SYS_STATE": 4.0, "GLOBAL_POSITION_INT": 5.0,
 }  # fmt: skip
 STICKS_EVERY_S = 0.05
-METRES_PER_DEGREE = 111318.845
-"""Of latitude, as ArduPilot's flat earth has it."""
 AUTOPILOT, COMPANION = (1, 1), (1, 197)
 STAMP_BYTES, MAVLINK_2 = 8, 0xFD
 CENTRED = (0.0, 0.0, 0.5, 0.0)
@@ -56,20 +55,11 @@ def messages_heard(path: Path, kind: str) -> Iterator[tuple[float, Any]]:
         at += length + STAMP_BYTES
 
 
-class Truth(NamedTuple):
-    """The simulator's own state."""
-
-    t_s: float
-    place_m: tuple[float, float, float]
-    velocity_m_s: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
-
-
 class Ground:
     """See above."""
 
-    def __init__(self, port: int, home: Home, log: Path) -> None:
-        self._home = home
+    def __init__(self, port: int, home: GeoOrigin, log: Path) -> None:
+        self._state = TrueState(origin=home)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
         self._socket.bind(("127.0.0.1", port))
@@ -83,7 +73,7 @@ class Ground:
         """By kind, of the autopilot; of the companion's, by `COMPANION/` and kind."""
         self.came_s: dict[str, float] = {}
         self.texts: list[tuple[float, str]] = []
-        self.true: list[Truth] = []
+        self.true: list[State] = []
         self.believed: list[tuple[float, float, float, float]] = []
         """LOCAL_POSITION_NED: time, north, east, down."""
         self.modes: list[tuple[float, str]] = []
@@ -117,14 +107,10 @@ class Ground:
 
     # -- what is known ---------------------------------------------------------------------------
 
-    def truth(self) -> Truth:
-        """The newest."""
-        return self.true[-1]
-
     @property
     def place_m(self) -> Array:
         """Where the vehicle truly is (3,)."""
-        return np.array(self.true[-1].place_m)
+        return self.true[-1].place_m
 
     @property
     def believed_m(self) -> Array:
@@ -238,25 +224,10 @@ class Ground:
                 self.modes.append((now_s, name))
         elif kind == "LOCAL_POSITION_NED":
             self.believed.append((now_s, message.x, message.y, message.z))
-        elif kind == "SIM_STATE":
-            q = (message.q1, message.q2, message.q3, message.q4)
-            place = message.lat_int * 1e-7, message.lon_int * 1e-7, message.alt
-            self._know(now_s, place, (message.vn, message.ve, message.vd), q)
-        elif kind == "HIL_STATE_QUATERNION":
-            place = message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3
-            velocity = message.vx * 0.01, message.vy * 0.01, message.vz * 0.01
-            self._know(now_s, place, velocity, tuple(message.attitude_quaternion))
-
-    def _know(
-        self, t_s: float, place: tuple[float, float, float],
-        velocity_m_s: tuple[float, float, float], quaternion: Any,
-    ) -> None:  # fmt: skip
-        home = self._home
-        middle = math.radians(0.5 * (place[0] + home.latitude_deg))
-        north_m = (place[0] - home.latitude_deg) * METRES_PER_DEGREE
-        east_m = (place[1] - home.longitude_deg) * METRES_PER_DEGREE * math.cos(middle)
-        here = (north_m, east_m, home.altitude_m - place[2])
-        self.true.append(Truth(t_s, here, velocity_m_s, quaternion))
+        elif kind in ("SIM_STATE", "HIL_STATE_QUATERNION"):
+            self._state.take(message, now_s)
+            if (newest := self._state.newest) is not None:
+                self.true.append(newest)
 
     def _speak(self) -> None:
         beat = mavlink.MAVLink_heartbeat_message(

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.transforms import Array
 from tests.firmware.ground import CENTRED, Ground
-from tests.firmware.simulators import Home, Simulator
+from tests.firmware.simulators import Simulator
 
 PLACE_AND_YAW, PLACE_SPEED_AND_YAW = 0b100111111000, 0b100111000000
 """What of SET_POSITION_TARGET_LOCAL_NED is not to be ignored."""
@@ -187,9 +187,8 @@ class Px4Pilot(Pilot):
         self._ground.command(mavlink.MAV_CMD_DO_SET_MODE, custom, *numbers, timeout_s=ACK_S)
 
     def _rise(self, height_m: float) -> bool:
-        home: Home = self._firmware.home
         heard = self._ground.latest.get("GLOBAL_POSITION_INT")
-        altitude_m = heard.alt * 1e-3 if heard else home.altitude_m
+        altitude_m = heard.alt * 1e-3 if heard else self._firmware.home.altitude_m
         nan = math.nan
         done = self._ground.command(
             mavlink.MAV_CMD_NAV_TAKEOFF, nan, 0, 0, nan, nan, nan, altitude_m + height_m

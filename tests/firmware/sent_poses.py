@@ -8,12 +8,13 @@ import numpy as np
 
 from companion.geometry.transforms import Array
 from tests.firmware.figures import Figures, percentile
-from tests.firmware.ground import Truth, messages_heard
+from tests.firmware.ground import messages_heard
+from tests.firmware.true_state import State
 
 LEAST = 30
 
 
-def add_poses(figures: Figures, cable: Path, true: list[Truth]) -> None:
+def add_poses(figures: Figures, cable: Path, true: list[State]) -> None:
     """What was wrong with the poses: place after the first is put where it was, heading, scale."""
     rows = [
         (t_s, m.time_usec * 1e-6, m.x, m.y, m.z, *m.q, m.reset_counter)

@@ -14,23 +14,18 @@ import signal
 import subprocess
 import time
 from collections.abc import Mapping
+from dataclasses import astuple
 from pathlib import Path
 from types import TracebackType
 from typing import IO, NamedTuple
+
+from companion.geometry.geodesy import GeoOrigin
 
 STOP_S = 8.0
 SHELL_S = 10.0
 UP_S = 3.0
 """PX4 takes commands of its shell after so long."""
 CAMERA_STREAM_BYTES_S = 4_000_000
-
-
-class Home(NamedTuple):
-    """Where the vehicle stands at first."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
 
 
 class Ports(NamedTuple):
@@ -45,7 +40,8 @@ class Simulator:
     """One firmware. `with` starts it, and ends it whatever happened."""
 
     name = ""
-    home = Home(0.0, 0.0, 0.0)
+    home = GeoOrigin(0.0, 0.0, 0.0)
+    """Where the vehicle stands at first."""
 
     def __init__(
         self, binary: Path, folder: Path, ports: Ports, parameters: Mapping[str, float]
@@ -117,13 +113,13 @@ class ArduCopter(Simulator):
     """`build/sitl/bin/arducopter`. Parameters are what it takes as the defaults of its board."""
 
     name = "ArduCopter"
-    home = Home(-35.363262, 149.165237, 584.0)
+    home = GeoOrigin(-35.363262, 149.165237, 584.0)
 
     def _command(self) -> list[str]:
         defaults = self.folder / "defaults.parm"
         defaults.write_text("".join(f"{k} {v:.9g}\n" for k, v in self.parameters.items()))
         of_frame = self.binary.parents[3] / "Tools/autotest/default_params/copter.parm"
-        home = ",".join(f"{each:.7f}" for each in (*self.home, 0.0))
+        home = ",".join(f"{each:.7f}" for each in (*astuple(self.home), 0.0))
         serial = [
             word
             for number, port in enumerate(self.ports)
@@ -142,7 +138,7 @@ class Px4(Simulator):
     """
 
     name = "PX4"
-    home = Home(47.397742, 8.545594, 489.4)
+    home = GeoOrigin(47.397742, 8.545594, 489.4)
     FIXED = (14550, 14540)
 
     def start(self) -> None:

@@ -21,7 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -256,7 +256,7 @@ class Trial:
 
     def _drawn_camera(self) -> contextlib.AbstractContextManager[Any]:
         c = self.conditions
-        origin = ",".join(str(each) for each in self.firmware.home)
+        origin = ",".join(str(each) for each in astuple(self.firmware.home))
         return self._child(
             "drawn_camera", "--state-port", self._camera_port, "--serve-port", self._video_port,
             "--rate-hz", CAMERA_HZ, "--latency-ms", LATENCY_MS, f"--pitch-deg={c.pitch_deg}",

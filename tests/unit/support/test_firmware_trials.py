@@ -13,9 +13,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.firmware.faulty_cable import FaultyCable, packets
 from tests.firmware.figures import Figures, append_to, strayed_m
-from tests.firmware.ground import Truth, messages_heard
+from tests.firmware.ground import messages_heard
 from tests.firmware.page import write_page
 from tests.firmware.sent_poses import add_poses
+from tests.firmware.true_state import State
 from tests.support.autopilot.fake_wire import free_port
 
 NORTH_M_S, RATE_HZ, N = 2.0, 20.0, 100
@@ -31,14 +32,16 @@ def odometry(codec: mavlink.MAVLink, t_s: float, north_m: float, resets: int) ->
 
 
 @pytest.fixture
-def flown(tmp_path: Path) -> tuple[Path, list[Truth]]:
+def flown(tmp_path: Path) -> tuple[Path, list[State]]:
     """A tlog of poses that leap by OFF_M half-way, and the truth, which is elsewhere by metres."""
     ours, autopilot = mavlink.MAVLink(None, 1, 197), mavlink.MAVLink(None, 1, 1)
     log, true = io.BytesIO(), []
     for k in range(N):
         t_s = 1000.0 + k / RATE_HZ
         north_m = NORTH_M_S * (t_s - 1000.0)
-        true.append(Truth(t_s, (north_m + 5.0, 1.0, -3.5), (NORTH_M_S, 0, 0), (1, 0, 0, 0)))
+        place_m, north = np.array([north_m + 5.0, 1.0, -3.5]), np.array([1.0, 0.0, 0.0])
+        level = np.array([1.0, 0.0, 0.0, 0.0])
+        true.append(State(t_s, place_m, NORTH_M_S * north, level, np.zeros(3)))
         off_m = OFF_M * (k >= N // 2)
         stamp = struct.pack(">Q", round((t_s + 0.06) * 1e6))
         log.write(stamp + odometry(ours, t_s, north_m + off_m, int(k >= N // 2)))
@@ -54,7 +57,7 @@ def test_a_datagram_is_taken_apart_into_packets() -> None:
     assert packets(b"".join(parts) + b"rest of nothing") == parts
 
 
-def test_poses_are_judged_by_how_they_move(flown: tuple[Path, list[Truth]]) -> None:
+def test_poses_are_judged_by_how_they_move(flown: tuple[Path, list[State]]) -> None:
     folder, true = flown
     figures = Figures()
     add_poses(figures, folder / "cable.tlog", true)
@@ -66,7 +69,7 @@ def test_poses_are_judged_by_how_they_move(flown: tuple[Path, list[Truth]]) -> N
     assert (values["reset counter, first"], values["reset counter, last"]) == (0, 1)
 
 
-def test_messages_are_found_by_who_said_them(flown: tuple[Path, list[Truth]]) -> None:
+def test_messages_are_found_by_who_said_them(flown: tuple[Path, list[State]]) -> None:
     log = flown[0] / "cable.tlog"
     assert len(list(messages_heard(log, "COMPANION/ODOMETRY"))) == N
     assert len(list(messages_heard(log, "HEARTBEAT"))) == N
