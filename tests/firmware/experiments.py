@@ -146,7 +146,7 @@ def gps_lost(trial: Trial, figures: Figures) -> None:
 
 def _armed_by_gps(trial: Trial, figures: Figures) -> bool:
     began_s = time.time()
-    trial.pilot.hold_sticks()
+    trial.pilot.hold_sticks(in_air=False)
     armed = trial.pilot.set_mode(trial.pilot.modes_to_arm_in[-1], 60.0) and trial.pilot.arm(60.0)
     texts = dict.fromkeys(trial.ground.texts_since(began_s)[-6:])
     trial.mark(f"armed {armed}: {' / '.join(texts)}")

@@ -16,6 +16,7 @@ import heapq
 import os
 import random
 import select
+import signal
 import socket
 import struct
 import sys
@@ -133,6 +134,7 @@ class FaultyCable:
 
 
 def main() -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # with its log written
     autopilot_port, companion_port, path = sys.argv[1:]
     with Path(path).open("wb") as log:
         FaultyCable(int(autopilot_port), int(companion_port), log).run()

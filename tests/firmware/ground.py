@@ -33,8 +33,8 @@ RATES_HZ = {
 STICKS_EVERY_S = 0.05
 AUTOPILOT, COMPANION = (1, 1), (1, 197)
 STAMP_BYTES, MAVLINK_2 = 8, 0xFD
-CENTRED = (0.0, 0.0, 0.5, 0.0)
-"""Roll, pitch and yaw from -1 to 1, throttle from 0 to 1."""
+CENTRED, THROTTLE_LOW = (0.0, 0.0, 0.5, 0.0), (0.0, 0.0, 0.0, 0.0)
+"""Roll, pitch and yaw from -1 to 1, throttle from 0 to 1: in the air, and to be armed."""
 
 
 def messages_heard(path: Path, kind: str) -> Iterator[tuple[float, Any]]:

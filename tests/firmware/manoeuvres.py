@@ -29,7 +29,7 @@ def get_ready(trial: Trial, figures: Figures) -> bool:
     if sending is None:
         trial.mark(f"why not: {trial.feedback}")
         return False
-    trial.pilot.hold_sticks()
+    trial.pilot.hold_sticks(in_air=False)
     for mode in trial.pilot.modes_to_arm_in:
         has_mode = trial.pilot.set_mode(mode, 20.0)
         armed = has_mode and trial.pilot.arm(20.0)

@@ -14,7 +14,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.transforms import Array
-from tests.firmware.ground import CENTRED, Ground
+from tests.firmware.ground import CENTRED, THROTTLE_LOW, Ground
 from tests.firmware.simulators import Simulator
 
 PLACE_AND_YAW, PLACE_SPEED_AND_YAW = 0b100111111000, 0b100111000000
@@ -42,9 +42,9 @@ class Pilot:
         self._ground, self._firmware = ground, firmware
         ground.hold_sticks = self._sticks
 
-    def hold_sticks(self) -> None:
-        """Have a remote control, sticks centred."""
-        self._ground.sticks = lambda: CENTRED
+    def hold_sticks(self, in_air: bool) -> None:
+        """Have a remote control, and hold its sticks so that nothing is asked of the vehicle."""
+        self._ground.sticks = lambda: CENTRED if in_air else THROTTLE_LOW
 
     def set_mode(self, name: str, timeout_s: float = 6.0) -> bool:
         """Whether it took a mode."""
@@ -75,6 +75,7 @@ class Pilot:
         if not self._rise(height_m):
             return False
         wanted_m = down_m - height_m
+        self.hold_sticks(in_air=True)
         return self._ground.until(lambda: self._ground.believed_m[2] < wanted_m + 0.3, timeout_s)
 
     def stream(self, setpoint: Callable[[], tuple[Array, Array, float]] | None) -> None:
@@ -104,6 +105,7 @@ class Pilot:
     def land(self, timeout_s: float = 60.0) -> bool:
         """Whether it landed and disarmed by itself."""
         self.stream(None)
+        self.hold_sticks(in_air=False)
         self._begin_landing()
         return self._ground.until(lambda: not self._ground.armed, timeout_s)
 

@@ -247,10 +247,8 @@ class Trial:
                 try:
                     yield process
                 finally:
-                    with contextlib.suppress(OSError):
-                        process.communicate(timeout=END_S)
-                    if process.poll() is None:
-                        process.kill()
+                    process.terminate()
+                    process.communicate()
 
         return running()
 

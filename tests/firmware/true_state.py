@@ -97,6 +97,12 @@ class TrueState:
         self._stop.set()
         self._thread.join()
 
+    @property
+    def newest(self) -> State | None:
+        """None before the first."""
+        with self._came:
+            return self._states[-1] if self._states else None
+
     def since(self, t_s: float) -> list[State]:
         """All states that came after a time, as far as they are kept."""
         with self._came:
