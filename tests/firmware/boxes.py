@@ -57,9 +57,9 @@ def boxes_of(seed: int) -> list[Box]:
 def triangles_of(boxes: list[Box], seed: int) -> Array:
     """Vertices (N, 9): place, metres on the face's texture, tint RGB, 0 for "no ground"."""
     rng = np.random.default_rng(seed + 3)
-    rows: list[Array] = []
+    rows: list[Array] = [np.zeros((0, 9))]
     for box in boxes:
-        tint = rng.uniform(0.7, 1.3) * rng.normal(1.0, 0.12, 3)
+        tint = rng.uniform(0.6, 1.0) * rng.normal(1.0, 0.12, 3)
         low = np.c_[box.corners(), np.zeros(4)]
         high = low - [0.0, 0.0, box.height]
         rows.append(_face(rng, high, tint * ROOF_SHADE))

@@ -167,6 +167,14 @@ def triple(text: str) -> tuple[float, float, float]:
     return latitude, longitude, altitude
 
 
+def _southern(words: list[str]) -> list[str]:
+    """The words, where a latitude south of the equator is not taken for an option."""
+    if "--origin" not in words[:-1]:
+        return words
+    k = words.index("--origin")
+    return [*words[:k], f"--origin={words[k + 1]}", *words[k + 2 :]]
+
+
 def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(
@@ -187,7 +195,7 @@ def main() -> None:
     parser.add_argument("--latency-ms", type=float, default=40.0)
     parser.add_argument("--out", type=Path, required=True)
     cv2.setNumThreads(1)
-    camera = DrawnCamera(parser.parse_args())
+    camera = DrawnCamera(parser.parse_args(_southern(sys.argv[1:])))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: camera.stop.set())
     threading.Thread(target=obey, args=(sys.stdin, camera), daemon=True).start()

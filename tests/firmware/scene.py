@@ -148,6 +148,10 @@ class Scene:
 
     def seen(self, world_from_camera: Pose, t_s: float) -> Bytes:
         """RGB picture (H, W, 3) of a sensor without noise that moves not."""
+        with self._gl:  # there may be other scenes
+            return self._drawn(world_from_camera, t_s)
+
+    def _drawn(self, world_from_camera: Pose, t_s: float) -> Bytes:
         camera_from_world = world_from_camera.inverse().matrix()
         clip = (_clip_from_camera(self._camera) @ camera_from_world).T.astype("f4")
         self._program["clip_from_world"].write(clip.tobytes())
