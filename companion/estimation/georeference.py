@@ -14,6 +14,7 @@ from functools import reduce
 import numpy as np
 
 from companion.config import GeoreferenceConfig
+from companion.estimation.range_climb import climb_scale
 from companion.estimation.sample_series import SampleSeries
 from companion.estimation.trajectory_alignment import (
     SIGMA_VELOCITY_M_S,
@@ -215,7 +216,10 @@ class Georeferencer:
                     return found
         if level is None:
             return None
-        scales = [self._range_scale(samples), self._height_scale(samples, level), inertial]
+        scales = [
+            self._range_scale(samples), self._climb_scale(samples, level),
+            self._height_scale(samples, level), inertial,
+        ]  # fmt: skip
         known = [scale for scale in scales if scale is not None]
         return self._from_scale(samples, level, reduce(reconciled, known) if known else None)
 
@@ -257,7 +261,7 @@ class Georeferencer:
             return None
         scales = [self._range_scale(samples), inertial]
         if level is not None:
-            scales.append(self._height_scale(samples, level))
+            scales += [self._climb_scale(samples, level), self._height_scale(samples, level)]
         prior = min((s for s in scales if s is not None), key=lambda s: s.sigma, default=None)
         solution = fit_map(t_ns[ok] * 1e-9, mapped, target, travelled_m[ok], level, prior)
         if solution is None:
@@ -300,6 +304,26 @@ class Georeferencer:
         spread = 1.4826 * float(np.median(np.abs(ratios - scale))) / scale
         sigma = max(spread / np.sqrt(len(ratios)), SIGMA_RANGE_SCALE)
         return Scale(scale, sigma, "rangefinder", len(ratios))
+
+    def _climb_scale(self, samples: list[AlignmentSample], level: Array) -> Scale | None:
+        """Scale from rangefinder on a way straight up or down, over whatever is below."""
+        if not self.has_ranges:
+            return None
+        distance, ok = self._range.at(np.array([p.t_ns for p in samples]))
+        seen = [
+            (level @ p.map_from_camera.translation, d[0] * self._steepness(p.ned_from_camera))
+            for p, d, good in zip(samples, distance, ok, strict=True)
+            if good and p.ned_from_camera is not None
+        ]
+        if len(seen) < MIN_RANGES:
+            return None
+        return climb_scale(np.array([place for place, _ in seen]), np.array([h for _, h in seen]))
+
+    def _steepness(self, ned_from_camera: Array) -> float:
+        """Cosine of the body's tilt, by which a range along its axis is longer than a height."""
+        if self._body_from_camera is None:
+            return 1.0
+        return float((ned_from_camera @ self._body_from_camera.rotation.T)[2, 2])
 
     def _height_scale(self, samples: list[AlignmentSample], level: Array) -> Scale | None:
         """Scale from changes of barometric height."""

@@ -17,6 +17,7 @@ SETTLE_S = 3.0
 LIMIT_HOLD_M, LIMIT_HEIGHT_M = 0.10, 0.15
 JUMP_M = 0.3
 CIRCLE_RADIUS_M, CIRCLE_SPEED_M_S = 5.0, 2.0
+CORNERS = ((1, 0), (1, 1), (0, 1), (0, 0))
 TURN_S = 24.0
 MEAN_S = 1.0
 
@@ -102,7 +103,7 @@ def fly_square(trial: Trial, figures: Figures, side_m: float, asked_m: float) ->
     """Corners where they were asked for; sides as long as they were."""
     start, true_start, yaw_rad = trial.ground.believed_m, mean_place(trial), believed_yaw(trial)
     errors, corners = [], [np.zeros(2)]
-    for corner in ((1, 0), (1, 1), (0, 1), (0, 0)):
+    for corner in CORNERS:
         way = np.array([*corner, 0.0]) * side_m
         there = trial.pilot.go_to(start + way, yaw_rad)
         time.sleep(SETTLE_S)
@@ -110,10 +111,21 @@ def fly_square(trial: Trial, figures: Figures, side_m: float, asked_m: float) ->
         errors.append(float(np.linalg.norm(corners[-1] - way[:2])))
         trial.mark(f"corner {corner} of {side_m:g} m: {there}, off by {errors[-1]:.2f} m")
     sides = np.linalg.norm(np.diff(np.array(corners), axis=0), axis=1)
-    figures.add(f"square of {side_m:g} m, worst corner", max(errors), "m", asked_m)
+    turned_rad, own = _in_own_axes(side_m * np.array([[0, 0], *CORNERS]), np.array(corners))
+    figures.add(f"square of {side_m:g} m, worst corner", max(errors), "m")
+    figures.add(f"square of {side_m:g} m, turned by its compass", math.degrees(turned_rad), "deg")
+    figures.add(f"square of {side_m:g} m, worst corner in its own axes", own, "m", asked_m)
     if side_m >= 10:
         scale = 100 * abs(sides.mean() / side_m - 1)
         figures.add(f"square of {side_m:g} m, scale off", scale, "%", 1.0)
+
+
+def _in_own_axes(wanted_m: Array, reached_m: Array) -> tuple[float, float]:
+    """Angle of the axes that an autopilot has by its compass, and the worst error about them."""
+    a, b = wanted_m - wanted_m.mean(0), reached_m - reached_m.mean(0)
+    angle = math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return angle, float(np.linalg.norm(wanted_m @ turn.T - reached_m, axis=1).max())
 
 
 def fly_circle(trial: Trial, figures: Figures) -> None:
