@@ -36,6 +36,9 @@ MAX_VELOCITY_AGE_NS = 400_000_000
 SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.02, 0.05
 """Lower bounds of the relative scale error by rangefinder and barometer. By ranges alone it was
 0.1, 0.5, 0.5 and 4 % on rendered flights with cameras 45, 80, 90 and 30 degrees down: 2 % RMS."""
+SIGMA_RANGE_OFFSET_M, NEAR_RATIO = 0.08, 0.5
+"""Where the rangefinder sits above or below the camera, which nobody states: near the ground it
+counts for most, so that only the greater ranges count."""
 MAX_SIGMA_ROTATION_RAD = np.radians(8.0)
 MAX_SAMPLES = 400
 MAX_SIGMA_SCALE_NEW_MAP = 0.5
@@ -293,16 +296,19 @@ class Georeferencer:
         if not self.has_ranges:
             return None
         distance, ok = self._range.at(np.array([p.t_ns for p in samples]))
-        ratios = np.array([
-            d[0] / p.ground_units
+        seen = np.array([
+            (d[0], p.ground_units)
             for p, d, good in zip(samples, distance, ok, strict=True)
             if good and p.ground_units is not None
-        ])  # fmt: skip
-        if len(ratios) < MIN_RANGES:
+        ]).reshape(-1, 2)  # fmt: skip
+        high = seen[seen[:, 0] >= NEAR_RATIO * seen[:, 0].max(initial=0.0)]
+        if len(high) < MIN_RANGES:
             return None
+        ratios = high[:, 0] / high[:, 1]
         scale = float(np.median(ratios))
         spread = 1.4826 * float(np.median(np.abs(ratios - scale))) / scale
-        sigma = max(spread / np.sqrt(len(ratios)), SIGMA_RANGE_SCALE)
+        offset = SIGMA_RANGE_OFFSET_M / float(np.median(high[:, 0]))
+        sigma = float(max(spread / np.sqrt(len(ratios)), np.hypot(SIGMA_RANGE_SCALE, offset)))
         return Scale(scale, sigma, "rangefinder", len(ratios))
 
     def _climb_scale(self, samples: list[AlignmentSample], level: Array) -> Scale | None:
