@@ -8,6 +8,7 @@ attitude and image must agree that nothing moves.
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,14 +24,28 @@ LANDED_NS = 2_500_000_000
 FRESH_NS = 300_000_000
 """Age of the newest IMU sample and attitude at the time of a frame."""
 LEAST_SAMPLES = 20
-MAX_TURN_RAD_S = 0.03
-"""Bias of a gyro that is not calibrated yet, 1 degree/s, and noise of the mean."""
-MAX_TILT_RAD = np.radians(0.5)
-"""Change of attitude in a second; of the tilt that an autopilot finds at rest, too."""
-MAX_CHANGE_M_S2 = 0.15
-"""Between the means of two half seconds, beside what their noise explains."""
-MAX_GRAVITY_ERROR_M_S2 = 0.6
-"""Bias and sensitivity of an accelerometer, and gravity on earth."""
+
+
+class Limits(NamedTuple):
+    """What accelerometers, gyro and attitude of a vehicle that stands may show.
+
+    Turn: bias of a gyro that is not calibrated yet, 1 degree/s, and noise of the mean. Tilt: change
+    of attitude in a second, of the tilt that an autopilot finds at rest, too. Change: between the
+    means of two half seconds, beside what their noise explains. Gravity: bias and sensitivity of an
+    accelerometer, and gravity on earth.
+    """
+
+    turn_rad_s: float
+    tilt_rad: float
+    change_m_s2: float
+    gravity_m_s2: float
+
+
+TO_BEGIN = Limits(0.03, float(np.radians(0.5)), 0.15, 0.6)
+TO_GO_ON = Limits(0.15, float(np.radians(4.0)), 1.0, 1.5)
+"""Motors that are started shake the vehicle, and its autopilot's attitude: PX4's turned by 1.2
+degrees in its simulator, on the ground. As long as the image does not move, and the autopilot says
+that it is on the ground, that is no lift-off."""
 GRAVITY_M_S2 = 9.80665
 WIDTH_PX = 160
 """Width of the compared images: noise is averaged away, and a blurred image shows as much."""
@@ -78,7 +93,13 @@ class Standing:
 
     def at(self, t_ns: int, grey: Bytes) -> bool:
         """True if it stands at an image, which is the newest; also keeps that for the next."""
-        still = self._on_ground(t_ns) and self._imu_still(t_ns) and self._attitude_still(t_ns)
+        stood = self._since_ns is not None and t_ns - self._since_ns >= STILL_NS
+        limits = TO_GO_ON if stood else TO_BEGIN
+        still = (
+            self._on_ground(t_ns)
+            and self._imu_still(t_ns, limits)
+            and self._attitude_still(t_ns, limits)
+        )
         if not still:
             self._image.clear()
         elif not self._image.still(t_ns, grey):
@@ -95,7 +116,7 @@ class Standing:
             return True
         return self._armed is False
 
-    def _imu_still(self, t_ns: int) -> bool:
+    def _imu_still(self, t_ns: int, limits: Limits) -> bool:
         samples = self._imu
         if len(samples) < LEAST_SAMPLES or t_ns - samples[-1].t_ns > FRESH_NS:
             return False
@@ -110,19 +131,19 @@ class Standing:
         noise = float(np.sqrt(np.diff(accel, axis=0).var(0).sum() / 2.0) * np.sqrt(2.0 / half))
         weight = float(np.linalg.norm(accel.mean(0)))
         return (
-            float(np.linalg.norm(gyro.mean(0))) < float(MAX_TURN_RAD_S)
-            and change < MAX_CHANGE_M_S2 + 2.0 * noise
-            and abs(weight - GRAVITY_M_S2) < MAX_GRAVITY_ERROR_M_S2
+            float(np.linalg.norm(gyro.mean(0))) < limits.turn_rad_s
+            and change < limits.change_m_s2 + 2.0 * noise
+            and abs(weight - GRAVITY_M_S2) < limits.gravity_m_s2
         )
 
-    def _attitude_still(self, t_ns: int) -> bool:
+    def _attitude_still(self, t_ns: int, limits: Limits) -> bool:
         if len(self._attitudes) < 2 or t_ns - self._attitudes[-1].t_ns > FRESH_NS:
             return False
         first, last = (
             rotation_from_quaternion(each.ned_from_body)
             for each in (self._attitudes[0], self._attitudes[-1])
         )
-        return angle_between(first, last) < float(MAX_TILT_RAD)
+        return angle_between(first, last) < limits.tilt_rad
 
 
 class ImageStillness:

@@ -44,10 +44,6 @@ from tests.firmware.scene import Scene
 from tests.firmware.true_state import TrueState
 
 WIDTH, HEIGHT, HFOV_DEG = 640, 480, 75.0
-STANDS_M = 0.08
-"""Height of the autopilot, and of the lens at the same place, while the vehicle stands: that of a
-small one with short legs. To a firmware its own place is on the ground then, so that the drawn
-ground lies by as much below its zero."""
 WAIT_S = 0.03
 """For the state at an exposure; states come every 5 ms."""
 LAST_EVERY_S = 2.0
@@ -119,7 +115,7 @@ class DrawnCamera:
 
     def _seen_from(self, world_from_body: Pose) -> Pose:
         lens = world_from_body @ self._body_from_camera
-        return Pose(lens.rotation, lens.translation - [0.0, 0.0, STANDS_M])
+        return Pose(lens.rotation, lens.translation - [0.0, 0.0, self._arguments.above_m])
 
     def _come_or_go(self, server: PictureServer, now_s: float) -> None:
         if self.faults.holds("gone", now_s):
@@ -186,6 +182,7 @@ def main() -> None:
     parser.add_argument("--pitch-deg", type=float, default=-45.0)
     parser.add_argument("--roll-deg", type=float, default=0.0)
     parser.add_argument("--yaw-deg", type=float, default=0.0)
+    parser.add_argument("--above-m", type=float, default=0.0, help="lens above the vehicle's place")
     parser.add_argument("--look", choices=sorted(LOOKS), default="day")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--photos", type=Path, help="folder of aerial photographs for the ground")

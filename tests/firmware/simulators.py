@@ -42,6 +42,8 @@ class Simulator:
     name = ""
     home = GeoOrigin(0.0, 0.0, 0.0)
     """Where the vehicle stands at first."""
+    stands_m = 0.0
+    """From the ground up to where its simulator says that it is while it stands."""
 
     def __init__(
         self, binary: Path, folder: Path, ports: Ports, parameters: Mapping[str, float]
@@ -114,6 +116,7 @@ class ArduCopter(Simulator):
 
     name = "ArduCopter"
     home = GeoOrigin(-35.363262, 149.165237, 584.0)
+    stands_m = 0.09
 
     def _command(self) -> list[str]:
         defaults = self.folder / "defaults.parm"

@@ -35,6 +35,8 @@ from tests.support.processes.daemon_process import PROGRAM, Daemon
 
 CAMERA_HZ = 20.0
 LATENCY_MS = 40.0
+LENS_M = 0.1
+"""Above the ground, while the vehicle stands on short legs."""
 HEARD_S, READY_S, END_S = 30.0, 60.0, 20.0
 RESTART_S = 2.0
 """RestartSec of the service."""
@@ -258,7 +260,7 @@ class Trial:
         return self._child(
             "drawn_camera", "--state-port", self._camera_port, "--serve-port", self._video_port,
             "--rate-hz", CAMERA_HZ, "--latency-ms", LATENCY_MS, f"--pitch-deg={c.pitch_deg}",
-            f"--roll-deg={c.mount_roll_deg}", "--look", c.look, "--seed", c.seed,
+            f"--roll-deg={c.mount_roll_deg}", "--above-m", LENS_M - self.firmware.stands_m, "--look", c.look, "--seed", c.seed,
             f"--origin={origin}", "--out", self.folder, *c.camera_words,
         )  # fmt: skip
 

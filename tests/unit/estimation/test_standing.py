@@ -101,6 +101,16 @@ def test_motors_that_idle_do_not_matter() -> None:
     assert np.mean(found[90:]) > 0.95
 
 
+def _shaken(vehicle: Vehicle) -> None:
+    vehicle.armed, vehicle.landed = True, True
+    vehicle.vibration_m_s2, vehicle.accelerated_m_s2, vehicle.tilt_rad_s = 1.1, 0.3, 0.02
+
+
+def test_motors_that_shake_it_as_they_start_end_no_stand() -> None:
+    """The autopilot's attitude turns by a degree a second meanwhile, the image does not move."""
+    assert np.mean(Vehicle().stands(5.0, _shaken)[90:]) > 0.95
+
+
 @pytest.mark.parametrize(("armed", "landed"), [(True, None), (None, None), (True, False)])
 def test_a_hover_is_no_stand(armed: bool | None, landed: bool | None) -> None:
     """Nor a restart while armed, whatever IMU and image show."""
@@ -118,9 +128,9 @@ def _set(name: str, value: object) -> Callable[[Vehicle], None]:
     [
         (_set("shift_px_s", 20.0), 0.2),  # carried about, or sliding
         (_set("grow_s", -0.05), 0.2),  # straight up above the ground
-        (_set("accelerated_m_s2", 1.0), 0.5),
-        (_set("tilt_rad_s", 0.05), 0.4),
-        (_set("gyro_rad_s", 0.2), 0.4),
+        (_set("accelerated_m_s2", 2.5), 0.5),
+        (_set("tilt_rad_s", 0.15), 0.6),
+        (_set("gyro_rad_s", 0.4), 0.5),
         (_set("image", np.full((480, 640), 100, np.uint8)), 0.1),  # a cover over the lens
     ],
 )
