@@ -260,8 +260,9 @@ class Trial:
         return self._child(
             "drawn_camera", "--state-port", self._camera_port, "--serve-port", self._video_port,
             "--rate-hz", CAMERA_HZ, "--latency-ms", LATENCY_MS, f"--pitch-deg={c.pitch_deg}",
-            f"--roll-deg={c.mount_roll_deg}", "--above-m", LENS_M - self.firmware.stands_m, "--look", c.look, "--seed", c.seed,
-            f"--origin={origin}", "--out", self.folder, *c.camera_words,
+            f"--roll-deg={c.mount_roll_deg}", "--above-m", LENS_M - self.firmware.stands_m,
+            "--look", c.look, "--seed", c.seed, f"--origin={origin}",
+            "--out", self.folder, *c.camera_words,
         )  # fmt: skip
 
     def _tell(self, process: subprocess.Popen[bytes], order: str) -> None:

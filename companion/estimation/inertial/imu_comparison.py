@@ -141,8 +141,14 @@ def force_by_way(window: ImuWindow) -> Array:
     return out
 
 
-def agreement(window: ImuWindow, latest_s: float) -> Agreement | None:
-    """Comparison with delays up to `latest_s`; None with too little data."""
+def agreement(
+    window: ImuWindow, latest_s: float, without_heading: bool = False
+) -> Agreement | None:
+    """Comparison with delays up to `latest_s`; None with too little data.
+
+    `without_heading` leaves out turns about the vertical, for the IMU's axes as they are:
+    autopilots align their heading anew in flight.
+    """
     delays_s = np.arange(-NARROW_S, latest_s + 0.5 * DELAY_STEP_S, DELAY_STEP_S)
     end_s = window.imu_s[-1] - latest_s
     begin_s = max(window.imu_s[0] + NARROW_S, end_s - WINDOW_S)
@@ -158,6 +164,10 @@ def agreement(window: ImuWindow, latest_s: float) -> Agreement | None:
     turns = vectors_from_rotations(np.matmul(rotations[:-1].transpose(0, 2, 1), rotations[1:]))
     seen = (turns / dt_s[:, None])[use]
     gyro = (np.diff(_turned(window, t_s[None] + delays_s[:, None]), axis=1) / dt_s[:, None])[:, use]
+    if without_heading:
+        down = rotations[:-1][use, 2]
+        seen = seen - np.einsum("na,na->n", seen, down)[:, None] * down
+        gyro = gyro - np.einsum("dna,na->dn", gyro, down)[..., None] * down
     seen_mean, gyro_mean = seen.mean(0), gyro.mean(1)
     seen, gyro = seen - seen_mean, gyro - gyro_mean[:, None]
     # |seen - H gyro|2 for all ways H and delays at once

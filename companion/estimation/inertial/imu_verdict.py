@@ -55,7 +55,7 @@ ALWAYS_NS = -(2**62)
 
 NOT_USED = "the autopilot's IMU is not used: no scale and no dead reckoning by it"
 USED_AGAIN = "the autopilot's IMU is used again"
-SILENT = "silent"
+SILENT, DELAY = "silent", "delay"
 FORWARD_LEFT_UP = "its axes are forward, left and up, not forward, right and down"
 
 
@@ -178,6 +178,8 @@ class ImuVerdict:
             compared, found = wide, _turned_or_late(wide)
         else:
             found = _turned_or_late(compared)
+        if found is not None and found.kind == DELAY and not _late_in_tilt(window):
+            found = None
         if found is None:
             found = _gravity(force_by_way(window))
         if found is None and excited and compared.identity_unexplained > UNEXPLAINED:
@@ -216,8 +218,22 @@ def _turned_or_late(compared: Agreement) -> _Fault | None:
     in_time = np.abs(compared.delays_s) <= MAX_DELAY_S
     if chi_square[IDENTITY, in_time].min() > least + SURE:
         side = "late" if delay_s > 0.0 else "early"
-        return _Fault("delay", f"it is {abs(delay_s) * 1e3:.0f} ms {side}", True)
+        return _Fault(DELAY, f"it is {abs(delay_s) * 1e3:.0f} ms {side}", True)
     return None
+
+
+def _late_in_tilt(window: ImuWindow) -> bool:
+    """True if turns about level axes show it, too.
+
+    ArduPilot aligns its heading anew as it climbs, by some degrees within a second or two: about
+    the vertical that looks like gyroscopes that are early or late.
+    """
+    compared = agreement(window, WIDE_S, without_heading=True)
+    if compared is None:
+        return False
+    chi_square = compared.chi_square[IDENTITY]
+    in_time = np.abs(compared.delays_s) <= MAX_DELAY_S
+    return bool(chi_square[in_time].min() > chi_square.min() + SURE)
 
 
 def _gravity(accelerations: Array) -> _Fault | None:
