@@ -175,6 +175,10 @@ class Px4Pilot(Pilot):
         super().__init__(ground, firmware)
         ground.named = self._named
 
+    def hold_sticks(self, in_air: bool) -> None:
+        """See `Pilot`; always centred: it takes a stick that moves for a pilot who takes over."""
+        self._ground.sticks = lambda: CENTRED
+
     @staticmethod
     def _named(mode: int) -> str:
         main, sub = mode >> 16 & 255, mode >> 24

@@ -263,18 +263,46 @@ def test_one_that_never_comes_is_not_spoken_of() -> None:
 def test_a_heading_that_jumps_is_not_the_imu() -> None:
     """The autopilot's filter corrects its heading in flight."""
 
-    def jumped(given: Iterator[Sample]) -> Iterator[Sample]:
-        yaw = quaternion_from_euler(0.0, 0.0, 0.3)
-        for each in given:
-            if isinstance(each, AttitudeSample) and each.t_ns > 9_000_000_000:
-                w, x, y, z = each.ned_from_body
-                a, d = yaw[0], yaw[3]
-                turned_by = np.array([a * w - d * z, a * x - d * y, a * y + d * x, a * z + d * w])
-                yield AttitudeSample(each.t_ns, turned_by)
-            else:
-                yield each
+    jumped = misheaded(samples(weaving), lambda t_s: 0.3 * (t_s > 9.0))
+    assert judged(jumped)[1] == []
 
-    assert judged(jumped(samples(weaving)))[1] == []
+
+def misheaded(given: Iterator[Sample], error_rad: Callable[[float], float]) -> Iterator[Sample]:
+    """With an attitude whose heading is off."""
+    for each in given:
+        if isinstance(each, AttitudeSample):
+            yaw = quaternion_from_euler(0.0, 0.0, error_rad(each.t_ns * 1e-9))
+            w, x, y, z = each.ned_from_body
+            a, d = yaw[0], yaw[3]
+            turned_by = np.array([a * w - d * z, a * x - d * y, a * y + d * x, a * z + d * w])
+            yield AttitudeSample(each.t_ns, turned_by)
+        else:
+            yield each
+
+
+ALIGNED_S = 9.0 + np.array([0.0, 0.1, 0.5, 1.0, 1.7, 2.1, 2.6, 3.1, 4.0, 5.0])
+HEADING_DEG = np.array([0.4, 0.5, 0.7, 1.5, -2.9, -8.3, -7.1, -2.7, 1.0, 2.6])
+AHEAD_S = 0.1
+"""As ArduCopter (4.7-dev, in its simulator) swung while it aligned its heading anew on the way up:
+its attitude was ahead of its gyroscopes, about the vertical."""
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.2])
+def test_a_heading_that_is_aligned_anew_is_no_delay(late_s: float) -> None:
+    def heading_rad(t_s: float) -> float:
+        return float(np.radians(np.interp(t_s, ALIGNED_S, HEADING_DEG)))
+
+    def motion(t_s: float) -> tuple[Array, Array]:
+        acceleration, angles = swaying(t_s)
+        return 0.3 * acceleration, 0.3 * angles + [0.0, 0.0, heading_rad(t_s)]
+
+    def error_rad(t_s: float) -> float:
+        return heading_rad(t_s + AHEAD_S) - heading_rad(t_s)
+
+    given = altered(made_up(motion, seconds=20.0), late(late_s))
+    changes = judged(misheaded(given, error_rad))[1]
+    assert all("ms late" in change.warning.detail for change in changes)
+    assert bool(changes) == (late_s > 0.0)
 
 
 def integrated(wrong: Wrong) -> tuple[AccelerationIntegral, list[int], list[Warned]]:
