@@ -83,7 +83,9 @@ class LocalisationStage:
         self._acceleration = AccelerationIntegral()
         self._navigation = InertialNavigation(self._acceleration)
         self._standing = Standing()
-        self._odometry = SmoothOdometry(camera, config.feedback.max_jump_m, self._navigation)
+        self._odometry = SmoothOdometry(
+            camera, config.feedback.max_jump_m, self._navigation, config.feedback.min_quality
+        )
         self._georeferences = SegmentGeoreferences(
             self._georeferencer, self._attitude, self._acceleration, camera.body_from_camera
         )

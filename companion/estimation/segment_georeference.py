@@ -34,6 +34,8 @@ CORRELATION_INFLATION = 3.0
 MAX_SIGMA_SCALE_DISPLACEMENT = 0.05
 """Displacement factors require a scale at least this certain."""
 MAX_SAMPLES, MAX_SAMPLES_FINAL = 120, 400
+MAX_GROUND_DISTANCES = 40
+"""Half a millisecond each, on the way to a pose; their median is no more certain of more."""
 INERTIAL_EVERY_NS = 400_000_000
 """Between keyframes for the inertial scale: with closer ones it is no more certain."""
 SETTLED_AFTER = 2
@@ -360,8 +362,10 @@ class SegmentGeoreferences:
         beams = [pose.rotation @ mount.rotation[2] for pose in poses]
         down = np.sum(beams, axis=0)
         ground = HeightAboveGround(segment.point_positions(), down / np.linalg.norm(down))
+        compared = set(np.linspace(0, len(poses) - 1, MAX_GROUND_DISTANCES).astype(int).tolist())
         return [
-            ground.distance(pose.translation, beam) for pose, beam in zip(poses, beams, strict=True)
+            ground.distance(pose.translation, beam) if i in compared else None
+            for i, (pose, beam) in enumerate(zip(poses, beams, strict=True))
         ]
 
 

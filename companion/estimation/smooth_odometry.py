@@ -27,6 +27,9 @@ from companion.messages import Georeference, Odometry, Track, TrackState
 
 SIGMA_DEAD_RECKONING_M_S = 0.3
 """Standard deviation of the velocity used in dead reckoning."""
+QUALITY_MARGIN, BETTER_RECKONED_M = 1.5, 0.5
+"""Below the first, times the least quality that is sent, inertial navigation counts for more, as
+long as it is this certain: a vehicle that turns on the spot sees new ground without parallax."""
 MAX_SIGMA_RECKONED_M = 5.0
 """By inertial navigation; beyond, it is of no use even to find the map again."""
 MAX_SIGMA_SCALE_AIDING = 0.05
@@ -46,13 +49,17 @@ class SmoothOdometry:
     Tracked places aid the inertial navigation, which carries the pose on where nothing is tracked.
     """
 
-    def __init__(self, camera: Camera, max_jump_m: float, navigation: InertialNavigation) -> None:
+    def __init__(
+        self, camera: Camera, max_jump_m: float, navigation: InertialNavigation,
+        min_quality: int = 1,
+    ) -> None:  # fmt: skip
         mount = camera.body_from_camera
         self._camera_from_body = mount.inverse() if mount is not None else Pose.identity()
         self._size = np.array([camera.width, camera.height], np.float64)
         self._gate = InnovationGate(max_jump_m)
         self._drift = OdometryDrift()
         self._navigation = navigation
+        self._least_quality = QUALITY_MARGIN * min_quality
         self._attitude: BodyAttitude | None = None
         self._reckoned: Reckoned | None = None
         """Attitude of the frame that has begun, and where inertial navigation has the body."""
@@ -121,6 +128,11 @@ class SmoothOdometry:
             if self._reckoned is not None:
                 return self._unknown(track)
             return self._dead_reckon(track, raw)
+        quality = quality_of(track, self._size)
+        reckoned = self._reckoned
+        if quality < self._least_quality and reckoned is not None:
+            if reckoned.sigma_place_m < BETTER_RECKONED_M:
+                return self._unknown(track)
         if self._dead_reckoning:
             self._reacquire(raw, track.t_ns)
         frame = self._frame
@@ -166,7 +178,7 @@ class SmoothOdometry:
         )
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter,
-            quality_of(track, self._size), placed, self._velocity.copy(),
+            quality, placed, self._velocity.copy(),
             float(np.linalg.norm([FLOOR_M, noise_m, *drift])),
             sigma_velocity,
             float(np.hypot(FLOOR_RAD, NOISE_INFLATION * track.sigma_rotation_rad)),

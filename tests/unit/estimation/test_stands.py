@@ -22,6 +22,7 @@ PLACED = Georeference(
 HERE = np.array([3.0, 2.0, -10.0])
 STEP_NS = 100_000_000
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+SPREAD_PX = np.random.default_rng(0).uniform(0.0, [640.0, 480.0], (200, 2)).astype(np.float32)
 
 
 class Vehicle:
@@ -29,14 +30,15 @@ class Vehicle:
 
     def __init__(self, has_imu: bool = True) -> None:
         self._integral = AccelerationIntegral()
-        self.odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(self._integral))
+        navigation = InertialNavigation(self._integral)
+        self.odometry = SmoothOdometry(CAMERA, 1.0, navigation, min_quality=20)
         self._has_imu = has_imu
         self.t_ns = 0
 
     def frame(
         self, at_m: Array | None = None, *, standing: bool = False, attitude: bool = True,
         segment: int = 0, georeference: Georeference = PLACED, north_m_s2: float = 0.0,
-        world_m: Array | None = None,
+        world_m: Array | None = None, n_points: int = 200,
     ) -> Odometry:  # fmt: skip
         """The next frame, tracked at a place (3,) in the map, or lost; `world_m` by satellites."""
         self.t_ns += STEP_NS
@@ -50,8 +52,8 @@ class Vehicle:
         if at_m is not None:
             pose = Pose(np.eye(3), np.array(at_m))
             track = replace(
-                track, state=TrackState.TRACKING, map_from_camera=pose, n_inliers=200,
-                n_matches=220, keypoints_px=np.zeros((200, 2), np.float32), sigma_position=0.01,
+                track, state=TrackState.TRACKING, map_from_camera=pose, n_inliers=n_points,
+                n_matches=220, keypoints_px=SPREAD_PX, sigma_position=0.01,
                 sigma_rotation_rad=0.001,
             )  # fmt: skip
         return self.odometry.step(track, segment, georeference, (np.zeros(3), 0.1))
@@ -146,6 +148,16 @@ def test_what_it_does_not_know_of_where_it_landed_is_stated() -> None:
     stood = vehicle.frames(20, standing=True)
     assert stood.reset_counter == 0
     assert abs(stood.sigma_position_m - blind.sigma_position_m) < 0.05
+
+
+@pytest.mark.parametrize("has_imu", [True, False])
+def test_a_few_points_at_the_edge_of_a_map_give_way_to_accelerometers(has_imu: bool) -> None:
+    vehicle = Vehicle(has_imu)
+    vehicle.frames(20, HERE)
+    for k in range(10):
+        poor = vehicle.frame(HERE + [0.03 * k, 0.0, 0.0], n_points=5)
+    assert poor.inertial is has_imu
+    assert abs(place(poor)[0] - HERE[0] - 0.27 * (not has_imu)) < 0.05
 
 
 def test_a_frame_without_attitude_ends_no_stand() -> None:
