@@ -32,25 +32,25 @@ class Limits(NamedTuple):
     Turn: bias of a gyro that is not calibrated yet, 1 degree/s, and noise of the mean. Tilt: change
     of attitude in a second, of the tilt that an autopilot finds at rest, too. Change: between the
     means of two half seconds, beside what their noise explains. Gravity: bias and sensitivity of an
-    accelerometer, and gravity on earth.
+    accelerometer, and gravity on earth. Shift: of the image at `WIDTH_PX` in `ANCHOR_NS`; 0.25 is 1
+    pixel of 640, some tenths of a millimetre on the ground below a landing gear.
     """
 
     turn_rad_s: float
     tilt_rad: float
     change_m_s2: float
     gravity_m_s2: float
+    shift_px: float
 
 
-TO_BEGIN = Limits(0.03, float(np.radians(0.5)), 0.15, 0.6)
-TO_GO_ON = Limits(0.15, float(np.radians(4.0)), 1.0, 1.5)
-"""Motors that are started shake the vehicle, and its autopilot's attitude: PX4's turned by 1.2
-degrees in its simulator, on the ground. As long as the image does not move, and the autopilot says
-that it is on the ground, that is no lift-off."""
+TO_BEGIN = Limits(0.03, float(np.radians(0.5)), 0.15, 0.6, 0.25)
+TO_GO_ON = Limits(0.15, float(np.radians(4.0)), 1.0, 1.5, 2.0)
+"""Motors that are started shake the vehicle on its gear, and its autopilot's attitude: PX4's turned
+by 1.2 degrees in its simulator, on the ground, the vehicle by 0.2. As long as the image hardly
+moves, and the autopilot says that it is on the ground, that is no lift-off."""
 GRAVITY_M_S2 = 9.80665
 WIDTH_PX = 160
 """Width of the compared images: noise is averaged away, and a blurred image shows as much."""
-MAX_SHIFT_PX = 0.25
-"""At that width, 1 pixel of 640: some tenths of a millimetre on the ground below a landing gear."""
 MAX_GAIN_CHANGE = 0.3
 """By exposure; more is another image, or none."""
 ANCHOR_NS = 2_000_000_000
@@ -102,7 +102,7 @@ class Standing:
         )
         if not still:
             self._image.clear()
-        elif not self._image.still(t_ns, grey):
+        elif not self._image.still(t_ns, grey, limits.shift_px):
             still = False
         if not still:
             self._since_ns = None
@@ -160,10 +160,10 @@ class ImageStillness:
         """Forget the image before."""
         self._anchor = None
 
-    def still(self, t_ns: int, grey: Bytes) -> bool:
+    def still(self, t_ns: int, grey: Bytes, shift_px: float = TO_BEGIN.shift_px) -> bool:
         """Compare with the image before; False for the first, and where there is nothing to see."""
         small, anchor = _reduced(grey), self._anchor
-        still = anchor is not None and anchor.shows(small)
+        still = anchor is not None and anchor.shows(small, shift_px)
         if anchor is None or not still or t_ns - anchor.t_ns > ANCHOR_NS:
             self._anchor = _Anchor(t_ns, small)
         return still
@@ -183,7 +183,7 @@ class _Anchor:
         self._inverse = np.linalg.pinv(self._changes @ self._changes.T)
         self._gradient = float(np.sqrt((across**2 + down**2).mean()))
 
-    def shows(self, small: Array) -> bool:
+    def shows(self, small: Array, most_px: float) -> bool:
         """True if another image shows the same, and there is enough in it to tell."""
         if small.shape != self._small.shape:
             return False
@@ -194,7 +194,7 @@ class _Anchor:
         return bool(
             self._gradient > LEAST_CONTRAST * float(left.std())
             and abs(gain) < MAX_GAIN_CHANGE
-            and shift_px < MAX_SHIFT_PX
+            and shift_px < most_px
         )
 
 
