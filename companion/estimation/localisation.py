@@ -423,7 +423,7 @@ class LocalisationStage:
         if checked.reinitialise:
             self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)
             self._reset_motion()
-            self._odometry.discard_map(segment.first_keyframe_id)
+            self._odometry.discard_map(segment.first_keyframe_id, checked.tilt_rad)
         return checked.warnings
 
     def _withdraw_accelerations(self, since_ns: int) -> None:

@@ -30,6 +30,8 @@ SIGMA_DEAD_RECKONING_M_S = 0.3
 QUALITY_MARGIN, BETTER_RECKONED_M = 1.5, 0.5
 """Below the first, times the least quality that is sent, inertial navigation counts for more, as
 long as it is this certain: a vehicle that turns on the spot sees new ground without parallax."""
+SIGMA_DOUBTED_M, SIGMA_DOUBTED_M_S = 0.1, 0.1
+"""At least, of inertial navigation that a wrong map has aided."""
 MAX_SIGMA_RECKONED_M = 5.0
 """By inertial navigation; beyond, it is of no use even to find the map again."""
 MAX_SIGMA_SCALE_AIDING = 0.05
@@ -79,6 +81,8 @@ class SmoothOdometry:
         """Of the place where it stands, since the last reset."""
         self._begins_m: Array = np.zeros(3)
         """Place (3,) of a stand before any other is known."""
+        self._map_began_m: Array = np.zeros(3)
+        """Place (3,) where the active map began."""
         self._in_world = False
         """True once satellites have placed the body, or its map."""
         self.reset_counter = 0
@@ -401,6 +405,7 @@ class SmoothOdometry:
         if owed_m is not None:
             self._frame = self._frame.shifted(-owed_m)
         self.reckoned_path.clear()
+        self._map_began_m = (self._frame.from_world @ raw).translation
         self._segment, self._georeference = segment, georeference
         self._last, self._dead_reckoning = None, False
         self._gate.clear()
@@ -457,10 +462,19 @@ class SmoothOdometry:
         self._reckoned = None
         self.reckoned_path.clear()
 
-    def discard_map(self, segment: int) -> None:
-        """Handle a map that was found wrong: what aided inertial navigation was wrong, too."""
-        if segment == self._segment:
-            self._navigation.reset()
+    def discard_map(self, segment: int, tilt_rad: float) -> None:
+        """Handle a map that was found tilted: what aided inertial navigation was tilted, too.
+
+        It is doubted by as much as that has turned the way since the map began, and the velocity.
+        """
+        if segment != self._segment or self._last is None:
+            return
+        share = float(np.sin(min(tilt_rad, np.pi / 2)))
+        way_m = float(np.linalg.norm(self._last[2].translation - self._map_began_m))
+        speed_m_s = float(np.linalg.norm(self._velocity))
+        self._navigation.doubt(
+            SIGMA_DOUBTED_M + share * way_m, SIGMA_DOUBTED_M_S + share * speed_m_s
+        )
 
     def correct_map(self, segment: int, t_ns: int, map_from_camera: Pose) -> None:
         """Apply a correction of a map: `map_from_camera` of its last tracked frame now.

@@ -45,13 +45,14 @@ BODY_FIXED_AGAIN = "camera turns with the body again: attitude used"
 class Verdict:
     """A warning, and what to do with map and attitudes.
 
-    With `reinitialise` the active map is discarded, for the `n_reinitialised`th time in a row,
-    entirely if it is `young`. Attitudes since `invalid_since_ns` were not those of the camera. With
-    `mount` the cause is, or was until now, the mount.
+    With `reinitialise` the active map, which is off by `tilt_rad`, is discarded, for the
+    `n_reinitialised`th time in a row, entirely if it is `young`. Attitudes since `invalid_since_ns`
+    were not those of the camera. With `mount` the cause is, or was until now, the mount.
     """
 
     warning: Warned
     reinitialise: bool = False
+    tilt_rad: float = 0.0
     young: bool = True
     invalid_since_ns: int | None = None
     mount: bool = False
@@ -177,14 +178,15 @@ class AttitudeVerdict:
         if self.n_reinitialised >= MAX_REINITIALISATIONS:
             return self._reject(t_ns, MOUNT_DISAGREES)
         self.n_reinitialised += 1
-        off_deg = np.degrees(max(moved_rad, absolute_rad))
+        tilt_rad = max(moved_rad, absolute_rad)
         young = not self._consistent
         self.reset()
         detail = (
-            f"by {off_deg:.0f} degrees, number {self.n_reinitialised} of "
+            f"by {np.degrees(tilt_rad):.0f} degrees, number {self.n_reinitialised} of "
             f"{MAX_REINITIALISATIONS} in a row"
         )
-        return Verdict(Warned(t_ns, REINITIALISED, detail), reinitialise=True, young=young)
+        warning = Warned(t_ns, REINITIALISED, detail)
+        return Verdict(warning, reinitialise=True, tilt_rad=tilt_rad, young=young)
 
     def _reject(self, t_ns: int, what: str) -> Verdict:
         """Ignore the attitude until rotations agree again."""

@@ -34,14 +34,15 @@ class AttitudeCheck(NamedTuple):
 
     After a correction `now_from_before` (3, 3) rotates measurements in camera axes by the mount
     before, and `before_from_now_ned` (3, 3) is the change of the attitude of the frame. With
-    `reinitialise` the active map is tilted, and useless if `young`; `n_reinitialised` counts
-    successive ones. Attitudes since `invalid_since_ns` were not those of the camera.
+    `reinitialise` the active map is tilted by `tilt_rad`, useless if `young`; `n_reinitialised`
+    counts successive ones. Attitudes since `invalid_since_ns` were not those of the camera.
     """
 
     warnings: list[Warned]
     now_from_before: Array | None = None
     before_from_now_ned: Array | None = None
     reinitialise: bool = False
+    tilt_rad: float = 0.0
     young: bool = True
     n_reinitialised: int = 0
     invalid_since_ns: int | None = None
@@ -169,8 +170,8 @@ class CameraAttitude:
                 if not verdict.mount:
                     self._estimator.reset()  # its rotations were those of a gimbal
             return AttitudeCheck(
-                [verdict.warning], reinitialise=verdict.reinitialise, young=verdict.young,
-                n_reinitialised=self._verdict.n_reinitialised,
+                [verdict.warning], reinitialise=verdict.reinitialise, tilt_rad=verdict.tilt_rad,
+                young=verdict.young, n_reinitialised=self._verdict.n_reinitialised,
                 invalid_since_ns=verdict.invalid_since_ns,
             )  # fmt: skip
         if not self.used or t_ns < self._due_ns:

@@ -155,6 +155,17 @@ class InertialNavigation:
             self._covariance[height, :] = self._covariance[:, height] = 0.0
         self._waiting.clear()
 
+    def doubt(self, sigma_m: float, sigma_m_s: float) -> None:
+        """Take that what has aided it was wrong: by how much in place and velocity.
+
+        Bias and tilt are as uncertain as at first again.
+        """
+        doubted = ((PLACE, sigma_m), (VELOCITY, sigma_m_s), (BIAS, SIGMA_BIAS_M_S2))
+        for part, sigma in (*doubted, (TILT, SIGMA_TILT_M_S2)):
+            self._covariance[part, part] += sigma**2 * np.eye(part.stop - part.start)
+        self._waiting = deque(each for each in self._waiting if not isinstance(each, AidedPlace))
+        self._refused_since_ns = None
+
     def forget(self) -> None:
         """Forget all: the accelerations were wrong."""
         self.reset()

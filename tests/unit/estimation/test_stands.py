@@ -221,3 +221,17 @@ def test_one_wrong_relocalisation_while_blind_is_no_reset_later() -> None:
     seen = vehicle.frame(HERE)
     assert (seen.state, seen.reset_counter) == (TrackState.TRACKING, 0)
     np.testing.assert_allclose(place(seen), HERE, atol=0.1)
+
+
+def test_a_map_that_was_tilted_leaves_a_doubt_about_place_and_velocity() -> None:
+    """What has flown ten metres on a map tilted by 6 degrees is a metre off."""
+    vehicle = Vehicle()
+    for k in range(21):
+        vehicle.frame(HERE + [0.5 * k, 0.0, 0.0])
+    before = vehicle.frame()
+    vehicle.odometry.discard_map(0, float(np.radians(6.0)))
+    doubted = vehicle.frame()
+    assert before.sigma_position_m < 0.2
+    assert 1.0 < doubted.sigma_position_m < 3.0
+    vehicle.odometry.discard_map(1, float(np.radians(40.0)))  # another map
+    assert vehicle.frame().sigma_position_m < 3.5
