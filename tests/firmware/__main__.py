@@ -71,11 +71,13 @@ def main() -> int:
         if getattr(options, each.name, None) is not None
     }
     pairs = (each.partition("=") for each in options.parameter)
-    given["parameters"] = {name: float(value) for name, _, value in pairs}
+    parameters = {name: float(value) for name, _, value in pairs}
     given["settings"] = tuple(options.set)
     holds = True
     for name in options.experiments:
-        conditions = dataclasses.replace(EXPERIMENTS[name][1], **given)
+        usual = EXPERIMENTS[name][1]
+        given["parameters"] = {**usual.parameters, **parameters}
+        conditions = dataclasses.replace(usual, **given)
         words = [f"fault={each}" for each in options.only]
         holds &= fly(name, options.firmware, options.out, conditions, words).hold
     return 0 if holds else 1
