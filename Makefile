@@ -10,7 +10,7 @@ OUT ?= out/demo
 # With it each process of the tests, seven a flight, compiles the whole program anew: a second each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint opencl clean reference regression settings deb system-test docs
+.PHONY: demo test lint opencl clean reference regression settings deb system-test trials docs
 
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
@@ -54,9 +54,14 @@ docs: $(VENV)/.installed-docs
 deb:
 	sh packaging/build_deb.sh
 
-# The package on a booted Debian, and ArduCopter in its simulator; tests/system says what they need.
+# The package on a booted Debian, and the firmwares in their simulators; tests/system and
+# tests/firmware say what they need.
 system-test: $(VENV)/.installed-dev
-	$(BIN)/pytest -s tests/system
+	$(BIN)/pytest -s tests/system tests/firmware
+
+# What draws the camera of the trials with firmwares: then `python -m tests.firmware --help`.
+trials: $(VENV)/.installed-dev
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev,trial]'
 
 # A stamp beside the environment: reinstalled only when the dependencies may have changed.
 $(VENV)/.installed: pyproject.toml | $(BIN)/python
