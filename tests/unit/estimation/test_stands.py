@@ -9,6 +9,7 @@ import pytest
 
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_navigation import BodyAttitude, InertialNavigation
+from companion.estimation.odometry_frame import MapView
 from companion.estimation.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity
@@ -39,6 +40,7 @@ class Vehicle:
         self, at_m: Array | None = None, *, standing: bool = False, attitude: bool = True,
         segment: int = 0, georeference: Georeference = PLACED, north_m_s2: float = 0.0,
         world_m: Array | None = None, n_points: int = 200,
+        first: MapView | None = None,
     ) -> Odometry:  # fmt: skip
         """The next frame, tracked at a place (3,) in the map, or lost; `world_m` by satellites."""
         self.t_ns += STEP_NS
@@ -56,7 +58,7 @@ class Vehicle:
                 n_matches=220, keypoints_px=SPREAD_PX, sigma_position=0.01,
                 sigma_rotation_rad=0.001,
             )  # fmt: skip
-        return self.odometry.step(track, segment, georeference, (np.zeros(3), 0.1))
+        return self.odometry.step(track, segment, georeference, (np.zeros(3), 0.1), first)
 
     def frames(self, n: int, at_m: Array | None = None, *, standing: bool = False) -> Odometry:
         """So many frames alike; the last odometry."""
@@ -235,3 +237,18 @@ def test_a_map_that_was_tilted_leaves_a_doubt_about_place_and_velocity() -> None
     assert 1.0 < doubted.sigma_position_m < 3.0
     vehicle.odometry.discard_map(1, float(np.radians(40.0)))  # another map
     assert vehicle.frame().sigma_position_m < 3.5
+
+
+def test_a_map_is_flown_on_once_it_has_settled() -> None:
+    """Until then it bends: here it says that a vehicle which hovers goes away at 0.3 m/s."""
+    vehicle = Vehicle()
+    vehicle.frames(20, standing=True)
+    vehicle.frames(5)
+    first = MapView(vehicle.t_ns, Pose(np.eye(3), HERE))
+    for k in range(19):
+        young = vehicle.frame(HERE + [0.03 * k, 0.0, 0.0], first=first)
+        assert young.inertial
+    np.testing.assert_allclose(place(young), 0.0, atol=0.05)
+    settled = vehicle.frame(HERE, first=first)
+    assert settled.state is TrackState.TRACKING and settled.reset_counter == 0
+    np.testing.assert_allclose(place(settled), 0.0, atol=0.05)
