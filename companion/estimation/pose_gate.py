@@ -27,6 +27,9 @@ from companion.telemetry import AttitudeSample, is_believed
 MAX_TILT_ERROR_RAD = np.radians(8.0)
 MAX_AGE_NS = 300_000_000
 """An older pose is of no use to an autopilot."""
+MAX_PAUSE_NS = 3_000_000_000
+"""After frames that came too late, dead reckoning begins again within this time, with proof: a
+computer that was busy for a moment has lost nothing of where the body is."""
 MAX_SIGMA_SCALE = 0.05
 """Relative; with it velocities are 5 % off, 0.5 m/s at 10 m/s, which an autopilot's EKF takes for
 noise: ArduPilot's VISO_VEL_M_NSE is 0.1 m/s and more, its innovation gates are five of these."""
@@ -115,6 +118,7 @@ class PoseGate:
         self._accepted: Odometry | None = None
         self._accepted_at_ns = 0
         self._accepted_since_ns: int | None = None
+        self._silent_since_ns: int | None = None
         self._last_stamp_ns = 0
         self._n_predicted = 0
         self._periods_ns: deque[int] = deque(maxlen=N_PERIODS)
@@ -255,7 +259,7 @@ class PoseGate:
         pose, velocity = odometry.world_from_body, odometry.velocity_world_m_s
         if odometry.state is TrackState.INITIALISING:
             return INITIALISING
-        bridging = odometry.inertial and self.sending
+        bridging = odometry.inertial and (self.sending or self._paused_lately(now_ns))
         seen = odometry.state in (TrackState.TRACKING, TrackState.STANDING)
         if not seen and not bridging:
             return LOST
@@ -308,12 +312,19 @@ class PoseGate:
     def _time_out(self) -> None:
         """Stop sending: no pose was accepted for too long."""
         if self.sending:
-            self._stop(self._last_rejection or SILENT)
+            why_not = self._last_rejection or SILENT
+            self._stop(why_not)
+            self._silent_since_ns = self._accepted_at_ns if why_not == SILENT else None
         self._accepted_since_ns = None
 
     def _stop(self, why_not: str) -> None:
         self.state, self.why_not = Sending.OFF, why_not
-        self._accepted_since_ns = None
+        self._accepted_since_ns = self._silent_since_ns = None
+
+    def _paused_lately(self, now_ns: int) -> bool:
+        """True where poses ceased for want of frames alone, and not long ago."""
+        since_ns = self._silent_since_ns
+        return since_ns is not None and now_ns - since_ns < MAX_PAUSE_NS
 
     def _pose_of(self, odometry: Odometry) -> PoseToSend:
         assert odometry.world_from_body is not None and odometry.velocity_world_m_s is not None

@@ -47,7 +47,7 @@ WITHOUT_GPS: dict[str, dict[str, float]] = {
 ON_OUR_POSE: dict[str, dict[str, float]] = {
     "ArduCopter": {
         "VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6,
-        "EK3_SRC1_POSZ": 1, "EK3_SRC1_YAW": 1, "VISO_DELAY_MS": 80,
+        "EK3_SRC1_POSZ": 1, "EK3_SRC1_YAW": 1, "VISO_DELAY_MS": 62,
     },
     "PX4": {
         "EKF2_EV_CTRL": 7, "EKF2_HGT_REF": 0, "EKF2_EV_DELAY": 0, "EKF2_EV_NOISE_MD": 0,

@@ -414,6 +414,18 @@ def test_a_bridge_ends_where_its_uncertainty_does() -> None:
     assert flight.run(0.3)
 
 
+@pytest.mark.parametrize(("late_s", "resumes"), [(0.5, True), (3.5, False)])
+def test_a_bridge_goes_on_after_frames_that_came_too_late(late_s: float, resumes: bool) -> None:
+    flight = Flight()
+    flight.run(2)
+    flight.run(1, **BLIND)
+    flight.run(late_s, frames=False)
+    assert (flight.gate.state, flight.gate.why_not) == (Sending.OFF, "no frames")
+    assert not flight.run(0.9, **BLIND)
+    assert bool(flight.run(0.5, **BLIND)) is resumes
+    assert flight.state() is (Sending.BRIDGING if resumes else Sending.OFF)
+
+
 def test_none_is_predicted_beyond_the_limit() -> None:
     """Which is of the place apart from the scale."""
     flight = Flight(max_sigma_m=1.0)
