@@ -233,8 +233,10 @@ class SmoothOdometry:
         self._attitude, self._reckoned = attitude, found
         if found is not None:
             world_m = self._frame.from_world.inverse().apply(found.place_m)
-            place = BodyPlace(t_ns, np.asarray(world_m), found.start._replace(t_ns=t_ns))
-            self.reckoned_path.add(place)
+            assert attitude is not None
+            rotation = self._navigation.world_from_attitude @ attitude.ned_from_body
+            start = found.start._replace(t_ns=t_ns)
+            self.reckoned_path.add(BodyPlace(t_ns, np.asarray(world_m), start, rotation))
         return found
 
     def without_frame(self, seq: int, t_ns: int, attitude: BodyAttitude | None) -> Odometry | None:
@@ -393,8 +395,9 @@ class SmoothOdometry:
         if georeference.has_origin and self._reckoned is not None:
             owed_m = raw.translation - self._reckoned.place_m
         elif not georeference.has_origin and first is not None and began is not None:
-            turn = self._heading_reckoned(raw)
             raw_first = self._raw(georeference, first.map_from_camera)
+            # of the first view: autopilots' headings swing on the way up
+            turn = yaw_rotation(yaw_angle(began.rotation @ raw_first.rotation.T))
             offset = before.from_world.apply(began.place_world_m) - turn @ raw_first.translation
             if self._reckoned is not None:
                 owed_m = turn @ raw.translation + offset - self._reckoned.place_m
@@ -418,17 +421,6 @@ class SmoothOdometry:
         self._segment, self._georeference = segment, georeference
         self._last, self._dead_reckoning = None, False
         self._gate.clear()
-
-    def _heading_reckoned(self, raw: Pose) -> Array:
-        """Rotation about the vertical (3, 3) from a world to the frame of the navigation.
-
-        `raw` is the pose of the body in that world now.
-        """
-        attitude = self._attitude
-        if attitude is None:
-            return np.eye(3)
-        here = self._navigation.world_from_attitude @ attitude.ned_from_body
-        return yaw_rotation(yaw_angle(here @ raw.rotation.T))
 
     def _update_georeference(self, georeference: Georeference) -> None:
         """Change the georeference of the same map, keeping the last pose."""
