@@ -12,7 +12,13 @@ from companion.estimation.inertial.inertial_navigation import BodyAttitude, Iner
 from companion.estimation.odometry_frame import MapView
 from companion.estimation.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose, Similarity
+from companion.geometry.transforms import (
+    Array,
+    Pose,
+    Similarity,
+    yaw_angle,
+    yaw_rotation,
+)
 from companion.messages import Georeference, Odometry, Track, TrackState
 from companion.telemetry import AttitudeSample, ImuSample
 
@@ -40,7 +46,7 @@ class Vehicle:
         self, at_m: Array | None = None, *, standing: bool = False, attitude: bool = True,
         segment: int = 0, georeference: Georeference = PLACED, north_m_s2: float = 0.0,
         world_m: Array | None = None, n_points: int = 200,
-        first: MapView | None = None,
+        first: MapView | None = None, heading_rad: float = 0.0,
     ) -> Odometry:  # fmt: skip
         """The next frame, tracked at a place (3,) in the map, or lost; `world_m` by satellites."""
         self.t_ns += STEP_NS
@@ -48,7 +54,7 @@ class Vehicle:
             t_ns = self.t_ns + step * 10_000_000
             self._integral.take(ImuSample(t_ns, np.zeros(3), np.array([north_m_s2, 0.0, -9.80665])))
             self._integral.take(AttitudeSample(t_ns, LEVEL))
-        known = BodyAttitude(self.t_ns, np.eye(3)) if attitude else None
+        known = BodyAttitude(self.t_ns, yaw_rotation(heading_rad)) if attitude else None
         self.odometry.begin(self.t_ns, known, standing, world_m)
         track = Track(self.t_ns // STEP_NS, self.t_ns, TrackState.LOST)
         if at_m is not None:
@@ -249,6 +255,9 @@ def test_a_map_is_flown_on_once_it_has_settled() -> None:
         young = vehicle.frame(HERE + [0.03 * k, 0.0, 0.0], first=first)
         assert young.inertial
     np.testing.assert_allclose(place(young), 0.0, atol=0.05)
-    settled = vehicle.frame(HERE, first=first)
+    settled = vehicle.frame(HERE, first=first, heading_rad=0.2)
     assert settled.state is TrackState.TRACKING and settled.reset_counter == 0
     np.testing.assert_allclose(place(settled), 0.0, atol=0.05)
+    # its heading is that of its first view: the autopilot's swings
+    assert settled.world_from_body is not None
+    assert abs(yaw_angle(settled.world_from_body.rotation)) < 1e-6
