@@ -114,7 +114,8 @@ def second_flight(trial: Trial, figures: Figures) -> None:
 def gps_lost(trial: Trial, figures: Figures) -> None:
     """Up by GPS; over to our pose by source set; GPS goes, and comes back 50 m off."""
     trial.start_daemon()
-    figures.add_true("armed by GPS", _armed_by_gps(trial, figures))
+    has_place = trial.ground.until(lambda: trial.ground.believed, 90.0)
+    figures.add_true("armed by GPS", has_place and _armed_by_gps(trial))
     if not trial.ground.armed or not trial.pilot.take_off(manoeuvres.TAKE_OFF_M):
         return
     manoeuvres.ready_to_go(trial)
@@ -144,7 +145,7 @@ def gps_lost(trial: Trial, figures: Figures) -> None:
     trial.pilot.land()
 
 
-def _armed_by_gps(trial: Trial, figures: Figures) -> bool:
+def _armed_by_gps(trial: Trial) -> bool:
     began_s = time.time()
     trial.pilot.hold_sticks(in_air=False)
     armed = trial.pilot.set_mode(trial.pilot.modes_to_arm_in[-1], 60.0) and trial.pilot.arm(60.0)

@@ -105,9 +105,9 @@ def _plots(folder: Path) -> str:
         heard = [(t_s, m.x, m.y, m.z) for t_s, m in messages_heard(folder / "ground.tlog", kind)]
         series.append((name, colour, np.array(heard, float).reshape(-1, 4)))
     figure = Figure(figsize=(11, 5.2), layout="constrained")
+    grid = figure.add_gridspec(3, 2)
     plan, *rest = (
-        figure.add_subplot(figure.add_gridspec(3, 2)[where])
-        for where in ((slice(None), 0), (0, 1), (1, 1), (2, 1))
+        figure.add_subplot(grid[where]) for where in ((slice(None), 0), (0, 1), (1, 1), (2, 1))
     )
     for name, colour, rows in series:
         if not len(rows):
