@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -73,6 +74,7 @@ def main() -> int:
     pairs = (each.partition("=") for each in options.parameter)
     parameters = {name: float(value) for name, _, value in pairs}
     given["settings"] = tuple(options.set)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # its children end with it
     holds = True
     for name in options.experiments:
         usual = EXPERIMENTS[name][1]

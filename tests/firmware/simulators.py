@@ -145,11 +145,19 @@ class Px4(Simulator):
     FIXED = (14550, 14540)
 
     def start(self) -> None:
-        """See `Simulator`; the camera gets a stream of its own."""
+        """See `Simulator`; the camera gets a stream of its own.
+
+        What is simulated is decided as it boots: with new parameters it boots twice.
+        """
         super().start()
         time.sleep(UP_S)
-        for name, value in self.parameters.items():
-            self.shell("param", "set", name, f"{value:g}")
+        if not (self.folder / "parameters.bson").exists():
+            for name, value in self.parameters.items():
+                self.shell("param", "set", name, f"{value:g}")
+            self.shell("param", "save")
+            self.stop()
+            super().start()
+            time.sleep(UP_S)
         local = self.ports.camera + 1
         self.shell(
             "mavlink", "start", "-x", "-u", str(local), "-r", str(CAMERA_STREAM_BYTES_S),
