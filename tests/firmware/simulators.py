@@ -143,6 +143,7 @@ class Px4(Simulator):
     name = "PX4"
     home = GeoOrigin(47.397742, 8.545594, 489.4)
     FIXED = (14550, 14540)
+    _has_parameters = False
 
     def start(self) -> None:
         """See `Simulator`; the camera gets a stream of its own.
@@ -151,7 +152,8 @@ class Px4(Simulator):
         """
         super().start()
         time.sleep(UP_S)
-        if not (self.folder / "parameters.bson").exists():
+        if not self._has_parameters:
+            self._has_parameters = True
             for name, value in self.parameters.items():
                 self.shell("param", "set", name, f"{value:g}")
             self.shell("param", "save")
