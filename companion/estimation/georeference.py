@@ -37,7 +37,7 @@ SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.02, 0.05
 """Lower bounds of the relative scale error by rangefinder and barometer. By ranges alone it was
 0.1, 0.5, 0.5 and 4 % on rendered flights with cameras 45, 80, 90 and 30 degrees down: 2 % RMS."""
 SIGMA_RANGE_OFFSET_M, NEAR_RATIO = 0.08, 0.5
-"""Where the rangefinder sits above or below the camera, which nobody states: near the ground it
+"""Height of the rangefinder above or below the camera, which nobody states: near the ground it
 counts for most, so that only the greater ranges count."""
 MAX_SIGMA_ROTATION_RAD = np.radians(8.0)
 MAX_SAMPLES = 400

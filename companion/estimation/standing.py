@@ -27,7 +27,7 @@ LEAST_SAMPLES = 20
 
 
 class Limits(NamedTuple):
-    """What accelerometers, gyro and attitude of a vehicle that stands may show.
+    """Limits of what accelerometers, gyro, attitude and image of a standing vehicle may show.
 
     Turn: bias of a gyro that is not calibrated yet, 1 degree/s, and noise of the mean. Tilt: change
     of attitude in a second, of the tilt that an autopilot finds at rest, too. Change: between the

@@ -129,7 +129,8 @@ def _library() -> Any:
     try:
         import zenoh
     except ImportError as error:
-        raise InputError("[distributed] needs Zenoh: pip install '.[distributed]' in a clone") from error
+        text = "[distributed] needs Zenoh: pip install '.[distributed]' in a clone"
+        raise InputError(text) from error
     return zenoh
 
 
