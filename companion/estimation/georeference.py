@@ -112,11 +112,6 @@ class Georeferencer:
             each.prune(before_ns, keyframes_ns)
 
     @property
-    def has_positions(self) -> bool:
-        """True once there was a position that may place a map."""
-        return any(len(self._positions[source]) for source in self._sources)
-
-    @property
     def newest_place(self) -> Array | None:
         """Newest position (3,), NED metres, that may place a map; None before there is one."""
         for source in self._sources:

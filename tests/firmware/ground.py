@@ -8,7 +8,6 @@ Times are seconds since the epoch. Truth is the simulator's own state about `hom
 
 from __future__ import annotations
 
-import math
 import socket
 import struct
 import threading
@@ -116,12 +115,6 @@ class Ground:
     def believed_m(self) -> Array:
         """Where the autopilot believes it to be (3,)."""
         return np.array(self.believed[-1][1:])
-
-    @property
-    def heading_rad(self) -> float:
-        """The true one."""
-        w, x, y, z = self.true[-1].quaternion
-        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
     @property
     def armed(self) -> bool:

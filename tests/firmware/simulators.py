@@ -91,11 +91,6 @@ class Simulator:
         self.stop()
         self.start()
 
-    @property
-    def running(self) -> bool:
-        """Whether it has not ended."""
-        return self._process is not None and self._process.poll() is None
-
     def version(self) -> str:
         """The source that it was built from, by its revision."""
         asked = subprocess.run(
