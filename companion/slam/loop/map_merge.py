@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -15,6 +17,8 @@ from companion.slam.optimisation.pose_graph import Edge, relax
 MIN_SHARED_POINTS = 30
 EDGES_EACH = 6
 LOOP_WEIGHT = 5.0
+YIELD_EVERY = 10
+"""Keyframes whose covisible ones are found in some milliseconds."""
 
 
 def merge_maps(here: SlamMap, there: SlamMap, here_from_there: Similarity) -> None:
@@ -37,23 +41,46 @@ def merge_maps(here: SlamMap, there: SlamMap, here_from_there: Similarity) -> No
     here.invalidate_centres()
 
 
-def close_loop(slam_map: SlamMap, loop: LoopClosure) -> float:
-    """Close a loop by pose-graph optimisation of the keyframes; points move along.
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopGraph:
+    """Pose graph of a map with a loop: the keyframes `keys`, in order, as nodes."""
 
-    Returns the displacement of the newest keyframe, map units.
-    """
+    keys: list[int]
+    nodes: list[Similarity]
+    edges: list[Edge]
+    newest: int
+    oldest: int
+    """Rows of the two keyframes of the loop; the second is held."""
+    level: bool
+
+    def relaxed(self) -> list[Similarity]:
+        """Nodes that agree with the loop. Takes long, and needs nothing of the map."""
+        return relax(self.nodes, self.edges, self.oldest, self.level)
+
+
+def loop_graph(
+    slam_map: SlamMap, loop: LoopClosure, yield_point: Callable[[], None] = lambda: None
+) -> LoopGraph:
+    """The graph of a map that a loop closes; `yield_point` is called every few keyframes."""
     keys = list(slam_map.keyframes)
     row = {key: n for n, key in enumerate(keys)}
     nodes = [_node(slam_map.keyframes[key].camera_from_map) for key in keys]
     newest, oldest = loop.keyframe.keyframe_id, loop.relocalised.keyframe.keyframe_id
     corrected = loop.here_from_there.inverse() @ nodes[row[newest]]
-    edges = _edges(slam_map, nodes, row)
+    edges = _edges(slam_map, nodes, row, yield_point)
     edges.append(
         Edge(row[newest], row[oldest], corrected.inverse() @ nodes[row[oldest]], LOOP_WEIGHT)
     )
-    relaxed = relax(nodes, edges, row[oldest], slam_map.level)
-    _move(slam_map, keys, nodes, relaxed)
-    before, after = nodes[row[newest]], relaxed[row[newest]]
+    return LoopGraph(keys, nodes, edges, row[newest], row[oldest], slam_map.level)
+
+
+def close_loop(slam_map: SlamMap, graph: LoopGraph, relaxed: list[Similarity]) -> float:
+    """Move the keyframes of a map to the nodes of its relaxed graph, and points with them.
+
+    Returns the displacement of the newest keyframe, map units.
+    """
+    _move(slam_map, graph.keys, graph.nodes, relaxed)
+    before, after = graph.nodes[graph.newest], relaxed[graph.newest]
     return float(np.linalg.norm(after.translation - before.translation))
 
 
@@ -62,15 +89,20 @@ def _node(camera_from_map: Pose) -> Similarity:
     return Similarity(1.0, pose.rotation, pose.translation)
 
 
-def _edges(slam_map: SlamMap, nodes: list[Similarity], row: dict[int, int]) -> list[Edge]:
+def _edges(
+    slam_map: SlamMap, nodes: list[Similarity], row: dict[int, int],
+    yield_point: Callable[[], None],
+) -> list[Edge]:  # fmt: skip
     """Edges of each keyframe to its predecessor and to its most covisible ones."""
     pairs: dict[tuple[int, int], float] = {}
     keys = list(slam_map.keyframes)
     for before, key in pairwise(keys):
         pairs[before, key] = 1.0
-    for key, keyframe in slam_map.keyframes.items():
+    for n, (key, keyframe) in enumerate(slam_map.keyframes.items()):
+        if n % YIELD_EVERY == 0:
+            yield_point()
         _, ids = slam_map.observations_of(keyframe)
-        ranked = [k for n, k in slam_map.covisible(ids, MIN_SHARED_POINTS) if k != key]
+        ranked = [k for _, k in slam_map.covisible(ids, MIN_SHARED_POINTS) if k != key]
         for other in ranked[:EDGES_EACH]:
             pairs[min(key, other), max(key, other)] = 1.0
     return [

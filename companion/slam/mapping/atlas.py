@@ -12,7 +12,7 @@ from companion.geometry.transforms import Array, angle_between
 from companion.messages import LoopClosed
 from companion.slam.features.orb_features import Features
 from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
-from companion.slam.loop.map_merge import close_loop, merge_maps
+from companion.slam.loop.map_merge import close_loop, loop_graph, merge_maps
 from companion.slam.loop.place_recognition import KeyframeDatabase
 from companion.slam.loop.relocalizer import (
     MIN_FOUND_RATIO,
@@ -169,7 +169,8 @@ class Atlas:
         """Add a keyframe to place recognition that was not added by `insert_keyframe`."""
         self._database.add(keyframe.keyframe_id, keyframe.features.descriptors)
 
-    def _close(self, segment: SlamMap, mapper: Mapper, found: LoopClosure) -> LoopClosed:
+    def _close(self, segment: SlamMap, mapper: Mapper, found: LoopClosure) -> LoopClosed | None:
+        """Close a loop; None where frames have begun another map meanwhile."""
         same = found.there is segment
         moved, keyframe, other = 0.0, found.keyframe, found.relocalised.keyframe
         seen_there = covisible_points(found.there, other)
@@ -180,7 +181,12 @@ class Atlas:
             self.segments = [s for s in self.segments if s is not found.there]
             seen_there = seen_there + offset
         elif _needs_pose_graph(found):
-            moved = close_loop(segment, found)
+            graph = loop_graph(segment, found, self._map_lock.yield_to_tracking)
+            with self._map_lock.released():
+                relaxed = graph.relaxed()
+            if segment is not self.map:
+                return None
+            moved = close_loop(segment, graph, relaxed)
         self.n_loops += 1
         mapper.fuse(keyframe, other, seen_there)
         if self._background:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -69,14 +70,21 @@ def build_problem(
     if len(ids) < 30:
         return None
     points, index = np.unique(ids, return_inverse=True)
+    of = _of_cameras(cam, len(cameras))
     bundle = Bundle(
         [k.camera_from_map for k in cameras], len(variable), slam_map.positions[points],
         cam, index,
-        np.concatenate([k.normalised[feat[cam == i]] for i, k in enumerate(cameras)]),
-        np.concatenate([k.whitening[feat[cam == i]] for i, k in enumerate(cameras)]),
+        np.concatenate([k.normalised[feat[o]] for k, o in zip(cameras, of, strict=True)]),
+        np.concatenate([k.whitening[feat[o]] for k, o in zip(cameras, of, strict=True)]),
         _factors(slam_map, cameras, displacements_of(slam_map, cameras)),
     )  # fmt: skip
     return AdjustmentProblem(bundle, cameras, feat, points, slam_map.born[points])
+
+
+def _of_cameras(camera: Ints, n: int) -> list[slice]:
+    """Observations of each camera, of `camera` (O,) in ascending order."""
+    bounds = np.searchsorted(camera, np.arange(n + 1))
+    return [slice(a, b) for a, b in pairwise(bounds.tolist())]
 
 
 def _factors(
@@ -164,10 +172,10 @@ def _remove_outliers(
     slam_map: SlamMap, problem: AdjustmentProblem, result: AdjustmentResult
 ) -> None:
     wrong = ~result.inlier
-    for i, keyframe in enumerate(problem.keyframes):
-        of = wrong & (problem.bundle.camera == i)
-        bad = problem.features[of]
-        still = keyframe.point_ids[bad] == problem.points[problem.bundle.point[of]]
+    of = _of_cameras(problem.bundle.camera, len(problem.keyframes))
+    for keyframe, o in zip(problem.keyframes, of, strict=True):
+        bad = problem.features[o][wrong[o]]
+        still = keyframe.point_ids[bad] == problem.points[problem.bundle.point[o][wrong[o]]]
         if still.any():
             slam_map.remove_observations(keyframe, bad[still])
     slam_map.clear_dead_observations(problem.keyframes)

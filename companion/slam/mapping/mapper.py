@@ -213,10 +213,12 @@ class Mapper:
         seen_here = np.unique(
             np.concatenate([slam_map.observations_of(k)[1] for k in [keyframe, *here]])
         )
-        for k in [keyframe, *here]:
-            self._fuse_into(k, seen_there)
-        for k in [other, *there]:
-            self._fuse_into(k, seen_here)
+        for k, seen in [
+            *((k, seen_there) for k in [keyframe, *here]),
+            *((k, seen_here) for k in [other, *there]),
+        ]:
+            self._map_lock.yield_to_tracking()
+            self._fuse_into(k, seen)
         slam_map.clear_dead_observations([keyframe, other, *here, *there])
         self.adjust_locally(keyframe)
 

@@ -11,7 +11,7 @@ from companion.geometry.transforms import Array, Pose, Similarity, angle_between
 from companion.slam.features.orb_features import Ints
 from companion.slam.features.patches import image_levels
 from companion.slam.loop.loop_closure import LoopDetector
-from companion.slam.loop.map_merge import close_loop, merge_maps
+from companion.slam.loop.map_merge import close_loop, loop_graph, merge_maps
 from companion.slam.loop.place_recognition import KeyframeDatabase
 from companion.slam.loop.relocalizer import Relocalizer
 from companion.slam.map.sparse_map import Keyframe, SlamMap
@@ -107,7 +107,8 @@ def test_loop_closure_and_merge_move_culled_keyframes() -> None:
     finder = LoopDetector(index, Relocalizer(CAMERA))
     found = finder.find(newest, slam_map, [slam_map], lambda loop, same: True)
     assert found is not None
-    close_loop(slam_map, found)
+    graph = loop_graph(slam_map, found)
+    close_loop(slam_map, graph, graph.relaxed())
     own = np.flatnonzero(slam_map.first_seen[: slam_map.n_points] == 30)
 
     def off(moved: SlamMap, scale: float) -> float:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import threading
+from typing import Any
 
 import numpy as np
 import pytest
 
+from companion.config import FeaturesConfig
 from companion.geometry.transforms import (
     Array,
     Pose,
@@ -15,11 +18,14 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     yaw_rotation,
 )
+from companion.slam.loop import map_merge
 from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
-from companion.slam.loop.map_merge import close_loop, merge_maps
+from companion.slam.loop.map_merge import close_loop, loop_graph, merge_maps
 from companion.slam.loop.place_recognition import KeyframeDatabase
 from companion.slam.loop.relocalizer import Relocalizer
 from companion.slam.map.sparse_map import SlamMap
+from companion.slam.mapping.atlas import Atlas
+from companion.slam.mapping.mapping_worker import MapLock
 from companion.slam.optimisation.pose_graph import Edge, relax
 from companion.slam.optimisation.upright_pose import upright_pose
 from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
@@ -145,7 +151,8 @@ def test_loop_closure_moves_its_points() -> None:
     found = find(newest, slam_map, [slam_map])
     assert found is not None
     assert found.relocalised.keyframe.keyframe_id < 4
-    moved = close_loop(slam_map, found)
+    graph = loop_graph(slam_map, found)
+    moved = close_loop(slam_map, graph, graph.relaxed())
     assert moved == pytest.approx(off, rel=0.2)
     assert slam_map.keyframes[newest].centre == pytest.approx(path[-1].translation, abs=0.3)
     keyframe = slam_map.keyframes[newest]
@@ -154,6 +161,49 @@ def test_loop_closure_moves_its_points() -> None:
     p = keyframe.camera_from_map.apply(slam_map.positions[points[own]])
     error = CAMERA.project(p) - keyframe.features.pixels[features[own]]
     assert np.median(np.linalg.norm(error, axis=1)) < 1.5
+
+
+def test_frames_are_tracked_while_the_graph_of_a_loop_is_relaxed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ground = Ground(np.random.default_rng(6))
+    corners = [(0.0, 0.0), (16.0, 0.0), (16.0, 16.0), (0.0, 16.0), (0.0, 1.0)]
+    path = [pose for a, b in itertools.pairwise(corners) for pose in line(a, b, 9, 0.0)]
+    slam_map = mapped(ground, path, NOWHERE, memory=12)
+    _bend(slam_map, 0.05)
+    found = find(max(slam_map.keyframes), slam_map, [slam_map])
+    assert found is not None
+    lock = MapLock()
+    atlas = Atlas(FeaturesConfig(), CAMERA, lock, background=True)
+    atlas.segments = [slam_map]
+    begins_anew, n_tracked = False, 0
+
+    def frame() -> None:
+        nonlocal n_tracked
+        with lock.tracking():
+            n_tracked += 1
+            if begins_anew:
+                atlas.new_map(level=False)
+
+    def relaxed(*graph: Any) -> list[Similarity]:
+        thread = threading.Thread(target=frame)
+        thread.start()
+        thread.join(10.0)
+        return relax(*graph)
+
+    monkeypatch.setattr(map_merge, "relax", relaxed)
+    point = lock.point
+    with lock.mapping():
+        assert atlas._close(slam_map, atlas.mapper, found) is not None
+    assert n_tracked == 1
+    assert lock.point - point > len(slam_map.keyframes) / 10  # and it yields besides
+    assert found.keyframe.centre == pytest.approx(path[-1].translation, abs=0.3)
+    begins_anew = True
+    _bend(slam_map, 0.05)
+    drifted = found.keyframe.centre
+    with lock.mapping():
+        assert atlas._close(slam_map, atlas.mapper, found) is None
+    assert found.keyframe.centre == pytest.approx(drifted)
 
 
 def _bend(slam_map: SlamMap, per_keyframe: float) -> None:
