@@ -61,6 +61,16 @@ class OdometryFrame:
         at = placed.translation - turn @ world_from_body.translation
         return replace(self, from_world=Pose(turn, at))
 
+    def turned(self, about_m: Array, by_rad: float, here_m: Array) -> OdometryFrame:
+        """Turned about a place (3,) of this frame, with the body at another (3,)."""
+        turn = yaw_rotation(by_rad)
+        at = about_m + turn @ (self.from_world.translation - about_m)
+        moved_m = about_m + turn @ (here_m - about_m) - here_m
+        return replace(
+            self, from_world=Pose(turn @ self.from_world.rotation, at), owed_m=turn @ self.owed_m,
+            slewed_m=self.slewed_m + moved_m,
+        )  # fmt: skip
+
     def slewed(self, world_from_body: Pose, dt_s: float) -> OdometryFrame:
         """After a time in which the body was there: towards the world, or what is owed.
 

@@ -17,7 +17,12 @@ from companion.estimation.inertial.inertial_navigation import (
 )
 from companion.estimation.innovation_gate import MIN_CONSISTENT_NS, InnovationGate
 from companion.estimation.odometry_drift import OdometryDrift
-from companion.estimation.odometry_frame import MapView, OdometryFrame, OdometryState
+from companion.estimation.odometry_frame import (
+    MAX_SLEW_RAD_S,
+    MapView,
+    OdometryFrame,
+    OdometryState,
+)
 from companion.estimation.reckoned_path import BodyPlace, ReckonedPath
 from companion.estimation.tracking_quality import quality_of
 from companion.estimation.trajectory_alignment import SIGMA_YAW_RAD
@@ -42,6 +47,10 @@ MAX_SIGMA_SCALE_AIDING = 0.05
 """Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
 FRESH_NS, MAX_SIGMA_STOOD_M = 300_000_000, 0.3
 """Of the place of a landing: older, or less certain, the place where it stands is another one."""
+NEAR_LIFT_OFF_M = 3.0
+MISALIGNED_RAD, ALIGNED_RAD = np.radians(1.0), np.radians(0.2)
+"""Of a frame without an origin and the autopilot's heading, to begin turning and to end it: less
+than the first is noise, and an autopilot whose heading is ours is never that far off."""
 SIGMA_RECKONED_RAD = np.radians(1.0)
 """Of the autopilot's attitude over some seconds."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
@@ -89,6 +98,10 @@ class SmoothOdometry:
         """Place (3,) where the active map began."""
         self._in_world = False
         """True once satellites have placed the body, or its map."""
+        self._lift_off: tuple[int, Array] | None = None
+        """Reset counter and place (3,) of the last lift-off."""
+        self._turns = False
+        """True while the frame turns to the autopilot's heading."""
         self.reset_counter = 0
 
     def step(
@@ -146,7 +159,7 @@ class SmoothOdometry:
         frame = self._frame
         here = frame.from_world @ raw
         if self._last is not None:
-            frame = frame.slewed(raw, min((track.t_ns - self._last[0]) * 1e-9, 1.0))
+            frame = self._slewed(raw, min((track.t_ns - self._last[0]) * 1e-9, 1.0))
         placed = frame.from_world @ raw
         within_gate = self._last is None or self._gate.reachable(
             self._last[2].translation, placed.translation, track.t_ns - self._last[0],
@@ -194,6 +207,27 @@ class SmoothOdometry:
             sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
 
+    def _slewed(self, raw: Pose, dt_s: float) -> OdometryFrame:
+        """The frame after some time; one without an origin takes the autopilot's heading.
+
+        That is aligned anew on the way up, away from what disturbs a compass on the ground: the
+        frame turns about the place of the lift-off, as long as that moves the body but little.
+        """
+        frame, attitude = self._frame.slewed(raw, dt_s), self._attitude
+        if frame.anchored or attitude is None or self._lift_off is None:
+            return frame
+        placed, (counter, place_m) = frame.from_world @ raw, self._lift_off
+        way_m = float(np.linalg.norm((placed.translation - place_m)[:2]))
+        if counter != self.reset_counter or way_m > NEAR_LIFT_OFF_M:
+            return frame
+        off_rad = yaw_angle(attitude.ned_from_body @ placed.rotation.T)
+        self._turns = abs(off_rad) > (ALIGNED_RAD if self._turns else MISALIGNED_RAD)
+        if not self._turns:
+            return frame
+        most_rad = float(MAX_SLEW_RAD_S) * dt_s
+        step_rad = float(np.clip(off_rad, -most_rad, most_rad))
+        return frame.turned(place_m, step_rad, placed.translation)
+
     @property
     def _reckons_well(self) -> bool:
         """True where inertial navigation counts for more than a map that is poor."""
@@ -225,6 +259,8 @@ class SmoothOdometry:
                 self._begin_stand(t_ns)
             self.ground.stand(attitude.t_ns, self._place_now())
         elif not standing:
+            if self.ground.stood is not None:
+                self._lift_off = self.reset_counter, self.ground.stood.place_m
             at_ns = t_ns if attitude is None else attitude.t_ns
             self.ground.fly(at_ns, float(self._place_now()[2]), self.ground.wants_flow(t_ns))
         found = None if attitude is None else self._navigation.at(attitude.t_ns)
@@ -345,6 +381,7 @@ class SmoothOdometry:
         """
         self._begins_m, self._in_world = world_m, True
         self._reckoned = self._last = self.ground.stood = None
+        self.reckoned_path.clear()
         self._navigation.reset()
 
     def _place_now(self) -> Array:
