@@ -47,6 +47,7 @@ class PilotMessage:
 
 POSITION_ON = PilotMessage(INFO, "vision position on")
 POSITION_LOST = PilotMessage(WARNING, "vision position lost: {reason}", {"reason": LONGEST_REASON})
+POSITION_NONE = PilotMessage(WARNING, "no vision position: {reason}", {"reason": LONGEST_REASON})
 DEAD_RECKONING = PilotMessage(WARNING, "position by dead reckoning")
 POSITION_OFF = PilotMessage(NOTICE, "vision position off: ground command")
 POSITION_STAYS_OFF = PilotMessage(WARNING, "vision position still off: by ground")
@@ -83,6 +84,7 @@ AUTOPILOT_LOST = PilotMessage(WARNING, "autopilot link lost")
 AUTOPILOT_RECOVERED = PilotMessage(INFO, "autopilot link recovered")
 AUTOPILOT_REBOOT = PilotMessage(WARNING, "autopilot reboot detected")
 SECOND_VEHICLE = PilotMessage(NOTICE, "second vehicle on link ignored")
+SECOND_COMPANION = PilotMessage(WARNING, "second companion on link")
 NO_SUCH_TELEMETRY = PilotMessage(NOTICE, "autopilot lacks a telemetry message")
 TELEMETRY_ORDER = PilotMessage(WARNING, "telemetry out of order")
 TELEMETRY_TIME = PilotMessage(WARNING, "telemetry time stamps wrong")
@@ -153,6 +155,7 @@ REASONS: Mapping[str, str] = {
     "no autopilot height": "no height",
     "position reset": "position reset",
     "no autopilot clock": "no clock",
+    "another companion on the link": "second companion",
     "disk is slow": "disk slow",
     "autopilot rebooted": "autopilot reboot",
 }
@@ -199,6 +202,7 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "autopilot heard again": AUTOPILOT_RECOVERED,
     "autopilot rebooted": AUTOPILOT_REBOOT,
     "another vehicle on the link": SECOND_VEHICLE,
+    "another companion on the link": SECOND_COMPANION,
     "autopilot does not send a message": NO_SUCH_TELEMETRY,
     "telemetry out of order": TELEMETRY_ORDER,
     "telemetry stamped wildly": TELEMETRY_TIME,
@@ -242,6 +246,11 @@ def of_warning(what: str, detail: str = "", good: bool = False) -> PilotText | N
     if message is PART_RESTARTED:
         return message(part=PARTS.get(detail.split(":")[0], "a process"))
     return message()
+
+
+def no_position(why_not: str) -> PilotText:
+    """Text for poses that do not begin, by the same reasons."""
+    return POSITION_NONE(reason=REASONS.get(why_not, OTHER_REASON))
 
 
 def position_lost(why_not: str) -> PilotText:

@@ -27,6 +27,7 @@ from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.commands import NO_ANSWER, TRIES, Commands
 from drivers.mavlink.imu_rate import ImuNews, ImuRate
 from drivers.mavlink.message_rates import MessageRates
+from drivers.mavlink.other_companion import OtherCompanion
 from drivers.mavlink.status_text import TextLimit, status_text
 from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
 from drivers.mavlink.vehicle import Vehicle, is_autopilot, vehicle_of
@@ -82,6 +83,9 @@ class AutopilotLink:
         self._text_limit = TextLimit()
         self.system_status: int = mavlink.MAV_STATE_BOOT
         """MAV_STATE of our HEARTBEAT."""
+        self.sends_poses = False
+        """True where this companion may send any: its HEARTBEAT tells others."""
+        self.other_companion = OtherCompanion()
         self.on_request: Take | None = None
         """Handler of all messages, for requests to our component."""
         self._takers: defaultdict[int, list[Take]] = defaultdict(list)
@@ -157,8 +161,8 @@ class AutopilotLink:
     def heartbeat(self) -> Any:
         """Our HEARTBEAT now."""
         return mavlink.MAVLink_heartbeat_message(
-            mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
-            self.system_status, 3,
+            mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0,
+            self.other_companion.mark if self.sends_poses else 0, self.system_status, 3,
         )  # fmt: skip
 
     def say(self, text: PilotText) -> bool:
@@ -227,7 +231,12 @@ class AutopilotLink:
             if self.vehicle is None:
                 self._found(vehicle_of(message), receive_ns)
         vehicle = self.vehicle
-        if vehicle is None or system != vehicle.system_id or component != AUTOPILOT:
+        if vehicle is None or system != vehicle.system_id:
+            return
+        if component != AUTOPILOT:
+            if self.other_companion.take(message, self.port.identity, receive_ns):
+                detail = f"component {component} of the same system sends poses"
+                self._warn(Warned(receive_ns, "another companion on the link", detail))
             return
         self._heard(receive_ns)
         if self._imu is not None:

@@ -18,7 +18,13 @@ from companion.estimation.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth, LatencyMeter, RateMeter
 from companion.messages import Odometry, Warned
-from companion.pilot_messages import DEAD_RECKONING, POSITION_ON, PilotText, position_lost
+from companion.pilot_messages import (
+    DEAD_RECKONING,
+    POSITION_ON,
+    PilotText,
+    no_position,
+    position_lost,
+)
 from companion.telemetry import AttitudeSample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_height import AutopilotHeight
@@ -33,6 +39,9 @@ ALOFT = (POSITION_ON(), DEAD_RECKONING())
 """Last texts while poses are sent."""
 UNHEARD = "the autopilot is silent"
 SWITCHED_OFF = "switched off"
+OTHER_COMPANION = "another companion on the link"
+SAY_WHY_AFTER_NS, SAY_WHY_EVERY_NS = 30_000_000_000, 60_000_000_000
+"""Without a pose for the first, the pilot is told why, and again after the second."""
 
 
 class PoseSender:
@@ -58,15 +67,33 @@ class PoseSender:
             config,
             counter,
             height.down_m,
-            self._counter.may_start,
+            self._may_start,
             clock.now_ns,
             lambda: link.alive,
             journal,
         )
         self._rate, self._latency = RateMeter(), LatencyMeter()
         self._n_sent = 0
+        self._heard_other = self._yields = False
         self._told: PilotText | None = None
+        self._not_sent_since_ns: int | None = None
+        self._said_why_ns = 0
+        link.sends_poses = config.mode != "off"
         self._bridging_since_ns: int | None = None
+
+    def _may_start(self, now_ns: int) -> str:
+        """Reason why no first pose of a sequence may be sent now; "" if it may."""
+        return OTHER_COMPANION if self._yields else self._counter.may_start(now_ns)
+
+    def _look_for_another(self, now_ns: int) -> None:
+        """Yield to another companion, unless poses were sent before it came."""
+        vehicle = self._link.vehicle
+        armed = vehicle is not None and vehicle.armed
+        heard = self._link.other_companion.is_heard(now_ns, armed)
+        if heard and not self._heard_other:
+            self._yields = not self._gate.sending
+        self._heard_other = heard
+        self._yields &= heard
 
     def restart(self) -> None:
         """Begin anew with another localisation."""
@@ -79,6 +106,7 @@ class PoseSender:
     def reconfigure(self, config: FeedbackConfig) -> None:
         """Apply other limits, from the next pose on, or another message."""
         self._config = config
+        self._link.sends_poses = config.mode != "off"
         self._gate.reconfigure(config)
         if config.mode == "off":
             self._gate.withhold(SWITCHED_OFF)
@@ -93,6 +121,7 @@ class PoseSender:
         if self._config.mode == "off":
             return
         self._counter.step(self._gate)
+        self._look_for_another(self._clock.now_ns())
         self._send(self._gate.take(odometry, self._clock.now_ns()))
         self._tell()
 
@@ -109,6 +138,7 @@ class PoseSender:
     def step(self) -> None:
         """Send a predicted pose if one is due; to be called when it is."""
         self._counter.step(self._gate)
+        self._look_for_another(self._clock.now_ns())
         if self._config.mode != "off" or self._told in ALOFT:
             self._send(self._gate.due(self._clock.now_ns()))
             self._tell()
@@ -145,6 +175,7 @@ class PoseSender:
     def _tell(self) -> None:
         """Tell the pilot when poses begin and cease, and when they go by dead reckoning."""
         state, now_ns = self._gate.state, self._clock.now_ns()
+        self._tell_why(now_ns)
         if state is not Sending.BRIDGING:
             self._bridging_since_ns = None
         elif self._bridging_since_ns is None:
@@ -161,3 +192,15 @@ class PoseSender:
             return
         if text != self._told and self._link.say(text):  # else it is tried again
             self._told = text
+
+    def _tell_why(self, now_ns: int) -> None:
+        """Tell the pilot now and then why there is no pose, where there was none for long."""
+        if self._gate.sending or self._config.mode == "off" or not self._link.alive:
+            self._not_sent_since_ns = None
+            return
+        if self._not_sent_since_ns is None:
+            self._not_sent_since_ns = now_ns
+        long = now_ns - self._not_sent_since_ns >= SAY_WHY_AFTER_NS
+        if long and now_ns - self._said_why_ns >= SAY_WHY_EVERY_NS:
+            if self._link.say(no_position(self._gate.why_not)):
+                self._said_why_ns = now_ns

@@ -44,6 +44,8 @@ class Vehicle:
         self.climb_m_s = 0.0
         self.warned: list[Warned] = []
         self.seq = 0
+        self.other: int | None = None
+        """Mark in the heartbeat of another companion; None: there is none."""
         self.joins = True
         """Whether disks are as fast as they should be."""
 
@@ -107,6 +109,8 @@ class Vehicle:
     def _say_slow(self, boot_ms: int) -> None:
         armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
         self._say(mavlink.MAVLink_heartbeat_message(2, 3, armed, 0, 4, 3))
+        if self.other is not None:
+            self._say(mavlink.MAVLink_heartbeat_message(18, 8, 0, self.other, 4, 3), 197)
         if self.down_m is not None:
             self._say(
                 mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, self.down_m, 0, 0, 0)
@@ -119,8 +123,8 @@ class Vehicle:
         if self.landed_state is not None:
             self._say(mavlink.MAVLink_extended_sys_state_message(0, self.landed_state))
 
-    def _say(self, message: Any) -> None:
-        self.port.hear(message, self.clock.t_ns + 2 * MS)
+    def _say(self, message: Any, component: int = 1) -> None:
+        self.port.hear(message, self.clock.t_ns + 2 * MS, component=component)
 
     @property
     def poses(self) -> list[Any]:
@@ -375,3 +379,50 @@ async def test_the_pilot_hears_of_dead_reckoning_that_lasts(tmp_path: Path) -> N
     assert vehicle.texts[3:] == [
         "Companion: position by dead reckoning", "Companion: vision position lost: no video"
     ]  # fmt: skip
+
+
+@flown
+async def test_nothing_begins_beside_another_companion(tmp_path: Path) -> None:
+    vehicle = Vehicle(tmp_path / "kept.json")
+    await vehicle.begin()
+    vehicle.armed, vehicle.other = False, 4711
+    assert not vehicle.run(35)
+    assert vehicle.why_not == "another companion on the link"
+    assert [each.what for each in vehicle.warned].count("another companion on the link") == 1
+    assert vehicle.texts == ["Companion: no vision position: second companion"]
+    vehicle.armed, vehicle.other = True, None  # gone in the air, where its poses were flown on
+    assert not vehicle.run(10)
+    vehicle.armed = False
+    assert vehicle.run(5)
+
+
+@flown
+async def test_who_sends_already_goes_on_beside_another_companion(tmp_path: Path) -> None:
+    vehicle = Vehicle(tmp_path / "kept.json")
+    await vehicle.begin()
+    vehicle.armed = False
+    vehicle.run(4)
+    vehicle.other = vehicle.link.other_companion.mark  # an echo of our own heartbeat
+    vehicle.run(2)
+    assert [each.what for each in vehicle.warned] == ["autopilot found"]
+    vehicle.other = 4711
+    assert len(vehicle.run(2)) > 30
+    vehicle.run(1, frames=False)
+    vehicle.armed = True
+    assert len(vehicle.run(4)) > 30
+    vehicle.other = 0  # one whose feedback is off
+    assert len(vehicle.run(2)) > 30
+
+
+@flown
+async def test_the_pilot_hears_why_there_is_no_pose_for_long(tmp_path: Path) -> None:
+    vehicle = Vehicle(tmp_path / "kept.json")
+    await vehicle.begin()
+    vehicle.down_m = None
+    vehicle.run(29)
+    assert not vehicle.texts
+    vehicle.run(70)
+    assert vehicle.texts == ["Companion: no vision position: no height"] * 2
+    vehicle.down_m = -7.5
+    vehicle.run(3)
+    assert vehicle.texts[2:] == ["Companion: vision position on"]
