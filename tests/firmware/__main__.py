@@ -43,7 +43,8 @@ def fly(
             version = f"{trial.firmware.name} {trial.firmware.version()}"
     add_poses(figures, folder / "cable.tlog", trial.ground.true)
     told = {"folder": folder.name, "version": version, "seed": conditions.seed,
-            "wind_m_s": conditions.wind_m_s, "look": conditions.look}  # fmt: skip
+            "wind_m_s": conditions.wind_m_s, "look": conditions.look,
+            "parameters": dict(conditions.parameters)}  # fmt: skip
     append_to(out / "runs.json", experiment, firmware, told, figures.rows)
     write_page(out)
     return figures

@@ -24,6 +24,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TextIO
 
@@ -61,6 +62,10 @@ class DrawnCamera:
         self._out.mkdir(parents=True, exist_ok=True)
         self._camera = assumed_camera(WIDTH, HEIGHT, HFOV_DEG)
         write_lens(self._camera, self._out / "lens.toml")
+        scale = arguments.lens_scale
+        self._camera = replace(
+            self._camera, fx=scale * self._camera.fx, fy=scale * self._camera.fy
+        )  # fmt: skip
         mount = MountConfig(
             known=True, roll_deg=arguments.roll_deg, pitch_deg=arguments.pitch_deg,
             yaw_deg=arguments.yaw_deg, z_m=0.0,
@@ -182,6 +187,7 @@ def main() -> None:
     parser.add_argument("--pitch-deg", type=float, default=-45.0)
     parser.add_argument("--roll-deg", type=float, default=0.0)
     parser.add_argument("--yaw-deg", type=float, default=0.0)
+    parser.add_argument("--lens-scale", type=float, default=1.0, help="focal length, really")
     parser.add_argument("--above-m", type=float, default=0.0, help="lens above the vehicle's place")
     parser.add_argument("--look", choices=sorted(LOOKS), default="day")
     parser.add_argument("--seed", type=int, default=1)

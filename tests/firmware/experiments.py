@@ -9,11 +9,13 @@ import numpy as np
 
 from tests.firmware import manoeuvres
 from tests.firmware.faults import FAULTS, suffer
-from tests.firmware.figures import Figures
+from tests.firmware.figures import Figures, strayed_m
 from tests.firmware.trial import Conditions, Trial
 
 Flown = Callable[[Trial, Figures], None]
-HOLD_S, READY_S = 60.0, 30.0
+HOLD_S, READY_S, PATIENT_S = 60.0, 30.0, 45.0
+USUAL = "position on", "dead reckoning", "autopilot connected", "camera recovered"
+"""Texts of a flight in which nothing is wrong."""
 SET_EKF_SOURCE_SET = 42007
 GLITCH_DEG = 50.0 / 111319.0
 SECOND_SOURCE = {
@@ -156,19 +158,65 @@ def _armed_by_gps(trial: Trial) -> bool:
 
 def doctor(trial: Trial, figures: Figures) -> None:
     """From the firmware's own defaults by `companion doctor --write` alone; then take-off."""
-    trial.start_daemon()
-    trial.until("the link", lambda: trial.status.get("sources"), READY_S)
-    time.sleep(5.0)
     said = trial.run_companion("doctor", "--write", "--yes")
     figures.add_true("doctor writes", said.returncode == 0, said.stdout[-300:])
     trial.firmware.restart()
     time.sleep(manoeuvres.SETTLE_S)
     trial.ground.ask_for_messages()
+    trial.start_daemon()
     stood = trial.ground.place_m
     if manoeuvres.get_ready(trial, figures) and manoeuvres.take_off(trial, figures):
         manoeuvres.land(trial, figures, stood)
 
 
+def wrong_set_up(trial: Trial, figures: Figures) -> None:
+    """Something is not as it is said to be: refused or said, and never flown away on."""
+    began_s, stood = time.time(), trial.ground.place_m
+    trial.start_daemon()
+    sending = trial.until("poses", lambda: trial.sending, PATIENT_S)
+    figures.add("first pose after both are up", sending, "s", note=str(trial.feedback))
+    armed = sending is not None and _armed_in(trial, trial.pilot.modes_to_arm_in[-1])
+    if armed:
+        trial.pilot.take_off(manoeuvres.TAKE_OFF_M)
+        time.sleep(10.0)
+        level_m, _ = strayed_m(trial.ground.window(began_s, time.time()), stood)
+        figures.add("level way until 10 s after take-off", level_m.max(), "m", 1.0)
+        trial.mark(f"sending {trial.sending}, {trial.ground.mode}")
+        trial.pilot.land()
+    texts = list(dict.fromkeys(t for t in trial.ground.texts_since(began_s) if "Companion" in t))
+    said = [text for text in texts if not any(good in text for good in USUAL)]
+    figures.add_true("the pilot is told", bool(said), " / ".join(said))
+
+
+def two_companions(trial: Trial, figures: Figures) -> None:
+    """Two are started at once: neither begins while the other is there; then one flies."""
+    trial.start_daemon()
+    with trial.second_companion():
+        began = trial.until("poses", lambda: trial.sending, 2 * READY_S)
+        figures.add_true("no pose beside another companion", began is None, str(trial.feedback))
+        told = any("second companion" in text for _, text in trial.ground.texts)
+        figures.add_true("the pilot is told", told)
+        figures.add_true("cannot be armed", not _armed_in(trial, trial.pilot.modes_to_arm_in[0]))
+    trial.mark("the other has gone")
+    stood = trial.ground.place_m
+    if manoeuvres.get_ready(trial, figures) and manoeuvres.take_off(trial, figures):
+        manoeuvres.land(trial, figures, stood)
+
+
+def _armed_in(trial: Trial, mode: str) -> bool:
+    trial.pilot.hold_sticks(in_air=False)
+    return trial.pilot.set_mode(mode, 10.0) and trial.pilot.arm(15.0)
+
+
+COPTER_PARAMETERS = {
+    "VISO_TYPE": (2, 3), "EK3_SRC1_POSZ": (6,), "EK3_SRC1_VELZ": (0,), "EK3_SRC1_VELXY": (0,),
+    "EK3_SRC1_YAW": (6,), "VISO_DELAY_MS": (0, 160), "EK3_SRC_OPTIONS": (0,),
+}  # fmt: skip
+PX4_PARAMETERS = {
+    "EKF2_EV_CTRL": (3, 15), "EKF2_HGT_REF": (3,), "EKF2_EV_DELAY": (50,), "EKF2_EV_NOISE_MD": (1,),
+    "COM_ARM_WO_GPS": (0,),
+}  # fmt: skip
+"""Values other than those that docs/autopilots.md asks for, tried one at a time."""
 EXPERIMENTS: dict[str, tuple[Flown, Conditions]] = {
     "take_off": (take_off, Conditions()),
     "tour": (tour, Conditions()),
@@ -177,5 +225,15 @@ EXPERIMENTS: dict[str, tuple[Flown, Conditions]] = {
     "second_flight": (second_flight, Conditions()),
     "doctor": (doctor, Conditions(by_doctor=True)),
     "gps_lost": (gps_lost, Conditions(has_gps=True, parameters=SECOND_SOURCE)),
+    "mount_90": (wrong_set_up, Conditions(mount_roll_deg=90.0)),
+    "upside_down": (wrong_set_up, Conditions(mount_roll_deg=180.0)),
+    "lens_10": (wrong_set_up, Conditions(lens_scale=1.1)),
+    "two_companions": (two_companions, Conditions()),
+    "perfect": (tour, Conditions(perfect=True)),
+    **{
+        f"{name}={value}": (take_off, Conditions(parameters={name: value}))
+        for name, values in (COPTER_PARAMETERS | PX4_PARAMETERS).items()
+        for value in values
+    },
     **{look: (take_off, Conditions(look=look)) for look in ("dusk", "lawn", "water", "shadow")},
 }

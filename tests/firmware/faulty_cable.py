@@ -1,9 +1,10 @@
 """The line between autopilot and companion, by UDP, with faults on demand; a process of its own.
 
-    python -m tests.firmware.faulty_cable AUTOPILOT_PORT COMPANION_PORT FLIGHT.tlog
+    python -m tests.firmware.faulty_cable AUTOPILOT_PORT COMPANION_PORT[,ANOTHER] FLIGHT.tlog
 
 It stands at the first port, where the firmware sends to, and speaks to the companion at the second.
-All that passes is written as a tlog. Orders are lines on standard input:
+Two companions hear each other, as by a router. All that passes is written as a tlog. Orders are
+lines on standard input:
 
     cut S            nothing passes for S seconds
     lose SHARE S     so many datagrams are lost, either way
@@ -47,14 +48,14 @@ def packets(data: bytes) -> list[bytes]:
 class FaultyCable:
     """See above."""
 
-    def __init__(self, autopilot_port: int, companion_port: int, log: IO[bytes]) -> None:
+    def __init__(self, autopilot_port: int, companion_ports: list[int], log: IO[bytes]) -> None:
         self.autopilot, self.companion = (
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)
         )
         for each in (self.autopilot, self.companion):
             each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         self.autopilot.bind(("127.0.0.1", autopilot_port))
-        self._companion_at = ("127.0.0.1", companion_port)
+        self._companions_at = [("127.0.0.1", port) for port in companion_ports]
         self._autopilot_at: tuple[str, int] | None = None
         self._log = log
         self._until_s = {"cut": 0.0, "lose": 0.0, "disturb": 0.0}
@@ -102,6 +103,9 @@ class FaultyCable:
             return
         if not up:
             self._autopilot_at = peer
+        for other in self._companions_at if up else ():
+            if other != peer:
+                self.companion.sendto(data, other)
         self.take(data, up)
 
     def take(self, data: bytes, up: bool) -> None:
@@ -126,7 +130,8 @@ class FaultyCable:
         self._log.write(b"".join(stamp + packet for packet in packets(data)))
         try:
             if not up:
-                self.companion.sendto(data, self._companion_at)
+                for companion in self._companions_at:
+                    self.companion.sendto(data, companion)
             elif self._autopilot_at is not None:
                 self.autopilot.sendto(data, self._autopilot_at)
         except OSError:
@@ -135,9 +140,9 @@ class FaultyCable:
 
 def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # with its log written
-    autopilot_port, companion_port, path = sys.argv[1:]
+    autopilot_port, companion_ports, path = sys.argv[1:]
     with Path(path).open("wb") as log:
-        FaultyCable(int(autopilot_port), int(companion_port), log).run()
+        FaultyCable(int(autopilot_port), list(map(int, companion_ports.split(","))), log).run()
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
@@ -28,6 +28,7 @@ from typing import Any
 
 from companion.errors import SourceError
 from tests.firmware.ground import Ground
+from tests.firmware.perfect_pose import PerfectPose
 from tests.firmware.pilots import PILOTS, Pilot
 from tests.firmware.simulators import ArduCopter, Ports, Px4, Simulator
 from tests.support.autopilot.fake_wire import free_port
@@ -66,6 +67,10 @@ class Conditions:
     pitch_deg: float = -45.0
     mount_roll_deg: float = 0.0
     """How the camera really sits, where that is not as it is said to."""
+    lens_scale: float = 1.0
+    """Focal length, really, over what the calibration says."""
+    perfect: bool = False
+    """The truth is sent, instead of the companion's poses."""
     look: str = "day"
     has_gps: bool = False
     has_range: bool = True
@@ -90,6 +95,7 @@ class Trial:
         kind = Px4 if firmware.name == "px4" else ArduCopter
         ground, cable = kind.FIXED if kind is Px4 else (free_port(), free_port())
         self._companion_port, self._camera_port = free_port(), free_port()
+        self._second_port = free_port()
         ports = Ports(ground, cable, self._camera_port)
         self.firmware: Simulator = kind(firmware, self.folder, ports, self._parameters(kind))
         self.ground = Ground(ground, kind.home, self.folder / "ground.tlog")
@@ -129,8 +135,8 @@ class Trial:
             entering.callback(self._write)
             entering.enter_context(self.ground)
             self._cable = entering.enter_context(self._child(
-                "faulty_cable", self.firmware.ports.companion, self._companion_port,
-                self.folder / "cable.tlog",
+                "faulty_cable", self.firmware.ports.companion,
+                f"{self._companion_port},{self._second_port}", self.folder / "cable.tlog",
             ))  # fmt: skip
             self._camera = entering.enter_context(self._drawn_camera())
             entering.enter_context(self.firmware)
@@ -155,9 +161,36 @@ class Trial:
 
     def start_daemon(self) -> None:
         """As its service does."""
+        if self.conditions.perfect:
+            self._open.enter_context(PerfectPose(
+                self.ground, self._companion_port, self.firmware.home, CAMERA_HZ
+            ))  # fmt: skip
+            self.status = {"feedback": {"sending": True}}
+            return
+        self.daemon = Daemon(self.folder, *self._settings(), program=(*PROGRAM,))
+        self.daemon.__enter__()
+        self.mark("companion started")
+        threading.Thread(target=self._ask, args=(self.daemon,), daemon=True).start()
+
+    @contextlib.contextmanager
+    def second_companion(self) -> Iterator[Daemon]:
+        """Another on the same vehicle, with a camera of its own."""
+        settings = [word for word in self._settings() if not word.startswith(("camera", "link"))]
+        folder = self.folder / "second"
+        folder.mkdir()
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            try:
+                with Daemon(
+                    folder, *settings, f"link.url=udpin:127.0.0.1:{self._second_port}",
+                    "camera.source=pattern", program=(*PROGRAM,),
+                ) as daemon:  # fmt: skip
+                    yield daemon
+            finally:
+                (folder / "journal.txt").write_text(said.getvalue())
+
+    def _settings(self) -> list[str]:
         home, c = self.firmware.home, self.conditions
-        self.daemon = Daemon(
-            self.folder,
+        return [
             "camera.source=network", f"camera.url=tcp://127.0.0.1:{self._video_port}",
             f"camera.rate_hz={CAMERA_HZ:g}", f"camera.stamp_offset_ms={-LATENCY_MS - 1:g}",
             f"camera.calibration={self.folder / 'lens.toml'}",
@@ -166,11 +199,7 @@ class Trial:
             "feedback.mode=odometry", f"feedback.origin_latitude_deg={home.latitude_deg}",
             f"feedback.origin_longitude_deg={home.longitude_deg}",
             f"feedback.origin_altitude_m={home.altitude_m}", "depth.enabled=false", *c.settings,
-            program=(*PROGRAM,),
-        )  # fmt: skip
-        self.daemon.__enter__()
-        self.mark("companion started")
-        threading.Thread(target=self._ask, args=(self.daemon,), daemon=True).start()
+        ]  # fmt: skip
 
     def kill_daemon(self) -> None:
         """SIGKILL to all of its processes; started again as the service would be."""
@@ -181,8 +210,7 @@ class Trial:
 
     def run_companion(self, *words: str) -> subprocess.CompletedProcess[str]:
         """Another of its commands, with the daemon's settings; kept in commands.txt."""
-        assert self.daemon is not None
-        settings = [word for each in self.daemon.settings for word in ("--set", each)]
+        settings = [word for each in self._settings() for word in ("--set", each)]
         done = subprocess.run(
             [sys.executable, *PROGRAM, *words, *settings], cwd=self.folder, check=False,
             capture_output=True, text=True, timeout=READY_S, stdin=subprocess.DEVNULL,
@@ -260,7 +288,8 @@ class Trial:
         return self._child(
             "drawn_camera", "--state-port", self._camera_port, "--serve-port", self._video_port,
             "--rate-hz", CAMERA_HZ, "--latency-ms", LATENCY_MS, f"--pitch-deg={c.pitch_deg}",
-            f"--roll-deg={c.mount_roll_deg}", "--above-m", LENS_M - self.firmware.stands_m,
+            f"--roll-deg={c.mount_roll_deg}", "--lens-scale", c.lens_scale,
+            "--above-m", LENS_M - self.firmware.stands_m,
             "--look", c.look, "--seed", c.seed, f"--origin={origin}",
             "--out", self.folder, *c.camera_words,
         )  # fmt: skip

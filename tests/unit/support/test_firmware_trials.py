@@ -101,7 +101,7 @@ def test_runs_add_up_in_one_page(tmp_path: Path) -> None:
 
 def test_a_cable_that_is_cut_lets_nothing_through() -> None:
     log = io.BytesIO()
-    cable = FaultyCable(free_port(), free_port(), log)
+    cable = FaultyCable(free_port(), [free_port()], log)
     try:
         data = odometry(mavlink.MAVLink(None, 1, 197), 1.0, 2.0, 0)
         cable.take(data, up=True)
