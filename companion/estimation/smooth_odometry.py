@@ -6,6 +6,8 @@ of a stationary camera. Here the pose is continuous, and corrections are slew-li
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from companion.estimation.ground_aiding import SIGMA_STANDING_M_S, GroundAiding
@@ -16,18 +18,15 @@ from companion.estimation.inertial.inertial_navigation import (
     Reckoned,
 )
 from companion.estimation.innovation_gate import MIN_CONSISTENT_NS, InnovationGate
+from companion.estimation.lift_off_heading import LiftOffHeading
 from companion.estimation.odometry_drift import OdometryDrift
-from companion.estimation.odometry_frame import (
-    MAX_SLEW_RAD_S,
-    MapView,
-    OdometryFrame,
-    OdometryState,
-)
+from companion.estimation.odometry_frame import MapView, OdometryFrame, OdometryState
+from companion.estimation.placed_map import PlacedMap, frame_of
 from companion.estimation.reckoned_path import BodyPlace, ReckonedPath
 from companion.estimation.tracking_quality import quality_of
 from companion.estimation.trajectory_alignment import SIGMA_YAW_RAD
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
+from companion.geometry.transforms import Array, Pose
 from companion.messages import Georeference, Odometry, Track, TrackState
 
 SIGMA_DEAD_RECKONING_M_S = 0.3
@@ -47,10 +46,6 @@ MAX_SIGMA_SCALE_AIDING = 0.05
 """Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
 FRESH_NS, MAX_SIGMA_STOOD_M = 300_000_000, 0.3
 """Of the place of a landing: older, or less certain, the place where it stands is another one."""
-NEAR_LIFT_OFF_M = 3.0
-MISALIGNED_RAD, ALIGNED_RAD = np.radians(1.0), np.radians(0.2)
-"""Of a frame without an origin and the autopilot's heading, to begin turning and to end it: less
-than the first is noise, and an autopilot whose heading is ours is never that far off."""
 SIGMA_RECKONED_RAD = np.radians(1.0)
 """Of the autopilot's attitude over some seconds."""
 FLOOR_M, FLOOR_RAD = 0.02, np.radians(0.3)
@@ -79,8 +74,7 @@ class SmoothOdometry:
         self._reckoned: Reckoned | None = None
         """Attitude of the frame that has begun, and where inertial navigation has the body."""
         self.reckoned_path = ReckonedPath()
-        self._segment: int | None = None
-        self._georeference: Georeference | None = None
+        self._map: PlacedMap | None = None
         self._frame = OdometryFrame()
         self._last: tuple[int, Pose, Pose] | None = None
         """Time, `map_from_camera` and `odometry_from_body` of the last accepted frame."""
@@ -94,14 +88,9 @@ class SmoothOdometry:
         """Of the place where it stands, since the last reset."""
         self._begins_m: Array = np.zeros(3)
         """Place (3,) of a stand before any other is known."""
-        self._map_began_m: Array = np.zeros(3)
-        """Place (3,) where the active map began."""
         self._in_world = False
         """True once satellites have placed the body, or its map."""
-        self._lift_off: tuple[int, Array] | None = None
-        """Reset counter and place (3,) of the last lift-off."""
-        self._turns = False
-        """True while the frame turns to the autopilot's heading."""
+        self._heading = LiftOffHeading()
         self.reset_counter = 0
 
     def step(
@@ -137,20 +126,21 @@ class SmoothOdometry:
         if self._last is not None and track.t_ns <= self._last[0]:
             # late: a pose without it was given meanwhile
             return Odometry(track.seq, track.t_ns, track.state, self.reset_counter)
-        if segment != self._segment or self._georeference is None:
+        if self._map is None or segment != self._map.segment:
             goes_on = self._reckoned is not None or self._given
             if goes_on and georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING:
                 return self._unknown(track)  # it would also be slower and faster than the body
             if first is not None and track.t_ns - first.t_ns < YOUNG_NS and self._reckons_well:
                 return self._unknown(track)
             self._start_map(segment, georeference, pose, first)
-        elif georeference is not self._georeference:
-            self._update_georeference(georeference)
-        raw = self._raw(georeference, pose)
+        elif georeference is not self._map.georeference:
+            self._update_georeference(self._map, georeference)
+        assert self._map is not None
+        raw = self._map.world_from_body(pose)
         if track.state is TrackState.DEAD_RECKONING:
             if self._reckoned is not None:
                 return self._unknown(track)
-            return self._dead_reckon(track, raw)
+            return self._dead_reckon(track, pose, raw, georeference)
         quality = quality_of(track, self._size)
         if quality < self._least_quality and self._reckons_well:
             return self._unknown(track)
@@ -159,7 +149,11 @@ class SmoothOdometry:
         frame = self._frame
         here = frame.from_world @ raw
         if self._last is not None:
-            frame = self._slewed(raw, min((track.t_ns - self._last[0]) * 1e-9, 1.0))
+            dt_s, attitude = min((track.t_ns - self._last[0]) * 1e-9, 1.0), self._attitude
+            frame = self._heading.turned(
+                frame.slewed(raw, dt_s), raw, None if attitude is None else attitude.ned_from_body,
+                self.reset_counter, dt_s,
+            )  # fmt: skip
         placed = frame.from_world @ raw
         within_gate = self._last is None or self._gate.reachable(
             self._last[2].translation, placed.translation, track.t_ns - self._last[0],
@@ -207,27 +201,6 @@ class SmoothOdometry:
             sigma_scale=georeference.sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
 
-    def _slewed(self, raw: Pose, dt_s: float) -> OdometryFrame:
-        """The frame after some time; one without an origin takes the autopilot's heading.
-
-        That is aligned anew on the way up, away from what disturbs a compass on the ground: the
-        frame turns about the place of the lift-off, as long as that moves the body but little.
-        """
-        frame, attitude = self._frame.slewed(raw, dt_s), self._attitude
-        if frame.anchored or attitude is None or self._lift_off is None:
-            return frame
-        placed, (counter, place_m) = frame.from_world @ raw, self._lift_off
-        way_m = float(np.linalg.norm((placed.translation - place_m)[:2]))
-        if counter != self.reset_counter or way_m > NEAR_LIFT_OFF_M:
-            return frame
-        off_rad = yaw_angle(attitude.ned_from_body @ placed.rotation.T)
-        self._turns = abs(off_rad) > (ALIGNED_RAD if self._turns else MISALIGNED_RAD)
-        if not self._turns:
-            return frame
-        most_rad = float(MAX_SLEW_RAD_S) * dt_s
-        step_rad = float(np.clip(off_rad, -most_rad, most_rad))
-        return frame.turned(place_m, step_rad, placed.translation)
-
     @property
     def _reckons_well(self) -> bool:
         """True where inertial navigation counts for more than a map that is poor."""
@@ -260,7 +233,7 @@ class SmoothOdometry:
             self.ground.stand(attitude.t_ns, self._place_now())
         elif not standing:
             if self.ground.stood is not None:
-                self._lift_off = self.reset_counter, self.ground.stood.place_m
+                self._heading.lift_off(self.reset_counter, self.ground.stood.place_m)
             at_ns = t_ns if attitude is None else attitude.t_ns
             self.ground.fly(at_ns, float(self._place_now()[2]), self.ground.wants_flow(t_ns))
         found = None if attitude is None else self._navigation.at(attitude.t_ns)
@@ -286,22 +259,22 @@ class SmoothOdometry:
             return None
         return self._unknown(Track(seq, t_ns, TrackState.LOST))
 
-    def _dead_reckon(self, track: Track, raw: Pose) -> Odometry:
+    def _dead_reckon(
+        self, track: Track, pose: Pose, raw: Pose, georeference: Georeference
+    ) -> Odometry:
         """Odometry by dead reckoning: of lowest quality and growing uncertainty."""
-        assert track.map_from_camera is not None
         placed = self._frame.from_world @ raw
         if self._last is not None:
             dt_s = max((track.t_ns - self._last[0]) * 1e-9, 1e-3)
             self._velocity = (placed.translation - self._last[2].translation) / dt_s
         self._dead_reckoning = True
-        self._last = (track.t_ns, track.map_from_camera, placed)
-        assert self._georeference is not None
-        scale = self._georeference.world_from_map.scale
+        self._last = (track.t_ns, pose, placed)
+        scale = georeference.world_from_map.scale
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter, 1, placed,
             self._velocity.copy(), max(FLOOR_M, scale * track.sigma_position),
             SIGMA_DEAD_RECKONING_M_S, float(np.hypot(FLOOR_RAD, track.sigma_rotation_rad)),
-            self._sigma_yaw_rad(self._georeference, track.sigma_rotation_rad),
+            self._sigma_yaw_rad(georeference, track.sigma_rotation_rad),
         )  # fmt: skip
 
     def _reacquire(self, raw: Pose, t_ns: int) -> None:
@@ -325,12 +298,10 @@ class SmoothOdometry:
         The place is in the frame of the odometry, metres; the rotation (3, 3) is the camera's in
         the map. None without a georeference.
         """
-        if self._georeference is None:
+        if self._map is None:
             return None
-        to_world = self._georeference.world_from_map
-        world_m = self._frame.from_world.inverse().apply(place_m)
-        lever_m = to_world.rotation @ map_from_camera @ self._camera_from_body.translation
-        return np.asarray(to_world.inverse().apply(world_m - lever_m))
+        place_world_m = self._frame.from_world.inverse().apply(place_m)
+        return self._map.place_of_camera(place_world_m, map_from_camera)
 
     def _unknown(self, track: Track) -> Odometry:
         """Odometry without a pose by the map: by inertial navigation, as far as that knows it."""
@@ -340,7 +311,7 @@ class SmoothOdometry:
         rotation = self._navigation.world_from_attitude @ attitude.ned_from_body
         placed, self._velocity = Pose(rotation, reckoned.place_m), reckoned.velocity_m_s
         self._dead_reckoning = True
-        georeference = self._georeference
+        georeference = None if self._map is None else self._map.georeference
         sigma_scale = 0.0 if georeference is None else georeference.sigma_scale
         self._hold(track.t_ns, placed)
         drift = self._drift.add(track.t_ns, placed.translation, sigma_scale, self._frame.slewed_m)
@@ -355,9 +326,8 @@ class SmoothOdometry:
 
     def _hold(self, t_ns: int, placed: Pose) -> None:
         """Take a pose that the active map did not give: the next by the map has to fit it."""
-        if self._georeference is not None:
-            camera = self._frame.from_world.inverse() @ placed @ self._camera_from_body.inverse()
-            pose = self._georeference.world_from_map.inverse().apply_to_pose(camera)
+        if self._map is not None:
+            pose = self._map.map_from_camera(self._frame.from_world.inverse() @ placed)
             self._last = (t_ns, pose, placed)
 
     def _begin_stand(self, t_ns: int) -> None:
@@ -409,66 +379,43 @@ class SmoothOdometry:
             track.seq, track.t_ns, TrackState.STANDING, self.reset_counter, 100, placed,
             np.zeros(3), float(np.hypot(FLOOR_M, self._sigma_stood_m)), SIGMA_STANDING_M_S,
             float(SIGMA_RECKONED_RAD),
-            self._sigma_yaw_rad(self._georeference, float(SIGMA_RECKONED_RAD)),
+            self._sigma_yaw_rad(
+                None if self._map is None else self._map.georeference, float(SIGMA_RECKONED_RAD)
+            ),
         )  # fmt: skip
-
-    def _raw(self, georeference: Georeference, map_from_camera: Pose) -> Pose:
-        """`world_from_body` by the map at present."""
-        return georeference.world_from_map.apply_to_pose(map_from_camera) @ self._camera_from_body
 
     def _start_map(
         self, segment: int, georeference: Georeference, pose: Pose, first: MapView | None
     ) -> None:
-        """Start in another map, or the first one.
-
-        A map without an origin goes on from where inertial navigation had the body at its first
-        view, else from the last known position. There is no jump where that, or the place in a map
-        with an origin, is close to where inertial navigation has the body now. All else is a reset:
-        its poses are unrelated.
-        """
-        began = None if first is None else self.reckoned_path.at(first.t_ns)
-        raw, before = self._raw(georeference, pose), self._frame
-        turn, offset, owed_m = np.eye(3), np.zeros(3), None
-        if georeference.has_origin and self._reckoned is not None:
-            owed_m = raw.translation - self._reckoned.place_m
-        elif not georeference.has_origin and first is not None and began is not None:
-            raw_first = self._raw(georeference, first.map_from_camera)
-            # of the first view: autopilots' headings swing on the way up
-            turn = yaw_rotation(yaw_angle(began.rotation @ raw_first.rotation.T))
-            offset = before.from_world.apply(began.place_world_m) - turn @ raw_first.translation
-            if self._reckoned is not None:
-                owed_m = turn @ raw.translation + offset - self._reckoned.place_m
-        elif not georeference.has_origin and self._last is not None:
-            offset = self._last[2].translation - raw.translation
-        if owed_m is not None and float(np.linalg.norm(owed_m)) >= self._gate.max_jump_m:
-            owed_m = None
+        """Start in another map, or the first one: see `frame_of`."""
+        placed = PlacedMap(segment, georeference, self._camera_from_body)
+        frame, goes_on = frame_of(
+            placed, pose, first, self._frame,
+            None if first is None else self.reckoned_path.at(first.t_ns),
+            None if self._reckoned is None else self._reckoned.place_m,
+            None if self._last is None else self._last[2].translation, self._gate.max_jump_m,
+        )  # fmt: skip
         self._in_world |= georeference.has_origin
-        if owed_m is None:
+        if not goes_on:
             self.reset_counter += self._given
             self._drift.clear()
             if self._last is not None and georeference.has_origin:
                 self._navigation.reset()
-        self._frame = OdometryFrame(
-            Pose(turn, offset), georeference.has_origin, slewed_m=before.slewed_m
-        )
-        if owed_m is not None:
-            self._frame = self._frame.shifted(-owed_m)
+        self._frame = frame
         self.reckoned_path.clear()
-        self._map_began_m = (self._frame.from_world @ raw).translation
-        self._segment, self._georeference = segment, georeference
+        began = frame.from_world @ placed.world_from_body(pose)
+        self._map = replace(placed, began_m=began.translation)
         self._last, self._dead_reckoning = None, False
         self._gate.clear()
 
-    def _update_georeference(self, georeference: Georeference) -> None:
+    def _update_georeference(self, before: PlacedMap, georeference: Georeference) -> None:
         """Change the georeference of the same map, keeping the last pose."""
-        before = self._georeference
-        if self._last is not None and before is not None:
+        self._map = replace(before, georeference=georeference)
+        if self._last is not None:
             _, pose, placed = self._last
-            raw = self._raw(georeference, pose)
-            self._frame = self._frame.holding(placed, raw)
-            ratio = georeference.world_from_map.scale / before.world_from_map.scale
+            self._frame = self._frame.holding(placed, self._map.world_from_body(pose))
+            ratio = georeference.world_from_map.scale / before.georeference.world_from_map.scale
             self._navigation.move(np.eye(3), placed.translation, placed.translation, ratio)
-        self._georeference = georeference
 
     @property
     def state(self) -> OdometryState | None:
@@ -485,7 +432,7 @@ class SmoothOdometry:
 
         The next pose is taken as is, since the motion meanwhile is unknown.
         """
-        self._segment, self._georeference = segment, georeference
+        self._map = PlacedMap(segment, georeference, self._camera_from_body)
         self._frame = OdometryFrame(
             state.odometry_from_world, state.anchored, slewed_m=self._frame.slewed_m
         )
@@ -505,10 +452,10 @@ class SmoothOdometry:
 
         It is doubted by as much as that has turned the way since the map began, and the velocity.
         """
-        if segment != self._segment or self._last is None:
+        if self._map is None or segment != self._map.segment or self._last is None:
             return
         share = float(np.sin(min(tilt_rad, np.pi / 2)))
-        way_m = float(np.linalg.norm(self._last[2].translation - self._map_began_m))
+        way_m = float(np.linalg.norm(self._last[2].translation - self._map.began_m))
         speed_m_s = float(np.linalg.norm(self._velocity))
         self._navigation.doubt(
             SIGMA_DOUBTED_M + share * way_m, SIGMA_DOUBTED_M_S + share * speed_m_s
@@ -520,10 +467,10 @@ class SmoothOdometry:
         The output stays continuous; the difference is slewed. A frame that the gate refused, or of
         another map, says nothing of the pose that was given.
         """
-        if self._last is None or self._georeference is None or self._dead_reckoning:
+        if self._last is None or self._map is None or self._dead_reckoning:
             return  # what dead reckoning is off by shows when the map is seen again
-        if segment != self._segment or t_ns != self._last[0]:
+        if segment != self._map.segment or t_ns != self._last[0]:
             return
         placed = self._last[2]
         self._last = (t_ns, map_from_camera, placed)
-        self._update_georeference(self._georeference)
+        self._update_georeference(self._map, self._map.georeference)
