@@ -214,7 +214,7 @@ class Daemon:
 
     def _on_frame(self, frame: Frame) -> None:
         """Take a frame; in the camera's thread."""
-        self._watch.frame_came()
+        self._watch.frame_came(frame.t_ns)
         self._overdue.came(frame, self._clock.now_ns())
         if self._starts.camera is None:
             self._soon(self._starts.camera_known)

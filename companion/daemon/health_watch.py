@@ -6,6 +6,7 @@ The governor's load levels go to the flight from here, and a hanging pose loop i
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +37,7 @@ from drivers.system.journal import Journal
 from drivers.system.system_load import SystemLoad
 
 GOVERN_NS = 1_000_000_000
+MAX_ARRIVALS = 64
 STUCK_NS = 3_000_000_000
 """Time with frames but no track after which the pose loop counts as hanging."""
 BUSY_STUCK_NS, BUSY_CORES = 10_000_000_000, 0.02
@@ -93,7 +95,10 @@ class HealthWatch:
         self.flight_due = False
         """True while a flight is to begin and cannot yet: then it is missed that no pose comes."""
         self._scale = ""
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=MAX_ARRIVALS)
+        """Time of the latest frames, and of their arrival."""
         self._recent = LatencyMeter(1.0)
+        """From arrival to pose: less work shortens nothing else of a pose's latency."""
         self.set_by_ground: Mapping[str, Any] = {}
         """Keys of the configuration, and the values set by the ground."""
         self._pose = StageMeter("localisation")
@@ -121,10 +126,11 @@ class HealthWatch:
         self._odometry_ns = self._clock.now_ns()
         self._governed_ns = 0
 
-    def frame_came(self) -> None:
-        """Count a frame; from the camera's thread."""
+    def frame_came(self, t_ns: int) -> None:
+        """Count a frame of this time; from the camera's thread."""
         now_ns = self._clock.now_ns()
         self._last_frame_ns = now_ns
+        self._arrivals.append((t_ns, now_ns))
 
     def take_odometry(self, odometry: Odometry) -> None:
         """Count the odometry of a frame."""
@@ -133,7 +139,9 @@ class HealthWatch:
             self._settled_ns = now_ns + SETTLE_NS
         self._odometry, self._odometry_ns, self._progress_ns = odometry, now_ns, now_ns
         self._pose.done(now_ns, odometry.t_ns)
-        self._recent.add(now_ns, (now_ns - odometry.t_ns) * 1e-6)
+        came_ns = next((at for t, at in tuple(self._arrivals) if t == odometry.t_ns), None)
+        if came_ns is not None:
+            self._recent.add(now_ns, (now_ns - came_ns) * 1e-6)
 
     def take_georeference(self, told: Georeferenced) -> None:
         """Take the source of the scale."""

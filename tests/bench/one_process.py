@@ -112,7 +112,7 @@ class Flown:
         began_s = time.monotonic()
         self._seq = frame.seq
         self._answered.clear()
-        self.watch.frame_came()
+        self.watch.frame_came(frame.t_ns)
         self.flight.frame(frame)
         assert self._answered.wait(ANSWER_S), f"no answer to frame {frame.seq}"
         time.sleep(max(0.0, began_s + LEAST_FRAME_S - time.monotonic()))

@@ -73,7 +73,32 @@ def test_no_pose_for_long_is_no_progress_where_a_flight_is_due(
     seen = []
     for now_ns in times_ns:
         clock.now_ns = lambda now_ns=now_ns: now_ns  # type: ignore[method-assign,misc]
-        watch.frame_came()
+        watch.frame_came(now_ns)
         seen.append(watch.progress)
     assert all(seen[:-1])
     assert seen[-1] is not is_due
+
+
+def test_a_camera_that_is_late_by_itself_is_no_load(tmp_path: Path) -> None:
+    """Of a network camera a picture may be 200 ms old when it comes."""
+    stage = SimpleNamespace(n_dropped=0)
+    levels: list[Any] = []
+    flight = SimpleNamespace(
+        ready=True,
+        stages={"localisation": stage},
+        set_load_levels=lambda *level: levels.append(level),
+    )
+    watch, clock = watch_of(flight, tmp_path), FlightClock()
+    watch._clock = clock
+    for work_ms, n_levels in ((20, 1), (80, 5)):
+        for second in range(10):
+            for frame in range(20):
+                t_ns = 1_000_000_000 * (100 * work_ms + second) + 50_000_000 * frame
+                clock.now_ns = lambda t_ns=t_ns: t_ns + 200_000_000  # type: ignore[method-assign,misc]
+                watch.frame_came(t_ns)
+                now_ns = t_ns + (200 + work_ms) * 1_000_000
+                clock.now_ns = lambda now_ns=now_ns: now_ns  # type: ignore[method-assign,misc]
+                pose: Any = SimpleNamespace(t_ns=t_ns, state=TrackState.TRACKING, quality=80)
+                watch.take_odometry(pose)
+            watch._step_governor()
+        assert len(levels) == n_levels

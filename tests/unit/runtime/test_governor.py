@@ -40,9 +40,7 @@ def test_nothing_is_left_out_while_it_goes_easily() -> None:
 def test_late_poses_take_one_step_at_a_time_to_the_last() -> None:
     governor = Governor(hot_c=85)
     assert run(governor, range(60), LATE) == [(1, 1), (3, 2), (5, 3), (7, 4)]
-    assert governor.degraded == (
-        "viewer and dense map off, fewer features, since poses come 80 ms after exposure"
-    )
+    assert governor.degraded == ("viewer and dense map off, fewer features, since poses take 80 ms")
 
 
 def test_one_late_second_is_no_reason() -> None:
