@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from companion.geometry.transforms import Array, angle_between, rotation_from_quaternion
+from companion.geometry.transforms import Array, rotation_from_quaternion
 from companion.messages import Bytes
 from companion.telemetry import ArmedSample, AttitudeSample, ImuSample, LandedSample, Telemetry
 
@@ -33,7 +33,8 @@ class Limits(NamedTuple):
     of attitude in a second, of the tilt that an autopilot finds at rest, too. Change: between the
     means of two half seconds, beside what their noise explains. Gravity: bias and sensitivity of an
     accelerometer, and gravity on earth. Shift: of the image at `WIDTH_PX` in `ANCHOR_NS`; 0.25 is 1
-    pixel of 640, some tenths of a millimetre on the ground below a landing gear.
+    pixel of 640, some tenths of a millimetre on the ground below a landing gear. A heading may
+    jump: autopilots align it anew on the ground, PX4 by 6 degrees in its simulator.
     """
 
     turn_rad_s: float
@@ -139,11 +140,11 @@ class Standing:
     def _attitude_still(self, t_ns: int, limits: Limits) -> bool:
         if len(self._attitudes) < 2 or t_ns - self._attitudes[-1].t_ns > FRESH_NS:
             return False
-        first, last = (
-            rotation_from_quaternion(each.ned_from_body)
+        first, last = (  # down in the body's axes; of the heading the gyro says what is true
+            rotation_from_quaternion(each.ned_from_body)[2]
             for each in (self._attitudes[0], self._attitudes[-1])
         )
-        return angle_between(first, last) < limits.tilt_rad
+        return float(np.linalg.norm(np.cross(first, last))) < float(np.sin(limits.tilt_rad))
 
 
 class ImageStillness:
