@@ -39,6 +39,8 @@ LATENCY_MS = 40.0
 LENS_M = 0.1
 """Above the ground, while the vehicle stands on short legs."""
 HEARD_S, READY_S, END_S = 30.0, 60.0, 20.0
+PERFECT_S = 20.0
+"""Until perfect poses count as sent: as long as a companion takes, and PX4 to find its heading."""
 RESTART_S = 2.0
 """RestartSec of the service."""
 WITHOUT_GPS: dict[str, dict[str, float]] = {
@@ -165,6 +167,7 @@ class Trial:
             self._open.enter_context(PerfectPose(
                 self.ground, self._companion_port, self.firmware.home, CAMERA_HZ
             ))  # fmt: skip
+            time.sleep(PERFECT_S)
             self.status = {"feedback": {"sending": True}}
             return
         self.daemon = Daemon(self.folder, *self._settings(), program=(*PROGRAM,))

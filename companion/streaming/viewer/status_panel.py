@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 MEANINGS = {
+    "Standing": "On the ground: the place is fixed until it lifts off.",
     "Tracking": "The camera knows where it is.",
     "Initialising": "Move sideways, so that the camera sees depth.",
     "Coasting": "Nothing is recognised; the place follows from attitude and speed.",

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from companion.geometry.transforms import Similarity
+from companion.streaming.items import Shown
 from companion.streaming.viewer.colours import HEIGHT_PERIOD_M, Colours
 from companion.streaming.viewer.status_panel import MEANINGS, status_text
 
@@ -11,6 +12,7 @@ def test_the_state_is_the_headline_and_what_to_do_follows() -> None:
     for state, meaning in MEANINGS.items():
         lines = status_text({"state": state}, "").splitlines()
         assert lines[0] == f"# {state}" and lines[1] == meaning
+    assert {state.value for state in Shown} <= MEANINGS.keys()
     assert "go back" in MEANINGS["Lost"].lower()
 
 
