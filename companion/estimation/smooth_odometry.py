@@ -151,8 +151,8 @@ class SmoothOdometry:
         if self._last is not None:
             dt_s, attitude = min((track.t_ns - self._last[0]) * 1e-9, 1.0), self._attitude
             frame = self._heading.turned(
-                frame.slewed(raw, dt_s), raw, None if attitude is None else attitude.ned_from_body,
-                self.reset_counter, dt_s,
+                frame.slewed(raw, dt_s), track.t_ns, raw,
+                None if attitude is None else attitude.ned_from_body, self.reset_counter, dt_s,
             )  # fmt: skip
         placed = frame.from_world @ raw
         within_gate = self._last is None or self._gate.reachable(
@@ -233,7 +233,7 @@ class SmoothOdometry:
             self.ground.stand(attitude.t_ns, self._place_now())
         elif not standing:
             if self.ground.stood is not None:
-                self._heading.lift_off(self.reset_counter, self.ground.stood.place_m)
+                self._heading.lift_off(t_ns, self.reset_counter, self.ground.stood.place_m)
             at_ns = t_ns if attitude is None else attitude.t_ns
             self.ground.fly(at_ns, float(self._place_now()[2]), self.ground.wants_flow(t_ns))
         found = None if attitude is None else self._navigation.at(attitude.t_ns)
