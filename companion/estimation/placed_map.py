@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,11 +45,22 @@ class PlacedMap:
         return np.asarray(to_world.inverse().apply(place_world_m - lever_m))
 
 
+class MapStart(NamedTuple):
+    """Frame in which a new map is flown on; its poses go on from those before where `goes_on`.
+
+    `off_m` is what its place differs by from that of inertial navigation, None where unknown.
+    """
+
+    frame: OdometryFrame
+    goes_on: bool
+    off_m: float | None
+
+
 def frame_of(
     placed: PlacedMap, map_from_camera: Pose, first: MapView | None, before: OdometryFrame,
     began: BodyPlace | None, reckoned_m: Array | None, last_m: Array | None, max_jump_m: float,
-) -> tuple[OdometryFrame, bool]:  # fmt: skip
-    """The frame in which a new map is flown on; True where its poses go on from those before.
+) -> MapStart:  # fmt: skip
+    """Start of a new map.
 
     A map without an origin goes on from where inertial navigation had the body at its first view
     (`began`), else from the last known place (3,). There is no jump where that, or the place in a
@@ -68,7 +80,10 @@ def frame_of(
             owed_m = turn @ raw.translation + offset - reckoned_m
     elif not has_origin and last_m is not None:
         offset = last_m - raw.translation
-    if owed_m is not None and float(np.linalg.norm(owed_m)) >= max_jump_m:
-        owed_m = None
     frame = OdometryFrame(Pose(turn, offset), has_origin, slewed_m=before.slewed_m)
-    return (frame, False) if owed_m is None else (frame.shifted(-owed_m), True)
+    if owed_m is None:
+        return MapStart(frame, False, None)
+    off_m = float(np.linalg.norm(owed_m))
+    if off_m >= max_jump_m:
+        return MapStart(frame, False, off_m)
+    return MapStart(frame.shifted(-owed_m), True, off_m)

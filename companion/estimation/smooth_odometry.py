@@ -40,6 +40,9 @@ YOUNG_NS = 2_000_000_000
 """A map of a take-off grows by ten keyframes a second, and their adjustment lags behind: until then
 it bends. Flown on at once in the firmwares' simulators, poses were off by 0.7 m after four metres
 of climb in one take-off of three, with 0.1 m stated."""
+CONTRADICTS_SIGMAS = 4.0
+"""Beyond, a new map that is off from inertial navigation is wrong, not navigation; what that was
+off by without aid in the firmwares' simulators was 2.5 of them at most."""
 MAX_SIGMA_RECKONED_M = 5.0
 """By inertial navigation; beyond, it is of no use even to find the map again."""
 MAX_SIGMA_SCALE_AIDING = 0.05
@@ -132,7 +135,8 @@ class SmoothOdometry:
                 return self._unknown(track)  # it would also be slower and faster than the body
             if first is not None and track.t_ns - first.t_ns < YOUNG_NS and self._reckons_well:
                 return self._unknown(track)
-            self._start_map(segment, georeference, pose, first)
+            if not self._start_map(segment, georeference, pose, first):
+                return self._unknown(track)
         elif georeference is not self._map.georeference:
             self._update_georeference(self._map, georeference)
         assert self._map is not None
@@ -386,15 +390,25 @@ class SmoothOdometry:
 
     def _start_map(
         self, segment: int, georeference: Georeference, pose: Pose, first: MapView | None
-    ) -> None:
-        """Start in another map, or the first one: see `frame_of`."""
+    ) -> bool:
+        """Start in another map, or the first one: see `frame_of`.
+
+        False where it contradicts inertial navigation, which is certain enough to know better: by
+        a wrong mount, say. Flown on in the firmwares' simulators, such maps took the vehicle away.
+        """
         placed = PlacedMap(segment, georeference, self._camera_from_body)
-        frame, goes_on = frame_of(
+        frame, goes_on, off_m = frame_of(
             placed, pose, first, self._frame,
             None if first is None else self.reckoned_path.at(first.t_ns),
             None if self._reckoned is None else self._reckoned.place_m,
             None if self._last is None else self._last[2].translation, self._gate.max_jump_m,
         )  # fmt: skip
+        if (
+            not goes_on and off_m is not None and not georeference.has_origin
+            and self._reckoned is not None
+            and off_m > CONTRADICTS_SIGMAS * self._reckoned.sigma_place_m
+        ):  # fmt: skip
+            return False
         self._in_world |= georeference.has_origin
         if not goes_on:
             self.reset_counter += self._given
@@ -407,6 +421,7 @@ class SmoothOdometry:
         self._map = replace(placed, began_m=began.translation)
         self._last, self._dead_reckoning = None, False
         self._gate.clear()
+        return True
 
     def _update_georeference(self, before: PlacedMap, georeference: Georeference) -> None:
         """Change the georeference of the same map, keeping the last pose."""

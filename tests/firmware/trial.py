@@ -41,6 +41,7 @@ LENS_M = 0.1
 HEARD_S, READY_S, END_S = 30.0, 60.0, 20.0
 PERFECT_S = 20.0
 """Until perfect poses count as sent: as long as a companion takes, and PX4 to find its heading."""
+OWN_TO_EACH = "camera.", "mount.", "link."
 RESTART_S = 2.0
 """RestartSec of the service."""
 WITHOUT_GPS: dict[str, dict[str, float]] = {
@@ -178,18 +179,20 @@ class Trial:
     @contextlib.contextmanager
     def second_companion(self) -> Iterator[Daemon]:
         """Another on the same vehicle, with a camera of its own."""
-        settings = [word for word in self._settings() if not word.startswith(("camera", "link"))]
+        settings = [word for word in self._settings() if not word.startswith(OWN_TO_EACH)]
         folder = self.folder / "second"
         folder.mkdir()
-        with contextlib.redirect_stdout(io.StringIO()) as said:
-            try:
-                with Daemon(
-                    folder, *settings, f"link.url=udpin:127.0.0.1:{self._second_port}",
-                    "camera.source=pattern", program=(*PROGRAM,),
-                ) as daemon:  # fmt: skip
-                    yield daemon
-            finally:
-                (folder / "journal.txt").write_text(said.getvalue())
+        daemon = Daemon(
+            folder, *settings, f"link.url=udpin:127.0.0.1:{self._second_port}",
+            "camera.source=pattern", program=(*PROGRAM,),
+        )  # fmt: skip
+        daemon.__enter__()
+        try:
+            yield daemon
+        finally:
+            with contextlib.redirect_stdout(io.StringIO()) as said:
+                daemon.__exit__(None, None, None)
+            (folder / "journal.txt").write_text(said.getvalue())
 
     def _settings(self) -> list[str]:
         home, c = self.firmware.home, self.conditions

@@ -20,6 +20,7 @@ from drivers.mavlink.wire.wire import Tap, Wire, run_together
 
 FIRST_SYSTEM = 1
 """Default system id of ArduPilot and PX4."""
+BEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 MANY_REFUSED = 10
 
 
@@ -132,7 +133,11 @@ class PymavlinkPort:
         packets = self._stream.feed(data, monotonic_ns)
         if any((packet.system, packet.component) == ours for packet in packets):
             # echoes of our own packets, of a wire whose ends are joined: not passed on
+            beats = [p for p in packets if (p.system, p.component, p.message_id) == (*ours, BEAT)]
             packets = [packet for packet in packets if (packet.system, packet.component) != ours]
+            for beat in beats:  # or of another companion
+                if self._is_signed(beat, monotonic_ns):
+                    self._deliver(beat, monotonic_ns)
         self.n_received += len(packets)
         try:
             for packet in packets:

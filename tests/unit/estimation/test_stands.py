@@ -263,6 +263,22 @@ def test_a_map_is_flown_on_once_it_has_settled() -> None:
     assert abs(yaw_angle(settled.world_from_body.rotation)) < 1e-6
 
 
+def test_a_map_that_contradicts_inertial_navigation_is_not_flown_on() -> None:
+    """As one of a camera that sits otherwise than stated; it would be a jump of six metres."""
+    vehicle = Vehicle()
+    vehicle.frames(20, standing=True)
+    first = MapView(vehicle.t_ns + STEP_NS, Pose(np.eye(3), HERE))
+    vehicle.frames(25)
+    for _ in range(20):
+        wrong = vehicle.frame(HERE + [6.0, 0.0, 0.0], first=first)
+        assert wrong.inertial and wrong.reset_counter == 0
+    np.testing.assert_allclose(place(wrong), 0.0, atol=0.1)
+    while vehicle.frame().sigma_position_m < 2.0:
+        pass
+    found = vehicle.frame(HERE + [6.0, 0.0, 0.0], first=first)
+    assert found.state is TrackState.TRACKING and found.reset_counter == 1
+
+
 @pytest.mark.parametrize(
     ("away_m", "n_frames", "frames", "turns"),
     [(0.5, 120, 1, True), (6.0, 120, 1, False), (0.5, 220, 1, False), (0.5, 120, 5, False)],

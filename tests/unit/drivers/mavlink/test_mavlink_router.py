@@ -187,6 +187,9 @@ def test_packets_do_not_go_in_circles() -> None:
             await asyncio.sleep(0.02)
             assert not any(packet.component == 197 for packet in first.hear())
             assert len(scene.heard.messages) == 2
+            scene.autopilot.send(Speaker(1, 197).heartbeat())  # an echo, or another companion
+            await until(lambda: len(scene.heard.messages) == 3)
+            assert not any(packet.component == 197 for packet in first.hear())
 
     asyncio.run(play())
 
