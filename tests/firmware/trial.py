@@ -41,6 +41,8 @@ LENS_M = 0.1
 HEARD_S, READY_S, END_S = 30.0, 60.0, 20.0
 PERFECT_S = 20.0
 """Until perfect poses count as sent: as long as a companion takes, and PX4 to find its heading."""
+N_FEATURES = 720
+"""Of each frame, instead of 1200: the firmware runs, and its camera is drawn, on the same cores."""
 OWN_TO_EACH = "camera.", "mount.", "link."
 RESTART_S = 2.0
 """RestartSec of the service."""
@@ -204,7 +206,8 @@ class Trial:
             f"link.url=udpin:127.0.0.1:{self._companion_port}", f"expert.link.backend={c.backend}",
             "feedback.mode=odometry", f"feedback.origin_latitude_deg={home.latitude_deg}",
             f"feedback.origin_longitude_deg={home.longitude_deg}",
-            f"feedback.origin_altitude_m={home.altitude_m}", "depth.enabled=false", *c.settings,
+            f"feedback.origin_altitude_m={home.altitude_m}", "depth.enabled=false",
+            f"expert.features.n_features={N_FEATURES}", *c.settings,
         ]  # fmt: skip
 
     def kill_daemon(self) -> None:
