@@ -16,6 +16,7 @@ from companion.estimation.inertial.inertial_navigation import (
     AidedPlace,
     InertialNavigation,
 )
+from companion.estimation.lift_off_flow import LiftOffFlow
 from companion.estimation.optical_flow import GroundVelocity
 from companion.geometry.transforms import Array
 
@@ -41,6 +42,8 @@ class GroundAiding:
         self._navigation = navigation
         self.stood: AidedPlace | None = None
         """The fixed place while the vehicle stands, else None."""
+        self.lift_off_flow = LiftOffFlow()
+        """Judge of flow at the last lift-off: only flow that has shown it aids."""
         self._held: deque[AidedPlace | AidedHeight] = deque()
         """Of the latest frames while the vehicle stands; empty when it does not."""
         self._waiting: list[AidedFlow | AidedHeight] = []
@@ -86,6 +89,7 @@ class GroundAiding:
         if self.stood is not None:
             self._stood_down_m = float(self.stood.place_m[2])
             self._navigation.lift_off(self._stood_down_m + LEGS_M, SIGMA_LEGS_M)
+            self.lift_off_flow = LiftOffFlow()
         self.stood = None
         self._held.clear()
         high = self._stood_down_m - down_m > LEAST_HEIGHT_M
@@ -100,12 +104,22 @@ class GroundAiding:
         self._waiting = [m for m in self._waiting if m.t_ns >= t_ns]
         return found
 
-    def take_flow(self, measured: GroundVelocity, delay_ns: int) -> None:
-        """Take flow over that ground; autopilot stamps are late by `delay_ns`."""
-        if measured.t_ns - self._flow_ns < FLOW_EVERY_NS:
-            return
+    def take_flow(self, measured: GroundVelocity, delay_ns: int) -> bool:
+        """Take flow over that ground; autopilot stamps are late by `delay_ns`.
+
+        True where it has just been found to contradict the accelerometers: the mount is wrong.
+        """
+        reckoned, contradicts = self._navigation.at(measured.t_ns + delay_ns), False
+        if reckoned is not None:
+            velocity_m_s = self._navigation.world_from_attitude.T @ reckoned.velocity_m_s
+            contradicts = self.lift_off_flow.take(
+                velocity_m_s, reckoned.sigma_velocity_m_s, measured
+            )
+        if not self.lift_off_flow.agrees or measured.t_ns - self._flow_ns < FLOW_EVERY_NS:
+            return contradicts
         self._flow_ns = measured.t_ns
         covariance_hz2 = measured.covariance_hz2 + SIGMA_FLOW_HZ**2 * np.eye(3)
         self._waiting.append(
             AidedFlow(measured.t_ns + delay_ns, measured.velocity_hz, covariance_hz2)
         )
+        return False

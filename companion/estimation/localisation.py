@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.config import Config
-from companion.estimation.attitude.camera_attitude import CameraAttitude
+from companion.estimation.attitude.camera_attitude import AttitudeCheck, CameraAttitude
 from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.checkpoint import MAX_BYTES, Checkpoint
 from companion.estimation.georeference import Georeferencer
@@ -54,6 +54,7 @@ FINAL_ITERATIONS = 8
 TELEMETRY_KEPT_NS = 600_000_000_000
 """Older telemetry is only needed at the times of keyframes."""
 PRUNE_PERIOD_NS = 60_000_000_000
+NO_CLIMB = "at lift-off it sees another motion than the accelerometers measure; check mount.*"
 MAP_RESUMED = "map resumed after restart"
 MAP_NOT_RECOGNISED = "old map not recognised: new map"
 
@@ -251,7 +252,10 @@ class LocalisationStage:
         with self._times("optical flow"):
             flow = self._flow.step(frame, self._attitude)
         if wanted and self._flow.over_ground is not None:
-            self._odometry.ground.take_flow(self._flow.over_ground, self._attitude.correction[1])
+            delay_ns = self._attitude.correction[1]
+            if self._odometry.ground.take_flow(self._flow.over_ground, delay_ns):
+                checked = self._attitude.contradicted(frame.t_ns, NO_CLIMB)
+                yield from self._apply_check(checked, self._tracker.map)
         if asked:
             yield flow
 
@@ -414,6 +418,9 @@ class LocalisationStage:
         checked = self._attitude.check(
             t_ns, rotation_of, None if placed is None else placed.world_from_map.rotation
         )
+        return self._apply_check(checked, segment)
+
+    def _apply_check(self, checked: AttitudeCheck, segment: SlamMap) -> list[Warned]:
         if checked.now_from_before is not None:
             self._correct_attitudes(checked.now_from_before)
         if checked.before_from_now_ned is not None:

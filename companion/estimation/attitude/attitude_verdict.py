@@ -188,7 +188,11 @@ class AttitudeVerdict:
         warning = Warned(t_ns, REINITIALISED, detail)
         return Verdict(warning, reinitialise=True, tilt_rad=tilt_rad, young=young)
 
-    def _reject(self, t_ns: int, what: str) -> Verdict:
+    def reject_mount(self, t_ns: int, why: str) -> Verdict:
+        """Ignore the attitude until rotations agree again: the mount was found to be wrong."""
+        return self._reject(t_ns, MOUNT_DISAGREES, why)
+
+    def _reject(self, t_ns: int, what: str, why: str = "") -> Verdict:
         """Ignore the attitude until rotations agree again."""
         since_ns = self._agreed_ns if self._agreed_ns is not None else 0
         self.used, self._mount = False, what == MOUNT_DISAGREES
@@ -196,7 +200,7 @@ class AttitudeVerdict:
         self._retry_ns = min(2 * self._retry_ns, MAX_RETRY_NS)
         self._n_stabilised = self._n_independent = self._n_body_fixed = 0
         self._reset_tilt()
-        warning = Warned(t_ns, what, _description(self._agreement))
+        warning = Warned(t_ns, what, why or _description(self._agreement))
         return Verdict(warning, invalid_since_ns=since_ns, mount=self._mount)
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.estimation.attitude.attitude_history import AttitudeHistory
-from companion.estimation.attitude.attitude_verdict import AttitudeVerdict
+from companion.estimation.attitude.attitude_verdict import AttitudeVerdict, Verdict
 from companion.estimation.attitude.map_tilt import RotationOf
 from companion.estimation.attitude.mount_estimation import (
     RATE_STEP_NS,
@@ -163,17 +163,7 @@ class CameraAttitude:
             return AttitudeCheck([])
         verdict = self._verdict.check(t_ns, rotation_of, self._mount, ned_from_map)
         if verdict is not None:
-            if verdict.invalid_since_ns is not None:
-                self._invalid_spans.append((verdict.invalid_since_ns, None))
-            elif self._invalid_spans and self._invalid_spans[-1][1] is None and self.used:
-                self._invalid_spans[-1] = (self._invalid_spans[-1][0], t_ns)
-                if not verdict.mount:
-                    self._estimator.reset()  # its rotations were those of a gimbal
-            return AttitudeCheck(
-                [verdict.warning], reinitialise=verdict.reinitialise, tilt_rad=verdict.tilt_rad,
-                young=verdict.young, n_reinitialised=self._verdict.n_reinitialised,
-                invalid_since_ns=verdict.invalid_since_ns,
-            )  # fmt: skip
+            return self._judged(t_ns, verdict)
         if not self.used or t_ns < self._due_ns:
             return AttitudeCheck([])
         self._due_ns = t_ns + MOUNT_EVERY_NS
@@ -181,6 +171,27 @@ class CameraAttitude:
         return (
             self._correct(t_ns, found) if found is not None and found.certain else AttitudeCheck([])
         )
+
+    def contradicted(self, t_ns: int, why: str) -> AttitudeCheck:
+        """Ignore the attitude, as the camera sits otherwise than stated, by other evidence.
+
+        The map, which was levelled by it, is useless.
+        """
+        return self._judged(t_ns, self._verdict.reject_mount(t_ns, why))._replace(reinitialise=True)
+
+    def _judged(self, t_ns: int, verdict: Verdict) -> AttitudeCheck:
+        """Consequences of a verdict."""
+        if verdict.invalid_since_ns is not None:
+            self._invalid_spans.append((verdict.invalid_since_ns, None))
+        elif self._invalid_spans and self._invalid_spans[-1][1] is None and self.used:
+            self._invalid_spans[-1] = (self._invalid_spans[-1][0], t_ns)
+            if not verdict.mount:
+                self._estimator.reset()  # its rotations were those of a gimbal
+        return AttitudeCheck(
+            [verdict.warning], reinitialise=verdict.reinitialise, tilt_rad=verdict.tilt_rad,
+            young=verdict.young, n_reinitialised=self._verdict.n_reinitialised,
+            invalid_since_ns=verdict.invalid_since_ns,
+        )  # fmt: skip
 
     def _correct(self, t_ns: int, found: MountEstimate) -> AttitudeCheck:
         """Apply an estimate of mount and delay; report large corrections."""
