@@ -19,8 +19,8 @@ MIN_FLOW_SIGMAS = 4.0
 N_FRAMES, SHARE = 8, 0.8
 """Frames that count, the latest, and how many of them must say the same."""
 AGREES_RAD, CONTRADICTS_RAD = np.radians(35.0), np.radians(60.0)
-"""Angle between both. In ArduCopter's simulator it is under 2 degrees with a right mount, 105 to 126
-with a camera that is upside down; relief and tilt may turn flow by 15."""
+"""Angle between both. In ArduCopter's simulator it is under 2 degrees with a right mount, and from
+105 to 126 with a camera upside down; relief and tilt may turn flow by 15."""
 
 
 class LiftOffFlow:
