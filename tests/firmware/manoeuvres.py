@@ -152,7 +152,7 @@ def fly_circle(trial: Trial, figures: Figures) -> None:
     path = trial.ground.window(began_s + 3.0, end_s) - true_start
     centre = np.array([-CIRCLE_RADIUS_M, 0.0])
     radius_m = np.linalg.norm(path[:, :2] - centre, axis=1)
-    time.sleep(SETTLE_S)
+    time.sleep(CORNER_S)
     back_m = float(np.linalg.norm((mean_place(trial) - true_start)[:2]))
     trial.mark(f"circle, radius {np.median(radius_m):.2f} m")
     figures.add("circle, median radius", float(np.median(radius_m)), "m")

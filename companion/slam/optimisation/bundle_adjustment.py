@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import solve_triangular
 
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.slam.compiled.bundle_sums import (
@@ -91,11 +91,15 @@ def adjust(
             )
         rhs = rhs_part - gradient.ravel()
         try:
-            dc = cho_solve(cho_factor(schur, check_finite=False), rhs, check_finite=False)
+            # numpy's, as frames are tracked beside a large adjustment: SciPy's cho_factor holds
+            # the interpreter's lock throughout, 0.16 s for 450 keyframes
+            lower = np.linalg.cholesky(schur)
         except np.linalg.LinAlgError:
             damping *= 10
             accepted = False
             continue
+        half = solve_triangular(lower, rhs, lower=True, check_finite=False)
+        dc = solve_triangular(lower, half, lower=True, trans=1, check_finite=False)
         steps = dc.reshape(n_var, 6)
         dp = back_substitute(inverse, gp, hcp, b.camera, b.point, by_point, steps)
         yield_point()
