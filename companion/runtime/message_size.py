@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from companion.geometry.pose_table import PoseTable
+
 SMALL_BYTES, ENTRY_BYTES = 256, 400
 """Measured: a message without arrays; an entry of a mapping whose values are poses."""
 
@@ -19,7 +21,7 @@ def size_bytes(message: Any) -> int:
 
 
 def _size(value: Any) -> int:
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | PoseTable):
         return int(value.nbytes)
     if isinstance(value, bytes | bytearray | str):
         return len(value)

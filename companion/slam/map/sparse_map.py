@@ -6,12 +6,12 @@ an id is recycled only once nothing can still refer to the old point.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
+from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Bytes
 from companion.slam.compiled.patch_alignment import STORED
@@ -337,12 +337,15 @@ class SlamMap:
         anchor = self.keyframes[retired.anchor_id].camera_from_map
         return retired.anchor_from_camera.inverse() @ anchor
 
-    def poses(self) -> Iterator[tuple[int, Pose]]:
-        """Id and `map_from_camera` of every keyframe, culled ones included."""
-        living = {key: k.camera_from_map.inverse() for key, k in self.keyframes.items()}
-        yield from living.items()
-        for key, retired in self.retired.items():
-            yield key, living[retired.anchor_id] @ retired.anchor_from_camera
+    def poses(self) -> PoseTable:
+        """`map_from_camera` of every keyframe, culled ones included."""
+        living = PoseTable.of({key: k.camera_from_map for key, k in self.keyframes.items()})
+        living = living.inverse()
+        if not self.retired:
+            return living
+        anchors = np.array([each.anchor_id for each in self.retired.values()], np.int64)
+        apart = PoseTable.of({key: r.anchor_from_camera for key, r in self.retired.items()})
+        return PoseTable.joined([living, living.followed_by(anchors, apart)])
 
     def invalidate_centres(self) -> None:
         """Invalidate cached camera centres after keyframes were added or moved."""
