@@ -55,6 +55,8 @@ def choose_devices(
     listed, unlisted = listed_devices(program)
     if not listed:
         raise DeviceError(_none(unlisted))
+    for each in unlisted:
+        say(f"OpenCL: {each.named}: {each.problem}")
     asked_for = config.device != "auto"
     wanted = [device_asked_for(config.device, listed)] if asked_for else list(listed)
     wanted = [each for each in wanted if each.identity not in failed]

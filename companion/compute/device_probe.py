@@ -10,13 +10,17 @@ import contextlib
 import ctypes
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from companion.compute.device_verdict import verdict_path
+from companion.compute.driver_files import VENDORS, driver_files, folder_with
 from companion.dense.device_choice import MeasuredDevice, measured, measured_device
 from companion.dense.opencl import ListedDevice, devices_of, platform_names
 from companion.timing.clock import monotonic_s
@@ -27,6 +31,9 @@ PATIENCE_S = 120.0
 LIST_PATIENCE_S = 30.0
 TICK_S = 0.1
 MAX_PLATFORMS = 32
+UNKNOWN = "?:?"
+"""Number of what has failed before the loader named a platform."""
+NOTHING_ELSE: Mapping[str, str] = {}
 MAX_LINE_CHARS = 160
 PR_SET_PDEATHSIG = 1
 """Option of prctl(2): the signal at the death of the parent."""
@@ -35,14 +42,45 @@ PR_SET_PDEATHSIG = 1
 def listed_devices(
     program: Sequence[str] = PROGRAM, patience_s: float = LIST_PATIENCE_S
 ) -> tuple[list[ListedDevice], list[MeasuredDevice]]:
-    """All devices; and platforms whose driver fails on listing."""
+    """All devices; and platforms whose driver fails on listing.
+
+    Where the loader itself fails, each driver is tried by itself: those that it fails with are left
+    out from now on, in this process and those that it starts, which must not have called the loader
+    yet.
+    """
+    devices, failed = _listed(program, patience_s)
+    if devices or not any(each.number == UNKNOWN for each in failed):
+        return devices, failed
+    left_out: list[MeasuredDevice] = []
+    good: list[Path] = []
+    for file in driver_files():
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / file.name).symlink_to(file.absolute())
+            _, alone = _listed(program, patience_s, {VENDORS: folder})
+        bad = [each for each in alone if each.number == UNKNOWN]
+        left_out += [dataclasses.replace(each, platform=f"the driver of {file}") for each in bad]
+        good += [] if bad else [file]
+    if not left_out or not good:
+        return [], left_out or failed
+    cache = verdict_path()
+    try:
+        os.environ[VENDORS] = str(folder_with(good, None if cache is None else cache.parent))
+    except OSError as error:
+        return [], [dataclasses.replace(each, detail=str(error)) for each in left_out]
+    devices, failed = _listed(program, patience_s)
+    return devices, [*left_out, *failed]
+
+
+def _listed(
+    program: Sequence[str], patience_s: float, environment: Mapping[str, str] = NOTHING_ELSE
+) -> tuple[list[ListedDevice], list[MeasuredDevice]]:
     devices: list[ListedDevice] = []
     failed: list[MeasuredDevice] = []
     first, before = 0, -1
     while before < first < MAX_PLATFORMS:
         before = first
-        said, ended, detail = _said(["list", str(first)], program, patience_s)
-        asked = ListedDevice(f"{first}:?", "", "a driver, when platforms are listed")
+        said, ended, detail = _said(["list", str(first)], program, patience_s, environment)
+        asked = ListedDevice(UNKNOWN, "", "a driver, when platforms are listed")
         finished = False
         for line in said:
             if "asked" in line:
@@ -72,13 +110,17 @@ def probed(
 
 
 def _said(
-    arguments: Sequence[str], program: Sequence[str], patience_s: float
-) -> tuple[list[dict[str, Any]], str, str]:
-    """JSON output of the program; how it ended, in words; and its error output."""
+    arguments: Sequence[str], program: Sequence[str], patience_s: float,
+    environment: Mapping[str, str] = NOTHING_ELSE,
+) -> tuple[list[dict[str, Any]], str, str]:  # fmt: skip
+    """JSON output of the program; how it ended, in words; and its error output.
+
+    `environment` is what differs from that of this process.
+    """
     # Ctrl-C is handled by this process, which ends it
     with subprocess.Popen(
         [*program, *arguments], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, start_new_session=True,
+        stderr=subprocess.PIPE, start_new_session=True, env={**os.environ, **environment},
     ) as process:  # fmt: skip
         began_s, left_s = monotonic_s(), patience_s
         while True:
