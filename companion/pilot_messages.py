@@ -159,7 +159,7 @@ REASONS: Mapping[str, str] = {
     "disk is slow": "disk slow",
     "autopilot rebooted": "autopilot reboot",
 }
-"""Texts by the reason for which no pose is sent, see `estimation.pose_gate`, `daemon.pose`."""
+"""Texts by the reason for which no pose is sent, see `estimation.gate`, `daemon.pose`."""
 OTHER_REASON = "see its log"
 SWITCHED_OFF = ("off", "switched off")
 """Reasons for which the pilot or the ground has switched poses off: not reported as a loss."""
@@ -219,6 +219,7 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "a stage did not give its last results in time": RESULTS_INCOMPLETE,
     "the disk is full: the flight is no longer recorded": DISK_FULL,
     "the recording cannot be written": RECORDING_FAILED,
+    "the folder of flights cannot be written": RECORDING_FAILED,
     "the disk is too slow: parts of the flight are not recorded": RECORDING_INCOMPLETE,
     "an old flight was deleted": RECORDING_DELETED,
     "an earlier recording was cut short": RECORDING_REPAIRED,
@@ -254,7 +255,7 @@ def no_position(why_not: str) -> PilotText:
 
 
 def position_lost(why_not: str) -> PilotText:
-    """Text for the end of poses, by a reason of `companion.estimation.pose_gate`."""
+    """Text for the end of poses, by a reason of `companion.estimation.gate.pose_gate`."""
     if why_not in SWITCHED_OFF:
         return POSITION_OFF()
     return POSITION_LOST(reason=REASONS.get(why_not, OTHER_REASON))

@@ -157,6 +157,6 @@ def host_and_port(text: str) -> tuple[str, int]:
     host, colon, port = text.rpartition(":")
     if not colon or "]" in port:
         host, port = text, str(PORT)
-    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+    if not host or "/" in host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise StreamError(f"{text}: wanted HOST or HOST:PORT")
     return host.strip("[]"), int(port)

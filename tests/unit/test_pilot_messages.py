@@ -14,7 +14,8 @@ from companion.daemon.control import armed_settings
 from companion.daemon.control.flight_parameters import PARAMETERS
 from companion.daemon.flights import live_flight, recording_recovery, viewing
 from companion.daemon.pose import pose_sender
-from companion.estimation import localisation, pose_gate
+from companion.estimation import localisation
+from companion.estimation.gate import pose_gate
 from companion.estimation.inertial import imu_verdict
 from companion.messages import Warned
 from companion.pilot_messages import (
@@ -131,7 +132,8 @@ def test_every_warning_has_its_words() -> None:
         live_flight.NOT_FINISHED,
         imu_verdict.NOT_USED, imu_verdict.USED_AGAIN,
         viewing.SHOWN, viewing.NO_VIEWER, viewing.GONE, viewing.BEHIND, viewing.CLOSED,
-        recording_recovery.CUT_SHORT, recording_recovery.NOT_REPAIRED, ground_requests.TOO_MANY,
+        recording_recovery.CUT_SHORT, recording_recovery.NOT_REPAIRED,
+        recording_recovery.NOT_WRITABLE, ground_requests.TOO_MANY,
         topics_work.MALFORMED, topics_work.TAKEN,
         topics_work.NOT_TAKEN, flight_result.GIVEN_UP, armed_settings.NOT_KEPT,
         localisation.MAP_RESUMED, localisation.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,

@@ -35,7 +35,10 @@ READER_GONE = 128 + signal.SIGPIPE
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status; no traceback where nobody reads its output."""
+    """Run one command and return its exit status.
+
+    No traceback where its output cannot be written, or nobody reads it.
+    """
     try:
         try:
             return _run(argv)
@@ -46,6 +49,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not _readers_gone():
             raise
         return READER_GONE
+    except OSError:
+        why = _why_not_written()
+        if why is None:
+            raise
+        print(f"companion: error: its output cannot be written: {why}", file=sys.stderr)
+        return 1
 
 
 def _run(argv: Sequence[str] | None) -> int:
@@ -75,6 +84,21 @@ def _readers_gone() -> bool:
         os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
     return bool(gone)
+
+
+def _why_not_written() -> str | None:
+    """The reason why standard output takes not even a line end; None where it does.
+
+    What is still buffered goes nowhere then.
+    """
+    try:
+        print(flush=True)
+    except OSError as error:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+        return error.strerror or str(error)
+    return None
 
 
 def _reader_gone(stream: TextIO) -> bool:

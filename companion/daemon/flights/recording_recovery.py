@@ -1,6 +1,7 @@
 """Recovery of recordings that an earlier daemon could not finish, in the background.
 
-Runs `companion flights repair` in a process of lowest priority, and never while armed.
+Runs `companion flights repair` in a process of lowest priority, and never while armed. A folder
+that cannot be written is told at once: the first flight would be too late to hear of it.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import sys
+import tempfile
 from asyncio.subprocess import DEVNULL, PIPE, Process
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +22,7 @@ AFTER_S = 10.0
 """Delay after the start, or the end of a flight, when other work has priority."""
 LOOK_S = 0.2
 CUT_SHORT = "an earlier recording was cut short"
+NOT_WRITABLE = "the folder of flights cannot be written"
 NOT_REPAIRED = "recordings that were cut short cannot be looked for now"
 
 
@@ -34,6 +37,10 @@ class RecordingRecovery:
 
     async def run(self) -> None:
         """Repair recordings, now and after each flight, until cancelled."""
+        loop = asyncio.get_running_loop()
+        why_not = await loop.run_in_executor(None, _why_not_writable, self._flights)
+        if why_not is not None:
+            self._warn(Warned(self._clock.now_ns(), NOT_WRITABLE, why_not))
         while True:
             await asyncio.sleep(AFTER_S)
             if not self._armed() and await self._repaired():
@@ -69,3 +76,13 @@ class RecordingRecovery:
         async for line in process.stdout:
             text = line.decode("utf-8", "replace").strip()
             self._warn(Warned(self._clock.now_ns(), CUT_SHORT, text))
+
+
+def _why_not_writable(folder: Path) -> str | None:
+    """The reason why nothing can be written to a folder, which is made; None where it can."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return None
+    except OSError as error:
+        return f"{folder}: {error.strerror or error}; daemon.flights names the folder"

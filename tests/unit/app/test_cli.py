@@ -118,6 +118,18 @@ def test_output_that_nobody_reads_is_no_error(arguments: list[str]) -> None:
     assert READER_GONE == 141
 
 
+@pytest.mark.parametrize("command", ["check-config", "flights list --flights ."])
+def test_a_full_disk_is_told_in_one_line(command: str) -> None:
+    program = [sys.executable, "-m", "companion", *command.split()]
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run(
+            program, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False
+        )
+    assert ended.returncode == 1
+    why = "its output cannot be written: No space left on device"
+    assert ended.stderr == f"companion: error: {why}\n"
+
+
 def test_errors_that_nobody_reads_end_it_too() -> None:
     reader, writer = os.pipe()
     os.close(reader)

@@ -20,6 +20,7 @@ from companion.daemon.flights.recording_recovery import (
     RecordingRecovery,
 )
 from companion.messages import Warned
+from companion.pilot_messages import of_warning
 from companion.timing.clock import FlightClock
 from drivers.recording.flight_summary import summarise
 from drivers.recording.repair import in_place, unfinished
@@ -121,6 +122,25 @@ def test_where_no_process_can_be_started_another_try_follows(
     monkeypatch.setattr(asyncio, "create_subprocess_exec", refuse)
     asyncio.run(scene())
     assert (warned[0].what, warned[0].detail) == (NOT_REPAIRED, "Cannot allocate memory")
+
+
+def test_a_folder_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:
+    warned: list[Warned] = []
+    (tmp_path / "file").touch()
+    flights = tmp_path / "file" / "flights"
+
+    async def scene() -> None:
+        over = RecordingRecovery(flights, FlightClock(), warned.append, lambda: True)
+        running = asyncio.ensure_future(over.run())
+        while not warned:
+            await asyncio.sleep(0)
+        running.cancel()
+        await asyncio.wait([running])
+
+    asyncio.run(asyncio.wait_for(scene(), PATIENCE_S))
+    (warning,) = warned
+    assert of_warning(warning.what, warning.detail, warning.good) is not None
+    assert warning.detail == f"{flights}: Not a directory; daemon.flights names the folder"
 
 
 def test_a_process_gives_way_to_all_others() -> None:

@@ -223,7 +223,7 @@ def test_a_host_may_have_a_port(text: str, wanted: tuple[str, int]) -> None:
     assert host_and_port(text) == wanted
 
 
-@pytest.mark.parametrize("text", ["", ":9870", "drone:", "drone:x", "drone:70000"])
+@pytest.mark.parametrize("text", ["", ":9870", "drone:", "drone:x", "drone:70000", "/x"])
 def test_what_is_no_host_is_refused(text: str) -> None:
     with pytest.raises(StreamError, match="wanted HOST"):
         host_and_port(text)
