@@ -14,7 +14,7 @@ from pathlib import Path
 from companion.app.progress import Progress
 from companion.config import Config
 from companion.errors import FlightError, StageError
-from companion.estimation.gate_journal import poses_as_sent
+from companion.estimation.gate.gate_journal import poses_as_sent
 from companion.estimation.localisation import (
     MAP_NOT_RECOGNISED,
     MAP_RESUMED,

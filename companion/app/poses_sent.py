@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from companion.config import Config
-from companion.estimation.pose_gate import PoseGate
+from companion.estimation.gate.pose_gate import PoseGate
 from companion.geometry.transforms import Pose
 from companion.messages import Message, Odometry
 from companion.products.atomic_file import write_atomically

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.estimation.motion_filter import MotionFilter
-from companion.estimation.smooth_odometry import SIGMA_DEAD_RECKONING_M_S
+from companion.estimation.odometry.smooth_odometry import SIGMA_DEAD_RECKONING_M_S
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Georeference, Track, TrackState
 from companion.slam.map.sparse_map import SlamMap

@@ -18,7 +18,7 @@ import numpy as np
 
 from companion.config import Config
 from companion.errors import CompanionError
-from companion.estimation.odometry_frame import OdometryState
+from companion.estimation.odometry.odometry_frame import OdometryState
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Georeference

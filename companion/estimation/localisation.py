@@ -14,7 +14,8 @@ from companion.config import Config
 from companion.estimation.attitude.camera_attitude import AttitudeCheck, CameraAttitude
 from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.checkpoint import MAX_BYTES, Checkpoint
-from companion.estimation.georeference import Georeferencer
+from companion.estimation.georeference.georeferencer import Georeferencer
+from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_navigation import (
     BodyAttitude,
@@ -22,12 +23,11 @@ from companion.estimation.inertial.inertial_navigation import (
     Reckoned,
 )
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
-from companion.estimation.odometry_frame import MapView
-from companion.estimation.optical_flow import FlowMeter
+from companion.estimation.lift_off.optical_flow import FlowMeter
+from companion.estimation.lift_off.standing import Standing
+from companion.estimation.odometry.odometry_frame import MapView
+from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.resumption import Resumption, Verdict
-from companion.estimation.segment_georeference import SegmentGeoreferences
-from companion.estimation.smooth_odometry import SmoothOdometry
-from companion.estimation.standing import Standing
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
@@ -100,7 +100,7 @@ class LocalisationStage:
         self._resumption: Resumption | None = None
         """While a stored map is being verified."""
         self._tracker.atlas.loop_allowed = self._loop_allowed
-        self._georeferences.reckoned_at = self._odometry.reckoned_path.at
+        self._georeferences.reckoned_at = self._odometry.reckoning.path.at
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
 
     @property

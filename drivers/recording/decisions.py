@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import Config
 from companion.config_file import config_of_text
 from companion.errors import FlightError
-from companion.estimation.pose_gate import PoseToSend
+from companion.estimation.gate.pose_gate import PoseToSend
 from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose
 from companion.messages import FrameTracked, Odometry, TrackState

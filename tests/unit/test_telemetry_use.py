@@ -10,7 +10,7 @@ import pytest
 
 from companion.config import MEASUREMENTS, Config, Measurement, TelemetryConfig
 from companion.estimation.attitude.camera_attitude import CameraAttitude
-from companion.estimation.georeference import Georeferencer
+from companion.estimation.georeference.georeferencer import Georeferencer
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.camera import Camera

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.config import FeedbackConfig
-from companion.estimation.optical_flow import NO_ATTITUDE
+from companion.estimation.lift_off.optical_flow import NO_ATTITUDE
 from companion.geometry.transforms import Array
 from companion.health import FlowHealth, LatencyMeter, RateMeter
 from companion.messages import OpticalFlow

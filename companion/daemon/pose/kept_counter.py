@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.estimation.reset_counter import BootIdentity
+from companion.estimation.gate.reset_counter import BootIdentity
 from companion.products.atomic_file import write_atomically
 
 NAME = "sent_poses.json"

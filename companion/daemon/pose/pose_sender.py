@@ -1,7 +1,7 @@
 """Poses to the autopilot: each frame's at once, predictions in between, with covariances.
 
-Everything here runs in the event loop. `companion.estimation.pose_gate` decides which poses are
-sent.
+Everything here runs in the event loop. Which poses are sent is decided by
+`companion.estimation.gate.pose_gate`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 
 from companion.config import FeedbackConfig, Measurement
 from companion.daemon.pose.sent_counter import SentCounter
-from companion.estimation.gate_journal import JournaledGate
-from companion.estimation.pose_gate import PoseToSend, Sending
-from companion.estimation.reset_counter import ResetCounter
+from companion.estimation.gate.gate_journal import JournaledGate
+from companion.estimation.gate.pose_gate import PoseToSend, Sending
+from companion.estimation.gate.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth, LatencyMeter, RateMeter
 from companion.messages import Odometry, Warned

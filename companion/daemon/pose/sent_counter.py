@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from companion.daemon.pose.kept_counter import CounterFile, KeptCounter, read_counter
-from companion.estimation.pose_gate import PoseGate
-from companion.estimation.reset_counter import (
+from companion.estimation.gate.pose_gate import PoseGate
+from companion.estimation.gate.reset_counter import (
     MAX_BACKWARD_S,
     BootIdentity,
     ResetCounter,

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import FeedbackConfig
 from companion.daemon.pose.flow_sender import NO_RATES, TOO_OLD, UNHEARD, FlowSender
-from companion.estimation.optical_flow import NO_ATTITUDE
+from companion.estimation.lift_off.optical_flow import NO_ATTITUDE
 from companion.messages import OpticalFlow
 from companion.telemetry import AttitudeSample, Telemetry
 from tests.support.autopilot.memory_link import SetClock, listen, memory_link

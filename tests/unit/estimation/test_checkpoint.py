@@ -23,7 +23,7 @@ from companion.estimation.checkpoint import (
     read_arrays,
 )
 from companion.estimation.localisation import LocalisationStage
-from companion.estimation.odometry_frame import OdometryState
+from companion.estimation.odometry.odometry_frame import OdometryState
 from companion.estimation.resumption import (
     MAX_ABSENT_NS,
     MIN_FRAMES,

@@ -1,0 +1,372 @@
+"""Gate of poses sent to the autopilot.
+
+A pose must be metric, tracked, certain, of sufficient quality, level by the autopilot's own
+attitude, and recent. What cannot be checked is not sent. All conditions must hold for a while
+before the first pose is sent; gaps shorter than an autopilot's timeout are bridged by prediction,
+and longer ones by inertial dead reckoning for as long as its standard deviation is within the
+limit. After others, and after every discontinuity, the conditions must hold again.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from enum import Enum
+from statistics import median
+
+import numpy as np
+
+from companion.config import MEASUREMENTS, FeedbackConfig, Measurement
+from companion.estimation.attitude.attitude_history import MAX_EXTRAPOLATION_NS, AttitudeHistory
+from companion.estimation.gate.reset_counter import ResetCounter
+from companion.geometry.transforms import Array, Pose
+from companion.messages import Odometry, TrackState
+from companion.telemetry import AttitudeSample, is_believed
+
+MAX_TILT_ERROR_RAD = np.radians(8.0)
+MAX_AGE_NS = 300_000_000
+"""An older pose is of no use to an autopilot."""
+MAX_PAUSE_NS = 3_000_000_000
+"""After frames that came too late, dead reckoning begins again within this time, with proof: a
+computer that was busy for a moment has lost nothing of where the body is."""
+MAX_SIGMA_SCALE = 0.05
+"""Relative; with it velocities are 5 % off, 0.5 m/s at 10 m/s, which an autopilot's EKF takes for
+noise: ArduPilot's VISO_VEL_M_NSE is 0.1 m/s and more, its innovation gates are five of these."""
+HYSTERESIS = 0.8
+"""To start sending, a pose must be better than the limits by this factor."""
+MAX_EXTENT_M = 1e5
+MIN_SPACING_NS = 4_000_000
+N_PERIODS = 20
+MAX_ATTITUDE_GAP_NS = 2 * MAX_EXTRAPOLATION_NS
+"""Between two attitude samples: no time is further from one than extrapolation reaches."""
+
+NOT_YET = "no pose yet"
+INITIALISING = "initialising"
+LOST = "lost"
+NO_SCALE = "no metric scale"
+SCALE_UNCERTAIN = "scale too uncertain"
+UNPROVED_IMU = "IMU being checked"
+UNCERTAIN = "position too uncertain"
+POOR = "quality too low"
+TILTED = "tilt differs from the autopilot's"
+LATE = "poses come too late"
+SILENT = "no frames"
+NO_ATTITUDE = "no autopilot attitude"
+NOT_BELIEVED = "attitude is not believed"
+RESTARTED = "localisation begins anew"
+RESET = "position reset"
+REBOOTED = "autopilot rebooted"
+NO_HEIGHT = "no autopilot height"
+PROVING = "belief must hold first"
+
+
+class Sending(Enum):
+    """State of the pose output; docs/pose.md has its changes as a table."""
+
+    OFF = "off"
+    PROVING = "proving"
+    SENDING = "sending"
+    BRIDGING = "bridging"
+    """Sent by inertial dead reckoning: nothing is tracked."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseToSend:
+    """A pose for the autopilot at `t_ns`, in NED-aligned metres; see Odometry.
+
+    Its down axis may be offset against that of an Odometry, to start at that of the autopilot.
+    """
+
+    t_ns: int
+    world_from_body: Pose
+    velocity_world_m_s: Array
+    sigma_position_m: float
+    sigma_velocity_m_s: float
+    sigma_attitude_rad: float
+    sigma_yaw_rad: float
+    quality: int
+    reset_counter: int
+    predicted: bool = False
+
+
+class PoseGate:
+    """Odometry and attitude in; poses to send out. `now_ns` is the time of the call.
+
+    `start_down_m` gives the autopilot's own down coordinate at the time of a frame, None to
+    withhold poses for want of it; without it poses stay in our world. That is where the receiver
+    counts from, no measurement of ours: it is asked whatever of telemetry is in `use`. `may_start`
+    gives other reasons not to start sending, "" if none.
+    """
+
+    def __init__(
+        self,
+        config: FeedbackConfig,
+        counter: ResetCounter | None = None,
+        start_down_m: Callable[[int], float | None] | None = None,
+        may_start: Callable[[int], str] = lambda _now_ns: "",
+        use: Collection[Measurement] = MEASUREMENTS,
+    ) -> None:
+        self._config = config
+        self._use = use
+        self._attitude = AttitudeHistory(400, MAX_ATTITUDE_GAP_NS)
+        self._counter = counter or ResetCounter()
+        self._start_down_m, self._may_start = start_down_m, may_start
+        self._down_shift_m: float | None = None
+        """Added to our down axis; fixed with the first pose, until a discontinuity."""
+        self._resets_seen: int | None = None
+        self._accepted: Odometry | None = None
+        self._accepted_at_ns = 0
+        self._accepted_since_ns: int | None = None
+        self._silent_since_ns: int | None = None
+        self._last_stamp_ns = 0
+        self._n_predicted = 0
+        self._periods_ns: deque[int] = deque(maxlen=N_PERIODS)
+        self._newest_ns = 0
+        self._last_rejection = ""
+        self.state = Sending.OFF
+        self.why_not = NOT_YET
+
+    @property
+    def sending(self) -> bool:
+        """True while poses are sent."""
+        return self.state in (Sending.SENDING, Sending.BRIDGING)
+
+    @property
+    def n_resets(self) -> int:
+        """Discontinuities reported to the autopilot, or to be with the next pose."""
+        return self._counter.value
+
+    def restart(self) -> None:
+        """Restart after a restart of localisation, whose poses are unrelated to earlier ones."""
+        if self.sending:
+            self._stop(RESTARTED)
+        self._discontinuity()
+        self._resets_seen = None
+        self._accepted, self._accepted_since_ns = None, None
+        self._periods_ns.clear()
+        self._newest_ns = 0
+
+    def autopilot_booted(self, last_sent: int | None) -> None:
+        """Handle a boot of the autopilot: the reset counter last sent to it, None if none."""
+        self._counter.booted(last_sent)
+        self._down_shift_m = None
+        self._stop(REBOOTED if self.sending else self.why_not)
+
+    def reconfigure(self, config: FeedbackConfig) -> None:
+        """Change limits; the state is kept."""
+        self._config = config
+
+    def withhold(self, why_not: str) -> None:
+        """Stop sending until the conditions have held anew."""
+        self._stop(why_not)
+
+    def take_attitude(self, sample: AttitudeSample) -> None:
+        """Add an attitude of the autopilot, for checks and predictions, where it is believed."""
+        if not is_believed(sample, self._use):
+            return
+        if not 0.5 < float(np.linalg.norm(sample.ned_from_body)) < 2.0:  # rejects nan too
+            return
+        rates = sample.rates_body_rad_s
+        if rates is not None and not np.isfinite(rates).all():
+            sample = replace(sample, rates_body_rad_s=None)
+        self._attitude.add(sample)
+
+    def take(self, odometry: Odometry, now_ns: int) -> PoseToSend | None:
+        """Process the odometry of a frame; the pose to send at once, or None."""
+        if odometry.t_ns <= self._newest_ns:
+            return None
+        if self._newest_ns:
+            self._periods_ns.append(odometry.t_ns - self._newest_ns)
+        self._newest_ns = odometry.t_ns
+        was_reset = self._resets_seen not in (None, odometry.reset_counter)
+        self._resets_seen = odometry.reset_counter
+        if was_reset:
+            self._discontinuity()
+            self._stop(RESET)
+            return None
+        if now_ns - self._accepted_at_ns > self._max_gap_ns:
+            self._time_out()
+        why_not = self._rejection_reason(odometry, now_ns)
+        if why_not:
+            self._accepted_since_ns = None
+            if not self.sending:
+                self.state, self.why_not = Sending.OFF, why_not
+            self._last_rejection = why_not
+            return None
+        self._accepted, self._accepted_at_ns, self._n_predicted = odometry, now_ns, 0
+        self._last_rejection = ""
+        if not self.sending:
+            if self._accepted_since_ns is None:
+                self._accepted_since_ns = now_ns
+            proven = now_ns - self._accepted_since_ns >= self._config.resume_after_s * 1e9
+            self.state = Sending.PROVING
+            self.why_not = self._start_sending(odometry, now_ns) if proven else PROVING
+            if self.why_not:
+                return None
+        self.state = Sending.BRIDGING if odometry.inertial else Sending.SENDING
+        return self._stamped(self._pose_of(odometry))
+
+    def due(self, now_ns: int) -> PoseToSend | None:
+        """A predicted pose, where the camera is slower than the output rate, or a frame is late.
+
+        To be polled, at `due_ns` at the latest; also detects timeouts.
+        """
+        accepted = self._accepted
+        if not self.sending or accepted is None:
+            return None
+        since_ns = now_ns - self._accepted_at_ns
+        if since_ns > self._max_gap_ns:
+            self._time_out()
+            return None
+        step_ns, wait_ns = self._next_step()
+        if since_ns < wait_ns:
+            return None
+        self._n_predicted += 1
+        predicted = self._predicted(accepted, self._n_predicted * step_ns)
+        return self._stamped(predicted) if predicted is not None else None
+
+    @property
+    def due_ns(self) -> int | None:
+        """Time of the next predicted pose, if no frame comes before; None where none is sent."""
+        if not self.sending or self._accepted is None:
+            return None
+        return self._accepted_at_ns + self._next_step()[1]
+
+    def _next_step(self) -> tuple[int, int]:
+        """Interval of poses, and time after a frame of the next that is to be predicted, ns."""
+        period_ns = self._period_ns()
+        n_steps = max(1, int(np.ceil(period_ns * 1e-9 * self._config.rate_hz - 0.1)))
+        step_ns = period_ns // n_steps
+        number = self._n_predicted + 1
+        # give a frame that is due itself some slack
+        slack_ns = step_ns // 2 if number >= n_steps else 0
+        return step_ns, number * step_ns + slack_ns
+
+    @property
+    def _max_gap_ns(self) -> int:
+        return int(self._config.max_gap_ms * 1e6)
+
+    def _period_ns(self) -> int:
+        if not self._periods_ns:
+            return int(1e9 / self._config.rate_hz)
+        return int(median(self._periods_ns))
+
+    def _rejection_reason(self, odometry: Odometry, now_ns: int) -> str:
+        """Reason why a pose is rejected; "" if accepted."""
+        if "attitude" not in self._use:
+            return NOT_BELIEVED
+        pose, velocity = odometry.world_from_body, odometry.velocity_world_m_s
+        if odometry.state is TrackState.INITIALISING:
+            return INITIALISING
+        bridging = odometry.inertial and (self.sending or self._paused_lately(now_ns))
+        seen = odometry.state in (TrackState.TRACKING, TrackState.STANDING)
+        if not seen and not bridging:
+            return LOST
+        if pose is None and odometry.state is TrackState.STANDING:
+            return UNPROVED_IMU
+        if pose is None or velocity is None:
+            return NO_SCALE if self._accepted is None else LOST
+        parts = pose.rotation, pose.translation, velocity
+        if (
+            not all(np.isfinite(part).all() for part in parts)
+            or np.abs(pose.translation).max() > MAX_EXTENT_M
+        ):
+            return UNCERTAIN
+        hysteresis = 1.0 if self.sending else HYSTERESIS
+        if not _sigma_place_m(odometry) <= hysteresis * self._config.max_sigma_m:
+            return UNCERTAIN
+        if not odometry.sigma_scale <= hysteresis * MAX_SIGMA_SCALE:
+            return SCALE_UNCERTAIN
+        if odometry.quality * hysteresis < self._config.min_quality and not bridging:
+            return POOR
+        if now_ns - odometry.t_ns > MAX_AGE_NS:
+            return LATE
+        attitude = self._attitude.at(odometry.t_ns)
+        if attitude is None:
+            return NO_ATTITUDE
+        cosine = float(np.clip(attitude[2] @ pose.rotation[2], -1.0, 1.0))
+        if not np.arccos(cosine) <= MAX_TILT_ERROR_RAD * hysteresis:
+            return TILTED
+        return ""
+
+    def _start_sending(self, odometry: Odometry, now_ns: int) -> str:
+        """Start sending with a proven pose; the reason where it may not."""
+        assert odometry.world_from_body is not None
+        shift_m = self._down_shift_m
+        if shift_m is None and self._start_down_m is not None:
+            start_m = self._start_down_m(odometry.t_ns)
+            if start_m is None or not np.isfinite(start_m):
+                return NO_HEIGHT
+            shift_m = start_m - float(odometry.world_from_body.translation[2])
+        why_not = self._may_start(now_ns)
+        if not why_not:
+            self._down_shift_m = shift_m or 0.0
+            self._counter.sent = True
+        return why_not
+
+    def _discontinuity(self) -> None:
+        self._counter.discontinuity()
+        self._down_shift_m = None
+
+    def _time_out(self) -> None:
+        """Stop sending: no pose was accepted for too long."""
+        if self.sending:
+            why_not = self._last_rejection or SILENT
+            self._stop(why_not)
+            self._silent_since_ns = self._accepted_at_ns if why_not == SILENT else None
+        self._accepted_since_ns = None
+
+    def _stop(self, why_not: str) -> None:
+        self.state, self.why_not = Sending.OFF, why_not
+        self._accepted_since_ns = self._silent_since_ns = None
+
+    def _paused_lately(self, now_ns: int) -> bool:
+        """True where poses ceased for want of frames alone, and not long ago."""
+        since_ns = self._silent_since_ns
+        return since_ns is not None and now_ns - since_ns < MAX_PAUSE_NS
+
+    def _pose_of(self, odometry: Odometry) -> PoseToSend:
+        assert odometry.world_from_body is not None and odometry.velocity_world_m_s is not None
+        pose, down_m = odometry.world_from_body, self._down_shift_m or 0.0
+        return PoseToSend(
+            odometry.t_ns, Pose(pose.rotation, pose.translation + [0.0, 0.0, down_m]),
+            odometry.velocity_world_m_s, odometry.sigma_position_m, odometry.sigma_velocity_m_s,
+            odometry.sigma_attitude_rad, odometry.sigma_yaw_rad, odometry.quality,
+            self._counter.value & 0xFF,
+        )  # fmt: skip
+
+    def _predicted(self, accepted: Odometry, ahead_ns: int) -> PoseToSend | None:
+        """A pose extrapolated by velocity, and rotated by measured attitude.
+
+        None where the attitude is unknown, or the pose too uncertain by then.
+        """
+        before, now = self._attitude.at(accepted.t_ns), self._attitude.at(accepted.t_ns + ahead_ns)
+        if before is None or now is None:
+            self._last_rejection = self._last_rejection or NO_ATTITUDE
+            return None
+        pose = replace(self._pose_of(accepted), t_ns=accepted.t_ns + ahead_ns, predicted=True)
+        rotation = pose.world_from_body.rotation @ before.T @ now
+        ahead_s = ahead_ns * 1e-9
+        grown_m = pose.sigma_velocity_m_s * ahead_s
+        if not np.hypot(_sigma_place_m(accepted), grown_m) <= self._config.max_sigma_m:
+            self._last_rejection = self._last_rejection or UNCERTAIN
+            return None
+        position = pose.world_from_body.translation + pose.velocity_world_m_s * ahead_s
+        sigma_m = float(np.hypot(pose.sigma_position_m, grown_m))
+        return replace(pose, world_from_body=Pose(rotation, position), sigma_position_m=sigma_m)
+
+    def _stamped(self, pose: PoseToSend) -> PoseToSend | None:
+        """The same, if its stamp is later than the last sent."""
+        if pose.t_ns < self._last_stamp_ns + MIN_SPACING_NS:
+            return None
+        self._last_stamp_ns = pose.t_ns
+        return pose
+
+
+def _sigma_place_m(odometry: Odometry) -> float:
+    """Standard deviation of the place apart from the scale.
+
+    A scale that is off shortens all ways alike, and no place where the body stands.
+    """
+    return float(np.sqrt(odometry.sigma_position_m**2 - odometry.sigma_by_scale_m**2))

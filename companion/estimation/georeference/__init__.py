@@ -1,0 +1,1 @@
+"""Georeference of maps: scale, heading and place from the autopilot's sensors, map by map."""

@@ -1,0 +1,404 @@
+"""Georeferences of map segments, and their placement in the frame of the main one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from companion.estimation.attitude.camera_attitude import CameraAttitude
+from companion.estimation.georeference.georeferencer import (
+    AlignmentSample,
+    Georeferencer,
+    place_new_map,
+)
+from companion.estimation.georeference.height_above_ground import HeightAboveGround
+from companion.estimation.georeference.inertial_scale import InertialScale, settled
+from companion.estimation.georeference.trajectory_alignment import (
+    DISAGREE,
+    MAX_STEP_S,
+    SIGMA_VELOCITY_M_S,
+    VELOCITY_TAU_S,
+    Scale,
+)
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.judged_acceleration import ByAcceleration
+from companion.estimation.inertial.reckoned_path import BodyPlace
+from companion.geometry.pose_table import PoseTable
+from companion.geometry.transforms import Array, Pose, Similarity
+from companion.messages import Georeference, MapUpdate
+from companion.slam.loop.loop_closure import LoopClosure
+from companion.slam.map.sparse_map import Keyframe, SlamMap
+from companion.slam.optimisation.displacement_factor import DisplacementFactor, typical_error
+
+MAX_LOOP_ERROR_M = 6.0
+"""Error of measured positions between two times."""
+CORRELATION_INFLATION = 3.0
+"""Inflation of sigmas: each adjustment window reuses the same displacements."""
+MAX_SIGMA_SCALE_DISPLACEMENT = 0.05
+"""Displacement factors require a scale at least this certain."""
+MAX_SAMPLES, MAX_SAMPLES_FINAL = 120, 400
+MAX_GROUND_DISTANCES = 40
+"""Half a millisecond each, on the way to a pose; their median is no more certain of more."""
+INERTIAL_EVERY_NS = 400_000_000
+"""Between keyframes for the inertial scale: with closer ones it is no more certain."""
+SETTLED_AFTER = 2
+"""Keyframes after which one has been adjusted."""
+
+
+class SegmentGeoreferences:
+    """Georeferences of segments, updated as they grow.
+
+    A segment is identified by its first keyframe. `body_from_camera` is the mount, None where
+    unknown.
+    """
+
+    def __init__(
+        self, georeferencer: Georeferencer, attitude: CameraAttitude,
+        acceleration: AccelerationIntegral, body_from_camera: Pose | None,
+    ) -> None:  # fmt: skip
+        self.main_from_newest = Similarity.identity()
+        self._georeferencer = georeferencer
+        self._attitude = attitude
+        self._body_from_camera = body_from_camera
+        self._known: dict[int, Georeference] = {}
+        self._kept: tuple[int, Georeference] | None = None
+        """A resumed segment and its stored georeference."""
+        self._main: int | None = None
+        self._revision = 0
+        self._acceleration = acceleration
+        self._by_acceleration = ByAcceleration()
+        self._inertial: dict[int, InertialScale] = {}
+        """By first keyframe of a segment, as is:"""
+        self._spaced: dict[int, list[tuple[int, int]]] = {}
+        """Ids and times of the keyframes that the inertial scale takes."""
+        self.reckoned_at: Callable[[int], BodyPlace | None] = lambda _t_ns: None
+        """Place of the body by inertial navigation at a recent frame."""
+        self._reckoned: dict[int, tuple[BodyPlace, Georeference | None]] = {}
+        """Place at which a segment began by it, and the segment so placed, by first keyframe."""
+
+    def of(self, segment: SlamMap) -> Georeference | None:
+        """Georeference of a segment; None until known."""
+        return self._known.get(segment.first_keyframe_id)
+
+    def resume(self, segment: SlamMap, kept: Georeference) -> None:
+        """Georeference a resumed segment as stored."""
+        self._known[segment.first_keyframe_id] = kept
+        self._kept = segment.first_keyframe_id, kept
+
+    def _more_certain(self, segment: SlamMap, found: Georeference) -> Georeference:
+        """The found or the stored georeference of a segment, whichever is more certain.
+
+        Stored measurements are not available, so it takes as long again to reach the same
+        certainty. Where scales contradict, the measured one is used. A position in the world is not
+        given up for a frame at the first camera, to avoid a jump; where scales contradict, sigma is
+        their difference.
+        """
+        if self._kept is None or self._kept[0] != segment.first_keyframe_id:
+            return found
+        kept = self._kept[1]
+        apart = abs(float(np.log(found.world_from_map.scale / kept.world_from_map.scale)))
+        disagree = apart > DISAGREE * float(np.hypot(found.sigma_scale, kept.sigma_scale))
+        if kept.has_origin and not found.has_origin:
+            return replace(kept, sigma_scale=apart) if disagree else kept
+        if (
+            found.sigma_scale <= kept.sigma_scale
+            or found.n_positions >= kept.n_positions
+            or found.has_origin > kept.has_origin
+            or disagree
+        ):
+            self._kept = None
+            return found
+        return kept
+
+    def update(self, segments: Sequence[SlamMap], t_ns: int, final: bool) -> MapUpdate:
+        """The map with all segments in the frame of the main one."""
+        self._revision += 1
+        for segment in segments:
+            if final or (segment is segments[-1] and _due(segment)):
+                found = self._georeferencer.solve(
+                    self._samples(segment, _subsample(segment, final)),
+                    self._inertial_scale(segment, final),
+                )
+                if found is not None:
+                    self._by_acceleration.note(t_ns, segment.first_keyframe_id, self._known, found)
+                    self._known[segment.first_keyframe_id] = self._more_certain(segment, found)
+        main = self._main_of(segments, final)
+        anchor = self.of(main)
+        poses: list[PoseTable] = []
+        scales: dict[int, float] = {}
+        points: list[Array] = []
+        n_retired = 0
+        for segment in segments:
+            own = self.of(segment)
+            if own is not None and not own.has_origin:
+                own = self._placed_by_dead_reckoning(segment, segments, own)
+            elif own is None and segment is segments[-1] and not final:
+                own = self._placed_by_dead_reckoning(segment, segments, None)
+            if segment is main:
+                main_from_own = Similarity.identity()
+            elif anchor is not None and own is not None:
+                main_from_own = anchor.world_from_map.inverse() @ own.world_from_map
+            else:
+                continue  # its pose relative to the main segment is unknown
+            if segment is segments[-1]:
+                self.main_from_newest = main_from_own
+            n_retired += len(segment.retired)
+            table, positions = segment.poses(), segment.point_positions()
+            if segment is not main:
+                table, positions = table.placed(main_from_own), main_from_own.apply(positions)
+            poses.append(table)
+            points.append(positions)
+            for key in table:
+                unit = main_from_own.scale * segment.unit_of.get(key, 1.0)
+                if unit != 1.0:
+                    scales[key] = unit
+        return MapUpdate(
+            self._revision, t_ns, PoseTable.joined(poses), np.concatenate(points), anchor, scales,
+            n_retired,
+        )  # fmt: skip
+
+    def _inertial_scale(self, segment: SlamMap, final: bool) -> Scale | None:
+        """Scale of a segment by accelerometers; None while it is unknown."""
+        mount = self._body_from_camera
+        if mount is None or not self._attitude.used or not self._acceleration.has_samples:
+            return None
+        key = segment.first_keyframe_id
+        spaced = self._spaced.setdefault(key, [])
+        newest_ns = spaced[-1][1] if spaced else -INERTIAL_EVERY_NS
+        in_time = sorted(
+            (k.t_ns, k.keyframe_id) for k in segment.keyframes.values() if k.t_ns > newest_ns
+        )
+        for t_ns, keyframe_id in in_time[: len(in_time) - SETTLED_AFTER * (not final)]:
+            if t_ns >= newest_ns + INERTIAL_EVERY_NS:
+                spaced.append((keyframe_id, t_ns))
+                newest_ns = t_ns
+
+        def sample_at(index: int) -> AlignmentSample | None:
+            keyframe_id, t_ns = spaced[index]
+            pose = segment.pose_of(keyframe_id)
+            attitude = self._attitude.of_keyframe(keyframe_id, t_ns)
+            if pose is None or attitude is None:
+                return None
+            return AlignmentSample(t_ns, pose.inverse(), attitude)
+
+        lever_m, delay_ns = mount.rotation.T @ mount.translation, self._attitude.correction[1]
+        begun = self._begun_by_navigation(segment, next(iter(segment.keyframes.values())))
+        start = None if begun is None else begun[0].start
+        if final and self._acceleration.believed:
+            return settled(len(spaced), sample_at, self._acceleration, lever_m, delay_ns, start)
+        estimate = self._inertial.get(key)
+        if estimate is None:
+            estimate = self._inertial[key] = InertialScale(lever_m, start)
+        found = estimate.update(len(spaced), sample_at, self._acceleration, delay_ns)
+        return found if self._acceleration.believed else None
+
+    def withdraw_accelerations(self, since_ns: int) -> None:
+        """Take back what accelerations since a time gave; scales begin anew with those before."""
+        self._by_acceleration.withdraw(since_ns, self._known)
+        self._inertial.clear()
+        late = [k for k, (start, _) in self._reckoned.items() if start.t_ns >= since_ns]
+        for key in late:
+            del self._reckoned[key]
+
+    def displacements_of(
+        self, segment: SlamMap, keyframes: list[Keyframe]
+    ) -> DisplacementFactor | None:
+        """Displacement factor between consecutive keyframes of a segment, by velocity.
+
+        Sigmas are scaled by the residuals over the segment; None where they do not fit.
+        """
+        placed = self.of(segment)
+        if placed is None or placed.sigma_scale > MAX_SIGMA_SCALE_DISPLACEMENT:
+            return None
+        everywhere = list(segment.keyframes.values())
+        whole = self._displacements(placed, everywhere)
+        if whole is None:
+            return None
+        error = typical_error(whole, *_poses(everywhere))
+        factor = None if error is None else self._displacements(placed, keyframes)
+        if factor is None or error is None:
+            return None
+        return replace(factor, sigma_m=CORRELATION_INFLATION * factor.sigma_m * max(error, 1.0))
+
+    def _displacements(
+        self, placed: Georeference, keyframes: list[Keyframe]
+    ) -> DisplacementFactor | None:
+        t_ns = np.array([k.t_ns for k in keyframes])
+        travelled_m = self._georeferencer.integrated_velocity(t_ns)
+        if travelled_m is None:
+            return None
+        to_world, (rotation, _) = placed.world_from_map, _poses(keyframes)
+        ned_from_camera = to_world.rotation @ rotation.transpose(0, 2, 1)
+        where_m = travelled_m + self._georeferencer.lever_ned(ned_from_camera)
+        order = np.argsort(t_ns, kind="stable")
+        first, second = order[:-1], order[1:]
+        displacement_m, dt_s = where_m[second] - where_m[first], (t_ns[second] - t_ns[first]) * 1e-9
+        use = np.isfinite(displacement_m[:, :2]).all(1) & (dt_s < MAX_STEP_S)
+        if not use.any():
+            return None
+        relative_sigma = np.hypot(placed.sigma_scale, placed.sigma_yaw_rad)
+        sigma_m = np.hypot(
+            SIGMA_VELOCITY_M_S * np.sqrt(dt_s * np.maximum(dt_s, VELOCITY_TAU_S)),
+            relative_sigma * np.linalg.norm(np.nan_to_num(displacement_m), axis=1),
+        )
+        return DisplacementFactor(
+            first[use],
+            second[use],
+            displacement_m[use],
+            sigma_m[use],
+            to_world.scale * to_world.rotation,
+        )
+
+    def _main_of(self, segments: Sequence[SlamMap], final: bool) -> SlamMap:
+        """The segment with most keyframes.
+
+        In flight the previous one while its georeference is as good.
+        """
+        main = max(segments, key=lambda s: len(s.keyframes))
+        kept = next((s for s in segments if s.first_keyframe_id == self._main), None)
+        if not final and kept is not None and self._anchor_rank(kept) >= self._anchor_rank(main):
+            main = kept  # poses published in its frame do not jump
+        self._main = main.first_keyframe_id
+        return main
+
+    def _anchor_rank(self, segment: SlamMap) -> int:
+        """Ability to place others: 0 none, 1 by dead reckoning, 2 in the world."""
+        placed = self.of(segment)
+        return 0 if placed is None else 1 + placed.has_origin
+
+    def _placed_by_dead_reckoning(
+        self, segment: SlamMap, segments: Sequence[SlamMap], own: Georeference | None
+    ) -> Georeference | None:
+        """Georeference of a young segment, by dead reckoning from the last keyframe before.
+
+        `own` gives its scale without an origin, or None.
+        """
+        first = next(iter(segment.keyframes.values()))
+        begun = self._begun_by_navigation(segment, first)
+        if begun is not None:
+            body, placed = begun
+            own = own or placed
+            if own is None:
+                return None
+            (sample,) = self._samples(segment, [first])
+            start_ned_m = body.place_world_m + self._georeferencer.lever_of(sample)
+            return _beginning_at(own, first, start_ned_m)
+        before = [
+            (k.t_ns, placed.world_from_map.apply(k.centre))
+            for s in segments
+            if s is not segment and (placed := self.of(s)) is not None
+            for k in s.keyframes.values()
+            if k.t_ns < first.t_ns
+        ]
+        if not before:
+            return None
+        since_ns, from_ned_m = max(before, key=lambda place: place[0])
+        displacement_m = self._georeferencer.displacement_by_velocity(since_ns, first.t_ns)
+        if displacement_m is None:
+            return None
+        start_ned_m = from_ned_m + displacement_m
+        if own is None:
+            samples = self._samples(segment, list(segment.keyframes.values()))
+            travelled = self._georeferencer.travelled(samples)
+            return None if travelled is None else place_new_map(samples, start_ned_m, *travelled)
+        return _beginning_at(own, first, start_ned_m)
+
+    def _begun_by_navigation(
+        self, segment: SlamMap, first: Keyframe
+    ) -> tuple[BodyPlace, Georeference | None] | None:
+        """Place of the body by inertial navigation as a segment began, and the segment so placed.
+
+        Found once, while the navigation does not go by this segment.
+        """
+        key = segment.first_keyframe_id
+        if key not in self._reckoned:
+            if first.keyframe_id != key:
+                return None  # a later one that is left may have aided the navigation
+            last = max(segment.keyframes.values(), key=lambda k: k.t_ns)
+            start, end = self.reckoned_at(first.t_ns), self.reckoned_at(last.t_ns)
+            if start is None or end is None or last is first:
+                return None
+            samples = self._samples(segment, [first, last])
+            levers = [self._georeferencer.lever_of(sample) for sample in samples]
+            moved_m = end.place_world_m + levers[1] - start.place_world_m - levers[0]
+            sigma_m_s = float(np.sqrt(np.diag(end.start.covariance)[:3].max()))
+            sigma_m = sigma_m_s * (last.t_ns - first.t_ns) * 1e-9
+            from_m = start.place_world_m + levers[0]
+            placed = place_new_map(samples, from_m, moved_m, sigma_m, "accelerometers")
+            self._reckoned[key] = start, placed
+        return self._reckoned[key]
+
+    def loop_allowed(
+        self, segment: SlamMap, keyframe: Keyframe, other: Keyframe, found: LoopClosure
+    ) -> bool:
+        """True if measured positions are consistent with a loop closure.
+
+        `keyframe` is in `segment`, if that is active.
+        """
+        here = keyframe.keyframe_id in segment.keyframes
+        placed = self.of(segment) if here else None
+        if placed is None:
+            return True
+        displacement = found.here_from_there.apply(other.centre) - keyframe.centre
+        displacement_m = placed.world_from_map.scale * placed.world_from_map.rotation @ displacement
+        measured_m = self._georeferencer.displacement_between(keyframe.t_ns, other.t_ns)
+        if measured_m is None:
+            return True
+        off_m = float(np.linalg.norm(displacement_m - measured_m))
+        return off_m < MAX_LOOP_ERROR_M + 3.0 * placed.sigma_scale * float(
+            np.linalg.norm(displacement_m)
+        )
+
+    def _samples(self, segment: SlamMap, keyframes: list[Keyframe]) -> list[AlignmentSample]:
+        poses = [k.camera_from_map.inverse() for k in keyframes]
+        ground_distances = self._ground_distances(segment, poses)
+        return [
+            AlignmentSample(k.t_ns, pose, self._attitude.of_keyframe(k.keyframe_id, k.t_ns), ground)
+            for k, pose, ground in zip(keyframes, poses, ground_distances, strict=True)
+        ]
+
+    def _ground_distances(self, segment: SlamMap, poses: list[Pose]) -> list[float | None]:
+        """Distances from cameras `map_from_camera` along the body axis to the ground, map units.
+
+        None where unknown: without rangefinder, or with a gimbal.
+        """
+        mount = self._body_from_camera
+        asked = self._georeferencer.has_ranges and self._attitude.used
+        if mount is None or not poses or not asked:
+            return [None] * len(poses)
+        beams = [pose.rotation @ mount.rotation[2] for pose in poses]
+        down = np.sum(beams, axis=0)
+        ground = HeightAboveGround(segment.point_positions(), down / np.linalg.norm(down))
+        compared = set(np.linspace(0, len(poses) - 1, MAX_GROUND_DISTANCES).astype(int).tolist())
+        return [
+            ground.distance(pose.translation, beam) if i in compared else None
+            for i, (pose, beam) in enumerate(zip(poses, beams, strict=True))
+        ]
+
+
+def _beginning_at(own: Georeference, first: Keyframe, start_ned_m: Array) -> Georeference:
+    """A georeference with the origin at which its first keyframe is where that began."""
+    to_world = own.world_from_map
+    origin = start_ned_m - to_world.scale * to_world.rotation @ first.centre
+    return replace(own, world_from_map=replace(to_world, translation=origin))
+
+
+def _poses(keyframes: list[Keyframe]) -> tuple[Array, Array]:
+    """Rotations (K, 3, 3) and translations (K, 3), `camera_from_map`."""
+    poses = [k.camera_from_map for k in keyframes]
+    return np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])
+
+
+def _due(segment: SlamMap) -> bool:
+    n = len(segment.keyframes)
+    return n < 40 or n % 5 == 0
+
+
+def _subsample(segment: SlamMap, final: bool) -> list[Keyframe]:
+    keyframes = list(segment.keyframes.values())
+    most = MAX_SAMPLES_FINAL if final else MAX_SAMPLES
+    if len(keyframes) <= most:
+        return keyframes
+    return [keyframes[int(i)] for i in np.linspace(0, len(keyframes) - 1, most).astype(int)]

@@ -1,0 +1,55 @@
+"""Place of the body by inertial navigation, frame by frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.estimation.inertial.inertial_navigation import (
+    BodyAttitude,
+    InertialNavigation,
+    Reckoned,
+)
+from companion.estimation.inertial.reckoned_path import BodyPlace, ReckonedPath
+from companion.geometry.transforms import Array, Pose
+
+MAX_SIGMA_M = 5.0
+"""Beyond, it is of no use even to find the map again."""
+GOOD_SIGMA_M = 0.5
+"""As long as it is this certain, it counts for more than a map that is poor."""
+
+
+class Reckoning:
+    """Attitude of the frame that has begun, and the body by inertial navigation there."""
+
+    def __init__(self, navigation: InertialNavigation) -> None:
+        self._navigation = navigation
+        self.attitude: BodyAttitude | None = None
+        self.reckoned: Reckoned | None = None
+        """In the frame of the odometry; None where unknown, or too uncertain to be of use."""
+        self.path = ReckonedPath()
+        """Of the latest frames, in the world."""
+
+    def begin(self, t_ns: int, attitude: BodyAttitude | None, odometry_from_world: Pose) -> None:
+        """Go on to a frame, with its attitude where that is known."""
+        found = None if attitude is None else self._navigation.at(attitude.t_ns)
+        if found is not None and found.sigma_place_m > MAX_SIGMA_M:
+            found = None
+        self.attitude, self.reckoned = attitude, found
+        if found is not None and attitude is not None:
+            world_m = np.asarray(odometry_from_world.inverse().apply(found.place_m))
+            start = found.start._replace(t_ns=t_ns)
+            self.path.add(BodyPlace(t_ns, world_m, start, self.rotation(attitude)))
+
+    def rotation(self, attitude: BodyAttitude) -> Array:
+        """Rotation (3, 3) of a body in the frame of the odometry, by its attitude."""
+        return np.asarray(self._navigation.world_from_attitude @ attitude.ned_from_body)
+
+    @property
+    def is_good(self) -> bool:
+        """True where it counts for more than a map that is poor."""
+        return self.reckoned is not None and self.reckoned.sigma_place_m < GOOD_SIGMA_M
+
+    def clear(self) -> None:
+        """Forget where it had the body."""
+        self.reckoned = None
+        self.path.clear()

@@ -1,0 +1,1 @@
+"""From a stand on the ground up to a metric map: standing still, optical flow, what they aid."""

@@ -1,0 +1,125 @@
+"""Aiding of inertial navigation from the ground up to a metric map: a place to stand on, then flow.
+
+Velocity is optical flow times the height over the ground that the vehicle stood on, which barometer
+and accelerometers know, as they know the vertical.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from companion.estimation.inertial.inertial_navigation import (
+    AidedFlow,
+    AidedHeight,
+    AidedPlace,
+    InertialNavigation,
+)
+from companion.estimation.lift_off.lift_off_flow import LiftOffFlow
+from companion.estimation.lift_off.optical_flow import GroundVelocity
+from companion.geometry.transforms import Array
+
+STANDING_LAG_NS = 500_000_000
+"""A fixed place aids inertial navigation that late: a lift-off shows so much later at most."""
+SIGMA_STANDING_M, SIGMA_STANDING_M_S = 0.005, 0.02
+LEGS_M, SIGMA_LEGS_M = 0.2, 0.15
+"""From the ground that the vehicle stood on up to its camera."""
+FLOW_EVERY_NS = 200_000_000
+"""Flow aids inertial navigation so often: what it is off by stays the same for some frames."""
+SIGMA_FLOW_HZ = 0.02
+"""Of flow, by errors of the attitude from frame to frame: 1 mrad in 50 ms."""
+HEIGHT_EVERY_NS, LEAST_HEIGHT_M = 200_000_000, 2.0
+"""Lower, what the rotors blow is reflected by the ground, and presses on a barometer."""
+MAP_AIDED_NS = 500_000_000
+"""A map that has placed the body lately makes flow needless."""
+
+
+class GroundAiding:
+    """Aids inertial navigation on the ground, and from a lift-off until a map has a scale."""
+
+    def __init__(self, navigation: InertialNavigation) -> None:
+        self._navigation = navigation
+        self.stood: AidedPlace | None = None
+        """The fixed place while the vehicle stands, else None."""
+        self.lift_off_flow = LiftOffFlow()
+        """Judge of flow at the last lift-off: only flow that has shown it aids."""
+        self._held: deque[AidedPlace | AidedHeight] = deque()
+        """Of the latest frames while the vehicle stands; empty when it does not."""
+        self._waiting: list[AidedFlow | AidedHeight] = []
+        """Since the last frame but one: flow is measured late, and all is to come in order."""
+        self._stood_down_m = 0.0
+        self._height_ns = self._flow_ns = self._frame_ns = 0
+        self._map_aided_ns: int | None = None
+
+    def map_aided(self, t_ns: int) -> None:
+        """Take that a map with a scale has placed the body of a frame."""
+        self._map_aided_ns = t_ns
+
+    def wants_flow(self, t_ns: int) -> bool:
+        """True after a lift-off, where no map has placed the body lately."""
+        if self.stood is not None or not self._navigation.knows_ground:
+            return False
+        return self._map_aided_ns is None or t_ns - self._map_aided_ns > MAP_AIDED_NS
+
+    def take_height(self, t_ns: int, height_m: float, rotors: bool) -> None:
+        """Take a barometric height; where rotors turn on the ground, they press on the sensor."""
+        if rotors and self.stood is not None:
+            return
+        if t_ns - self._height_ns >= HEIGHT_EVERY_NS:
+            self._height_ns = t_ns
+            self._waiting.append(AidedHeight(t_ns, height_m))
+
+    def stand(self, t_ns: int, place_m: Array) -> None:
+        """Take a frame of a vehicle that stands: at `place_m` (3,), unless it stood before."""
+        held_m = place_m if self.stood is None else self.stood.place_m
+        turn = self._navigation.world_from_attitude
+        self.stood = AidedPlace(t_ns, held_m, turn, SIGMA_STANDING_M)
+        self._held.extend(h for h in self._before(t_ns) if isinstance(h, AidedHeight))
+        self._held.append(self.stood)
+        self._frame_ns = t_ns
+        while self._held[0].t_ns < t_ns - STANDING_LAG_NS:
+            self._navigation.aid(self._held.popleft())
+
+    def fly(self, t_ns: int, down_m: float, wants: bool) -> None:
+        """Take a frame of a vehicle that does not stand, at a down coordinate.
+
+        `wants` where it is aided from here.
+        """
+        if self.stood is not None:
+            self._stood_down_m = float(self.stood.place_m[2])
+            self._navigation.lift_off(self._stood_down_m + LEGS_M, SIGMA_LEGS_M)
+            self.lift_off_flow = LiftOffFlow()
+        self.stood = None
+        self._held.clear()
+        high = self._stood_down_m - down_m > LEAST_HEIGHT_M
+        for measured in self._before(self._frame_ns):
+            if wants and (high or isinstance(measured, AidedFlow)):
+                self._navigation.aid(measured)
+        self._frame_ns = t_ns
+
+    def _before(self, t_ns: int) -> list[AidedFlow | AidedHeight]:
+        """Take out, in order, what waits from before a time."""
+        found = sorted((m for m in self._waiting if m.t_ns < t_ns), key=lambda m: m.t_ns)
+        self._waiting = [m for m in self._waiting if m.t_ns >= t_ns]
+        return found
+
+    def take_flow(self, measured: GroundVelocity, delay_ns: int) -> bool:
+        """Take flow over that ground; autopilot stamps are late by `delay_ns`.
+
+        True where it has just been found to contradict the accelerometers: the mount is wrong.
+        """
+        reckoned, contradicts = self._navigation.at(measured.t_ns + delay_ns), False
+        if reckoned is not None:
+            velocity_m_s = self._navigation.world_from_attitude.T @ reckoned.velocity_m_s
+            contradicts = self.lift_off_flow.take(
+                velocity_m_s, reckoned.sigma_velocity_m_s, measured
+            )
+        if not self.lift_off_flow.agrees or measured.t_ns - self._flow_ns < FLOW_EVERY_NS:
+            return contradicts
+        self._flow_ns = measured.t_ns
+        covariance_hz2 = measured.covariance_hz2 + SIGMA_FLOW_HZ**2 * np.eye(3)
+        self._waiting.append(
+            AidedFlow(measured.t_ns + delay_ns, measured.velocity_hz, covariance_hz2)
+        )
+        return False
