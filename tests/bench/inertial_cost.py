@@ -17,7 +17,7 @@ import numpy as np
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_navigation import AidedPlace, InertialNavigation
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
-from companion.estimation.standing import Standing
+from companion.estimation.lift_off.standing import Standing
 from companion.telemetry import AttitudeSample, ImuSample
 from tests.support.flights.measured_motion import MeasuredMotion, weaving
 

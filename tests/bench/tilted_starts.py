@@ -17,8 +17,8 @@ import numpy as np
 
 from companion.config import Config
 from companion.estimation.attitude.attitude_history import AttitudeHistory
+from companion.estimation.gate.pose_gate import MAX_TILT_ERROR_RAD
 from companion.estimation.localisation import LocalisationStage
-from companion.estimation.pose_gate import MAX_TILT_ERROR_RAD
 from companion.messages import Frame, Odometry, TrackState, Warned
 from companion.runtime.in_order import in_order_of_time
 from companion.telemetry import AttitudeSample

@@ -13,7 +13,7 @@ from tests.firmware.figures import Figures, strayed_m
 from tests.firmware.trial import Conditions, Trial
 
 Flown = Callable[[Trial, Figures], None]
-HOLD_S, READY_S, PATIENT_S = 60.0, 30.0, 45.0
+HOLD_S, READY_S, PATIENT_S, GPS_S = 60.0, 30.0, 45.0, 60.0
 USUAL = "position on", "dead reckoning", "autopilot connected", "camera recovered"
 """Texts of a flight in which nothing is wrong."""
 SET_EKF_SOURCE_SET = 42007
@@ -117,7 +117,8 @@ def gps_lost(trial: Trial, figures: Figures) -> None:
     """Up by GPS; over to our pose by source set; GPS goes, and comes back 50 m off."""
     trial.start_daemon()
     has_place = trial.ground.until(lambda: trial.ground.believed, 90.0)
-    figures.add_true("armed by GPS", has_place and _armed_by_gps(trial))
+    mode = trial.pilot.modes_to_arm_in[-1]
+    figures.add_true("armed by GPS", has_place and _armed_in(trial, mode, GPS_S))
     if not trial.ground.armed or not trial.pilot.take_off(manoeuvres.TAKE_OFF_M):
         return
     manoeuvres.ready_to_go(trial)
@@ -145,15 +146,6 @@ def gps_lost(trial: Trial, figures: Figures) -> None:
         figures.add(f"{name}: moved", float(np.linalg.norm(moved, axis=1).max()), "m", 0.3)
     manoeuvres.fly_square(trial, figures, 4.0, 0.15)
     trial.pilot.land()
-
-
-def _armed_by_gps(trial: Trial) -> bool:
-    began_s = time.time()
-    trial.pilot.hold_sticks(in_air=False)
-    armed = trial.pilot.set_mode(trial.pilot.modes_to_arm_in[-1], 60.0) and trial.pilot.arm(60.0)
-    texts = dict.fromkeys(trial.ground.texts_since(began_s)[-6:])
-    trial.mark(f"armed {armed}: {' / '.join(texts)}")
-    return armed
 
 
 def doctor(trial: Trial, figures: Figures) -> None:
@@ -203,9 +195,14 @@ def two_companions(trial: Trial, figures: Figures) -> None:
         manoeuvres.land(trial, figures, stood)
 
 
-def _armed_in(trial: Trial, mode: str) -> bool:
+def _armed_in(trial: Trial, mode: str, patience_s: float = 15.0) -> bool:
+    """Arm in a mode with the sticks at rest; what the autopilot says to it is noted."""
+    began_s = time.time()
     trial.pilot.hold_sticks(in_air=False)
-    return trial.pilot.set_mode(mode, 10.0) and trial.pilot.arm(15.0)
+    armed = trial.pilot.set_mode(mode, patience_s) and trial.pilot.arm(patience_s)
+    texts = dict.fromkeys(trial.ground.texts_since(began_s)[-6:])
+    trial.mark(f"armed {armed}: {' / '.join(texts)}")
+    return armed
 
 
 COPTER_PARAMETERS = {

@@ -9,7 +9,7 @@ from types import TracebackType
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.estimation.pose_gate import PoseToSend
+from companion.estimation.gate.pose_gate import PoseToSend
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Pose, rotation_from_quaternion
 from drivers.mavlink.pose_messages import odometry_message
