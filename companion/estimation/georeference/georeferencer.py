@@ -7,14 +7,14 @@ does; without positions a rangefinder or barometer gives the scale.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 
 import numpy as np
 
 from companion.config import GeoreferenceConfig
-from companion.estimation.georeference.range_climb import climb_scale
+from companion.estimation.georeference.alignment_sample import AlignmentSample, mean_rotation
+from companion.estimation.georeference.height_scales import HeightScales
 from companion.estimation.georeference.trajectory_alignment import (
     SIGMA_VELOCITY_M_S,
     SIGMA_YAW_RAD,
@@ -27,36 +27,14 @@ from companion.estimation.georeference.velocity_verdict import VelocityVerdict
 from companion.estimation.sample_series import SampleSeries
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Georeference, Warned
-from companion.telemetry import HeightSample, PositionSample, PositionSource, RangeSample, Telemetry
+from companion.telemetry import PositionSample, PositionSource, Telemetry
 
-MIN_RANGES = 4
-"""Ranges required for a median."""
 MAX_VELOCITY_AGE_NS = 400_000_000
 """A velocity is extrapolated for at most so long."""
-SIGMA_RANGE_SCALE, SIGMA_HEIGHT_SCALE = 0.02, 0.05
-"""Lower bounds of the relative scale error by rangefinder and barometer. By ranges alone it was
-0.1, 0.5, 0.5 and 4 % on rendered flights with cameras 45, 80, 90 and 30 degrees down: 2 % RMS."""
-SIGMA_RANGE_OFFSET_M, NEAR_RATIO = 0.08, 0.5
-"""Height of the rangefinder above or below the camera, which nobody states: near the ground it
-counts for most, so that only the greater ranges count."""
 MAX_SIGMA_ROTATION_RAD = np.radians(8.0)
 MAX_SAMPLES = 400
 MAX_SIGMA_SCALE_NEW_MAP = 0.5
 """Largest relative scale error at which a new map is placed."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AlignmentSample:
-    """A keyframe to align: its pose in the map, and its measured attitude.
-
-    `ground_units` is the distance from the body down its own axis to the mapped ground, map units,
-    where mapped.
-    """
-
-    t_ns: int
-    map_from_camera: Pose
-    ned_from_camera: Array | None
-    ground_units: float | None = None
 
 
 class Georeferencer:
@@ -79,8 +57,7 @@ class Georeferencer:
         self._velocity_integral = {source: SampleSeries() for source in PositionSource}
         self._velocity = {source: VelocityVerdict() for source in PositionSource}
         self._warnings: list[Warned] = []
-        self._height = SampleSeries()
-        self._range = SampleSeries()
+        self._heights = HeightScales(config.min_travel_m, body_from_camera)
 
     def take(self, sample: Telemetry) -> None:
         """Add a sample; irrelevant ones are ignored."""
@@ -91,10 +68,8 @@ class Georeferencer:
                 self._integrate(integral, sample.t_ns, sample.velocity_ned_m_s)
                 if integral.newest is not None and integral.newest[0] == sample.t_ns:
                     self._judge(sample, integral.newest[1][1])
-        elif isinstance(sample, HeightSample):
-            self._height.add(sample.t_ns, np.array([-sample.height_m]))
-        elif isinstance(sample, RangeSample):
-            self._range.add(sample.t_ns, np.array([sample.distance_m]))
+        else:
+            self._heights.take(sample)
 
     def warnings(self) -> list[Warned]:
         """Changes of the verdict on a velocity since the last call."""
@@ -103,12 +78,8 @@ class Georeferencer:
 
     def prune(self, before_ns: int, keyframes_ns: Array) -> None:
         """Drop samples before a time, except at the times of keyframes (N,), sorted."""
-        for each in (
-            *self._positions.values(),
-            *self._velocity_integral.values(),
-            self._height,
-            self._range,
-        ):
+        self._heights.prune(before_ns, keyframes_ns)
+        for each in (*self._positions.values(), *self._velocity_integral.values()):
             each.prune(before_ns, keyframes_ns)
 
     @property
@@ -123,7 +94,7 @@ class Georeferencer:
     @property
     def has_ranges(self) -> bool:
         """True if there are enough ranges to compare with a map."""
-        return len(self._range) >= MIN_RANGES
+        return self._heights.has_ranges
 
     def _integrate(self, series: SampleSeries, t_ns: int, velocity: Array) -> None:
         # rows: velocity and its integral; a GPS may lack the vertical component
@@ -214,12 +185,15 @@ class Georeferencer:
                     return found
         if level is None:
             return None
-        scales = [
-            self._range_scale(samples), self._climb_scale(samples, level),
-            self._height_scale(samples, level), inertial,
-        ]  # fmt: skip
-        known = [scale for scale in scales if scale is not None]
+        known = self._scales(samples, level, inertial)
         return self._from_scale(samples, level, reduce(reconciled, known) if known else None)
+
+    def _scales(
+        self, samples: list[AlignmentSample], level: Array | None, inertial: Scale | None
+    ) -> list[Scale]:
+        """All scales that do not follow from positions."""
+        by_height = self._heights.of(samples, level)
+        return by_height if inertial is None else [*by_height, inertial]
 
     def travelled(self, samples: list[AlignmentSample]) -> tuple[Array, float, str] | None:
         """Displacement (3,) by velocity from the first to the last sample, NED metres.
@@ -257,10 +231,8 @@ class Georeferencer:
         extent = target - target.mean(0)
         if float(np.linalg.norm(extent, axis=1).max()) < 0.5 * self._config.min_travel_m:
             return None
-        scales = [self._range_scale(samples), inertial]
-        if level is not None:
-            scales += [self._climb_scale(samples, level), self._height_scale(samples, level)]
-        prior = min((s for s in scales if s is not None), key=lambda s: s.sigma, default=None)
+        known = self._scales(samples, level, inertial)
+        prior = min(known, key=lambda scale: scale.sigma, default=None)
         solution = fit_map(t_ns[ok] * 1e-9, mapped, target, travelled_m[ok], level, prior)
         if solution is None:
             return None
@@ -285,65 +257,6 @@ class Georeferencer:
         missing = np.zeros((3, 3))
         rotations = [missing if p.ned_from_camera is None else p.ned_from_camera for p in samples]
         return self.lever_ned(np.stack(rotations))
-
-    def _range_scale(self, samples: list[AlignmentSample]) -> Scale | None:
-        """Scale from rangefinder against mapped ground."""
-        if not self.has_ranges:
-            return None
-        distance, ok = self._range.at(np.array([p.t_ns for p in samples]))
-        seen = np.array([
-            (d[0], p.ground_units)
-            for p, d, good in zip(samples, distance, ok, strict=True)
-            if good and p.ground_units is not None
-        ]).reshape(-1, 2)  # fmt: skip
-        high = seen[seen[:, 0] >= NEAR_RATIO * seen[:, 0].max(initial=0.0)]
-        if len(high) < MIN_RANGES:
-            return None
-        ratios = high[:, 0] / high[:, 1]
-        scale = float(np.median(ratios))
-        spread = 1.4826 * float(np.median(np.abs(ratios - scale))) / scale
-        offset = SIGMA_RANGE_OFFSET_M / float(np.median(high[:, 0]))
-        sigma = float(max(spread / np.sqrt(len(ratios)), np.hypot(SIGMA_RANGE_SCALE, offset)))
-        return Scale(scale, sigma, "rangefinder", len(ratios))
-
-    def _climb_scale(self, samples: list[AlignmentSample], level: Array) -> Scale | None:
-        """Scale from rangefinder on a way straight up or down, over whatever is below."""
-        if not self.has_ranges:
-            return None
-        distance, ok = self._range.at(np.array([p.t_ns for p in samples]))
-        seen = [
-            (level @ p.map_from_camera.translation, d[0] * self._steepness(p.ned_from_camera))
-            for p, d, good in zip(samples, distance, ok, strict=True)
-            if good and p.ned_from_camera is not None
-        ]
-        if len(seen) < MIN_RANGES:
-            return None
-        return climb_scale(np.array([place for place, _ in seen]), np.array([h for _, h in seen]))
-
-    def _steepness(self, ned_from_camera: Array) -> float:
-        """Cosine of the body's tilt, by which a range along its axis is longer than a height."""
-        if self._body_from_camera is None:
-            return 1.0
-        return float((ned_from_camera @ self._body_from_camera.rotation.T)[2, 2])
-
-    def _height_scale(self, samples: list[AlignmentSample], level: Array) -> Scale | None:
-        """Scale from changes of barometric height."""
-        if len(self._height) < 4:
-            return None
-        t_ns = np.array([p.t_ns for p in samples])
-        down, ok = self._height.at(t_ns)
-        if ok.sum() < 4:
-            return None
-        mapped = np.stack([level @ p.map_from_camera.translation for p in samples])[ok, 2]
-        a, b = mapped - mapped.mean(), down[ok, 0] - down[ok, 0].mean()
-        if float(np.ptp(b)) < self._config.min_travel_m:
-            return None
-        scale = float((a * b).sum() / max(float((a * a).sum()), 1e-12))
-        if scale <= 0:
-            return None
-        size_m = float(np.sqrt(max(float((b * b).sum()), 1e-9)))
-        sigma = max((0.5 + float(np.std(b - scale * a))) / size_m, SIGMA_HEIGHT_SCALE)
-        return Scale(scale, sigma, "barometric height", int(ok.sum()))
 
     def _from_scale(
         self, samples: list[AlignmentSample], level: Array, found: Scale | None
@@ -392,17 +305,3 @@ def place_new_map(
     return Georeference(
         Similarity(scale, level, origin), sigma, float(SIGMA_YAW_RAD), method, len(samples), 0.0
     )
-
-
-def mean_rotation(samples: Sequence[AlignmentSample]) -> Array | None:
-    """Chordal mean of world_from_map rotations by attitude; None without."""
-    rotations = [
-        p.ned_from_camera @ p.map_from_camera.rotation.T
-        for p in samples
-        if p.ned_from_camera is not None
-    ]
-    if not rotations:
-        return None
-    u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))
-    out: Array = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    return out

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from companion.estimation.georeference.georeferencer import AlignmentSample, mean_rotation
+from companion.estimation.georeference.alignment_sample import AlignmentSample, mean_rotation
 from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral, Change
 from companion.estimation.inertial.inertial_motion import (

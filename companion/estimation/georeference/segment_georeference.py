@@ -8,20 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
-from companion.estimation.georeference.georeferencer import (
-    AlignmentSample,
-    Georeferencer,
-    place_new_map,
-)
+from companion.estimation.georeference.alignment_sample import AlignmentSample
+from companion.estimation.georeference.displacement_by_velocity import displacement_factor
+from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
 from companion.estimation.georeference.height_above_ground import HeightAboveGround
 from companion.estimation.georeference.inertial_scale import InertialScale, settled
-from companion.estimation.georeference.trajectory_alignment import (
-    DISAGREE,
-    MAX_STEP_S,
-    SIGMA_VELOCITY_M_S,
-    VELOCITY_TAU_S,
-    Scale,
-)
+from companion.estimation.georeference.trajectory_alignment import DISAGREE, Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.judged_acceleration import ByAcceleration
 from companion.estimation.inertial.reckoned_path import BodyPlace
@@ -30,14 +22,10 @@ from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Georeference, MapUpdate
 from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.sparse_map import Keyframe, SlamMap
-from companion.slam.optimisation.displacement_factor import DisplacementFactor, typical_error
+from companion.slam.optimisation.displacement_factor import DisplacementFactor
 
 MAX_LOOP_ERROR_M = 6.0
 """Error of measured positions between two times."""
-CORRELATION_INFLATION = 3.0
-"""Inflation of sigmas: each adjustment window reuses the same displacements."""
-MAX_SIGMA_SCALE_DISPLACEMENT = 0.05
-"""Displacement factors require a scale at least this certain."""
 MAX_SAMPLES, MAX_SAMPLES_FINAL = 120, 400
 MAX_GROUND_DISTANCES = 40
 """Half a millisecond each, on the way to a pose; their median is no more certain of more."""
@@ -205,51 +193,12 @@ class SegmentGeoreferences:
     def displacements_of(
         self, segment: SlamMap, keyframes: list[Keyframe]
     ) -> DisplacementFactor | None:
-        """Displacement factor between consecutive keyframes of a segment, by velocity.
-
-        Sigmas are scaled by the residuals over the segment; None where they do not fit.
-        """
+        """Displacement factor between consecutive keyframes of a segment, by velocity."""
         placed = self.of(segment)
-        if placed is None or placed.sigma_scale > MAX_SIGMA_SCALE_DISPLACEMENT:
+        if placed is None:
             return None
         everywhere = list(segment.keyframes.values())
-        whole = self._displacements(placed, everywhere)
-        if whole is None:
-            return None
-        error = typical_error(whole, *_poses(everywhere))
-        factor = None if error is None else self._displacements(placed, keyframes)
-        if factor is None or error is None:
-            return None
-        return replace(factor, sigma_m=CORRELATION_INFLATION * factor.sigma_m * max(error, 1.0))
-
-    def _displacements(
-        self, placed: Georeference, keyframes: list[Keyframe]
-    ) -> DisplacementFactor | None:
-        t_ns = np.array([k.t_ns for k in keyframes])
-        travelled_m = self._georeferencer.integrated_velocity(t_ns)
-        if travelled_m is None:
-            return None
-        to_world, (rotation, _) = placed.world_from_map, _poses(keyframes)
-        ned_from_camera = to_world.rotation @ rotation.transpose(0, 2, 1)
-        where_m = travelled_m + self._georeferencer.lever_ned(ned_from_camera)
-        order = np.argsort(t_ns, kind="stable")
-        first, second = order[:-1], order[1:]
-        displacement_m, dt_s = where_m[second] - where_m[first], (t_ns[second] - t_ns[first]) * 1e-9
-        use = np.isfinite(displacement_m[:, :2]).all(1) & (dt_s < MAX_STEP_S)
-        if not use.any():
-            return None
-        relative_sigma = np.hypot(placed.sigma_scale, placed.sigma_yaw_rad)
-        sigma_m = np.hypot(
-            SIGMA_VELOCITY_M_S * np.sqrt(dt_s * np.maximum(dt_s, VELOCITY_TAU_S)),
-            relative_sigma * np.linalg.norm(np.nan_to_num(displacement_m), axis=1),
-        )
-        return DisplacementFactor(
-            first[use],
-            second[use],
-            displacement_m[use],
-            sigma_m[use],
-            to_world.scale * to_world.rotation,
-        )
+        return displacement_factor(self._georeferencer, placed, everywhere, keyframes)
 
     def _main_of(self, segments: Sequence[SlamMap], final: bool) -> SlamMap:
         """The segment with most keyframes.
@@ -383,12 +332,6 @@ def _beginning_at(own: Georeference, first: Keyframe, start_ned_m: Array) -> Geo
     to_world = own.world_from_map
     origin = start_ned_m - to_world.scale * to_world.rotation @ first.centre
     return replace(own, world_from_map=replace(to_world, translation=origin))
-
-
-def _poses(keyframes: list[Keyframe]) -> tuple[Array, Array]:
-    """Rotations (K, 3, 3) and translations (K, 3), `camera_from_map`."""
-    poses = [k.camera_from_map for k in keyframes]
-    return np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])
 
 
 def _due(segment: SlamMap) -> bool:

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from companion.config import GeoreferenceConfig
-from companion.estimation.georeference.georeferencer import (
-    AlignmentSample,
-    Georeferencer,
-    place_new_map,
-)
+from companion.estimation.georeference.alignment_sample import AlignmentSample
+from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
 from companion.geometry.transforms import Pose, Similarity, rotation_from_vector, yaw_rotation
 from companion.telemetry import HeightSample, PositionSample, PositionSource, RangeSample
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.georeference.georeferencer import AlignmentSample
+from companion.estimation.georeference.alignment_sample import AlignmentSample
 from companion.estimation.georeference.inertial_scale import LEAST_PLACES, InertialScale, settled
 from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
