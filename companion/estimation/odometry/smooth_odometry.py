@@ -6,8 +6,6 @@ of a stationary camera. Here the pose is continuous, and corrections are slew-li
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from companion.estimation.georeference.trajectory_alignment import SIGMA_YAW_RAD
@@ -19,10 +17,11 @@ from companion.estimation.inertial.inertial_navigation import (
 )
 from companion.estimation.inertial.reckoning import Reckoning
 from companion.estimation.lift_off.ground_aiding import GroundAiding
+from companion.estimation.odometry.flown_map import FlownMap, LastPose
 from companion.estimation.odometry.innovation_gate import MIN_CONSISTENT_NS, InnovationGate
 from companion.estimation.odometry.lift_off_heading import LiftOffHeading
 from companion.estimation.odometry.odometry_drift import OdometryDrift
-from companion.estimation.odometry.odometry_frame import MapView, OdometryFrame, OdometryState
+from companion.estimation.odometry.odometry_frame import MapView, OdometryState
 from companion.estimation.odometry.placed_map import PlacedMap, frame_of
 from companion.estimation.odometry.stand import FLOOR_M, FRESH_NS, SIGMA_ATTITUDE_RAD, Stand
 from companion.estimation.odometry.tracking_quality import quality_of
@@ -62,17 +61,13 @@ class SmoothOdometry:
         min_quality: int = 1,
     ) -> None:  # fmt: skip
         mount = camera.body_from_camera
-        self._camera_from_body = mount.inverse() if mount is not None else Pose.identity()
+        self._flown = FlownMap(mount.inverse() if mount is not None else Pose.identity())
         self._size = np.array([camera.width, camera.height], np.float64)
         self._gate = InnovationGate(max_jump_m)
         self._drift = OdometryDrift()
         self._navigation = navigation
         self._least_quality = QUALITY_MARGIN * min_quality
         self.reckoning = Reckoning(navigation)
-        self._map: PlacedMap | None = None
-        self._frame = OdometryFrame()
-        self._last: tuple[int, Pose, Pose] | None = None
-        """Time, `map_from_camera` and `odometry_from_body` of the last accepted frame."""
         self._velocity = np.zeros(3)
         self._dead_reckoning = False
         self._given = False
@@ -113,9 +108,10 @@ class SmoothOdometry:
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
         if not known or pose is None or georeference is None:
             return self._unknown(track)
-        if self._last is not None and track.t_ns <= self._last[0]:
+        if self._flown.last is not None and track.t_ns <= self._flown.last.t_ns:
             return self._none(track)  # late: a pose without it was given meanwhile
-        if self._map is None or segment != self._map.segment:
+        active = self._flown.placed
+        if active is None or segment != active.segment:
             goes_on = reckoned is not None or self._given
             if goes_on and georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING:
                 return self._unknown(track)  # it would also be slower and faster than the body
@@ -123,10 +119,13 @@ class SmoothOdometry:
                 return self._unknown(track)
             if not self._start_map(segment, georeference, pose, first):
                 return self._unknown(track)
-        elif georeference is not self._map.georeference:
-            self._update_georeference(self._map, georeference)
-        assert self._map is not None
-        raw = self._map.world_from_body(pose)
+        elif georeference is not active.georeference:
+            ratio = self._flown.georeferenced(georeference)
+            if self._flown.last is not None:
+                place_m = self._flown.last.place_m
+                self._navigation.move(np.eye(3), place_m, place_m, ratio)
+        assert self._flown.placed is not None
+        raw = self._flown.placed.world_from_body(pose)
         if track.state is TrackState.DEAD_RECKONING:
             if reckoned is not None:
                 return self._unknown(track)
@@ -136,22 +135,21 @@ class SmoothOdometry:
             return self._unknown(track)
         if self._dead_reckoning:
             self._reacquire(raw, track.t_ns)
-        frame = self._frame
+        frame, last = self._flown.frame, self._flown.last
         here, attitude = frame.from_world @ raw, self.reckoning.attitude
-        if self._last is not None:
-            dt_s = min((track.t_ns - self._last[0]) * 1e-9, 1.0)
+        if last is not None:
+            dt_s = min((track.t_ns - last.t_ns) * 1e-9, 1.0)
             frame = self._heading.turned(
                 frame.slewed(raw, dt_s, georeference.residual_m), track.t_ns, raw,
                 None if attitude is None else attitude.ned_from_body, self.reset_counter, dt_s,
             )  # fmt: skip
         placed = frame.from_world @ raw
-        within_gate = self._last is None or self._gate.reachable(
-            self._last[2].translation, placed.translation, track.t_ns - self._last[0],
-            self._velocity,
-        )  # fmt: skip
+        within_gate = last is None or self._gate.reachable(
+            last.place_m, placed.translation, track.t_ns - last.t_ns, self._velocity
+        )
         if not within_gate and not self._gate.agree(placed.translation, track.t_ns, self._velocity):
             return self._unknown(track)
-        self._frame = frame
+        self._flown.frame = frame
         ceased = reckoned is None and self._gate.refused_ns(track.t_ns) >= MIN_CONSISTENT_NS
         if not within_gate or ceased:
             self._reset()
@@ -166,7 +164,7 @@ class SmoothOdometry:
         if reckoned is not None and reckoned.sigma_velocity_m_s < sigma_velocity:
             self._velocity = reckoned.velocity_m_s
             sigma_velocity = reckoned.sigma_velocity_m_s
-        self._last = (track.t_ns, pose, placed)
+        self._flown.last = LastPose(track.t_ns, pose, placed)
         noise_m = NOISE_INFLATION * track.sigma_position * georeference.world_from_map.scale
         self._navigation.move(
             placed.rotation @ here.rotation.T, here.translation, placed.translation, 1.0
@@ -201,7 +199,7 @@ class SmoothOdometry:
         is one, of the autopilot's heading.
         """
         sigma_rad = float(SIGMA_YAW_RAD) if georeference is None else georeference.sigma_yaw_rad
-        return float(np.linalg.norm([FLOOR_RAD, noise_rad, sigma_rad, self._frame.yaw_rad]))
+        return float(np.linalg.norm([FLOOR_RAD, noise_rad, sigma_rad, self._flown.frame.yaw_rad]))
 
     def begin(
         self, t_ns: int, attitude: BodyAttitude | None, standing: bool = False,
@@ -224,7 +222,7 @@ class SmoothOdometry:
                 self._heading.lift_off(t_ns, self.reset_counter, self.ground.stood.place_m)
             at_ns = t_ns if attitude is None else attitude.t_ns
             self.ground.fly(at_ns, float(self._place_now()[2]), self.ground.wants_flow(t_ns))
-        self.reckoning.begin(t_ns, attitude, self._frame.from_world)
+        self.reckoning.begin(t_ns, attitude, self._flown.frame.from_world)
         return self.reckoning.reckoned
 
     def without_frame(self, seq: int, t_ns: int, attitude: BodyAttitude | None) -> Odometry | None:
@@ -242,12 +240,12 @@ class SmoothOdometry:
         self, track: Track, pose: Pose, raw: Pose, georeference: Georeference
     ) -> Odometry:
         """Odometry by dead reckoning: of lowest quality and growing uncertainty."""
-        placed = self._frame.from_world @ raw
-        if self._last is not None:
-            dt_s = max((track.t_ns - self._last[0]) * 1e-9, 1e-3)
-            self._velocity = (placed.translation - self._last[2].translation) / dt_s
+        placed, last = self._flown.frame.from_world @ raw, self._flown.last
+        if last is not None:
+            dt_s = max((track.t_ns - last.t_ns) * 1e-9, 1e-3)
+            self._velocity = (placed.translation - last.place_m) / dt_s
         self._dead_reckoning = True
-        self._last = (track.t_ns, pose, placed)
+        self._flown.last = LastPose(track.t_ns, pose, placed)
         scale = georeference.world_from_map.scale
         return Odometry(
             track.seq, track.t_ns, track.state, self.reset_counter, 1, placed,
@@ -261,26 +259,19 @@ class SmoothOdometry:
 
         What the pose is then off by is slewed away.
         """
-        self._dead_reckoning = False
-        if self._last is None:
+        self._dead_reckoning, last = False, self._flown.last
+        if last is None:
             return
-        expected = self._last[2].translation + self._velocity * ((t_ns - self._last[0]) * 1e-9)
+        expected = last.place_m + self._velocity * ((t_ns - last.t_ns) * 1e-9)
         if self.reckoning.reckoned is not None:
             expected = self.reckoning.reckoned.place_m
-        correction = expected - (self._frame.from_world @ raw).translation
+        correction = expected - (self._flown.frame.from_world @ raw).translation
         if float(np.linalg.norm(correction)) < self._gate.max_jump_m:
-            self._frame = self._frame.shifted(correction)
+            self._flown.frame = self._flown.frame.shifted(correction)
 
     def place_in_map(self, place_m: Array, map_from_camera: Array) -> Array | None:
-        """Place of the camera (3,) in the active map, for a place (3,) of the body.
-
-        The place is in the frame of the odometry, metres; the rotation (3, 3) is the camera's in
-        the map. None without a georeference.
-        """
-        if self._map is None:
-            return None
-        place_world_m = self._frame.from_world.inverse().apply(place_m)
-        return self._map.place_of_camera(place_world_m, map_from_camera)
+        """Place of the camera (3,) in the active map; see `FlownMap.place_of_camera`."""
+        return self._flown.place_of_camera(place_m, map_from_camera)
 
     def _none(self, track: Track) -> Odometry:
         """Odometry without a pose."""
@@ -293,10 +284,10 @@ class SmoothOdometry:
             return self._none(track)
         placed = Pose(self.reckoning.rotation(attitude), reckoned.place_m)
         self._velocity, self._dead_reckoning = reckoned.velocity_m_s, True
-        georeference = None if self._map is None else self._map.georeference
+        georeference, slewed_m = self._flown.georeference, self._flown.frame.slewed_m
         sigma_scale = 0.0 if georeference is None else georeference.sigma_scale
-        self._hold(track.t_ns, placed)
-        drift = self._drift.add(track.t_ns, placed.translation, sigma_scale, self._frame.slewed_m)
+        self._flown.hold(track.t_ns, placed)
+        drift = self._drift.add(track.t_ns, placed.translation, sigma_scale, slewed_m)
         return Odometry(
             track.seq, track.t_ns, TrackState.DEAD_RECKONING, self.reset_counter, 1, placed,
             reckoned.velocity_m_s,
@@ -306,18 +297,12 @@ class SmoothOdometry:
             sigma_scale=sigma_scale, sigma_by_scale_m=drift.by_scale_m,
         )  # fmt: skip
 
-    def _hold(self, t_ns: int, placed: Pose) -> None:
-        """Take a pose that the active map did not give: the next by the map has to fit it."""
-        if self._map is not None:
-            pose = self._map.map_from_camera(self._frame.from_world.inverse() @ placed)
-            self._last = (t_ns, pose, placed)
-
     def _begin_stand(self, t_ns: int) -> None:
         """Begin a stand where the body is; a reset where that is not known any more."""
-        reckoned, last, sigma_m = self.reckoning.reckoned, self._last, float("inf")
+        reckoned, last, sigma_m = self.reckoning.reckoned, self._flown.last, float("inf")
         if reckoned is not None:
             sigma_m = reckoned.sigma_place_m
-        elif last is not None and t_ns - last[0] <= FRESH_NS:
+        elif last is not None and t_ns - last.t_ns <= FRESH_NS:
             sigma_m = 0.0
         if not self._stand.begin(sigma_m, self._given):
             self._reset()
@@ -328,7 +313,7 @@ class SmoothOdometry:
         A reset, if it stood elsewhere before.
         """
         self._stand.begins_m, self._stand.in_world = world_m, True
-        self._last = self.ground.stood = None
+        self._flown.last = self.ground.stood = None
         self.reckoning.clear()
         self._navigation.reset()
 
@@ -336,7 +321,8 @@ class SmoothOdometry:
         """Place (3,) of the body as far as it is known: where it begins, if not at all."""
         if self.reckoning.reckoned is not None:
             return self.reckoning.reckoned.place_m
-        return self._stand.begins_m if self._last is None else self._last[2].translation
+        last = self._flown.last
+        return self._stand.begins_m if last is None else last.place_m
 
     def _standing(self, track: Track) -> Odometry:
         """Odometry of a vehicle that stands on the ground: at a fixed place, as the attitude is.
@@ -352,9 +338,8 @@ class SmoothOdometry:
             return Odometry(track.seq, track.t_ns, TrackState.STANDING, self.reset_counter)
         placed = Pose(fixed.world_from_attitude @ attitude.ned_from_body, fixed.place_m)
         self._velocity, self._dead_reckoning = np.zeros(3), True
-        self._hold(track.t_ns, placed)
-        georeference = None if self._map is None else self._map.georeference
-        sigma_yaw_rad = self._sigma_yaw_rad(georeference, SIGMA_ATTITUDE_RAD)
+        self._flown.hold(track.t_ns, placed)
+        sigma_yaw_rad = self._sigma_yaw_rad(self._flown.georeference, SIGMA_ATTITUDE_RAD)
         return self._stand.odometry(track, self.reset_counter, placed, sigma_yaw_rad)
 
     def _start_map(
@@ -365,13 +350,13 @@ class SmoothOdometry:
         False where it contradicts inertial navigation, which is certain enough to know better: by
         a wrong mount, say. Flown on in the firmwares' simulators, such maps took the vehicle away.
         """
-        placed = PlacedMap(segment, georeference, self._camera_from_body)
-        reckoned = self.reckoning.reckoned
+        placed = PlacedMap(segment, georeference, self._flown.camera_from_body)
+        reckoned, last = self.reckoning.reckoned, self._flown.last
         frame, goes_on, off_m = frame_of(
-            placed, pose, first, self._frame,
+            placed, pose, first, self._flown.frame,
             None if first is None else self.reckoning.path.at(first.t_ns),
             None if reckoned is None else reckoned.place_m,
-            None if self._last is None else self._last[2].translation, self._gate.max_jump_m,
+            None if last is None else last.place_m, self._gate.max_jump_m,
         )  # fmt: skip
         if (
             not goes_on and off_m is not None and not georeference.has_origin
@@ -382,45 +367,32 @@ class SmoothOdometry:
         if not goes_on:
             self.reset_counter += self._given
             self._drift.clear()
-            if self._last is not None and georeference.has_origin:
+            if last is not None and georeference.has_origin:
                 self._navigation.reset()
-        self._frame = frame
         self.reckoning.path.clear()
-        began = frame.from_world @ placed.world_from_body(pose)
-        self._map = replace(placed, began_m=began.translation)
-        self._last, self._dead_reckoning = None, False
+        self._flown.begin(placed, frame, pose)
+        self._dead_reckoning = False
         self._gate.clear()
         return True
-
-    def _update_georeference(self, before: PlacedMap, georeference: Georeference) -> None:
-        """Change the georeference of the same map, keeping the last pose."""
-        self._map = replace(before, georeference=georeference)
-        if self._last is not None:
-            _, pose, placed = self._last
-            self._frame = self._frame.holding(placed, self._map.world_from_body(pose))
-            ratio = georeference.world_from_map.scale / before.georeference.world_from_map.scale
-            self._navigation.move(np.eye(3), placed.translation, placed.translation, ratio)
 
     @property
     def state(self) -> OdometryState | None:
         """State to continue from; None before the first pose."""
-        if self._last is None:
+        frame, last = self._flown.frame, self._flown.last
+        if last is None:
             return None
         return OdometryState(
-            self._frame.from_world, self._frame.anchored, self._last[2].translation.copy(),
-            self._velocity.copy(),
-        )  # fmt: skip
+            frame.from_world, frame.anchored, last.place_m.copy(), self._velocity.copy()
+        )
 
     def resume(self, segment: int, georeference: Georeference, state: OdometryState) -> None:
         """Continue in a stored frame; `segment` and `georeference` are of the map stored with it.
 
         The next pose is taken as is, since the motion meanwhile is unknown.
         """
-        self._map = PlacedMap(segment, georeference, self._camera_from_body)
-        self._frame = OdometryFrame.settled(
-            state.odometry_from_world, state.anchored, self._frame.slewed_m
-        )
-        self._last, self._dead_reckoning = None, False
+        placed = PlacedMap(segment, georeference, self._flown.camera_from_body)
+        self._flown.resume(placed, state.odometry_from_world, state.anchored)
+        self._dead_reckoning = False
         self._gate.clear()
         self._drift.clear()
         self._navigation.reset()
@@ -435,10 +407,10 @@ class SmoothOdometry:
 
         It is doubted by as much as that has turned the way since the map began, and the velocity.
         """
-        if self._map is None or segment != self._map.segment or self._last is None:
+        active = self._flown.placed
+        if active is None or segment != active.segment or self._flown.last is None:
             return
-        share = float(np.sin(min(tilt_rad, np.pi / 2)))
-        way_m = float(np.linalg.norm(self._last[2].translation - self._map.began_m))
+        share, way_m = float(np.sin(min(tilt_rad, np.pi / 2))), self._flown.way_m()
         speed_m_s = float(np.linalg.norm(self._velocity))
         self._navigation.doubt(
             SIGMA_DOUBTED_M + share * way_m, SIGMA_DOUBTED_M_S + share * speed_m_s
@@ -450,10 +422,8 @@ class SmoothOdometry:
         The output stays continuous; the difference is slewed. A frame that the gate refused, or of
         another map, says nothing of the pose that was given.
         """
-        if self._last is None or self._map is None or self._dead_reckoning:
+        active, last = self._flown.placed, self._flown.last
+        if last is None or active is None or self._dead_reckoning:
             return  # what dead reckoning is off by shows when the map is seen again
-        if segment != self._map.segment or t_ns != self._last[0]:
-            return
-        placed = self._last[2]
-        self._last = (t_ns, map_from_camera, placed)
-        self._frame = self._frame.corrected(placed, self._map.world_from_body(map_from_camera))
+        if segment == active.segment and t_ns == last.t_ns:
+            self._flown.corrected(map_from_camera)
