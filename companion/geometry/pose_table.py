@@ -27,7 +27,9 @@ class PoseTable(Mapping[int, Pose]):
 
     @staticmethod
     def of(poses: Mapping[int, Pose]) -> PoseTable:
-        """A table of some poses."""
+        """A table of some poses; the same, if they are in one."""
+        if isinstance(poses, PoseTable):
+            return poses
         n = len(poses)
         return PoseTable(
             np.fromiter(poses, np.int64, n),
@@ -68,6 +70,13 @@ class PoseTable(Mapping[int, Pose]):
         if self._rows is None:
             self._rows = {key: row for row, key in enumerate(self.ids.tolist())}
         return self._rows
+
+    def changed_since(self, before: PoseTable) -> set[int]:
+        """Ids whose poses are not in another table, or other ones there."""
+        kept, here, there = np.intersect1d(self.ids, before.ids, True, return_indices=True)
+        turned = (self.rotations[here] != before.rotations[there]).any((1, 2))
+        moved = (self.translations[here] != before.translations[there]).any(1)
+        return set(self.ids.tolist()).difference(kept[~(turned | moved)].tolist())
 
     def inverse(self) -> PoseTable:
         """The inverse of each."""

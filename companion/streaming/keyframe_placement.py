@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Similarity
 from companion.messages import SPANS_REACH, KeyframeAdded, MapUpdate, PointChunk
 from companion.streaming.items import PlacesItem
@@ -26,6 +27,8 @@ class KeyframePlacement:
         self.world: Similarity | None = None
         """Transform `world_from_map`; None while unknown."""
         self._update: MapUpdate | None = None
+        self._poses = PoseTable.of({})
+        """Those of the update."""
         self._mapped: dict[int, Similarity] = {}
         """Places in the newest map."""
         self._sent: dict[int, Similarity] = {}
@@ -49,23 +52,24 @@ class KeyframePlacement:
         return self._changes_of(chunk.t_ns, {chunk.keyframe_id: self._mapped[chunk.keyframe_id]})
 
     def mapped(self, update: MapUpdate) -> list[PlacesItem]:
-        """Take a new map."""
-        self._update = update
-        places: dict[int, Similarity | None] = {}
-        changed: set[int] = set()
-        for keyframe_id in update.map_from_camera:
+        """Take a new map. Only what differs from the one before is looked at."""
+        poses, before = PoseTable.of(update.map_from_camera), self._update
+        changed = poses.changed_since(self._poses)
+        if before is not None:
+            changed |= {k for k, _ in update.scale_of.items() ^ before.scale_of.items()}
+        self._update, self._poses = update, poses
+        for keyframe_id in changed:
             place = update.place_of(keyframe_id)
             if place is not None:
-                places[keyframe_id] = place
-                if not _same(self._mapped.get(keyframe_id), place, 0.0):
-                    changed.add(keyframe_id)
-                    self._mapped[keyframe_id] = place
-        last = max(places, default=-1)
-        for keyframe_id in [k for k in self._mapped if k < last and k not in places]:
-            places[keyframe_id] = None
+                self._mapped[keyframe_id] = place
+        known = set(poses.ids.tolist())
+        last = max(known, default=-1)
+        for keyframe_id in [k for k in self._mapped if k < last and k not in known]:
             changed.add(keyframe_id)
             del self._mapped[keyframe_id]
-        self._update_local_scale(_about(changed), update)
+        about = _about(changed)
+        self._update_local_scale(about, update)
+        places = {k: self._mapped.get(k) for k in sorted(about) if k in known or k in changed}
         world = update.georeference.world_from_map if update.georeference is not None else None
         return self._changes_of(update.t_ns, places, world)
 

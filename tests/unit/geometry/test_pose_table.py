@@ -60,3 +60,17 @@ def test_its_bytes_are_those_of_its_arrays(poses: dict[int, Pose]) -> None:
     packed = pickle.dumps(table, protocol=5)
     assert_same(pickle.loads(packed), poses)
     assert table.nbytes == N * 13 * 8 < len(packed) < table.nbytes + 500
+
+
+def test_it_tells_what_has_changed(poses: dict[int, Pose]) -> None:
+    before = PoseTable.of(poses)
+    assert before.changed_since(PoseTable.of(poses)) == set()
+    assert before.changed_since(PoseTable.of({})) == set(poses)
+    turned, moved, left, *_ = poses
+    after = {
+        **{key: pose for key, pose in poses.items() if key != left},
+        turned: Pose(poses[turned].rotation.T, poses[turned].translation),
+        moved: Pose(poses[moved].rotation, poses[moved].translation + [0, 0, 1e-9]),
+        1000: Pose.identity(),
+    }
+    assert PoseTable.of(dict(sorted(after.items()))).changed_since(before) == {turned, moved, 1000}
