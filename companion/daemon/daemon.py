@@ -206,6 +206,7 @@ class Daemon:
             keeper = OriginKeeper(
                 feedback, self._link, self._journal.say,
                 lambda: self._settings.config.feedback.mode != "off", self._believed_origin,
+                lambda: "satellites" in self._settings.config.telemetry.use,
             )  # fmt: skip
             work.append(keeper.run())
         return work

@@ -15,8 +15,10 @@ from companion.geometry.geodesy import GeoOrigin
 from drivers.mavlink.autopilot_link import AutopilotLink
 
 LOOK_EVERY_S = 0.5
-PATIENCE = 12
-"""Consecutive checks without an origin before one is set: its own GPS may still find one."""
+PATIENCE, PATIENCE_SEARCHING = 12, 120
+"""Consecutive checks without an origin before one is set, and where its GPS sees satellites: from
+a cold start receivers take half a minute to a fix, and an origin cannot be changed afterwards."""
+SEARCHING = "the autopilot's GPS sees satellites: the origin is left to it for a minute"
 AGAIN_AFTER_S = 10.0
 """Time after which an origin that was not accepted is set again."""
 DO_SET_GLOBAL_ORIGIN = 611
@@ -27,13 +29,16 @@ NOWHERE_DEG = 1e-7
 class OriginKeeper:
     """Ensures that the autopilot has an origin; the link itself requests the present one.
 
-    `known` gives the place that it was at before, None where there is none to be believed.
+    `known` gives the place that it was at before, None where there is none to be believed;
+    `believes_gps` whether a GPS of the autopilot may give the origin.
     """
 
     def __init__(
         self, config: FeedbackConfig, link: AutopilotLink, say: Callable[[str], None],
         is_wanted: Callable[[], bool], known: Callable[[], GeoOrigin | None],
+        believes_gps: Callable[[], bool],
     ) -> None:  # fmt: skip
+        self._believes_gps = believes_gps
         self._link, self._say, self._is_wanted, self._known = link, say, is_wanted, known
         self._place = GeoOrigin(
             config.origin_latitude_deg, config.origin_longitude_deg, config.origin_altitude_m
@@ -50,7 +55,10 @@ class OriginKeeper:
                 and self._link.samples.positions.origin is None
             )
             n_without = n_without + 1 if without else 0
-            if n_without >= PATIENCE:
+            searching = self._link.samples.gps_searches and self._believes_gps()
+            if searching and n_without == PATIENCE:
+                self._say(SEARCHING)
+            if n_without >= (PATIENCE_SEARCHING if searching else PATIENCE):
                 await self._set()
                 await asyncio.sleep(AGAIN_AFTER_S)
 

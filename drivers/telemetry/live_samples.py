@@ -21,7 +21,14 @@ from companion.telemetry import PositionSample, PositionSource, Telemetry
 from companion.timing.link_clock import ClockFilter
 from companion.timing.stamp_filter import MAX_BOOT_NS
 from drivers.telemetry.live_positions import LivePositions
-from drivers.telemetry.mavlink_samples import ATTITUDE_IDS, IMU_IDS, READERS, boot_ns, samples_of
+from drivers.telemetry.mavlink_samples import (
+    ATTITUDE_IDS,
+    IMU_IDS,
+    READERS,
+    boot_ns,
+    samples_of,
+    searches,
+)
 from drivers.telemetry.telemetry_log import GeodeticFix, is_finite
 
 LATE_NS, AHEAD_NS = 2_000_000_000, 100_000_000
@@ -48,6 +55,8 @@ class LiveSamples:
     ) -> None:
         self._clock, self._deliver, self._warn = clock, deliver, warn
         self.positions = LivePositions()
+        self.gps_searches = False
+        """True while the autopilot's GPS sees satellites, and has no fix yet."""
         self.n_dropped: Counter[str] = Counter()
         """By reason."""
         self._unix_minus_boot_ns: int | None = None
@@ -65,6 +74,8 @@ class LiveSamples:
         if kind == mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
             self._take_origin(message, receive_ns)
             return
+        if kind == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
+            self.gps_searches = searches(message)
         if kind not in READERS and kind != mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
             return
         try:

@@ -29,7 +29,7 @@ SEA_LEVEL_KG_M3 = 1.225
 """Density of the air at sea level in the standard atmosphere (ISO 2533)."""
 GPS_RANGE_ERROR_M = 1.5
 """One sigma of a GPS position at dilution 1, where the receiver states no accuracy of its own."""
-UNKNOWN_16 = 65535
+UNKNOWN_8, UNKNOWN_16 = 255, 65535
 FIX_3D = 3
 UNIX_SINCE_NS = 10**17
 """Larger stamps count from 1970, smaller ones from boot."""
@@ -223,6 +223,11 @@ READERS: dict[int, tuple[Reader, ...]] = {
 def landed(message: Any) -> bool:
     """True if an EXTENDED_SYS_STATE says that the vehicle stands on the ground."""
     return bool(message.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND)
+
+
+def searches(message: Any) -> bool:
+    """True if a GPS_RAW_INT says that the receiver sees satellites, and has no fix yet."""
+    return bool(message.fix_type < FIX_3D and 0 < message.satellites_visible < UNKNOWN_8)
 
 
 def samples_of(message: Any) -> list[Telemetry | GeodeticFix]:
