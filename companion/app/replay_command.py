@@ -71,11 +71,12 @@ class RecordedInput:
         self._start_ns, self._stop_ns = _span(self.flight, start_s, stop_s)
         self.log = self.flight.telemetry()
         self.n_frames = self.flight.n_frames_between(self._start_ns, self._stop_ns)
+        self.warnings = [*self.flight.warnings, *self.log.warnings]
+        """Faults of the recording."""
 
     def messages(self) -> Iterator[Message]:
         """All in order of time, with warnings of gaps and notices of frames that are missing."""
-        yield from self.flight.warnings
-        yield from self.log.warnings
+        yield from self.warnings
         first_ns = self._start_ns - LEAD_NS
         samples = [s for s in self.log.samples if first_ns <= s.t_ns <= self._stop_ns]
         frames = self.flight.frames(self._start_ns, self._stop_ns)

@@ -54,6 +54,16 @@ def test_list_of_frames_that_is_none(flight: Path, tmp_path: Path) -> None:
     assert "frames.csv" in refused(replay_here(flight, tmp_path / "out"))
 
 
+def test_list_of_frames_that_was_cut_is_said(flight: Path, tmp_path: Path) -> None:
+    """The rest is replayed."""
+    rows = (flight / "frames.csv").read_text().splitlines()
+    (flight / "frames.csv").write_text("\n".join(rows[:-5]) + "\n")
+    run = replay_here(flight, tmp_path / "out", "--set", "depth.enabled=false")
+    assert run.status == 0
+    assert "warning: frames.csv ends early: 5 frames at the end have no time" in run.stdout
+    assert run.report["frames"] == 15
+
+
 @pytest.mark.parametrize(
     ("changes", "named"),
     [

@@ -69,6 +69,8 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     belief = belief_in_words(config.telemetry.use)
     if belief:
         print(f"telemetry: {belief}")
+    for fault in given.warnings:
+        print(f"warning: {fault.what}: {fault.detail}")
     made_folder(arguments.out)
     replay(given, arguments.out, config, arguments.viewer, progress, print)
     if config.export.formats:
