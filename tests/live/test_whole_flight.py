@@ -29,8 +29,9 @@ from tests.support.reference.scoring import Trajectory, read_ply, read_tum, scor
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
 TRUTH = read_tum(SAMPLE / "truth" / "world_from_camera.tum")
-ARMS_S, DISARMS_S = 1.0, 45.0
-"""After the first picture."""
+ARMS_S, DISARMS_S = 1.0, 42.0
+"""After the first picture; the last comes four seconds later: time for the proof of poses after a
+gap, on a busy machine."""
 
 
 @dataclass
@@ -127,6 +128,7 @@ def test_arming_keeps_the_flight_and_disarming_stops_nothing(flown: Flown) -> No
     assert flown.health_after["flight"] == flown.folder.name
     assert {"report.json", "report.html", "trajectory.tum", "cloud.ply"} <= flown.written
     n_after = len(flown.poses.between(flown.disarmed_ns + 300_000_000, 2**62))
+    print(f"{n_after} poses after disarming")
     assert n_after > 10, "poses go on after disarming"
 
 
