@@ -16,11 +16,15 @@ demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
 
 # First what only computes, on all cores; then, with nothing beside them, tests that measure times.
-# Of these, what fails is flown once more: a machine that others use too may be too busy for one.
+# Of these, files in which one fails are run once more: a machine that others use too may be too busy
+# for one, and in some files one flight goes through all tests.
 test: lint opencl
 	$(BIN)/pytest -m "not alone" -n logical --maxprocesses 4 --dist loadfile
-	$(BIN)/pytest -m alone || { [ $$? -eq 1 ] && \
-	  $(BIN)/pytest -m alone --last-failed --last-failed-no-failures none; }
+	$(BIN)/pytest -m alone || { [ $$? -eq 1 ] && $(BIN)/pytest -m alone $$($(FAILED_FILES)); }
+
+FAILED_FILES := $(BIN)/python -c "import json; \
+  failed = json.load(open('.pytest_cache/v/cache/lastfailed')); \
+  print(*sorted({name.partition('::')[0] for name in failed}))"
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check
