@@ -13,14 +13,13 @@ that scale is found sooner.
     frozen        True: the same picture again and again
     size          (width, height) of what it sends
     covered       True: it is dark, but for the sensor's noise
-    lost          the share of pictures that never leave it
+    lost          the share of pictures that never leave it, evenly spread
     sent_ns       CLOCK_MONOTONIC of the last picture that a client was sent
 """
 
 from __future__ import annotations
 
 import json
-import random
 import socket
 import threading
 import time
@@ -68,7 +67,7 @@ class HttpCamera:
         self._optics = pattern_optics(CameraConfig(width=width, height=height))
         self._scene = PatternScene()
         self._last: Bytes | None = None
-        self._random, self._noise = random.Random(1), np.random.default_rng(1)
+        self._noise, self._to_lose = np.random.default_rng(1), 0.0
         self._stop, self._there = threading.Event(), threading.Event()
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
@@ -145,7 +144,9 @@ class HttpCamera:
             # drawn beforehand for the time at which it is sent: whoever gets it takes that for its
             picture = self._picture(due_ns)
             self._stop.wait((due_ns - time.monotonic_ns()) * 1e-9)
-            if self.stalled or self._random.random() < self.lost:
+            self._to_lose += self.lost
+            if self.stalled or self._to_lose >= 1.0:
+                self._to_lose %= 1.0
                 continue
             if time.monotonic_ns() - due_ns > MOST_LATE_NS:
                 continue
