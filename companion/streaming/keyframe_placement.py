@@ -27,8 +27,6 @@ class KeyframePlacement:
         self.world: Similarity | None = None
         """Transform `world_from_map`; None while unknown."""
         self._update: MapUpdate | None = None
-        self._poses = PoseTable.of({})
-        """Those of the update."""
         self._mapped: dict[int, Similarity] = {}
         """Places in the newest map."""
         self._sent: dict[int, Similarity] = {}
@@ -54,22 +52,22 @@ class KeyframePlacement:
     def mapped(self, update: MapUpdate) -> list[PlacesItem]:
         """Take a new map. Only what differs from the one before is looked at."""
         poses, before = PoseTable.of(update.map_from_camera), self._update
-        changed = poses.changed_since(self._poses)
+        known = changed = set(poses.ids.tolist())
         if before is not None:
+            changed = poses.changed_since(PoseTable.of(before.map_from_camera))
             changed |= {k for k, _ in update.scale_of.items() ^ before.scale_of.items()}
-        self._update, self._poses = update, poses
+        self._update = update
         for keyframe_id in changed:
             place = update.place_of(keyframe_id)
             if place is not None:
                 self._mapped[keyframe_id] = place
-        known = set(poses.ids.tolist())
         last = max(known, default=-1)
-        for keyframe_id in [k for k in self._mapped if k < last and k not in known]:
-            changed.add(keyframe_id)
+        gone = {k for k in self._mapped if k < last and k not in known}
+        for keyframe_id in gone:
             del self._mapped[keyframe_id]
-        about = _about(changed)
+        about = _about(changed | gone)
         self._update_local_scale(about, update)
-        places = {k: self._mapped.get(k) for k in sorted(about) if k in known or k in changed}
+        places = {k: self._mapped.get(k) for k in sorted(about) if k in known or k in gone}
         world = update.georeference.world_from_map if update.georeference is not None else None
         return self._changes_of(update.t_ns, places, world)
 
