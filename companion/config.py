@@ -145,7 +145,8 @@ class FeedbackConfig:
     max_gap_ms: Annotated[float, Meta(ge=30, le=300)] = 200.0
     """Longest prediction after the frame that a pose is from, milliseconds."""
     resume_after_s: Annotated[float, Meta(ge=0.1, le=60)] = 1.0
-    """The gate must have accepted poses for this long before they are sent again, seconds."""
+    """The gate must have accepted poses for this long before they are sent again, seconds; after
+    frames that were missing for a shorter time, and of which none was refused, for that time."""
     max_jump_m: Annotated[float, Meta(ge=0.05, le=100)] = 1.0
     """Largest innovation of a pose against the predicted motion, metres; beyond, it is a reset."""
     set_origin: bool = True

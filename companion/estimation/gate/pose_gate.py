@@ -4,7 +4,9 @@ A pose must be metric, tracked, certain, of sufficient quality, level by the aut
 attitude, and recent. What cannot be checked is not sent. All conditions must hold for a while
 before the first pose is sent; gaps shorter than an autopilot's timeout are bridged by prediction,
 and longer ones by inertial dead reckoning for as long as its standard deviation is within the
-limit. After others, and after every discontinuity, the conditions must hold again.
+limit. After others, and after every discontinuity, the conditions must hold again: after a pause
+in which no frame came and none was refused for as long as the pause, after others for the whole
+time.
 """
 
 from __future__ import annotations
@@ -119,6 +121,8 @@ class PoseGate:
         self._accepted_at_ns = 0
         self._accepted_since_ns: int | None = None
         self._silent_since_ns: int | None = None
+        self._only_silent = False
+        """True where poses ceased for want of frames, and none was refused since."""
         self._last_stamp_ns = 0
         self._n_predicted = 0
         self._periods_ns: deque[int] = deque(maxlen=N_PERIODS)
@@ -190,6 +194,7 @@ class PoseGate:
         why_not = self._rejection_reason(odometry, now_ns)
         if why_not:
             self._accepted_since_ns = None
+            self._only_silent = False
             if not self.sending:
                 self.state, self.why_not = Sending.OFF, why_not
             self._last_rejection = why_not
@@ -199,7 +204,7 @@ class PoseGate:
         if not self.sending:
             if self._accepted_since_ns is None:
                 self._accepted_since_ns = now_ns
-            proven = now_ns - self._accepted_since_ns >= self._config.resume_after_s * 1e9
+            proven = now_ns - self._accepted_since_ns >= self._proof_ns(self._accepted_since_ns)
             self.state = Sending.PROVING
             self.why_not = self._start_sending(odometry, now_ns) if proven else PROVING
             if self.why_not:
@@ -314,12 +319,25 @@ class PoseGate:
         if self.sending:
             why_not = self._last_rejection or SILENT
             self._stop(why_not)
-            self._silent_since_ns = self._accepted_at_ns if why_not == SILENT else None
+            if why_not == SILENT:
+                self._silent_since_ns, self._only_silent = self._accepted_at_ns, True
         self._accepted_since_ns = None
 
     def _stop(self, why_not: str) -> None:
         self.state, self.why_not = Sending.OFF, why_not
         self._accepted_since_ns = self._silent_since_ns = None
+        self._only_silent = False
+
+    def _proof_ns(self, began_ns: int) -> int:
+        """Time for which the conditions must hold, since `began_ns`, before poses are sent.
+
+        A pause casts doubt on a pose that goes on without a discontinuity by what may have happened
+        in it: two frames lost at 10 frames/s are no reason to withhold a second of good ones.
+        """
+        whole_ns = int(self._config.resume_after_s * 1e9)
+        if self._silent_since_ns is None or not self._only_silent:
+            return whole_ns
+        return min(whole_ns, began_ns - self._silent_since_ns)
 
     def _paused_lately(self, now_ns: int) -> bool:
         """True where poses ceased for want of frames alone, and not long ago."""

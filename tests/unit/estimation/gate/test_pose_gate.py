@@ -214,6 +214,43 @@ def test_stalled_loop_is_a_gap() -> None:
     assert flight.run(0.4)
 
 
+@pytest.mark.parametrize(("pause_s", "proof_s"), [(0.3, 0.25), (0.6, 0.55), (5.0, 1.0)])
+def test_proof_after_missing_frames_lasts_as_long_as_they_were_missing(
+    pause_s: float, proof_s: float
+) -> None:
+    flight = Flight()
+    flight.run(2)
+    flight.run(pause_s, frames=False)
+    assert flight.gate.why_not == "no frames"
+    assert not flight.run(proof_s)
+    assert flight.run(0.2)
+    assert {pose.reset_counter for _, pose in flight.sent} == {0}
+
+
+@pytest.mark.parametrize(
+    "doubt",
+    [{"quality": 5}, {"reset_counter": 1}, {"state": TrackState.LOST, "world_from_body": None}],
+)
+def test_what_is_doubted_after_missing_frames_takes_the_whole_proof(doubt: dict[str, Any]) -> None:
+    flight = Flight()
+    flight.run(2)
+    flight.run(0.4, frames=False)
+    flight.run(0.05, **doubt)
+    after: dict[str, Any] = {"reset_counter": doubt.get("reset_counter", 0)}
+    assert not flight.run(0.95, **after)
+    assert flight.run(0.3, **after)
+
+
+def test_another_pause_while_proving_is_proven_too() -> None:
+    flight = Flight()
+    flight.run(2)
+    flight.run(0.4, frames=False)
+    flight.run(0.2)
+    flight.run(0.4, frames=False)
+    assert not flight.run(0.9)
+    assert flight.run(0.2)
+
+
 def rolled_over(t_ns: int) -> Pose:
     return Pose(rotation_from_quaternion(quaternion_from_euler(np.pi, 0.0, 0.7)), np.zeros(3))
 
@@ -421,7 +458,7 @@ def test_a_bridge_goes_on_after_frames_that_came_too_late(late_s: float, resumes
     flight.run(1, **BLIND)
     flight.run(late_s, frames=False)
     assert (flight.gate.state, flight.gate.why_not) == (Sending.OFF, "no frames")
-    assert not flight.run(0.9, **BLIND)
+    assert not flight.run(min(late_s, 1.0) - 0.1, **BLIND)
     assert bool(flight.run(0.5, **BLIND)) is resumes
     assert flight.state() is (Sending.BRIDGING if resumes else Sending.OFF)
 
