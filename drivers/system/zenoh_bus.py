@@ -89,6 +89,17 @@ class ZenohBus:
         self._session.close()
 
 
+def check_distributed(config: DistributedConfig) -> None:
+    """Raise InputError where no session is possible as configured, as far as it shows without one.
+
+    So that a daemon says so as it starts, before it begins a flight.
+    """
+    if config.enabled:
+        _library()
+        key_prefix(config)
+        _settings(config)
+
+
 def key_prefix(config: DistributedConfig) -> str:
     """Prefix of all keys of a vehicle; InputError for an invalid name."""
     if not NAME.fullmatch(config.vehicle):

@@ -19,11 +19,13 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
     bound_heap()
     from companion.daemon.nodes.node_config import with_stages
+    from drivers.system.zenoh_bus import check_distributed
 
     def load() -> Config:
         config = load_config(arguments.config, arguments.set)
         return with_stages(config, arguments.stages, arguments.join)
 
+    check_distributed(load().distributed)
     if "tracking" not in load().distributed.stages:
         from companion.daemon.nodes.depth_node import run_depth_node
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -158,6 +159,19 @@ def test_what_cannot_be_had_is_named(
     monkeypatch.setattr("drivers.system.zenoh_bus.LISTEN_MS", 100)
     with pytest.raises(InputError, match=re.escape(said)):
         ZenohBus(distributed)
+
+
+def test_without_zenoh_no_flight_begins(tmp_path: Path) -> None:
+    hidden, flights = tmp_path / "hidden", tmp_path / "flights"
+    hidden.mkdir()
+    (hidden / "zenoh.py").write_text("raise ImportError\n", "utf-8")
+    command = [sys.executable, "-m", "companion", "run", "--stages", "tracking"]
+    ended = subprocess.run(
+        [*command, "--set", f"daemon.flights={flights}", "--set", "camera.source=pattern"],
+        env=os.environ | {"PYTHONPATH": str(hidden)}, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert ended.returncode == 2 and not flights.exists()
+    assert "needs Zenoh: pip install" in ended.stderr
 
 
 def test_options_say_what_runs_where() -> None:
