@@ -125,6 +125,7 @@ def gps_lost(trial: Trial, figures: Figures) -> None:
     start, yaw_rad = trial.ground.believed_m, manoeuvres.believed_yaw(trial)
     for way in ((6, 0), (6, 6), (0, 6), (0, 0)):
         trial.pilot.go_to(start + np.array([*way, 0.0]), yaw_rad, within_m=0.7)
+    time.sleep(manoeuvres.CORNER_S)  # it still brakes: what it moves is to be of the change alone
     sending = trial.until("poses", lambda: trial.sending, 20.0)
     figures.add_true("poses beside GPS", sending is not None, str(trial.feedback))
     if sending is None:

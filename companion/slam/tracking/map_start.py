@@ -78,12 +78,17 @@ def backfill(
     first: View,
     second: View,
     reference: Keyframe,
+    most: int | None = None,
 ) -> list[View]:
     """Track the buffered frames of before the initialisation, outwards from the first view.
 
-    `reference` is the keyframe of the first view.
+    `reference` is the keyframe of the first view. Of more than `most` frames only each second,
+    third or so from the first view is tracked.
     """
     views = [v for v in views if v.seq != second.seq]
+    if most is not None:
+        step = max(1, -(-len(views) // most))
+        views = [v for v in views if (v.seq - first.seq) % step == 0]
     tracked_views: list[View] = []
     before = [v for v in views if v.seq <= first.seq][::-1]
     after = [v for v in views if v.seq > first.seq]

@@ -42,6 +42,9 @@ MIN_PREDICTED_INLIERS, MIN_PREDICTED_RATIO = 25, 0.2
 attitude."""
 PARALLAX_RATIO = 1.5
 """Factor on the required parallax each time that a map was found wrong."""
+BACKFILLED_IN_FLIGHT = 25
+"""Earlier frames that are tracked where a map begins: two to four milliseconds each, for which the
+frame of now waits. The pose gate bridges 200 ms; all 150 of the buffer took 250 to 400."""
 TrackerOutput = Track | KeyframeAdded | LoopClosed
 
 
@@ -74,6 +77,7 @@ class Tracker:
         self._camera = camera
         self._times = times
         self._extractor = FeatureExtractor(config.features, camera)
+        self._is_live = background
         self._next_keyframe_id = 0
         self.map_lock = MapLock(order)
         """Lock to be held by all other readers of the map."""
@@ -229,7 +233,10 @@ class Tracker:
         return [keyframe_added(self.map, first), *between, track_of(self.map, view, second)]
 
     def _backfilled(self, first: View, second: View, reference: Keyframe) -> list[TrackerOutput]:
-        views = backfill(self._frame_tracker, self._bootstrap.pending, first, second, reference)
+        views = backfill(
+            self._frame_tracker, self._bootstrap.pending, first, second, reference,
+            BACKFILLED_IN_FLIGHT if self._is_live else None,
+        )  # fmt: skip
         return [track_of(self.map, view, reference, backfilled=True) for view in views]
 
     # -- tracking -------------------------------------------------------------------------------

@@ -76,6 +76,31 @@ def positions(tracker: Tracker, tracks: dict[int, Track]) -> tuple[Array, Array]
     return np.array(estimated), np.array(truth)
 
 
+@pytest.mark.parametrize("is_live", [False, True], ids=["replay", "flight"])
+def test_frames_before_the_map_are_tracked_and_in_flight_no_more_than_there_is_time_for(
+    images: list[np.ndarray], is_live: bool
+) -> None:
+    """A hundred frames over one spot before it moves: the next pose waits for all of these."""
+    n_still = 100
+    tracker = Tracker(Config(), CAMERA, nothing, background=is_live)
+    earlier: list[Track] = []
+    for k in range(n_still + 20):
+        grey = images[max(0, k - n_still)]
+        frame = Frame(k, k * 100_000_000, grey, np.repeat(grey[..., None], 3, 2))
+        with tracker.map_lock.tracking():
+            found = tracker.step(frame, Prior(None, path(max(0, k - n_still)).rotation))
+        earlier = [m for m in found if isinstance(m, Track) and m.backfilled]
+        if earlier:
+            break
+    tracker.close()
+    seqs = np.array([track.seq for track in earlier])
+    assert seqs[0] < 5 and seqs[-1] > k - 10, "from the first to the last"
+    if is_live:
+        assert 15 <= len(seqs) <= 25 and np.diff(seqs).max() < 10
+    else:
+        assert len(seqs) >= k - 2
+
+
 @pytest.mark.parametrize("attitude", [False, True], ids=["vision alone", "with attitude"])
 def test_every_frame_of_an_easy_flight_is_tracked_to_centimetres(
     images: list[np.ndarray], attitude: bool
