@@ -25,12 +25,13 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
         config = load_config(arguments.config, arguments.set)
         return with_stages(config, arguments.stages, arguments.join)
 
-    check_distributed(load().distributed)
-    if "tracking" not in load().distributed.stages:
+    config = load()
+    check_distributed(config.distributed)
+    if "tracking" not in config.distributed.stages:
         from companion.daemon.nodes.depth_node import run_depth_node
 
         signals.defer()
-        return run_depth_node(load(), lambda: signals.received is not None)
+        return run_depth_node(config, lambda: signals.received is not None)
     from companion.runtime.fork_server import ForkServer
 
     with ForkServer(copy=True) as server:  # before there are threads and what only the daemon needs

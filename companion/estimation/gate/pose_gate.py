@@ -313,6 +313,7 @@ class PoseGate:
     def _discontinuity(self) -> None:
         self._counter.discontinuity()
         self._down_shift_m = None
+        self._only_silent = False
 
     def _time_out(self) -> None:
         """Stop sending: no pose was accepted for too long."""

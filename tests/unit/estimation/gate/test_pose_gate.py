@@ -241,6 +241,18 @@ def test_what_is_doubted_after_missing_frames_takes_the_whole_proof(doubt: dict[
     assert flight.run(0.3, **after)
 
 
+def test_localisation_that_is_restarted_in_a_pause_takes_the_whole_proof() -> None:
+    """Its poses are unrelated to those before, however short the pause was."""
+    flight = Flight()
+    flight.run(2)
+    flight.run(0.4, frames=False)
+    assert flight.gate.why_not == "no frames"
+    flight.gate.restart()
+    assert not flight.run(0.95)
+    assert flight.run(0.3)
+    assert flight.sent[-1][1].reset_counter == 1
+
+
 def test_another_pause_while_proving_is_proven_too() -> None:
     flight = Flight()
     flight.run(2)
