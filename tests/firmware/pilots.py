@@ -21,6 +21,9 @@ PLACE_AND_YAW, PLACE_SPEED_AND_YAW = 0b100111111000, 0b100111000000
 """What of SET_POSITION_TARGET_LOCAL_NED is not to be ignored."""
 FORCED = 21196
 ACK_S = 2.0
+PX4_SPEED_M_S = 2.0
+"""Told a place far away, PX4 tilts by 45 degrees, and the camera looks at the horizon: so the place
+that it is told moves there."""
 SET_TIMES = 3
 """Over UDP, without waiting for its answer."""
 COPTER_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "GUIDED": 4, "LOITER": 5, "LAND": 9, "BRAKE": 17}
@@ -178,6 +181,23 @@ class Px4Pilot(Pilot):
     def hold_sticks(self, in_air: bool) -> None:
         """See `Pilot`; always centred: it takes a stick that moves for a pilot who takes over."""
         self._ground.sticks = lambda: CENTRED
+
+    def go_to(
+        self, place_m: Array, yaw_rad: float, within_m: float = 0.25, timeout_s: float = 30.0
+    ) -> bool:
+        """See `Pilot`."""
+        began_s, start = time.monotonic(), self._ground.believed_m
+        way = np.asarray(place_m) - start
+        lasts_s = float(np.linalg.norm(way)) / PX4_SPEED_M_S
+
+        def setpoint() -> tuple[Array, Array, float]:
+            share = min(1.0, (time.monotonic() - began_s) / max(lasts_s, 1e-3))
+            return start + share * way, np.zeros(3), yaw_rad
+
+        self.stream(setpoint)
+        return self._ground.until(
+            lambda: np.linalg.norm(self._ground.believed_m - place_m) < within_m, timeout_s
+        )
 
     @staticmethod
     def _named(mode: int) -> str:

@@ -87,7 +87,14 @@ class AidedHeight(NamedTuple):
     height_m: float
 
 
-Aiding = AidedPlace | AidedFlow | AidedHeight
+class AidedRest(NamedTuple):
+    """A body that does not move, to a standard deviation along each axis."""
+
+    t_ns: int
+    sigma_m_s: float
+
+
+Aiding = AidedPlace | AidedFlow | AidedHeight | AidedRest
 
 
 class Reckoned(NamedTuple):
@@ -131,6 +138,8 @@ class InertialNavigation:
                 self._take(first)
             elif isinstance(first, AidedFlow):
                 self._take_flow(first)
+            elif isinstance(first, AidedRest):
+                self._take_rest(first)
             else:
                 self._take_height(first)
         while len(self._waiting) > 1 and (
@@ -266,6 +275,16 @@ class InertialNavigation:
         covariance = height_m**2 * (turn[:2] @ flow.covariance_hz2 @ turn[:2].T + along @ along.T)
         covariance += LEAST_SIGMA_FLOW_M_S**2 * np.eye(2)
         self._correct(flow.t_ns, change, seen, np.zeros(2), covariance, considered=(DOWN, GROUND))
+
+    def _take_rest(self, rest: AidedRest) -> None:
+        """Correct by a velocity of nothing."""
+        if self._t_ns is None or rest.t_ns <= self._t_ns:
+            return
+        change = self._integral.between(self._t_ns, rest.t_ns)
+        if change is not None:
+            seen = np.zeros((3, N_STATE))
+            seen[:, VELOCITY] = np.eye(3)
+            self._correct(rest.t_ns, change, seen, np.zeros(3), rest.sigma_m_s**2 * np.eye(3))
 
     def _take_height(self, measured: AidedHeight) -> None:
         """Correct by a barometric height; the first gives the barometer's zero."""

@@ -14,6 +14,7 @@ from companion.estimation.inertial.inertial_navigation import (
     AidedFlow,
     AidedHeight,
     AidedPlace,
+    AidedRest,
     InertialNavigation,
 )
 from companion.estimation.lift_off.lift_off_flow import LiftOffFlow
@@ -29,6 +30,10 @@ FLOW_EVERY_NS = 200_000_000
 """Flow aids inertial navigation so often: what it is off by stays the same for some frames."""
 SIGMA_FLOW_HZ = 0.02
 """Of flow, by errors of the attitude from frame to frame: 1 mrad in 50 ms."""
+STILL_HZ = 0.25
+SIGMA_STILL_M_S = STILL_HZ * LEGS_M
+"""Flow below it is of a vehicle that stands, and the velocity it may have on such legs. However
+a camera sits, it sees nothing move there: this aids before a lift-off has shown the mount."""
 HEIGHT_EVERY_NS, LEAST_HEIGHT_M = 200_000_000, 2.0
 """Lower, what the rotors blow is reflected by the ground, and presses on a barometer."""
 MAP_AIDED_NS = 500_000_000
@@ -46,7 +51,7 @@ class GroundAiding:
         """Judge of flow at the last lift-off: only flow that has shown it aids."""
         self._held: deque[AidedPlace | AidedHeight] = deque()
         """Of the latest frames while the vehicle stands; empty when it does not."""
-        self._waiting: list[AidedFlow | AidedHeight] = []
+        self._waiting: list[AidedFlow | AidedHeight | AidedRest] = []
         """Since the last frame but one: flow is measured late, and all is to come in order."""
         self._stood_down_m = 0.0
         self._height_ns = self._flow_ns = self._frame_ns = 0
@@ -94,11 +99,11 @@ class GroundAiding:
         self._held.clear()
         high = self._stood_down_m - down_m > LEAST_HEIGHT_M
         for measured in self._before(self._frame_ns):
-            if wants and (high or isinstance(measured, AidedFlow)):
+            if wants and (high or not isinstance(measured, AidedHeight)):
                 self._navigation.aid(measured)
         self._frame_ns = t_ns
 
-    def _before(self, t_ns: int) -> list[AidedFlow | AidedHeight]:
+    def _before(self, t_ns: int) -> list[AidedFlow | AidedHeight | AidedRest]:
         """Take out, in order, what waits from before a time."""
         found = sorted((m for m in self._waiting if m.t_ns < t_ns), key=lambda m: m.t_ns)
         self._waiting = [m for m in self._waiting if m.t_ns >= t_ns]
@@ -109,17 +114,29 @@ class GroundAiding:
 
         True where it has just been found to contradict the accelerometers: the mount is wrong.
         """
-        reckoned, contradicts = self._navigation.at(measured.t_ns + delay_ns), False
-        if reckoned is not None:
-            velocity_m_s = self._navigation.world_from_attitude.T @ reckoned.velocity_m_s
-            contradicts = self.lift_off_flow.take(
-                velocity_m_s, reckoned.sigma_velocity_m_s, measured
-            )
-        if not self.lift_off_flow.agrees or measured.t_ns - self._flow_ns < FLOW_EVERY_NS:
-            return contradicts
-        self._flow_ns = measured.t_ns
+        reckoned, judge = self._navigation.at(measured.t_ns + delay_ns), self.lift_off_flow
+        if reckoned is None:
+            return False
+        still = float(np.linalg.norm(measured.velocity_hz)) < STILL_HZ
+        if still and judge.agrees is None:
+            risen_m = self._stood_down_m - float(reckoned.place_m[2])
+            if risen_m < LEGS_M and self._is_due(measured):
+                self._waiting.append(AidedRest(measured.t_ns + delay_ns, SIGMA_STILL_M_S))
+            return False
+        velocity_m_s = self._navigation.world_from_attitude.T @ reckoned.velocity_m_s
+        if judge.take(velocity_m_s, reckoned.sigma_velocity_m_s, measured):
+            return True
+        if not judge.agrees or not self._is_due(measured):
+            return False
         covariance_hz2 = measured.covariance_hz2 + SIGMA_FLOW_HZ**2 * np.eye(3)
         self._waiting.append(
             AidedFlow(measured.t_ns + delay_ns, measured.velocity_hz, covariance_hz2)
         )
         return False
+
+    def _is_due(self, measured: GroundVelocity) -> bool:
+        """True once in FLOW_EVERY_NS."""
+        if measured.t_ns - self._flow_ns < FLOW_EVERY_NS:
+            return False
+        self._flow_ns = measured.t_ns
+        return True

@@ -1,0 +1,85 @@
+"""Optical flow aids inertial navigation on the ground: what sees nothing move has not moved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_navigation import InertialNavigation
+from companion.estimation.lift_off.ground_aiding import LEGS_M, GroundAiding
+from companion.estimation.lift_off.optical_flow import GroundVelocity
+from companion.geometry.transforms import Array
+from companion.telemetry import AttitudeSample, ImuSample
+
+STEP_NS, IMU_STEP_NS = 50_000_000, 10_000_000
+STOOD_M = np.array([2.0, 1.0, -0.5])
+G_M_S2 = 9.80665
+TILTED_RAD = np.radians(2.0)
+
+
+class Vehicle:
+    """One that stands for two seconds; afterwards its stand is not known to last."""
+
+    def __init__(self) -> None:
+        self._integral = AccelerationIntegral()
+        self.navigation = InertialNavigation(self._integral)
+        self.ground = GroundAiding(self.navigation)
+        self.t_ns, self.contradicted = 0, False
+        for _ in range(40):
+            self._measure(np.zeros(3), 0.0)
+            self.ground.stand(self.t_ns, STOOD_M)
+
+    def go_on(
+        self, seconds: float, accelerates_m_s2: Array, tilted_rad: float, flow_hz: Array | None
+    ) -> None:
+        """By its own measurements; its autopilot's pitch is wrong by `tilted_rad`."""
+        for _ in range(round(seconds * 1e9 / STEP_NS)):
+            self._measure(accelerates_m_s2, tilted_rad)
+            self.ground.fly(self.t_ns, float(self.place_m[2]), True)
+            if flow_hz is not None:
+                seen = GroundVelocity(self.t_ns - STEP_NS // 2, flow_hz, 0.01**2 * np.eye(3))
+                self.contradicted |= self.ground.take_flow(seen, 0)
+
+    @property
+    def place_m(self) -> Array:
+        found = self.navigation.at(self.t_ns)
+        assert found is not None
+        return found.place_m
+
+    @property
+    def velocity_m_s(self) -> Array:
+        found = self.navigation.at(self.t_ns)
+        assert found is not None
+        return found.velocity_m_s
+
+    def _measure(self, accelerates_m_s2: Array, tilted_rad: float) -> None:
+        for _ in range(STEP_NS // IMU_STEP_NS):
+            self.t_ns += IMU_STEP_NS
+            force = accelerates_m_s2 - np.array([0.0, 0.0, G_M_S2])
+            half = 0.5 * tilted_rad
+            said = np.array([np.cos(half), 0.0, np.sin(half), 0.0])
+            self._integral.take(ImuSample(self.t_ns, np.zeros(3), force))
+            self._integral.take(AttitudeSample(self.t_ns, said))
+
+
+def test_a_vehicle_that_rocks_on_its_gear_does_not_move_nor_is_its_mount_wrong() -> None:
+    """PX4's attitude is wrong by two degrees as its motors start, and its stand ends.
+
+    They shake its accelerometers, too, which show it sink.
+    """
+    unaided, aided, sinks_m_s2 = Vehicle(), Vehicle(), np.array([0.0, 0.0, 0.1])
+    unaided.go_on(2.5, sinks_m_s2, TILTED_RAD, None)
+    aided.go_on(2.5, sinks_m_s2, TILTED_RAD, np.array([0.02, -0.07, 0.01]))
+    assert np.linalg.norm(unaided.velocity_m_s[:2]) > 0.7 and unaided.velocity_m_s[2] > 0.2
+    assert np.linalg.norm(aided.velocity_m_s) < 0.1
+    assert np.linalg.norm(aided.place_m - STOOD_M) < 0.12
+    assert not aided.contradicted and aided.ground.lift_off_flow.agrees is None
+
+
+def test_a_picture_in_which_nothing_moves_holds_no_vehicle_that_has_risen() -> None:
+    """A camera that sees nothing but its own vehicle."""
+    vehicle = Vehicle()
+    up_and_north = np.array([0.5, 0.0, -2.0])
+    vehicle.go_on(2.0, up_and_north, 0.0, np.zeros(3))
+    assert STOOD_M[2] - vehicle.place_m[2] > 10.0 * LEGS_M
+    assert vehicle.velocity_m_s[0] > 0.5 * (2.0 - 0.7)
