@@ -69,7 +69,7 @@ def replay_as_flown(
                 lambda seq: _known(of_frame, seq),
             )
             if step.sent
-            for payload in payloads_of(pose, told.config.feedback.mode)
+            for payload in payloads_of(pose, told.config.feedback.mode, told.firmware)
         ]
     finally:
         flight.recording.close()

@@ -1,7 +1,6 @@
 """Pose messages: the one place where poses leave our frames and units.
 
-The world of a pose is NED-aligned and metric. MAV_FRAME_LOCAL_FRD is that with a heading of its
-own, which both ArduPilot and PX4 take; MAV_FRAME_BODY_FRD is our body.
+The world of a pose is NED-aligned and metric; MAV_FRAME_BODY_FRD is our body.
 
 Covariances are of the axes of a message's frame. Those of positions and velocities are isotropic,
 and so the same in any frame; of the attitude, tilt about the level axes stands for roll and pitch,
@@ -18,26 +17,34 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.estimation.gate.pose_gate import PoseToSend
 from companion.geometry.transforms import Array, quaternion_from_rotation
+from drivers.mavlink.vehicle import Firmware
 
 N_COVARIANCE = 21
 ROW_STARTS = (0, 6, 11, 15, 18, 20)
 """Indices of the diagonal of a 6 x 6 matrix in its upper triangle, row by row."""
+FRAMES: dict[Firmware, int] = {
+    "ardupilot": mavlink.MAV_FRAME_LOCAL_FRD,
+    "px4": mavlink.MAV_FRAME_LOCAL_NED,
+    "other": mavlink.MAV_FRAME_LOCAL_FRD,
+}
+"""ArduPilot takes no other than LOCAL_FRD, and takes it for NED. PX4 turns one by what its compass
+differs from our heading, which changes: in its simulator by 5 degrees, 2 m at 20 m from home."""
 UNKNOWN = [math.nan] * N_COVARIANCE
 
 
-def pose_messages(pose: PoseToSend, mode: str) -> tuple[Any, ...]:
-    """Messages of a pose, as `feedback.mode` wants them."""
-    return (odometry_message(pose),) if mode == "odometry" else vision_messages(pose)
+def pose_messages(pose: PoseToSend, mode: str, firmware: Firmware) -> tuple[Any, ...]:
+    """Messages of a pose, as `feedback.mode` and the autopilot want them."""
+    return (odometry_message(pose, firmware),) if mode == "odometry" else vision_messages(pose)
 
 
-def odometry_message(pose: PoseToSend) -> Any:
-    """ODOMETRY: position and attitude in LOCAL_FRD, velocity in BODY_FRD, microseconds."""
+def odometry_message(pose: PoseToSend, firmware: Firmware) -> Any:
+    """ODOMETRY: position and attitude in NED, velocity in BODY_FRD, microseconds."""
     rotation = pose.world_from_body.rotation
     position = pose.world_from_body.translation
     velocity_body = rotation.T @ pose.velocity_world_m_s
     return mavlink.MAVLink_odometry_message(
         time_usec=pose.t_ns // 1000,
-        frame_id=mavlink.MAV_FRAME_LOCAL_FRD,
+        frame_id=FRAMES[firmware],
         child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
         x=float(position[0]), y=float(position[1]), z=float(position[2]),
         q=[float(each) for each in quaternion_from_rotation(rotation)],

@@ -20,7 +20,8 @@ from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose
 from companion.messages import FrameTracked, Odometry, TrackState
 from companion.telemetry import Telemetry
-from drivers.mavlink.pose_messages import pose_messages
+from drivers.mavlink.pose_messages import FRAMES, pose_messages
+from drivers.mavlink.vehicle import Firmware
 from drivers.mavlink.wire.packet_stream import MavlinkStream
 from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recorder import CONFIG_TOML, NOTES
@@ -50,6 +51,16 @@ class Decisions:
     """Warnings and good news, in words."""
     sent: list[tuple[int, bytes]] = field(default_factory=list)
     """Id and payload of the messages with poses that were sent."""
+
+    @property
+    def firmware(self) -> Firmware:
+        """A firmware whose poses are as those that were sent, by the frame that they state."""
+        layout = mavlink.MAVLink_odometry_message.unpacker
+        for kind, payload in self.sent:
+            if kind == mavlink.MAVLINK_MSG_ID_ODOMETRY:
+                *_, frame, _, _, _, _ = layout.unpack(payload.ljust(layout.size, b"\0"))
+                return next((each for each in FRAMES if FRAMES[each] == frame), "other")
+        return "other"
 
 
 def decisions_of(recording: Recording) -> Decisions:
@@ -85,10 +96,10 @@ def decisions_of(recording: Recording) -> Decisions:
     return found
 
 
-def payloads_of(pose: PoseToSend, mode: str) -> list[tuple[int, bytes]]:
+def payloads_of(pose: PoseToSend, mode: str, firmware: Firmware) -> list[tuple[int, bytes]]:
     """Id and payload of the messages of a pose."""
     codec = mavlink.MAVLink(None)
-    packed = b"".join(bytes(each.pack(codec)) for each in pose_messages(pose, mode))
+    packed = b"".join(bytes(each.pack(codec)) for each in pose_messages(pose, mode, firmware))
     return [(packet.message_id, packet.payload) for packet in MavlinkStream().feed(packed, 0)]
 
 

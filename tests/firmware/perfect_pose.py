@@ -13,6 +13,7 @@ from companion.estimation.gate.pose_gate import PoseToSend
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Pose, rotation_from_quaternion
 from drivers.mavlink.pose_messages import odometry_message
+from drivers.mavlink.vehicle import Firmware
 from tests.firmware.ground import COMPANION, Ground
 
 SIGMA_M, SIGMA_M_S, SIGMA_RAD = 0.02, 0.05, 0.01
@@ -23,8 +24,11 @@ ORIGIN_AFTER_S = 6.0
 class PerfectPose:
     """Sends them over the companion's side of the cable, as often as a camera would; `with`."""
 
-    def __init__(self, ground: Ground, port: int, origin: GeoOrigin, rate_hz: float) -> None:
+    def __init__(
+        self, ground: Ground, port: int, origin: GeoOrigin, rate_hz: float, firmware: Firmware
+    ) -> None:
         self._ground, self._origin, self._period_s = ground, origin, 1.0 / rate_hz
+        self._firmware: Firmware = firmware
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", port))
         self._socket.settimeout(0.05)
@@ -57,7 +61,7 @@ class PerfectPose:
             if cable is None:
                 continue
             now_s = time.time()
-            messages = [odometry_message(self._true_pose())]
+            messages = [odometry_message(self._true_pose(), self._firmware)]
             if now_s - said_s > 1.0:
                 said_s = now_s
                 messages.append(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))

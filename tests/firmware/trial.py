@@ -168,7 +168,8 @@ class Trial:
         """As its service does."""
         if self.conditions.perfect:
             self._open.enter_context(PerfectPose(
-                self.ground, self._companion_port, self.firmware.home, CAMERA_HZ
+                self.ground, self._companion_port, self.firmware.home, CAMERA_HZ,
+                "px4" if isinstance(self.firmware, Px4) else "ardupilot",
             ))  # fmt: skip
             time.sleep(PERFECT_S)
             self.status = {"feedback": {"sending": True}}

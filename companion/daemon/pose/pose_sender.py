@@ -162,9 +162,10 @@ class PoseSender:
         )
 
     def _send(self, pose: PoseToSend | None) -> None:
-        if pose is None or not self._link.alive:
+        vehicle = self._link.vehicle
+        if pose is None or vehicle is None or not self._link.alive:
             return
-        for message in pose_messages(pose, self._config.mode):
+        for message in pose_messages(pose, self._config.mode, vehicle.firmware):
             self._link.send(message)
         now_ns = self._clock.now_ns()
         self._n_sent += 1

@@ -404,7 +404,7 @@ def test_unknown_heading_variance_is_sent_as_unknown() -> None:
     pose = PoseToSend(
         10**12, Pose.identity(), np.zeros(3), 0.1, math.inf, 0.01, math.inf, 80, 0
     )  # fmt: skip
-    message = odometry_message(pose)
+    message = odometry_message(pose, "ardupilot")
     assert message.pose_covariance[18] == pytest.approx(1e-4)
     assert math.isnan(message.pose_covariance[20])
     assert math.isnan(message.velocity_covariance[0])
@@ -420,8 +420,11 @@ def test_odometry_message() -> None:
         1_234_567_890_123, Pose(rotation_from_quaternion(ATTITUDE), np.array([1.0, 2.0, -3.0])),
         np.array([1.0, 0.5, -0.2]), 0.1, 0.2, 0.01, 0.05, 80, 7,
     )  # fmt: skip
-    message = odometry_message(pose)
-    assert (message.frame_id, message.child_frame_id) == (20, 12)
+    message = odometry_message(pose, "ardupilot")
+    assert (message.frame_id, message.child_frame_id) == (20, 12), "LOCAL_FRD"
+    to_px4 = odometry_message(pose, "px4")
+    assert (to_px4.frame_id, to_px4.child_frame_id) == (1, 12), "LOCAL_NED: it would turn the other"
+    assert (to_px4.x, to_px4.y, to_px4.z) == (message.x, message.y, message.z) == (1.0, 2.0, -3.0)
     assert (message.time_usec, message.reset_counter, message.quality) == (1_234_567_890, 7, 80)
     assert np.allclose(message.q, ATTITUDE)
     body = pose.world_from_body.rotation.T @ pose.velocity_world_m_s

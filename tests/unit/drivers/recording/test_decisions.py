@@ -1,0 +1,32 @@
+"""What a recording says of the poses that were sent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.config import Config
+from companion.estimation.gate.pose_gate import PoseToSend
+from companion.geometry.transforms import Pose
+from drivers.mavlink.vehicle import Firmware
+from drivers.recording.decisions import Decisions, payloads_of
+
+POSE = PoseToSend(
+    10**12, Pose(np.eye(3), np.array([1.0, 2.0, -3.0])), np.array([0.5, 0.0, 0.1]),
+    0.1, 0.2, 0.01, 0.05, 80, 0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4", "other"])
+@pytest.mark.parametrize("mode", ["odometry", "vision_position"])
+def test_poses_are_made_again_for_the_firmware_that_they_were_sent_to(
+    firmware: Firmware, mode: str
+) -> None:
+    sent = payloads_of(POSE, mode, firmware)
+    told = Decisions(Config(), lossless=True, sent=sent)
+    assert payloads_of(POSE, mode, told.firmware) == sent
+
+
+def test_what_one_firmware_gets_another_does_not() -> None:
+    to_px4, to_ardupilot = (payloads_of(POSE, "odometry", each) for each in ("px4", "ardupilot"))
+    assert to_px4 != to_ardupilot
