@@ -21,6 +21,7 @@ Ints = NDArray[np.int64]
 
 WINDOW_NS = 10_000_000_000
 MIN_SPAN_NS = 3_000_000_000
+MIN_PAIRS = 20
 SPACING_NS = 45_000_000
 """A little under the period of 20 frames/s: every frame of such a camera."""
 LAGS_NS = (200_000_000, 500_000_000)
@@ -40,6 +41,10 @@ camera rotates independently; jitter of 30 ms leaves ratios up to 0.3 over 0.2 s
 KEPT_QUANTILE = 0.85
 """Larger rotations of the body are excluded: a heading reset of the autopilot rotates only its own
 estimate, by tens of degrees, in at most one pair of eight."""
+CORRECTED_RAD, CORRECTED_RATIO = np.radians(0.7), 0.1
+"""Where a rotation differs by more from what the autopilot's own rates add up to, it has corrected
+its estimate: PX4 turns its heading by some degrees a second after a take-off. Of such a rotation
+the camera sees nothing, gimbal or not."""
 OVERLAP_INFLATION = 3.0
 """Reduction of the degrees of freedom by overlapping spans."""
 
@@ -89,14 +94,14 @@ class RotationComparison:
     """Collects attitudes of both for some seconds and compares their relative rotations."""
 
     def __init__(self) -> None:
-        self._body: deque[tuple[int, Array]] = deque()
+        self._body: deque[AttitudeSample] = deque()
         self._camera: deque[tuple[int, Array]] = deque()
 
     def add(self, sample: AttitudeSample) -> None:
         """Add an attitude of the autopilot; out-of-order samples are dropped."""
-        if not self._body or sample.t_ns > self._body[-1][0]:
-            self._body.append((sample.t_ns, np.asarray(sample.ned_from_body, np.float64)))
-            while self._body[0][0] < sample.t_ns - WINDOW_NS - int(OFFSETS_NS[-1]) * 2:
+        if not self._body or sample.t_ns > self._body[-1].t_ns:
+            self._body.append(sample)
+            while self._body[0].t_ns < sample.t_ns - WINDOW_NS - int(OFFSETS_NS[-1]) * 2:
                 self._body.popleft()
 
     def take(self, t_ns: int, map_from_camera: Array) -> None:
@@ -115,29 +120,51 @@ class RotationComparison:
         """Agreement for a mount (3, 3); None with too little data."""
         if len(self._body) < 2 or not self._camera:
             return None
-        known_ns = (self._body[0][0] - int(OFFSETS_NS[0]), self._body[-1][0] - int(OFFSETS_NS[-1]))
+        known_ns = (
+            self._body[0].t_ns - int(OFFSETS_NS[0]), self._body[-1].t_ns - int(OFFSETS_NS[-1])
+        )  # fmt: skip
         camera = [(t, r) for t, r in self._camera if known_ns[0] <= t <= known_ns[1]]
         if not camera or camera[-1][0] - camera[0][0] < MIN_SPAN_NS:
             return None
         t_ns = np.array([t for t, _ in camera])
         first, second = _pairs(t_ns)
-        if len(first) < 20:
+        if len(first) < MIN_PAIRS:
             return None
         rotation = np.stack([r for _, r in camera])
         camera_rotation = vectors_from_rotations(
             rotation[first].transpose(0, 2, 1) @ rotation[second]
         )
         camera_rotation = camera_rotation @ body_from_camera.T
-        body_t_ns = np.array([t for t, _ in self._body])
-        body_q = np.stack([q for _, q in self._body])
+        body_t_ns = np.array([each.t_ns for each in self._body])
+        body_q = np.stack([np.asarray(each.ned_from_body, np.float64) for each in self._body])
         at = _interpolated(body_t_ns, body_q, t_ns[None] + OFFSETS_NS[:, None])
         body_rotation = _relative_rotations(at[:, first], at[:, second])
         left = np.median(np.linalg.norm(camera_rotation - body_rotation, axis=2), axis=1)
         best = int(left.argmin())
         span_s = float(t_ns[-1] - t_ns[0]) * 1e-9
-        return _regress(
-            camera_rotation, body_rotation[best], span_s, float(OFFSETS_NS[best]) * 1e-9
-        )
+        turned = self._turned(body_t_ns, t_ns + OFFSETS_NS[best])
+        body_rotation = body_rotation[best]
+        if turned is not None:
+            apart = np.linalg.norm(body_rotation - (turned[second] - turned[first]), axis=1)
+            size = np.linalg.norm(body_rotation, axis=1)
+            kept = apart < CORRECTED_RAD + CORRECTED_RATIO * size
+            if np.count_nonzero(kept) < MIN_PAIRS:
+                return None
+            camera_rotation, body_rotation = camera_rotation[kept], body_rotation[kept]
+        return _regress(camera_rotation, body_rotation, span_s, float(OFFSETS_NS[best]) * 1e-9)
+
+    def _turned(self, body_t_ns: Ints, at_ns: Ints) -> Array | None:
+        """Sums (S, 3) of the body's rates up to some times, rad; None where rates are missing.
+
+        Their differences are rotations in body axes, as long as these are small.
+        """
+        rates = [each.rates_body_rad_s for each in self._body if each.rates_body_rad_s is not None]
+        if len(rates) < len(self._body):
+            return None
+        rate = np.stack(rates)
+        step_s = np.diff(body_t_ns)[:, None] * 1e-9
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum((rate[1:] + rate[:-1]) / 2 * step_s, 0)])
+        return np.stack([np.interp(at_ns, body_t_ns, each) for each in sums.T], axis=1)
 
 
 def _pairs(t_ns: Ints) -> tuple[Ints, Ints]:

@@ -15,6 +15,7 @@ from companion.geometry.transforms import (
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
+    vector_from_rotation,
 )
 from companion.telemetry import AttitudeSample
 from tests.support.flights.scene import DOWN_LOOKING
@@ -64,15 +65,23 @@ def result(
     body_as: Callable[[float], Array] = body,
     mount: Array = DOWN_LOOKING,
     rate_hz: float = 20.0,
+    turns_as: Callable[[float], Array] | None = None,
 ) -> RotationAgreement:
-    """Agreement at the end of a flight with these stamps."""
+    """Agreement at the end of a flight with these stamps.
+
+    The autopilot tells rates of a body that really turns as `turns_as`; none without.
+    """
     rng = np.random.default_rng(3)
     test = RotationComparison()
     heading = rotation_from_vector(np.array([0.0, 0.0, 1.1]))
     for k in range(int((SECONDS + 1.0) * 50)):
         noise = rotation_from_vector(rng.normal(scale=0.0015, size=3))
         attitude = quaternion_from_rotation(body_as(k / 50) @ noise)
-        test.add(AttitudeSample(T0_NS + int(k / 50 * 1e9), attitude))
+        rates = None
+        if turns_as is not None:
+            step = turns_as(k / 50 - 0.01).T @ turns_as(k / 50 + 0.01)
+            rates = vector_from_rotation(step) / 0.02 + rng.normal(scale=0.02, size=3)
+        test.add(AttitudeSample(T0_NS + int(k / 50 * 1e9), attitude, rates))
     for k in range(int(SECONDS * rate_hz)):
         t_s = k / rate_hz
         noise = rotation_from_vector(rng.normal(scale=0.001, size=3))
@@ -107,10 +116,11 @@ def test_late_and_jittery_camera_is_body_fixed(delay_s: float, jitter_s: float, 
 
 @pytest.mark.parametrize("camera_on", [levelled, without_roll, fixed, swept])
 @pytest.mark.parametrize("jitter_s", [0.0, 0.03])
+@pytest.mark.parametrize("turns_as", [None, body], ids=["without rates", "with rates"])
 def test_gimbal_is_detected_as_stabilised(
-    camera_on: Callable[[float], Array], jitter_s: float
+    camera_on: Callable[[float], Array], jitter_s: float, turns_as: Callable[[float], Array] | None
 ) -> None:
-    found = result(late(0.05, jitter_s, "uniform"), camera_on)
+    found = result(late(0.05, jitter_s, "uniform"), camera_on, turns_as=turns_as)
     assert found.stabilised
     assert not found.body_fixed
 
@@ -136,6 +146,24 @@ def test_heading_reset_is_no_gimbal() -> None:
 
     found = result(camera_on=camera_on, body_as=body_as)
     assert not found.stabilised
+    assert found.body_fixed
+
+
+def test_a_heading_that_is_corrected_for_seconds_is_no_gimbal() -> None:
+    """PX4 turns its heading by some degrees a second after a take-off; its rates do not show it."""
+
+    def leaning(t_s: float) -> Array:
+        return rotation_from_quaternion(
+            quaternion_from_euler(*(euler(t_s) * [0.5, 0.5, 0.0] + [0.25, 0.0, 0.0]))
+        )
+
+    def corrected(t_s: float) -> Array:
+        heading_rad = np.radians(9.0) * min(max(t_s - 1.0, 0.0), 5.0)
+        return rotation_from_vector(np.array([0.0, 0.0, heading_rad])) @ leaning(t_s)
+
+    assert result(camera_on=leaning, body_as=corrected).stabilised, "by the attitude alone"
+    found = result(camera_on=leaning, body_as=corrected, turns_as=leaning)
+    assert not found.stabilised and not found.rotates_independently
     assert found.body_fixed
 
 
