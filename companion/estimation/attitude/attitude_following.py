@@ -42,9 +42,9 @@ KEPT_QUANTILE = 0.85
 """Larger rotations of the body are excluded: a heading reset of the autopilot rotates only its own
 estimate, by tens of degrees, in at most one pair of eight."""
 CORRECTED_RAD, CORRECTED_RATIO = np.radians(0.7), 0.1
-"""Where a rotation differs by more from what the autopilot's own rates add up to, it has corrected
-its estimate: PX4 turns its heading by some degrees a second after a take-off. Of such a rotation
-the camera sees nothing, gimbal or not."""
+"""A rotation that differs by more from what the autopilot's own rates add up to is a correction of
+its estimate: PX4 turns its heading by some degrees a second after a take-off. The camera sees
+nothing of such a rotation, gimbal or not."""
 OVERLAP_INFLATION = 3.0
 """Reduction of the degrees of freedom by overlapping spans."""
 
