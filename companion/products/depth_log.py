@@ -38,12 +38,12 @@ class Spent:
         return Spent(kernel_ms=kernels, host_ms=host_ms, **copies)
 
     def rounded(self) -> dict[str, Any]:
-        """Rounded for JSON."""
+        """For JSON, to the nanosecond, as devices count: a small image takes some hundred."""
         return {
-            "upload_ms": round(self.upload_ms, 3),
-            "kernel_ms": {name: round(ms, 3) for name, ms in self.kernel_ms.items()},
-            "copy_ms": round(self.copy_ms, 3), "read_back_ms": round(self.read_back_ms, 3),
-            "host_ms": round(self.host_ms, 3),
+            "upload_ms": round(self.upload_ms, 6),
+            "kernel_ms": {name: round(ms, 6) for name, ms in self.kernel_ms.items()},
+            "copy_ms": round(self.copy_ms, 6), "read_back_ms": round(self.read_back_ms, 6),
+            "host_ms": round(self.host_ms, 6),
         }  # fmt: skip
 
 
