@@ -84,6 +84,11 @@ class RotationAgreement:
         return bool(in_range.all()) and not self.rotates_independently
 
     @property
+    def rotates_otherwise(self) -> bool:
+        """True if the camera is known not to rotate as the body does."""
+        return self.stabilised or self.rotates_independently
+
+    @property
     def rotates_independently(self) -> bool:
         """True if the camera rotates by more than the body's rotation and clock errors explain."""
         body_rad = float(np.linalg.norm(self.body_rad))

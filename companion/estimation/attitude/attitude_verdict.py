@@ -155,13 +155,20 @@ class AttitudeVerdict:
         found = self._tilt.result(rotation_of, body_from_camera)
         if found is None:
             return None
-        body_fixed = self._agreement is not None and self._agreement.body_fixed
-        moved_rad = found.spread_rad if body_fixed else found.spread_with_gimbal_rad()
-        absolute_rad = 0.0
+        agreement = self._agreement
+        moved_rad = found.spread_rad
+        if agreement is None or not agreement.body_fixed:
+            moved_rad = min(moved_rad, found.spread_with_gimbal_rad())
+        max_moved_rad, absolute_rad = float(MAX_TILT_RAD), 0.0
         if ned_from_map is not None and found.mount_rad < float(MAX_TILT_RAD):
             cosine = float((ned_from_map @ found.map_from_ned)[2, 2])
             absolute_rad = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        if max(moved_rad, absolute_rad) < float(MAX_TILT_RAD):
+            contradicted = agreement is None or agreement.rotates_otherwise
+            if self._consistent and not contradicted and absolute_rad < float(MAX_TILT_RAD):
+                # Neither map nor mount moves, and the autopilot's vertical, which swings where its
+                # own aiding has failed for seconds, may be off that of the map to both sides.
+                max_moved_rad = 2.0 * float(MAX_TILT_RAD)
+        if moved_rad < max_moved_rad and absolute_rad < float(MAX_TILT_RAD):
             self._tilted_since_ns = None
             if found.spread_rad < float(MAX_TILT_RAD):
                 self._agreed_ns = t_ns
@@ -172,8 +179,7 @@ class AttitudeVerdict:
             self._tilted_since_ns = t_ns
         if t_ns - self._tilted_since_ns < MIN_TILTED_NS:
             return None
-        moved = moved_rad >= float(MAX_TILT_RAD)
-        if moved and self._consistent:
+        if moved_rad >= max_moved_rad and self._consistent:
             return self._reject(t_ns, NOT_BODY_FIXED)
         if self.n_reinitialised >= MAX_REINITIALISATIONS:
             return self._reject(t_ns, MOUNT_DISAGREES)

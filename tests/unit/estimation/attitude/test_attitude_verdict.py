@@ -181,6 +181,21 @@ def test_gimbal_is_detected_and_its_end_too() -> None:
     assert flight.used
 
 
+@pytest.mark.parametrize(("swing_deg", "used"), [(4.0, True), (10.0, False)])
+def test_autopilots_vertical_may_swing_about_a_map_known_to_be_level(
+    swing_deg: float, used: bool
+) -> None:
+    """As that of an autopilot after seconds without aiding; camera and body turn alike."""
+
+    def swung(t_s: float) -> Array:
+        angle = np.radians(swing_deg) * np.sin(0.5 * (t_s - 20.0)) if t_s > 20.0 else 0.0
+        return rotation_from_vector(np.array([0.0, angle, 0.0])) @ body(t_s)
+
+    flight = fly(30.0, lambda t_s, since_s: body(t_s), body_at=swung, ned_from_map=MAP_FROM_NED.T)
+    assert not flight.anew_s
+    assert (not flight.warned) is used
+
+
 def test_panned_gimbal_on_a_hovering_body_is_detected() -> None:
     """The map was consistent for long, so it is not the cause."""
 
