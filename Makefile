@@ -15,13 +15,16 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
 
-# First what only computes, on all cores; then, with nothing beside them, tests that measure times.
-# Of these, files in which one fails are run once more: a machine that others use too may be too busy
-# for one, and in some files one flight goes through all tests.
+# First what only computes; then flights in real time, which wait more than they compute, three at a
+# time too; last what wants the computer for itself. Files in which one of these fails are run once
+# more, one after the other: a machine that others use too may be too busy for one, and in some files
+# one flight goes through all tests.
 test: lint opencl
-	$(BIN)/pytest -m "not alone" -n logical --maxprocesses 4 --dist loadfile
-	$(BIN)/pytest -m alone || { [ $$? -eq 1 ] && $(BIN)/pytest -m alone $$($(FAILED_FILES)); }
+	$(BIN)/pytest -m "not real_time" -n 3 --dist loadfile
+	$(BIN)/pytest -m "real_time and not alone" -n 3 --dist loadfile || $(ONCE_MORE)
+	$(BIN)/pytest tests/system tests/firmware || $(ONCE_MORE)
 
+ONCE_MORE = { [ $$? -eq 1 ] && $(BIN)/pytest -m real_time $$($(FAILED_FILES)); }
 FAILED_FILES := $(BIN)/python -c "import json; \
   failed = json.load(open('.pytest_cache/v/cache/lastfailed')); \
   print(*sorted({name.partition('::')[0] for name in failed}))"

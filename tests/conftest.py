@@ -18,7 +18,8 @@ import pytest
 from tests.support.left_behind import left_since, running, watch_tasks
 from tests.support.processes.steal import FlownAgain
 
-ALONE = [Path(__file__).with_name(name) for name in ("live", "system")]
+MARKS = {"live": ("real_time",), "system": ("real_time", "alone")}
+"""Of the tests in these folders."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -27,8 +28,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if any(folder in item.path.parents for folder in ALONE):
-            item.add_marker("alone")
+        for mark in MARKS.get(item.path.relative_to(Path(__file__).parent).parts[0], ()):
+            item.add_marker(mark)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ import pytest
 from tests.firmware.__main__ import FIRMWARES, fly
 from tests.firmware.experiments import EXPERIMENTS
 
-pytestmark = [pytest.mark.alone, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.real_time, pytest.mark.alone, pytest.mark.timeout(400)]
 
 
 @pytest.fixture(params=list(FIRMWARES))

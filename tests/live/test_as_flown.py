@@ -12,8 +12,6 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from companion.config import MEASUREMENTS, CameraConfig, TelemetryConfig
 from companion.telemetry import MEASURED, PositionSample
 from drivers.recording.decisions import decisions_of
@@ -71,7 +69,6 @@ def again(path: Path, out: Path) -> tuple[Run, dict[str, Any]]:
     return done, found
 
 
-@pytest.mark.alone
 def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> None:
     """Of what was believed: what was not is in the recording as well."""
     path = flown(tmp_path, "png", ("attitude", "imu", "satellites"), has_imu=True)
@@ -91,7 +88,6 @@ def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> No
     assert "the same to the byte" in done.stdout
 
 
-@pytest.mark.alone
 def test_compressed_images_give_the_decisions_of_the_gate_again(tmp_path: Path) -> None:
     path = flown(tmp_path, "mjpeg")
     _, found = again(path, tmp_path / "again")

@@ -112,7 +112,7 @@ def test_poses_are_level_two_seconds_after_a_tilted_start(
 
 
 @pytest.mark.parametrize(("kind", "tilt_deg"), [("axes", 10.0), ("turn", 20.0), ("depth", 40.0)])
-@pytest.mark.alone
+@pytest.mark.real_time
 def test_poses_of_the_live_stage_are_level_two_seconds_after_a_tilted_start(
     sample: tuple[Flight, list[Frame], list[Telemetry]], kind: str, tilt_deg: float
 ) -> None:

@@ -21,6 +21,8 @@ SPAN_S, SHARE = 2.0, 0.2
 """A fifth of all processors taken for two seconds: poses are late, the dense map is shed."""
 FLIGHTS = 3
 MOST_AGAIN_S = 1200.0
+FLOWN_AGAIN = "flown again"
+"""A property of a report, which a worker of pytest-xdist sends with it."""
 
 
 class Steal:
@@ -62,7 +64,7 @@ def worst_share(seen: Sequence[tuple[float, float, float]]) -> float:
 
 
 class FlownAgain:
-    """The rule, as a plugin of pytest. For tests marked `alone`."""
+    """The rule, as a plugin of pytest. For tests marked `real_time`."""
 
     def __init__(self, steal: Steal | None = None) -> None:
         self._steal = steal
@@ -71,7 +73,6 @@ class FlownAgain:
         """When that which the module's tests share was begun."""
         self._before: list[pytest.Item] = []
         """The module's tests so far."""
-        self._again: list[str] = []
         self._again_s = 0.0
 
     def pytest_unconfigure(self) -> None:
@@ -79,13 +80,20 @@ class FlownAgain:
             self._steal.close()
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        for line in self._again:
+        told = {
+            f"FLOWN AGAIN {report.nodeid} - {text}": None
+            for reports in terminalreporter.stats.values()
+            for report in reports
+            for name, text in getattr(report, "user_properties", ())
+            if name == FLOWN_AGAIN
+        }
+        for line in told:
             terminalreporter.write_line(line)
 
     def pytest_runtest_protocol(
         self, item: pytest.Item, nextitem: pytest.Item | None
     ) -> bool | None:
-        if item.get_closest_marker("alone") is None:
+        if item.get_closest_marker("real_time") is None:
             return None
         steal = self._steal = self._steal or Steal()
         module = item.getparent(pytest.Module)
@@ -102,7 +110,7 @@ class FlownAgain:
                 no_verdict(item, reports, shares)
                 break
             taken = f"the host took {100 * shares[-1]:.0f} % of the processors"
-            self._again.append(f"FLOWN AGAIN {item.nodeid} - {taken}")
+            item.user_properties.append((FLOWN_AGAIN, f"{taken} ({len(shares)})"))
             item.session._setupstate.teardown_exact(None)  # what the module shares is flown again
             self._begun_s = time.monotonic()
             for flown, following in pairwise([*self._before, item]):

@@ -21,7 +21,7 @@ class Told:
         pass
 
 def pytest_configure(config):
-    config.addinivalue_line("markers", "alone: flies")
+    config.addinivalue_line("markers", "real_time: flies")
     config.pluginmanager.register(FlownAgain(Told()))
 """
 FLIGHTS = """
@@ -34,16 +34,16 @@ def flown():
     done.clear()
     return len(flights)
 
-@pytest.mark.alone
+@pytest.mark.real_time
 def test_take_off(flown):
     done.append("take off")
 
-@pytest.mark.alone
+@pytest.mark.real_time
 def test_cruise(flown):
     assert done == ["take off"]
     assert flown >= {needed}
 
-@pytest.mark.alone
+@pytest.mark.real_time
 def test_land(flown):
     assert flown == len(flights)
 """

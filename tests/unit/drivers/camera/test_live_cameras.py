@@ -128,7 +128,7 @@ def test_no_such_file(tmp_path: Path, name: str) -> None:
 # --- the test pattern
 
 
-@pytest.mark.alone
+@pytest.mark.real_time
 def test_the_pattern_keeps_time() -> None:
     camera = camera_source(CameraConfig(source="pattern", width=160, height=120, rate_hz=50))
     camera.open()

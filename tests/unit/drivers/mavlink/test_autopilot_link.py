@@ -47,7 +47,7 @@ from tests.support.autopilot.memory_port import MemoryPort
 
 SURVEY = Path(__file__).parents[4] / "sample" / "survey"
 SECOND = 1_000_000_000
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 SET_INTERVAL = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
 
 

@@ -83,7 +83,7 @@ def test_a_computer_that_tells_nothing_is_not_guessed_at(tmp_path: Path) -> None
     assert load.disk_total_mib is not None  # of what the folder will be made on
 
 
-@pytest.mark.alone
+@pytest.mark.real_time
 def test_load_of_this_computer(tmp_path: Path) -> None:
     system = SystemLoad(tmp_path)
     ours = {"here": 0, "gone": 2**22 + 1}

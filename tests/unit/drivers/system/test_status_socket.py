@@ -100,7 +100,7 @@ def test_only_owner_and_group_reach_it(path: Path) -> None:
     run(test)
 
 
-@pytest.mark.alone
+@pytest.mark.real_time
 def test_clients_that_never_read_or_never_leave_do_no_harm(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
