@@ -149,7 +149,7 @@ run_tests() {
   says "$(date -u +%F), $(inside uname -m), $(inside python -V), $QEMU_CPU"
   status=0
   # shellcheck disable=SC2086 # one word each
-  inside sh -c 'cd /companion && exec python -m pytest -p no:cacheprovider -m "not alone" -o timeout=3600 "$@"' \
+  inside sh -c 'cd /companion && exec python -m pytest -p no:cacheprovider -m "not real_time" -o timeout=3600 "$@"' \
     sh $deselected "$@" >"$folder/tests.log" 2>&1 || status=$?
   grep -E '^(FAILED|ERROR|SKIPPED) ' "$folder/tests.log" || :
   says "left out:$left_out"
