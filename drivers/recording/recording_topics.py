@@ -36,6 +36,8 @@ EVENTS, HEALTH = "/events", "/health"
 TRACKING, GATE = "/decisions/tracking", "/decisions/pose_gate"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
 """Topics of images, of which a flight has one."""
+FROM_PICTURES = frozenset({GREY, POSE, ODOMETRY, CLOUD, TRACKING, GATE})
+"""Topics of what was made of images."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 

@@ -10,10 +10,17 @@ from drivers.recording.growing_file import GrowingFile
 from drivers.recording.mcap_file import McapMessage
 from drivers.recording.mcap_writer import McapWriter
 from drivers.recording.recording import Recording
-from drivers.recording.recording_topics import GREY, LASTING, PICTURES, PROFILE, open_channels
+from drivers.recording.recording_topics import (
+    FROM_PICTURES,
+    LASTING,
+    PICTURES,
+    PROFILE,
+    open_channels,
+)
 
 LEAD_NS = 10_000_000_000
-"""Messages other than images are kept from this long before the first, as a replay uses them."""
+"""Messages other than images and what was made of them are kept from this long before the first, as
+a replay uses them."""
 CHUNK_BYTES = 4 << 20
 
 
@@ -74,7 +81,8 @@ def _copy(
             if topic in PICTURES:
                 keep = (number, at) in pictures
             else:
-                keep = (first_ns if topic == GREY else lead_ns) <= message.t_ns < stop_ns
+                from_ns = first_ns if topic in FROM_PICTURES else lead_ns
+                keep = from_ns <= message.t_ns < stop_ns
             if topic in LASTING and message.t_ns < lead_ns:
                 held[topic] = message
             elif keep and topic in channels:

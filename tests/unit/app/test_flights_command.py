@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from companion.app.cli import main
 from companion.config import CameraConfig
@@ -82,6 +83,10 @@ def test_a_part_has_the_same_pictures_and_samples(
     by_seq = {f.seq: f for f in whole}
     assert all(np.array_equal(f.rgb, by_seq[f.seq].rgb) for f in part)
     assert len(open_flight(out, CameraConfig()).telemetry().samples) > 100
+    with out.open("rb") as file:
+        times_ns = [m.log_time for _, _, m in make_reader(file).iter_messages(["/odometry"])]
+    assert times_ns
+    assert min(times_ns) >= part[0].t_ns, "a pose of a picture that is not in it"
     status, _, err = run(capsys, "trim", path, "--start", 1, "--out", out)
     assert status == 2 and "File exists" in err
     status, _, err = run(capsys, "trim", path, "--start", 100, "--out", flights / "no.mcap")
