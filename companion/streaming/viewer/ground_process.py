@@ -29,10 +29,14 @@ def main() -> int:
     except InputError as error:
         _say(str(error).encode() + b"\n")
         return 1
-    _say(READY + b" " + screen.page.encode() + b"\n")
-    link = GroundLink(LOOPBACK, port, lambda text: None, again=False)
-    show(link, screen, colours, threading.Event())
-    screen.close()
+    try:
+        _say(READY + b" " + screen.page.encode() + b"\n")
+        link = GroundLink(LOOPBACK, port, lambda text: None, again=False)
+        show(link, screen, colours, threading.Event())
+    except BrokenPipeError:
+        return 1  # who asked for it has ended while it started
+    finally:
+        screen.close()
     return 0
 
 

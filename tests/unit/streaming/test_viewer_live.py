@@ -22,6 +22,7 @@ from companion.messages import Frame
 from companion.streaming.ground_link import GroundLink
 from companion.streaming.items import Item, PictureItem, PointsItem, PoseItem, StatusItem
 from companion.streaming.live_viewer import LiveViewer
+from companion.streaming.onboard_viewer import GROUND
 from companion.streaming.viewer.inbox import Inbox
 from companion.streaming.viewer.screen import GRPC_PORT, WEB_PORT, listens
 from tests.support.flights import flown
@@ -169,6 +170,21 @@ def test_the_web_viewer_listens_on_loopback_only_and_ends_with_the_flight() -> N
         assert ours == {("0100007F", GRPC_PORT), ("0100007F", WEB_PORT)}  # 127.0.0.1
     assert viewer.n_dropped == 0
     assert free(GRPC_PORT) and free(WEB_PORT)
+
+
+@pytest.mark.skipif(not (free(GRPC_PORT) and free(WEB_PORT)), reason="a viewer runs here")
+def test_a_web_viewer_ends_with_what_it_started_where_its_caller_is_gone() -> None:
+    """As where a stage is killed while its viewer starts."""
+    command = [sys.executable, "-m", GROUND, "web", "1", "height", "127.0.0.1"]
+    viewer = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert viewer.stdout is not None and viewer.stderr is not None
+    viewer.stdout.close()
+    said = viewer.stderr.read()
+    viewer.stderr.close()
+    assert viewer.wait(60) == 1
+    assert b"Traceback" not in said
+    with pytest.raises(ProcessLookupError):  # of its group none is left
+        os.killpg(viewer.pid, 0)
 
 
 def test_view_refuses_what_is_no_host_and_what_is_no_viewer() -> None:
