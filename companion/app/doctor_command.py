@@ -1,7 +1,7 @@
 """`companion doctor`: parameters of the autopilot that keep it from using our pose.
 
 Reads over the configured link, or through the router of a daemon that holds that link. With `write`
-sets them, after confirmation, reads each back, and examines again.
+sets them, after confirmation, reads each back, examines again, and has them stored.
 """
 
 from __future__ import annotations
@@ -51,6 +51,8 @@ class Examination:
     written: list[dict[str, Any]] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     """Parameters that the autopilot refused, in words."""
+    not_stored: str = ""
+    """Why those written may be lost with the power; "" where they are not."""
 
     @property
     def blocking(self) -> list[Finding]:
@@ -148,6 +150,11 @@ async def _examine(
             found.findings, found.n_examined = await look()
             if not _to_set(found) or found.refused:
                 break
+        if found.written:
+            try:
+                await parameters.store()
+            except SourceError as error:
+                found.not_stored = f"{error}: leave it on for ten seconds before it is rebooted"
         return found
 
 
@@ -250,6 +257,7 @@ def _document(found: Examination) -> dict[str, Any]:
         "notes": [_plain(finding) for finding in found.findings if not finding.blocking],
         "written": found.written,
         "refused": found.refused,
+        "not_stored": found.not_stored,
         "reboot_needed": bool(found.reboot_for),
     }
 
@@ -291,6 +299,8 @@ def _print_outcome(found: Examination, write: bool, out: TextIO) -> None:
               file=out)  # fmt: skip
     for refusal in found.refused:
         print(f"not set: {refusal}", file=out)
+    if found.not_stored:
+        print(f"not stored: {found.not_stored}", file=out)
     if found.reboot_for:
         print(f"Reboot the autopilot, for {', '.join(found.reboot_for)}", file=out)
     if not found.blocking:

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import SourceError
+from drivers.mavlink.commands import Commands
 from drivers.mavlink.vehicle import Firmware, Vehicle
 from drivers.mavlink.wire.message_port import OnMessage
 from drivers.system.within import within
@@ -30,6 +31,8 @@ SLACK = 4
 TRIES = 3
 MOST_ANSWERS_S = 3.0
 MOST_KNOWN = 10_000
+STORE, NEITHER = 1.0, -1.0
+"""Of MAV_CMD_PREFLIGHT_STORAGE: parameters to flash; missions are left as they are."""
 LETTERS = {
     mavlink.MAV_PARAM_TYPE_UINT8: "B", mavlink.MAV_PARAM_TYPE_INT8: "b",
     mavlink.MAV_PARAM_TYPE_UINT16: "H", mavlink.MAV_PARAM_TYPE_INT16: "h",
@@ -73,6 +76,8 @@ class Parameters:
         self._unknown: set[str] = set()
         self._came = asyncio.Event()
         self._slowest_s: float | None = None
+        self._commands = Commands(link.send)
+        link.listen(mavlink.MAVLINK_MSG_ID_COMMAND_ACK, self._take_acknowledgement)
         link.listen(mavlink.MAVLINK_MSG_ID_PARAM_VALUE, self._take_value)
         link.listen(mavlink.MAVLINK_MSG_ID_PARAM_ERROR, self._take_error)
 
@@ -111,6 +116,30 @@ class Parameters:
         if not math.isclose(now.value, value, rel_tol=1e-6, abs_tol=1e-9):
             raise SourceError(f"{name}: the autopilot keeps {now.value:g}, {value:g} was set")
         return now
+
+    async def store(self) -> None:
+        """Have what was written outlive a loss of power: PX4 stores it some time later by itself.
+
+        ArduPilot does at once. SourceError if the autopilot does not say that it has.
+        """
+        if self._firmware != "px4":
+            return
+
+        def make(attempt: int) -> Any:
+            return mavlink.MAVLink_command_long_message(
+                self._system, AUTOPILOT, mavlink.MAV_CMD_PREFLIGHT_STORAGE, attempt,
+                STORE, NEITHER, 0.0, 0.0, 0.0, 0.0, 0.0,
+            )  # fmt: skip
+
+        result = await self._commands.ask(
+            mavlink.MAV_CMD_PREFLIGHT_STORAGE, make, MOST_ANSWERS_S, TRIES
+        )
+        if result != mavlink.MAV_RESULT_ACCEPTED:
+            raise SourceError("the autopilot does not say that it has stored its parameters")
+
+    def _take_acknowledgement(self, message: Any, t_ns: int) -> None:
+        # whoever asked for it
+        self._commands.answered(message, (message.target_system, message.target_component))
 
     def _take_error(self, message: Any, t_ns: int) -> None:
         if len(self._unknown) < MOST_KNOWN:

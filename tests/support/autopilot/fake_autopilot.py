@@ -608,6 +608,10 @@ class FakeAutopilot:
         elif command == mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and values[0] == 1:
             result = DENIED if self.armed else ACCEPTED
             after = None if self.armed else self.reboot
+        elif command == mavlink.MAV_CMD_PREFLIGHT_STORAGE and values[0] == 1:
+            result = ACCEPTED if self.firmware == "px4" and not self.armed else UNSUPPORTED
+            if result == ACCEPTED:
+                self.parameters.store()
         elif command == DO_SET_GLOBAL_ORIGIN and self.knows_do_set_origin:
             # its latitude and longitude have their digits in a COMMAND_INT only
             result = ACCEPTED if got.kind == "COMMAND_INT" else DENIED

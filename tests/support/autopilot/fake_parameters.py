@@ -56,6 +56,8 @@ class Parameters:
         self._table = dict(PX4 if self._bytewise else ARDUPILOT)
         self.refused: set[str] = set()
         """Names whose writing is answered with the old value."""
+        self.stored: dict[str, float] = {}
+        """What is in flash: of PX4 what it was told to store, of ArduPilot all that was set."""
 
     def __getitem__(self, name: str) -> float:
         return self._table[name][0]
@@ -99,3 +101,9 @@ class Parameters:
                 return
             (value,) = struct.unpack("<i", struct.pack("<f", value))
         self[name] = value
+        if not self._bytewise:
+            self.stored[name] = self[name]
+
+    def store(self) -> None:
+        """As at MAV_CMD_PREFLIGHT_STORAGE."""
+        self.stored = {name: self[name] for name in self._table}

@@ -67,6 +67,7 @@ def test_names_sets_and_finds_nothing_more(config: Config, firmware: str, names:
         assert text.count("read back") == len(names)
         assert "Reboot the autopilot, for" in text
         assert {each.message.param_id for each in autopilot.of("PARAM_SET")} == set(names)
+        assert set(names) <= set(autopilot.parameters.stored), "lost with the power"
 
         document = json.loads(examine(config, autopilot.url, as_json=True)[1])
         assert document["in_the_way"] == []
