@@ -52,7 +52,7 @@ class Examination:
     refused: list[str] = field(default_factory=list)
     """Parameters that the autopilot refused, in words."""
     not_stored: str = ""
-    """Why those written may be lost with the power; "" where they are not."""
+    """Reason for which those written may be lost with the power; "" where they are not."""
 
     @property
     def blocking(self) -> list[Finding]:
