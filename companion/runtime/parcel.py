@@ -38,6 +38,7 @@ MOST_BYTES = 2 * INLINE_BYTES
 """Largest packet."""
 _HEADER = struct.Struct("<qQB")
 _LENGTH = struct.Struct("<Q")
+_DESCRIPTOR = struct.Struct("i")
 _ALONE = struct.Struct(f"<QQ{ALIGNMENT - 16}x")
 """Head of a message without parts apart: how many parts, their length, padding."""
 
@@ -145,11 +146,16 @@ class Parcel:
         return pickle.loads(parts[0], buffers=parts[1:])
 
     def send(self, to: socket.socket, flags: int = 0) -> None:
-        """Send through a socket of packets; waits for room in it. OSError where nobody reads."""
-        if self._memory is None:
-            to.sendmsg(self._packet(), (), flags)
-        else:
-            socket.send_fds(to, self._packet(), [self._memory.descriptor], flags)
+        """Send through a socket of packets; waits for room in it, unless the flags say not to.
+
+        OSError where nobody reads, BlockingIOError where there is no room. Not by socket.send_fds,
+        which ignores flags and so waited for a stage that was stopped.
+        """
+        with_it = []
+        if self._memory is not None:
+            descriptor = _DESCRIPTOR.pack(self._memory.descriptor)
+            with_it = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, descriptor)]
+        to.sendmsg(self._packet(), with_it, flags)
 
     @classmethod
     def send_together(cls, parcels: Sequence[Parcel], to: socket.socket) -> None:

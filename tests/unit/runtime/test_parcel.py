@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Iterator
 from dataclasses import fields
@@ -12,7 +13,7 @@ import pytest
 
 from companion.geometry.transforms import Pose
 from companion.messages import Bytes, Frame, MapUpdate, Track, TrackState
-from companion.runtime.parcel import INLINE_BYTES, Parcel
+from companion.runtime.parcel import INLINE_BYTES, MOST_BYTES, Parcel
 from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
@@ -69,15 +70,25 @@ def test_small_and_large_messages_come_in_their_order(ends: Ends, rng: np.random
     assert [p.open().seq for p in got] == [1, 7, 2, 7]
 
 
-def test_a_small_message_is_sent_without_descriptors(
-    ends: Ends, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+def test_only_a_large_message_is_sent_with_a_descriptor(
+    ends: Ends, rng: np.random.Generator
 ) -> None:
-    sent: list[list[int]] = []
-    monkeypatch.setattr(socket, "send_fds", lambda to, packet, handles, flags: sent.append(handles))
-    Parcel.of(frame(rng, 16)).send(ends[0])
-    assert not sent and received(ends[1]).open().seq == 7
-    Parcel.of(frame(rng)).send(ends[0])
-    assert [len(handles) for handles in sent] == [1]
+    for message, n in ((frame(rng, 16), 0), (frame(rng), 1)):
+        Parcel.of(message).send(ends[0])
+        _packet, descriptors, _flags, _address = socket.recv_fds(ends[1], MOST_BYTES, 2)
+        for each in descriptors:
+            os.close(each)
+        assert len(descriptors) == n
+
+
+@pytest.mark.timeout(20)
+def test_nothing_waits_for_room_that_is_told_not_to(ends: Ends, rng: np.random.Generator) -> None:
+    small = Parcel.of(Track(1, 1, TrackState.LOST))
+    with pytest.raises(BlockingIOError):
+        while True:
+            small.send(ends[0], socket.MSG_DONTWAIT)
+    with pytest.raises(BlockingIOError):
+        Parcel.of(frame(rng)).send(ends[0], socket.MSG_DONTWAIT)
 
 
 def test_small_messages_cross_together_in_one_packet(ends: Ends, rng: np.random.Generator) -> None:
