@@ -22,10 +22,11 @@ from companion.messages import (
     TrackState,
 )
 from companion.products.flight_result import RunFacts
+from companion.products.site_map_file import SITE_MAP
 from companion.products.surroundings import peak_memory_mb, versions
 from companion.runtime.gaps import with_gap_warnings
 from companion.runtime.in_order import InOrder, in_order_of_time, in_words
-from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_protocol import Finish, SaveSiteMap, Setup
 from companion.runtime.stages import Stage, stage_named
 from companion.streaming.live_viewer import LiveViewer
 from companion.timing.clock import monotonic_s
@@ -113,6 +114,9 @@ def replay(
         completed = False
 
         def finish(stage: Stage) -> Finish:
+            if stage.name == "localisation":
+                save = SaveSiteMap(out / SITE_MAP, given.flight.path.name, log.origin)
+                return Finish(hurry=False, save_map=save)
             if stage.name != "results":
                 return Finish(hurry=False)
             dropped = {"frames": 0, "depth frames": 0}

@@ -28,7 +28,9 @@ from companion.estimation.lift_off.standing import Standing
 from companion.estimation.odometry.odometry_frame import MapView
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.resumption import Resumption, Verdict
+from companion.estimation.site.site_of_flight import site_of_flight
 from companion.geometry.camera import Camera
+from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
     Frame,
@@ -44,6 +46,7 @@ from companion.messages import (
 )
 from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.map_part import map_of, part_around
+from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
 from companion.telemetry import AttitudeSample, HeightSample, ImuSample, Telemetry, is_believed
@@ -210,6 +213,15 @@ class LocalisationStage:
         if self._segments():
             out.append(self._georeferences.update(self._segments(), self._t_ns, final=True))
         return out
+
+    def site_map(self, flight: str, origin: GeoOrigin | None) -> SiteMap | None:
+        """The map of the site, of a flight that has finished; None without a scale.
+
+        `flight` is its name, `origin` that of local NED.
+        """
+        segments = ((s, self._georeferences.of(s)) for s in self._segments())
+        metric = [(segment, placed) for segment, placed in segments if placed is not None]
+        return site_of_flight(metric, self._camera, flight, origin, None)
 
     def _segments(self) -> list[SlamMap]:
         return [s for s in self._tracker.segments if s.keyframes]

@@ -33,6 +33,18 @@ class Setup:
 
 
 @dataclass(frozen=True, slots=True)
+class SaveSiteMap:
+    """Localisation writes the map of the site at the end: where, by which name of the flight.
+
+    `origin` is that of local NED, None where unknown.
+    """
+
+    path: Path
+    flight: str
+    origin: GeoOrigin | None
+
+
+@dataclass(frozen=True, slots=True)
 class Finish:
     """Last message to a stage: give the last results.
 
@@ -45,6 +57,8 @@ class Finish:
     facts: RunFacts | None = None
     keep_map: bool = False
     n_viewers: int = 0
+    save_map: SaveSiteMap | None = None
+    """For `localisation`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ import numpy as np
 from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
 from companion.messages import Frame, Georeferenced, MapUpdate, Message, Warned
+from companion.products.site_map_file import write_site_map
 from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import cache_errors
@@ -63,7 +64,18 @@ class _Localisation(Work):
     def finish(self, finish: Finish) -> Iterable[Message]:
         if self._keeper is not None:
             self._keeper.close(forget=not finish.keep_map)
-        return self._stage.finish(adjust=not finish.hurry)
+        yield from self._stage.finish(adjust=not finish.hurry)
+        save = finish.save_map
+        if save is None or finish.hurry:  # a disk may take longer than is left
+            return
+        site = self._stage.site_map(save.flight, save.origin)
+        if site is None:
+            return
+        try:
+            write_site_map(save.path, site)
+        except OSError as error:
+            why = error.strerror or str(error)
+            print(f"companion: {save.path}: cannot be written: {why}", file=sys.stderr)
 
     def _begin_keeping(self, message: KeepMap) -> None:
         self._keeper = MapKeeper(message.path, self._setup)

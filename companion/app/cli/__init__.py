@@ -18,13 +18,21 @@ from collections.abc import Sequence
 from typing import TextIO
 
 from companion import __version__
-from companion.app.cli import flying, hardware, measuring, recordings, replaying, service_commands
+from companion.app.cli import (
+    flying,
+    hardware,
+    maps,
+    measuring,
+    recordings,
+    replaying,
+    service_commands,
+)
 from companion.app.cli.options import Command
 from companion.app.stopping import StopSignals
 from companion.errors import CompanionError, InputError, StageError
 
 # In a command libraries are loaded late: they take a second, and --help needs none of them.
-FAMILIES = (flying, replaying, recordings, hardware, measuring, service_commands)
+FAMILIES = (flying, replaying, recordings, maps, hardware, measuring, service_commands)
 COMMANDS: dict[str, Command] = {
     name: command for family in FAMILIES for name, command in family.COMMANDS.items()
 }

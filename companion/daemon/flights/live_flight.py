@@ -28,6 +28,7 @@ from companion.messages import (
     Warned,
 )
 from companion.products.flight_result import RunFacts
+from companion.products.site_map_file import SITE_MAP
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor, in_words
 from companion.runtime.stage_process import GATHER_S, StageProcess
@@ -36,6 +37,7 @@ from companion.runtime.stage_protocol import (
     KeepMap,
     Listening,
     ResultsWritten,
+    SaveSiteMap,
     SetBudget,
     SetLoadLevel,
     Setup,
@@ -262,7 +264,10 @@ class LiveFlight:
             hurried = self._processes.hurried
             of_flight = facts(self) if stage.name == "results" else None
             is_shown = self._viewing is not None and self._viewing.is_shown
-            return Finish(hurried, of_flight, self.keep_map, n_viewers=int(is_shown))
+            save = None
+            if stage.name == "localisation" and self.folder is not None:
+                save = SaveSiteMap(self.folder / SITE_MAP, self.folder.name, self._origin)
+            return Finish(hurried, of_flight, self.keep_map, n_viewers=int(is_shown), save_map=save)
 
         self._publish_reads()
         for name, why in self._processes.finish(finish_of).items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -51,6 +52,14 @@ def part_around(slam_map: SlamMap, keyframe: Keyframe, most_bytes: int) -> MapPa
             break
         chosen[key] = near
         wanted[ids] = True
+    return part_of(slam_map, chosen)
+
+
+def part_of(slam_map: SlamMap, chosen: Mapping[int, Keyframe]) -> MapPart:
+    """The part of the map that some keyframes, by id, and their points are; a copy."""
+    wanted = np.zeros(slam_map.n_points, bool)
+    for keyframe in chosen.values():
+        wanted[slam_map.observations_of(keyframe)[1]] = True
     ids = np.flatnonzero(wanted)
     index = np.full(slam_map.n_points + 1, -1)  # its last is that of no point
     index[ids] = np.arange(len(ids))

@@ -104,6 +104,8 @@ class SlamMap:
     """Culled keyframes by id; frames and chunks of the cloud may still refer to them."""
     unit_of: dict[int, float] = field(default_factory=dict)
     """Map units per unit of what was reported about a keyframe at its creation, where not 1."""
+    held: frozenset[int] = frozenset()
+    """Keyframes of an earlier flight, in whose frame the others are placed: nothing moves them."""
     n_points: int = 0
     positions: Array = field(default_factory=lambda: np.zeros((0, 3)))
     alive: Bools = field(default_factory=lambda: np.zeros(0, bool))

@@ -1,0 +1,59 @@
+"""Commands for the maps of sites."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from companion.app.cli.options import Command, json_option, made_folder
+from companion.app.stopping import StopSignals
+
+
+def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    """Show, verify, export or save; 1 where a map is damaged."""
+    from companion.app import map_command as maps
+
+    if arguments.what == "show":
+        print(maps.show(arguments.map, arguments.json))
+    elif arguments.what == "verify":
+        verified = [maps.verify(path) for path in arguments.maps]
+        print("\n".join(text for text, _ in verified))
+        return 0 if all(whole for _, whole in verified) else 1
+    elif arguments.what == "export":
+        made_folder(arguments.out)
+        for path in maps.export(arguments.map, arguments.out):
+            print(path)
+    else:
+        for each in maps.save(arguments.map, arguments.out).damaged:
+            print(f"companion: {arguments.map}: {each} is damaged, and left out", file=sys.stderr)
+        print(arguments.out)
+    signals.take()
+    return 0
+
+
+COMMANDS: dict[str, Command] = {"map": _map}
+
+
+def add_parsers(commands: Any) -> None:
+    """Add the parsers of these commands."""
+    of_map = commands.add_parser(
+        "map", help="maps of sites that flights have left",
+        description="Maps of sites: the site.map in the folder of a run or a flight.",
+    )  # fmt: skip
+    whats = of_map.add_subparsers(dest="what", required=True, metavar="WHAT")
+    given = argparse.ArgumentParser(add_help=False)
+    given.add_argument("map", type=Path, metavar="MAP", help="a site map, or the folder of a run")
+
+    whats.add_parser(
+        "show", parents=[given, json_option()], help="what it is of, and how well it is placed"
+    )
+    verified = whats.add_parser("verify", help="whether maps are whole; 1 where one is not")
+    verified.add_argument("maps", type=Path, nargs="+", metavar="MAP")
+    exported = whats.add_parser(
+        "export", parents=[given], help="points.ply, keyframes.tum and map.json for other programs"
+    )
+    exported.add_argument("--out", type=Path, required=True, metavar="DIR")
+    saved = whats.add_parser("save", parents=[given], help="keep the map of a run elsewhere")
+    saved.add_argument("--out", type=Path, required=True, metavar="FILE")

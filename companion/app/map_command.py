@@ -1,0 +1,140 @@
+"""companion map: site maps of flights, shown, verified, exported, kept and merged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.geometry.geodesy import GeoOrigin
+from companion.products.atomic_file import write_atomically
+from companion.products.cloud import Cloud
+from companion.products.cloud_ply import ply_parts
+from companion.products.flight_result import WorldPose
+from companion.products.site_map_file import (
+    SITE_MAP,
+    ReadSiteMap,
+    SiteHead,
+    read_head,
+    read_site_map,
+    write_site_map,
+)
+from companion.products.trajectory_file import trajectory_tum
+from companion.slam.map.site_map import SiteMap
+
+BYTES_PER_MB = 1e6
+
+
+def map_meant(path: Path) -> Path:
+    """The site map that a file, or the folder of a run, stands for."""
+    return path / SITE_MAP if path.is_dir() else path
+
+
+def show(path: Path, as_json: bool) -> str:
+    """The head of a map: what it is of, how well it is placed, its parts."""
+    path = map_meant(path)
+    head = read_head(path)
+    if as_json:
+        return json.dumps(_head_numbers(path, head), indent=2)
+    found, origin = head.georeference, head.georeference.origin
+    size_mb = path.stat().st_size / BYTES_PER_MB
+    placed = (
+        "no place on the globe: level and scale only"
+        if origin is None
+        else f"origin {origin.latitude_deg:.7f} {origin.longitude_deg:.7f}, "
+        f"{origin.altitude_m:.1f} m above sea level, within {found.sigma_m:.2f} m"
+    )
+    lines = [
+        f"{path}: revision {head.revision}, {head.n_keyframes} keyframes, {head.n_points} points, "
+        f"{size_mb:.1f} MB",
+        placed,
+        f"scale within {100 * found.sigma_scale:.2f} %, heading within "
+        f"{np.degrees(found.sigma_yaw_rad):.2f} degrees, by {found.method}",
+    ]
+    for part in head.parts:
+        camera = part.camera
+        lines.append(
+            f"since revision {part.revision}: {part.flight}, camera "
+            f"{camera.width}x{camera.height}, "
+            f"focal length {camera.focal_px:.1f} pixels"
+        )
+    return "\n".join(lines)
+
+
+def verify(path: Path) -> tuple[str, bool]:
+    """A line for each damaged part of a map, or that it is whole; True if it is."""
+    path = map_meant(path)
+    read = read_site_map(path)
+    if not read.damaged:
+        return f"{path}: whole", True
+    return "\n".join(f"{path}: {each} is damaged" for each in read.damaged), False
+
+
+def export(path: Path, out: Path) -> list[Path]:
+    """Write points.ply, keyframes.tum and map.json of a map into a folder; their paths."""
+    path = map_meant(path)
+    read = read_site_map(path)
+    origin = read.site.georeference.origin
+    poses = [
+        WorldPose(k.keyframe_id, k.t_ns, k.camera_from_map.inverse()) for k in read.site.keyframes
+    ]
+    numbers = _head_numbers(path, read_head(path)) | {"damaged": list(read.damaged)}
+    files: dict[str, Any] = {
+        "points.ply": b"".join(ply_parts(_cloud(read.site), "m", origin)),
+        "keyframes.tum": trajectory_tum(poses, "m", origin),
+        "map.json": (json.dumps(numbers, indent=2) + "\n").encode(),
+    }
+    for name, data in files.items():
+        write_atomically(out / name, data)
+    return [out / name for name in files]
+
+
+def save(path: Path, out: Path) -> ReadSiteMap:
+    """Keep the map of a run as a file of its own, as far as it is whole."""
+    read = read_site_map(map_meant(path))
+    write_site_map(out, read.site)
+    return read
+
+
+def _head_numbers(path: Path, head: SiteHead) -> dict[str, Any]:
+    found = head.georeference
+    return {
+        "revision": head.revision, "keyframes": head.n_keyframes, "points": head.n_points,
+        "bytes": path.stat().st_size, "origin": _origin_numbers(found.origin),
+        "sigma_m": found.sigma_m, "sigma_yaw_deg": float(np.degrees(found.sigma_yaw_rad)),
+        "sigma_scale": found.sigma_scale, "scale_by": found.method,
+        "parts": [
+            {
+                "flight": part.flight, "began_ns": part.began_ns, "revision": part.revision,
+                "image": [part.camera.width, part.camera.height],
+                "focal_px": part.camera.focal_px,
+            }
+            for part in head.parts
+        ],
+    }  # fmt: skip
+
+
+def _origin_numbers(origin: GeoOrigin | None) -> dict[str, float] | None:
+    if origin is None:
+        return None
+    return {
+        "latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg,
+        "altitude_m": origin.altitude_m,
+    }  # fmt: skip
+
+
+def _cloud(site: SiteMap) -> Cloud:
+    """Points whose error is known, grey as in the image that they were found in."""
+    variance = site.covariances.trace(axis1=1, axis2=2)
+    known = np.isfinite(variance) & np.isfinite(site.points.positions).all(1)
+    patches = site.points.patch_grey[known]
+    grey = patches[:, patches.shape[1] // 2, patches.shape[2] // 2]
+    found = site.points.n_found[known] / np.maximum(site.points.n_visible[known], 1)
+    return Cloud(
+        site.points.positions[known], np.repeat(grey[:, None], 3, 1),
+        np.clip(found, 0.0, 1.0).astype(np.float32),
+        site.points.normals[known].astype(np.float32),
+        np.sqrt(variance[known]).astype(np.float32),
+    )  # fmt: skip

@@ -1,0 +1,220 @@
+"""Files of site maps: the same map back, what is damaged left out, what is no map refused."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.app import map_command
+from companion.app.cli import main
+from companion.geometry.geodesy import GeoOrigin
+from companion.geometry.transforms import Similarity, yaw_rotation
+from companion.products.site_map_file import (
+    SITE_MAP,
+    SiteMapError,
+    read_head,
+    read_site_map,
+    write_site_map,
+)
+from companion.slam.map.site_map import (
+    SiteGeoreference,
+    SiteMap,
+    SitePart,
+    site_map_of,
+    slam_map_of,
+)
+from companion.slam.map.sparse_map import SlamMap
+from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
+
+TO_WORLD = Similarity(2.5, yaw_rotation(0.4), np.array([10.0, -20.0, -30.0]))
+ORIGIN = GeoOrigin(47.1, 8.5, 400.0)
+
+
+@pytest.fixture(scope="module")
+def slam_map() -> SlamMap:
+    path = [flown(p) for p in np.linspace((-6, 0), (6, 0), 10)]
+    made = mapped(Ground(np.random.default_rng(5)), path, Similarity.identity(), first_id=7)
+    made.keyframes[12].ned_from_camera = flown(np.zeros(2)).rotation
+    made.keyframes[12].refined_for[:] = made.keyframes[12].point_ids
+    made.keyframes[12].whitening *= 2.0
+    return made
+
+
+@pytest.fixture(scope="module")
+def site(slam_map: SlamMap) -> SiteMap:
+    part = SitePart("morning", min(k.t_ns for k in slam_map.keyframes.values()), CAMERA, 1)
+    georeference = SiteGeoreference(ORIGIN, 0.8, 0.01, 0.004, "gps")
+    return site_map_of(slam_map, TO_WORLD, (part,), {}, georeference, 1)
+
+
+@pytest.fixture
+def path(tmp_path: Path, site: SiteMap) -> Path:
+    path = tmp_path / SITE_MAP
+    write_site_map(path, site)
+    return path
+
+
+def test_a_map_comes_back_as_it_was(path: Path, site: SiteMap) -> None:
+    read = read_site_map(path)
+    again = read.site
+    assert not read.damaged
+    assert again.georeference == site.georeference and again.revision == 1
+    assert [p.flight for p in again.parts] == ["morning"]
+    for before, after in zip(site.keyframes, again.keyframes, strict=True):
+        assert before.t_ns == after.t_ns
+        np.testing.assert_array_equal(before.point_ids, after.point_ids)
+        np.testing.assert_array_equal(before.features.descriptors, after.features.descriptors)
+        np.testing.assert_allclose(before.normalised, after.normalised, atol=1e-7)
+        np.testing.assert_allclose(before.whitening, after.whitening, rtol=1e-6)
+        np.testing.assert_array_equal(
+            before.camera_from_map.matrix(), after.camera_from_map.matrix()
+        )
+    np.testing.assert_array_equal(site.points.positions, again.points.positions)
+    np.testing.assert_allclose(site.covariances, again.covariances, rtol=1e-5, equal_nan=True)
+
+
+def test_it_is_metric_and_projects_as_before(slam_map: SlamMap, site: SiteMap) -> None:
+    old, new = slam_map.keyframes[7], site.keyframes[0]
+    np.testing.assert_allclose(
+        TO_WORLD.apply(old.centre), new.camera_from_map.inverse().translation, atol=1e-9
+    )
+    _, ids = slam_map.observations_of(old)
+    seen = old.camera_from_map.apply(slam_map.positions[ids])
+    kept = new.point_ids[new.point_ids >= 0]
+    again = new.camera_from_map.apply(site.points.positions[kept])
+    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], again[:, :2] / again[:, 2:], atol=1e-9)
+
+
+def test_covariances_are_those_of_scattered_observations(site: SiteMap) -> None:
+    rng = np.random.default_rng(0)
+    seen_often = np.argmax([
+        sum(int(np.any(k.point_ids == p)) for k in site.keyframes) for p in range(200)
+    ])  # fmt: skip
+    views = [
+        (k, np.flatnonzero(k.point_ids == seen_often)[0])
+        for k in site.keyframes
+        if np.any(k.point_ids == seen_often)
+    ]
+    truth = site.points.positions[seen_often]
+    errors = []
+    for _ in range(400):
+        information, gradient = np.zeros((3, 3)), np.zeros(3)
+        for k, feature in views:
+            p = k.camera_from_map.apply(truth)
+            projection = np.array([[1, 0, -p[0] / p[2]], [0, 1, -p[1] / p[2]]]) / p[2]
+            jacobian = k.whitening[feature] @ projection @ k.camera_from_map.rotation
+            information += jacobian.T @ jacobian
+            gradient += jacobian.T @ rng.normal(size=2)
+        errors.append(np.linalg.solve(information, gradient))
+    measured = np.cov(np.array(errors).T)
+    stated = site.covariances[seen_often]
+    assert 0.75 < np.trace(measured) / np.trace(stated) < 1.33
+
+
+def test_keyframes_of_another_day_lie_before_all_of_today(site: SiteMap) -> None:
+    again = slam_map_of(site)
+    assert again.held == frozenset(range(10)) and again.level
+    assert max(k.t_ns for k in again.keyframes.values()) < 0
+    assert all(k.ned_from_camera is None for k in again.keyframes.values())
+    often = again.n_observers[: again.n_points] >= 2
+    np.testing.assert_array_equal(again.alive[: again.n_points], often)
+
+
+def test_what_is_damaged_is_left_out_and_named(path: Path, site: SiteMap) -> None:
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("UPDATE keyframe SET features = zeroblob(length(features)) WHERE id = 3")
+        file.execute("UPDATE points SET data = zeroblob(length(data)) WHERE id = 0")
+        file.commit()
+    read = read_site_map(path)
+    assert len(read.damaged) == 2 and "keyframe 3" in read.damaged
+    assert len(read.site.keyframes) == 9
+    lost = np.isnan(read.site.points.positions[:, 0])
+    assert lost[:1024].all() and not lost[1024:].any()
+    seen = np.concatenate([k.point_ids for k in read.site.keyframes])
+    assert not lost[seen[seen >= 0]].any()
+    assert main(["map", "verify", str(path)]) == 1
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_file_cut_short_is_read_as_far_or_refused(path: Path, share: float) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    try:
+        read = read_site_map(path)
+    except SiteMapError as error:
+        assert str(path) in str(error)
+    else:
+        assert read.damaged
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_damage_is_taken_for_a_map(path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = bytearray(path.read_bytes())
+    for at in rng.integers(0, len(data), 200):
+        data[at] = rng.integers(256)
+    path.write_bytes(bytes(data))
+    try:
+        read = read_site_map(path)
+    except SiteMapError:
+        return
+    assert read.damaged
+    slam_map_of(read.site)
+
+
+def test_a_newer_version_is_refused_in_words(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("PRAGMA user_version = 2")
+    with pytest.raises(SiteMapError, match="version 2"):
+        read_head(path)
+
+
+def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "letter.map"
+    with pytest.raises(SiteMapError, match="no such file"):
+        read_site_map(path)
+    path.write_bytes(b"Dear all,\n" * 500)
+    with pytest.raises(SiteMapError, match="no site map"):
+        read_site_map(path)
+
+
+def test_a_failed_write_leaves_the_old_map(
+    path: Path, site: SiteMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost_power(_from: object, _to: object) -> None:
+        raise OSError(5, "power lost")
+
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "replace", lost_power)
+    with pytest.raises(OSError, match="power lost"):
+        write_site_map(path, site)
+    assert path.read_bytes() == before and list(path.parent.iterdir()) == [path]
+
+
+def test_the_same_map_gives_the_same_bytes(path: Path, site: SiteMap, tmp_path: Path) -> None:
+    again = tmp_path / "again.map"
+    write_site_map(again, site)
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_commands_show_export_and_save(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", "show", str(path.parent)]) == 0
+    said = capsys.readouterr().out
+    assert "10 keyframes" in said and "47.1000000 8.5000000" in said and "morning" in said
+    out = tmp_path / "out"
+    out.mkdir()
+    assert main(["map", "export", str(path), "--out", str(out)]) == 0
+    assert (out / "points.ply").read_bytes().startswith(b"ply")
+    assert len([line for line in (out / "keyframes.tum").read_text().splitlines()
+                if not line.startswith("#")]) == 10  # fmt: skip
+    kept = tmp_path / "kept.map"
+    assert main(["map", "save", str(path), "--out", str(kept)]) == 0
+    assert map_command.verify(kept)[1]
+    assert main(["map", "show", str(tmp_path / "none.map")]) == 2
