@@ -59,6 +59,12 @@ def geodetic_from_ned(points_ned_m: Array, origin: GeoOrigin) -> Array:
     return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], 1)
 
 
+def earth_from_ned(origin: GeoOrigin) -> tuple[Array, Array]:
+    """Zero (3,) and unit axes (3, 3), rows north, east, down, of local NED in ECEF metres."""
+    zero = _ecef(origin.latitude_deg, origin.longitude_deg, origin.altitude_m)
+    return zero, _ned_from_ecef(origin.latitude_deg, origin.longitude_deg)
+
+
 def origin_of(
     latitude_deg: float, longitude_deg: float, altitude_m: float, position_ned_m: Array
 ) -> GeoOrigin:

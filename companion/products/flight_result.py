@@ -21,6 +21,7 @@ from companion.messages import (
     DepthMap,
     Frame,
     Georeference,
+    KeyframeAdded,
     LoopClosed,
     MapUpdate,
     Message,
@@ -101,6 +102,7 @@ class FlightResult:
         self._tracks = TrackStore()
         self._chunks = ChunkStore(folder, memory_mb)
         self._median_depths: dict[int, float] = {}
+        self._keyframe_t_ns: dict[int, int] = {}
         self._kernel_times = StageTimes()
         self._positions: dict[PositionSource, tuple[array[int], array[float]]] = {}
         """Times, and coordinates one after the other."""
@@ -117,6 +119,8 @@ class FlightResult:
             self._tracks.put(message)
         elif isinstance(message, MapUpdate):
             self.update = message
+        elif isinstance(message, KeyframeAdded):
+            self._keyframe_t_ns[message.keyframe_id] = message.t_ns
         elif isinstance(message, LoopClosed):
             self.loop_closures.append(message)
         elif isinstance(message, PointChunk):
@@ -200,6 +204,23 @@ class FlightResult:
             if self.georeference is not None:
                 pose = self.georeference.world_from_map.apply_to_pose(pose)
             out.append(WorldPose(track.seq, track.t_ns, pose))
+        return out
+
+    def keyframes(self) -> list[tuple[int, int | None, Pose]]:
+        """Keyframes placed by the final map: number, t_ns (None where unknown), world_from_camera.
+
+        Redundant ones that have left the map are among them, where their neighbours carried them.
+        """
+        if self.update is None:
+            return []
+        out = []
+        for keyframe_id in sorted(self.update.map_from_camera):
+            place = self.update.place_of(keyframe_id)
+            assert place is not None
+            pose = place.apply_to_pose(Pose.identity())
+            if self.georeference is not None:
+                pose = self.georeference.world_from_map.apply_to_pose(pose)
+            out.append((keyframe_id, self._keyframe_t_ns.get(keyframe_id), pose))
         return out
 
     def cloud(self, voxel_m: float) -> Cloud:

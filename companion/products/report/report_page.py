@@ -15,7 +15,13 @@ from companion.geometry.transforms import Array
 from companion.products.cloud import Cloud
 from companion.products.flight_result import FlightResult, RunFacts, WorldPose
 from companion.products.report import plots
-from companion.products.report.cloud_views import CloudView, cloud_views
+from companion.products.report.cloud_scene import PlacedKeyframe, cloud_scene
+from companion.products.report.cloud_views import (
+    SLANT_DOWN_RAD,
+    CloudView,
+    cloud_views,
+    slant_heading_rad,
+)
 from companion.products.report.templates import rendered
 from companion.telemetry import belief_in_words
 
@@ -33,6 +39,11 @@ def report_page(
 ) -> bytes:
     """HTML with all styles and pictures embedded; `numbers` are those of report.json."""
     segments = path_segments(poses)
+    flown = [places for _, places in segments]
+    scene = None
+    if len(cloud):
+        view = slant_heading_rad(cloud, flown), SLANT_DOWN_RAD
+        scene = cloud_scene(cloud, flown, _keyframes(result), view, result.unit, facts.origin)
     return rendered(
         "report.html.j2",
         distance,
@@ -43,7 +54,8 @@ def report_page(
         plots=_plots(result, facts, segments, numbers["duration_s"]),
         autopilot=_autopilot_name(result),
         belief=belief_in_words(facts.believed),
-        views=[_view(view) for view in cloud_views(cloud, [p for _, p in segments])],
+        scene=scene,
+        views=[_view(view) for view in cloud_views(cloud, flown)],
         depths=_depths(result),
         stages={**numbers["stages"], **kernel_stages(result)},
         config=json.dumps(numbers["config"], indent=2, ensure_ascii=False),
@@ -134,6 +146,14 @@ def _plots(
 def _autopilot_name(result: FlightResult) -> str | None:
     found = result.autopilot_path()
     return found[0].value if found is not None else None
+
+
+def _keyframes(result: FlightResult) -> list[PlacedKeyframe]:
+    first = result.first_t_ns or 0
+    return [
+        PlacedKeyframe(keyframe_id, None if t_ns is None else (t_ns - first) * 1e-9, pose)
+        for keyframe_id, t_ns, pose in result.keyframes()
+    ]
 
 
 def _view(view: CloudView) -> dict[str, Any]:
