@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from companion.config import Config
-from companion.estimation.gate.pose_gate import PoseGate
-from companion.geometry.transforms import Pose
+from companion.estimation.gate.pose_gate import PoseGate, PoseToSend
 from companion.messages import Message, Odometry
 from companion.products.atomic_file import write_atomically
 from companion.products.trajectory_file import sent_poses_tum
@@ -24,8 +23,7 @@ class PosesSent:
 
     def __init__(self, config: Config) -> None:
         self._gate = PoseGate(config.feedback, use=config.telemetry.use)
-        self.poses: list[tuple[int, Pose]] = []
-        """Times, ns, and `world_from_body`."""
+        self.poses: list[PoseToSend] = []
 
     def take(self, message: Message) -> None:
         """Take a message of any kind, in the order of a replay."""
@@ -36,15 +34,16 @@ class PosesSent:
             self._predict_until(message.t_ns - 1)
             pose = self._gate.take(message, message.t_ns)
             if pose is not None:
-                self.poses.append((pose.t_ns, pose.world_from_body))
+                self.poses.append(pose)
 
     def write(self, folder: Path) -> None:
         """Write `poses_sent.tum`."""
-        write_atomically(folder / POSES_SENT, sent_poses_tum(self.poses))
+        lines = sent_poses_tum((p.t_ns, p.world_from_body) for p in self.poses)
+        write_atomically(folder / POSES_SENT, lines)
 
     def _predict_until(self, t_ns: int) -> None:
         """Poses that are due between frames."""
         while (due_ns := self._gate.due_ns) is not None and due_ns <= t_ns:
             pose = self._gate.due(due_ns)
             if pose is not None:
-                self.poses.append((pose.t_ns, pose.world_from_body))
+                self.poses.append(pose)

@@ -92,7 +92,7 @@ def report(
     blind = np.array([is_blind(t) for t in t_s])
     all_s = np.array([(o.t_ns - start_ns) * 1e-9 for o in seen])
     all_blind = np.array([is_blind(t) for t in all_s])
-    sent_s = np.array([(t - start_ns) * 1e-9 for t, _ in sent.poses])
+    sent_s = np.array([(p.t_ns - start_ns) * 1e-9 for p in sent.poses])
     way_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))]
     for first in np.flatnonzero(all_blind & ~np.r_[False, all_blind[:-1]]):
         begins_s = all_s[first]
