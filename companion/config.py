@@ -48,6 +48,9 @@ class CameraConfig:
     """Added to stamps, milliseconds: from the source's stamp to mid-exposure."""
     calibration: str = ""
     """Calibration file of a live camera, as `companion calibrate` writes it."""
+    readout_ms: Annotated[float, Meta(ge=-1, le=200)] = -1.0
+    """Rolling shutter: from the exposure of the first row to that of the last, milliseconds; 0 for
+    a global one, -1: as the calibration says."""
     assumed_hfov_deg: Annotated[float, Meta(ge=0, le=150)] = 75.0
     """Horizontal field of view assumed without a calibration, degrees; 0: refuse."""
     pixel_format: Expert[str] = "auto"

@@ -77,6 +77,8 @@ class Track:
     backfilled: bool = False
     sigma_position: float = float("inf")
     sigma_rotation_rad: float = float("inf")
+    rates_camera_rad_s: Array | None = None
+    """Angular rate (3,) in camera axes by which the rolling shutter of the image was undone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

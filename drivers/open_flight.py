@@ -17,6 +17,7 @@ from drivers.datasets.posed_flight import is_posed_folder, open_posed_flight
 from drivers.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from drivers.datasets.video_flight import is_video, open_video
 from drivers.flight import Flight
+from drivers.images.calibration_file import with_readout
 from drivers.recording.recorded_flight import (
     is_recorded_folder,
     is_recording,
@@ -61,7 +62,9 @@ def open_flight(
 
     FlightError where it is invalid, or of no known format.
     """
-    return format_of(path).open(path, config, telemetry or TelemetryConfig())
+    flight = format_of(path).open(path, config, telemetry or TelemetryConfig())
+    flight.camera = with_readout(flight.camera, config.readout_ms)
+    return flight
 
 
 def format_of(path: Path) -> Format:

@@ -43,6 +43,7 @@ N_UPDATES = MAX_VIEWS + 1
 @dataclass(slots=True, eq=False)
 class _BufferedFrame:
     grey: Bytes
+    """Undistorted, of a rolling shutter only once its track has come."""
     rgb: Bytes | None
     """None once it is known that it is no keyframe."""
     track: Track | None = None
@@ -92,6 +93,9 @@ class DepthStage:
         elif isinstance(message, Track):
             buffered = self._frames.get(message.seq)
             if buffered is not None:
+                if self._undistortion.rolls and buffered.track is None:
+                    rates = message.rates_camera_rad_s
+                    buffered.grey = self._undistortion.image(buffered.grey, rates)
                 buffered.track = message
         elif isinstance(message, KeyframeAdded):
             self._waiting.append(message)
@@ -118,7 +122,10 @@ class DepthStage:
         return out
 
     def _buffer(self, frame: Frame) -> None:
-        self._frames[frame.seq] = _BufferedFrame(self._undistortion.image(frame.grey), frame.rgb)
+        # of a rolling shutter once its track says how fast the camera turned
+        rolls = self._undistortion.rolls
+        grey = frame.grey if rolls else self._undistortion.image(frame.grey)
+        self._frames[frame.seq] = _BufferedFrame(grey, frame.rgb)
         if len(self._frames) > MAX_FRAMES:
             # thin out the older half, except frames of pending keyframes
             needed = {k.seq for k in self._waiting}
@@ -143,7 +150,8 @@ class DepthStage:
         if len(chosen) < 3 or not self._scheduled():
             return []
         self._last_reference = keyframe.keyframe_id
-        rgb = self._undistortion.image(buffered.rgb)
+        rates = None if buffered.track is None else buffered.track.rates_camera_rad_s
+        rgb = self._undistortion.image(buffered.rgb, rates)
 
         def depth(engine: DepthEngine) -> DepthMap:
             engine.begin(buffered.grey, near, far)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from companion.dense.view_selection import Intrinsics
 from companion.geometry.camera import Camera
+from companion.geometry.rolling_shutter import Unrolling, nodes
 from companion.geometry.transforms import Array
 from companion.messages import Bytes, Floats
 
@@ -30,9 +31,25 @@ class Undistortion:
         self.intrinsics = Intrinsics(fx, fy, camera.cx, camera.cy)
         self._camera = camera
         self._fixed = cv2.convertMaps(*self._maps(), cv2.CV_16SC2)
+        self._unrolling: Unrolling | None = None
+        if camera.readout_ms:
+            k, grid = self.intrinsics, nodes(camera.width, camera.height)
+            rays = (grid - [k.cx, k.cy]) / [k.fx, k.fy]
+            self._unrolling = Unrolling(camera, 1e-3 * camera.readout_ms, rays, self._maps())
 
-    def image(self, image: Bytes) -> Bytes:
-        """The undistorted image, (H, W) or (H, W, 3)."""
+    @property
+    def rolls(self) -> bool:
+        """True if the camera has a rolling shutter, which is undone by `image`."""
+        return self._unrolling is not None
+
+    def image(self, image: Bytes, rates_rad_s: Array | None = None) -> Bytes:
+        """The undistorted image, (H, W) or (H, W, 3).
+
+        That of a rolling shutter is of the time of its middle row, where `rates_rad_s` (3,), by
+        which its camera turns in its own axes, is known.
+        """
+        if self._unrolling is not None and rates_rad_s is not None:
+            return self._unrolling.image(image, rates_rad_s)
         return np.asarray(cv2.remap(image, *self._fixed, cv2.INTER_LINEAR), np.uint8)
 
     def grey(self, rgb: Bytes) -> Bytes:

@@ -28,6 +28,7 @@ from companion.estimation.lift_off.standing import Standing
 from companion.estimation.odometry.odometry_frame import MapView
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.resumption import Resumption, Verdict
+from companion.estimation.shutter.frame_unrolling import FrameUnrolling
 from companion.estimation.site.site_of_flight import site_of_flight
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
@@ -95,6 +96,7 @@ class LocalisationStage:
         )
         self._imu = JudgedAcceleration(self._acceleration, self._withdraw_accelerations)
         self._flow = FlowMeter(camera)
+        self._unrolling = FrameUnrolling(camera) if camera.readout_ms else None
         self._t_ns = 0
         self._samples: list[Telemetry] = []
         """Telemetry since the last frame: taken with the next, while nothing is mapped."""
@@ -229,7 +231,20 @@ class LocalisationStage:
     def _frame(self, frame: Frame) -> Iterator[Message]:
         # one section for all of a frame: interleaved with mapping each would slow the other
         with self._tracker.map_lock.tracking():
-            yield from self._tracked(frame)
+            self._t_ns = frame.t_ns
+            self._take_samples()
+            rates = None
+            if self._unrolling is not None:
+                with self._times("rolling shutter"):
+                    frame, rates = self._unrolling.unrolled(
+                        frame, self._attitude, self._motion.filter
+                    )
+                yield from self._unrolling.warnings()
+            for out in self._tracked(frame):
+                if rates is not None and isinstance(out, Track) and out.seq == frame.seq:
+                    yield replace(out, rates_camera_rad_s=rates)
+                else:
+                    yield out
             yield FrameTracked(
                 frame.t_ns, frame.seq, self._n_samples, self._tracker.map_lock.point,
                 self._tracker.feature_ratio,
@@ -272,8 +287,6 @@ class LocalisationStage:
             yield flow
 
     def _tracked(self, frame: Frame) -> Iterator[Message]:
-        self._t_ns = frame.t_ns
-        self._take_samples()
         attitude = self._attitude.at(frame.t_ns)
         self._apply_map_correction()
         stands = self._standing.at(frame.t_ns, frame.grey)

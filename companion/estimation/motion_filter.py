@@ -24,6 +24,8 @@ ACCELERATION_NO_ATTITUDE, SIGMA_POSITION_NO_ATTITUDE = 1.5, 0.002
 """Process and measurement noise in map units, one of which is about the scene distance, with and
 without attitude."""
 
+MAX_RATE_SPAN_NS = 300_000_000
+"""Over longer spans a drone may turn this way and back."""
 
 VARIANCE_ALIGNMENT_RAD2 = 1e-4
 """Variance of `map_from_ned` after one image: 0.6 degrees."""
@@ -64,6 +66,19 @@ class MotionFilter:
             return None
         variance = float(np.diag(self._filter.P)[3:6].max())
         return self._filter.x.ravel()[3:6].copy(), float(np.sqrt(max(variance, 0.0)))
+
+    @property
+    def rates_camera_rad_s(self) -> Array | None:
+        """Angular rate (3,) of the camera in its axes between the last two images.
+
+        None where unknown.
+        """
+        if len(self._poses) < 2:
+            return None
+        (t0, a), (t1, b) = self._poses
+        if not 0 < t1 - t0 < MAX_RATE_SPAN_NS:
+            return None
+        return vector_from_rotation(a.rotation.T @ b.rotation) / ((t1 - t0) * 1e-9)
 
     def predict(self, t_ns: int, ned_from_camera: Array | None) -> Pose | None:
         """Predicted `map_from_camera`; None when unknown."""

@@ -57,6 +57,9 @@ class Camera:
     body_from_camera: Pose | None = None
     assumed: bool = field(default=False)
     """True if the intrinsics are a guess, without calibration."""
+    readout_ms: float | None = None
+    """Time from the exposure of the top row to that of the bottom one; 0 for a global shutter, None
+    where unknown."""
 
     @property
     def focal_px(self) -> float:

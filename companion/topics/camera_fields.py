@@ -12,6 +12,7 @@ from companion.topics.pose_rows import POSE_NUMBERS, pose_of, pose_row
 LEAST_SIDE, MOST_SIDE = 16, 8192
 MOST_PIXELS = 20_000_000
 MOST_FOCAL_PX = 1e6
+MOST_READOUT_MS = 1000.0
 
 
 def camera_fields(camera: Camera) -> dict[str, Any]:
@@ -22,7 +23,7 @@ def camera_fields(camera: Camera) -> dict[str, Any]:
         "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
         "distortion": camera.distortion.value, "coefficients": list(camera.coefficients),
         "body_from_camera": pose_row(body) if body is not None else None,
-        "assumed": camera.assumed,
+        "assumed": camera.assumed, "readout_ms": camera.readout_ms,
     }  # fmt: skip
 
 
@@ -42,7 +43,10 @@ def camera_of(part: Envelope) -> Camera:
     body = None
     if part.known("body_from_camera"):
         body = pose_of(part.numbers("body_from_camera", POSE_NUMBERS, MOST_FOCAL_PX))
+    readout_ms = None
+    if part.known("readout_ms"):
+        readout_ms = part.number("readout_ms", 0.0, MOST_READOUT_MS)
     return Camera(
         width, height, focal[0], focal[1], centre[0], centre[1], distortion,
-        tuple(coefficients), body, part.flag("assumed"),
+        tuple(coefficients), body, part.flag("assumed"), readout_ms,
     )  # fmt: skip

@@ -191,7 +191,7 @@ def _pictures_of(envelope: Envelope) -> list[Picture]:
 
 def _tracks(tracks: Sequence[Track]) -> dict[str, np.ndarray]:
     known = [t.keyframe_id if t.keyframe_id is not None else -1 for t in tracks]
-    return {
+    arrays = {
         "track_seq_t": _pairs([(t.seq, t.t_ns) for t in tracks]),
         "track_state": np.array([STATES.index(t.state) for t in tracks], np.uint8),
         "track_backfilled": np.array([t.backfilled for t in tracks], np.uint8),
@@ -203,6 +203,11 @@ def _tracks(tracks: Sequence[Track]) -> dict[str, np.ndarray]:
         "track_map_from_camera": pose_rows([t.map_from_camera for t in tracks]),
         "track_keyframe_from_camera": pose_rows([t.keyframe_from_camera for t in tracks]),
     }
+    rates = [t.rates_camera_rad_s for t in tracks]
+    if any(rate is not None for rate in rates):  # of a rolling shutter only
+        unknown = np.full(3, np.nan)
+        arrays["track_rates"] = np.stack([unknown if r is None else r for r in rates])
+    return arrays
 
 
 def _tracks_of(envelope: Envelope) -> list[Track]:
@@ -218,6 +223,9 @@ def _tracks_of(envelope: Envelope) -> list[Track]:
         envelope.array(name, "<f8", n, 7, finite=False)
         for name in ("track_map_from_camera", "track_keyframe_from_camera")
     )
+    rates = np.full((n, 3), np.nan)
+    if "track_rates" in envelope.arrays:
+        rates = envelope.array("track_rates", "<f8", n, 3, finite=False)
     out = []
     for k in range(n):
         track = Track(
@@ -225,6 +233,7 @@ def _tracks_of(envelope: Envelope) -> list[Track]:
             int(keyframes[k]) if keyframes[k] >= 0 else None, pose_of(relative[k]),
             int(found[k, 0]), int(found[k, 1]), None, bool(backfilled[k]),
             float(sigmas[k, 0]), float(sigmas[k, 1]),
+            rates[k] if np.isfinite(rates[k]).all() else None,
         )  # fmt: skip
         out.append(track)
     return out

@@ -13,7 +13,12 @@ from companion.errors import ConfigError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from drivers.camera.pattern_camera import pattern_optics
-from drivers.images.calibration_file import FORWARD_UPRIGHT, assumed_camera, read_calibration
+from drivers.images.calibration_file import (
+    FORWARD_UPRIGHT,
+    assumed_camera,
+    read_calibration,
+    with_readout,
+)
 
 
 def live_camera(
@@ -52,7 +57,7 @@ def live_camera(
             "how the camera sits on the body is not known, so that the autopilot's attitude cannot "
             "be used; set [mount]"
         )
-    return camera, warnings
+    return with_readout(camera, config.readout_ms), warnings
 
 
 def body_from_camera(mount: MountConfig) -> Pose:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import sys
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.errors import FlightError
+from companion.errors import ConfigError, FlightError
 from companion.geometry.camera import COEFFICIENTS, Camera, Distortion
 from companion.geometry.transforms import Array, Pose
 from drivers.images.text_table import numbers_of, read_rows
@@ -30,6 +31,10 @@ MODELS = {
     "fisheye": Distortion.EQUIDISTANT,
 }
 MAX_TURN_ERROR = 1e-3
+MAX_READOUT_MS = 200.0
+"""No camera that gives 5 frames/s or more takes longer."""
+AS_CALIBRATED = -1.0
+"""Value of `camera.readout_ms` that leaves it to the calibration."""
 FORWARD_UPRIGHT: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Rotation body_from_camera of a camera that looks forward, upright."""
 
@@ -56,7 +61,23 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
     return Camera(
         width, height, fx, fy, cx, cy, model, _coefficients(path, content, model),
         body_from_camera_of(path, content.get("body_from_camera")), content.get("assumed") is True,
+        _readout_ms(path, content),
     )  # fmt: skip
+
+
+def with_readout(camera: Camera, readout_ms: float) -> Camera:
+    """The camera with the readout that is configured; -1 leaves it as it is.
+
+    ConfigError for any other negative number.
+    """
+    if readout_ms == AS_CALIBRATED:
+        return camera
+    if readout_ms < 0:
+        raise ConfigError(
+            f"camera.readout_ms = {readout_ms:g}: give the readout in milliseconds, 0 for a global "
+            "shutter, or -1 to take it from the calibration"
+        )
+    return dataclasses.replace(camera, readout_ms=readout_ms)
 
 
 def read_matrix(path: Path, width: int, height: int) -> Camera:
@@ -100,6 +121,18 @@ def _number(path: Path, content: Mapping[str, Any], key: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise FlightError(f"{path}: {key} must be a number, it is {value!r}")
     return float(value)
+
+
+def _readout_ms(path: Path, content: Mapping[str, Any]) -> float | None:
+    if content.get("readout_ms") is None:
+        return None
+    readout_ms = _number(path, content, "readout_ms")
+    if not 0 <= readout_ms <= MAX_READOUT_MS:
+        raise FlightError(
+            f"{path}: readout_ms must be between 0 (a global shutter) and {MAX_READOUT_MS:g}, it "
+            f"is {readout_ms:g}"
+        )
+    return readout_ms
 
 
 def _model(path: Path, content: Mapping[str, Any]) -> Distortion:

@@ -28,6 +28,8 @@ def camera_document(camera: Camera) -> bytes:
         "D": [float(each) for each in camera.coefficients],
         "assumed": camera.assumed,
     }  # fmt: skip
+    if camera.readout_ms is not None:
+        document["readout_ms"] = camera.readout_ms
     mount = camera.body_from_camera
     if mount is not None:
         matrix = np.eye(4)
@@ -47,11 +49,14 @@ def camera_of(document: bytes) -> Camera:
         mount = None if matrix is None else Pose.from_matrix(np.array(matrix, np.float64))
         coefficients = tuple(map(float, given["D"]))
         assumed = bool(given["assumed"])
+        readout_ms = None if given.get("readout_ms") is None else float(given["readout_ms"])
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise ValueError(f"not a camera: {error}") from error
     if len(coefficients) != len(COEFFICIENTS[model]) or min(width, height, fx, fy) <= 0:
         raise ValueError("not a camera: numbers are missing")
-    return Camera(width, height, fx, fy, cx, cy, model, coefficients, mount, assumed)
+    if readout_ms is not None and not 0 <= readout_ms < 1e3:
+        raise ValueError(f"not a camera: a readout of {readout_ms} ms")
+    return Camera(width, height, fx, fy, cx, cy, model, coefficients, mount, assumed, readout_ms)
 
 
 def calibration_bytes(camera: Camera, t_ns: int) -> bytes:

@@ -83,6 +83,16 @@ class CameraAttitude:
         attitude = self._history.at(t_ns + self._delay_ns)
         return None if attitude is None else attitude @ self._mount
 
+    def rates_at(self, t_ns: int, half_span_ns: int) -> Array | None:
+        """Mean angular rate (3,) of the camera in its axes, rad/s, over a span about a time.
+
+        None where unknown.
+        """
+        if not self.used or self._is_invalid(t_ns):
+            return None
+        found = self._history.with_rates_at(t_ns + self._delay_ns, half_span_ns)
+        return None if found is None else self._mount.T @ found[1]
+
     def of_keyframe(self, keyframe_id: int, t_ns: int) -> Array | None:
         """The same of a keyframe, interpolated once later samples have arrived."""
         if not self.used or self._is_invalid(t_ns):

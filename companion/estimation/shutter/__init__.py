@@ -1,0 +1,1 @@
+"""Rolling shutter: undone in images, and noticed where it is not known."""
