@@ -30,6 +30,8 @@ from companion.topics.pose_rows import known_pose_of, pose_of, pose_rows
 
 STATES = list(TrackState)
 MOST_FRAMES, MOST_TRACKS, MOST_KEYFRAMES = 256, 4096, 64
+MOST_RATE_RAD_S = 100.0
+"""Gyroscopes end at a third of it."""
 
 
 NO_COLOUR = np.zeros((0, 0, 3), np.uint8)
@@ -233,7 +235,7 @@ def _tracks_of(envelope: Envelope) -> list[Track]:
             int(keyframes[k]) if keyframes[k] >= 0 else None, pose_of(relative[k]),
             int(found[k, 0]), int(found[k, 1]), None, bool(backfilled[k]),
             float(sigmas[k, 0]), float(sigmas[k, 1]),
-            rates[k] if np.isfinite(rates[k]).all() else None,
+            rates[k] if np.abs(rates[k]).max() < MOST_RATE_RAD_S else None,
         )  # fmt: skip
         out.append(track)
     return out

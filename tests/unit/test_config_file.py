@@ -24,7 +24,7 @@ from tests.support.settings_text import described_toml, settings, settings_page
 ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
-SINCE = {"feedback.flow", "telemetry.use"}
+SINCE = {"camera.readout_ms", "feedback.flow", "telemetry.use"}
 """Keys that version did not have."""
 
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Pose, rotation_from_vector
+from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.messages import Frame, KeyframeAdded, MapUpdate, Message, Track, TrackState
+from tests.support.flights.rolling_scene import rolled
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld
 
 KEYFRAME_EVERY = 4
+
+
+def _turning(pose: Pose, rates_rad_s: Array, t_s: float) -> Pose:
+    return Pose(pose.rotation @ rotation_from_vector(rates_rad_s * t_s), pose.translation)
 
 
 def at(k: int) -> Pose:
@@ -21,19 +28,30 @@ def at(k: int) -> Pose:
 
 
 def told(
-    camera: Camera, n: int, scale_of: dict[int, float] | None = None
+    camera: Camera,
+    n: int,
+    scale_of: dict[int, float] | None = None,
+    rates_of: Callable[[int], Array] | None = None,
 ) -> Iterator[tuple[int, Message]]:
-    """Messages of n frames in order, each with the frame's number, which is its time in ns too."""
+    """Messages of n frames in order, each with the frame's number, which is its time in ns too.
+
+    With a rolling shutter the camera turns by `rates_of` a frame (3,), rad/s, while it is read out.
+    """
     world = PlaneWorld(np.random.default_rng(21))
     poses: dict[int, Pose] = {}
     for k in range(n):
         grey, depth = world.render(camera, at(k))
+        if rates_of is not None:
+            assert camera.readout_ms
+            pose_at = partial(_turning, at(k), rates_of(k))
+            grey = rolled(world, camera, pose_at, 1e-3 * camera.readout_ms)
         yield k, Frame(k, k, grey, np.repeat(grey[..., None], 3, 2))
         keyframe = k // KEYFRAME_EVERY
         if k % KEYFRAME_EVERY == 0:
             poses[keyframe] = at(k)
         relative = poses[keyframe].inverse() @ at(k)
-        yield k, Track(k, k, TrackState.TRACKING, at(k), keyframe, relative)
+        track = Track(k, k, TrackState.TRACKING, at(k), keyframe, relative)
+        yield k, track if rates_of is None else replace(track, rates_camera_rad_s=rates_of(k))
         if k % KEYFRAME_EVERY == 0:
             v, u = np.nonzero(depth)
             some = slice(None, None, 97)

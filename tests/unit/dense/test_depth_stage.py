@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pyopencl as cl
@@ -58,6 +59,30 @@ def fly(
         last = k
         out += it.step(message)
     return out + it.flush()
+
+
+def turning(k: int) -> np.ndarray:
+    """Angular rates of a camera that turns this way and that: 90 degrees/s at most."""
+    return np.array([0.8 * np.sin(0.9 * k), 1.4 * np.cos(1.7 * k), 1.0 * np.sin(2.3 * k)])
+
+
+def test_the_turning_of_a_rolling_shutter_is_undone() -> None:
+    messages = [m for _, m in told(replace(RADTAN, readout_ms=25.0), 34, None, turning)]
+
+    def heights(readout_ms: float | None) -> np.ndarray:
+        """Of the points, m."""
+        it, out = stage(replace(RADTAN, readout_ms=readout_ms)), []
+        for message in messages:
+            out += it.step(message)
+        chunks = [m for m in [*out, *it.flush()] if isinstance(m, PointChunk)]
+        return np.concatenate(
+            [at(4 * c.keyframe_id).apply(c.points_camera.astype(np.float64))[:, 2] for c in chunks]
+        )
+
+    undone, ignored = heights(25.0), heights(None)
+    surfaces = np.array([0.0, -1.5, -2.0, -2.5, -3.0, -3.5, -4.0])
+    assert np.median(np.abs(undone[:, None] - surfaces).min(1)) < 0.06, "metres, from 12 m above"
+    assert len(undone) > 2.5 * len(ignored), "ignored, few depths are consistent"
 
 
 @pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=["radtan", "fisheye"])

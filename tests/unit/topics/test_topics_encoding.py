@@ -103,15 +103,17 @@ def test_map_and_depth_are_as_documented() -> None:
 def test_cameras_are_as_they_were() -> None:
     lens = Camera(
         640, 480, 500.0, 501.0, 320.5, 239.5, Distortion.RADTAN, (0.1, -0.05, 0.0, 0.001, 0.0),
-        Pose(flown.WORLD_FROM_MAP.rotation, np.array([0.1, 0.0, 0.05])),
+        Pose(flown.WORLD_FROM_MAP.rotation, np.array([0.1, 0.0, 0.05])), readout_ms=18.0,
     )  # fmt: skip
     about = unpack(Envelope("flight", {"camera": camera_fields(lens)}, {}).pack())
     back = camera_of(about.part("camera"))
     assert [getattr(back, n) for n in ("width", "fy", "cx")] == [640, 501.0, 320.5]
+    assert back.readout_ms == 18.0
     assert back.coefficients == lens.coefficients and back.distortion is lens.distortion
     assert back.body_from_camera is not None and lens.body_from_camera is not None
     assert np.allclose(back.body_from_camera.matrix(), lens.body_from_camera.matrix(), atol=1e-12)
-    for wrong in ({"width": 10**6}, {"fx": 0}, {"coefficients": [1]}, {"distortion": "fish"}):
+    for wrong in ({"width": 10**6}, {"fx": 0}, {"coefficients": [1]}, {"distortion": "fish"},
+                  {"readout_ms": -1}):  # fmt: skip
         with pytest.raises(StreamError):
             camera_of(Envelope("flight.camera", {**camera_fields(lens), **wrong}, {}))
 
@@ -130,6 +132,17 @@ def test_bundles_are_as_they_were() -> None:
             image = frame_of(picture, topic_flight.CAMERA)
             true_frame = topic_flight.frame(picture.seq, topic_flight.wall())
             assert np.abs(image.grey.astype(int) - true_frame.grey).mean() < 3
+
+
+def test_angular_rates_of_a_rolling_shutter_come_along_and_impossible_ones_do_not() -> None:
+    (sent, *_) = topic_flight.bundles(20)
+    rates = [None, np.array([0.1, -2.0, 0.3]), np.array([0.0, 1e200, 0.0])]
+    tracks = [replace(sent.tracks[0], rates_camera_rad_s=rate) for rate in rates]
+    back = bundle_of(unpack(replace(sent, tracks=tracks).pack())).tracks
+    assert back[0].rates_camera_rad_s is None and back[2].rates_camera_rad_s is None
+    assert back[1].rates_camera_rad_s is not None
+    assert back[1].rates_camera_rad_s.tolist() == [0.1, -2.0, 0.3]
+    assert "track_rates" not in unpack(sent.pack()).arrays
 
 
 def test_a_map_is_rebuilt_from_its_changes() -> None:

@@ -11,7 +11,8 @@ from companion.config import CameraConfig, MountConfig
 from companion.errors import ConfigError, FlightError
 from companion.geometry.camera import Distortion
 from drivers.camera.live_calibration import body_from_camera, live_camera
-from drivers.images.calibration_file import assumed_camera, read_calibration
+from drivers.images.calibration_file import assumed_camera, read_calibration, with_readout
+from drivers.recording.camera_document import camera_document, camera_of
 
 GOOD: dict[str, Any] = {
     "width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 31.0, "cy": 24.0,
@@ -101,6 +102,28 @@ def test_no_json(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "camera.json").write_bytes(content)
     with pytest.raises(FlightError, match=r"camera\.json"):
         read_calibration(tmp_path / "camera.json", 64, 48)
+
+
+def test_readout_is_read_and_what_is_configured_goes_before(tmp_path: Path) -> None:
+    assert read_calibration(write(tmp_path), 64, 48).readout_ms is None
+    stated = read_calibration(write(tmp_path, readout_ms=18.5), 64, 48)
+    assert stated.readout_ms == 18.5
+    assert with_readout(stated, -1.0) is stated
+    assert with_readout(stated, 0.0).readout_ms == 0.0
+    config = CameraConfig(calibration=str(write(tmp_path, readout_ms=18.5)), readout_ms=25.0)
+    assert live_camera(config, MountConfig(), 64, 48)[0].readout_ms == 25.0
+    assert camera_of(camera_document(stated)).readout_ms == 18.5
+
+
+@pytest.mark.parametrize("wrong", [-1, 201, "25", True, float("inf")])
+def test_a_readout_that_cannot_be_is_refused(tmp_path: Path, wrong: object) -> None:
+    with pytest.raises(FlightError, match="readout_ms"):
+        read_calibration(write(tmp_path, readout_ms=wrong), 64, 48)
+
+
+def test_a_configured_readout_that_cannot_be_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"camera\.readout_ms = -0\.5"):
+        with_readout(assumed_camera(64, 48, 70.0), -0.5)
 
 
 def test_assumed_camera_sees_as_wide_as_said() -> None:
