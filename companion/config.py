@@ -345,6 +345,15 @@ class StreamConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class PageConfig:
+    """The page on the drone, for a browser; see docs/page.md."""
+
+    listen: str = "127.0.0.1:9880"
+    """HOST:PORT of the page; "" for none. 0.0.0.0 is every network: whoever is not on this machine
+    needs a code, which `companion page` shows."""
+
+
+@dataclass(frozen=True, slots=True)
 class DistributedConfig:
     """Stages on several machines, joined by topics over Zenoh; see docs/topics.md."""
 
@@ -412,6 +421,7 @@ class Config:
     depth: DepthConfig = field(default_factory=DepthConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
+    page: PageConfig = field(default_factory=PageConfig)
     distributed: DistributedConfig = field(default_factory=DistributedConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
     export: ExportConfig = field(default_factory=ExportConfig)

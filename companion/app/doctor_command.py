@@ -10,7 +10,7 @@ import asyncio
 import dataclasses
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TextIO
 
@@ -70,11 +70,14 @@ def doctor(
     *,
     write: bool = False,
     yes: bool = False,
+    only: Collection[str] = (),
     as_json: bool = False,
     out: TextIO | None = None,
     ask: Ask | None = None,
 ) -> int:
     """Examine, print, and set on request; 0 if nothing prevents use of the pose, else 1.
+
+    With `only`, parameters of these names are set and no others.
 
     InputError for an impossible configuration or usage, SourceError without an autopilot.
     """
@@ -95,7 +98,7 @@ def doctor(
     link = replace(config.link, url=_url_to_ask_at(config, daemon))
     decide: Ask = (lambda question: True) if yes else ask
     show = None if as_json else lambda examination: _print_findings(examination, config, out)
-    found = asyncio.run(_examine(config, link, daemon, decide if write else None, show))
+    found = asyncio.run(_examine(config, link, daemon, decide if write else None, only, show))
     if as_json:
         print(json.dumps(_document(found), ensure_ascii=False), file=out)
     else:
@@ -108,6 +111,7 @@ async def _examine(
     link_config: LinkConfig,
     daemon: Mapping[str, Any] | None,
     decide: Ask | None,
+    only: Collection[str],
     show: Callable[[Examination], None] | None,
 ) -> Examination:
     feedback, latency_ms = config.feedback, _latency_ms(daemon)
@@ -138,17 +142,17 @@ async def _examine(
         found = Examination(vehicle, link_config.url, mode, findings, n_examined, comes)
         if show is not None:
             show(found)
-        if decide is None or not _to_set(found):
+        if decide is None or not _to_set(found, only):
             return found
         if link.vehicle is not None and link.vehicle.armed:
             raise SourceError(f"{vehicle} is armed; nothing is set in flight")
-        if not await asyncio.to_thread(decide, _question(found)):
+        if not await asyncio.to_thread(decide, _question(found, only)):
             return found
         for _ in range(ROUNDS):
-            for finding in _to_set(found):
+            for finding in _to_set(found, only):
                 await _set(parameters, finding, found)
             found.findings, found.n_examined = await look()
-            if not _to_set(found) or found.refused:
+            if not _to_set(found, only) or found.refused:
                 break
         if found.written:
             try:
@@ -173,12 +177,13 @@ async def _set(parameters: Parameters, finding: Finding, found: Examination) -> 
     )  # fmt: skip
 
 
-def _to_set(found: Examination) -> list[Finding]:
-    return [finding for finding in found.blocking if finding.set_to is not None]
+def _to_set(found: Examination, only: Collection[str] = ()) -> list[Finding]:
+    settable = [finding for finding in found.blocking if finding.set_to is not None]
+    return [finding for finding in settable if not only or finding.name in only]
 
 
-def _question(found: Examination) -> str:
-    n = len(_to_set(found))
+def _question(found: Examination, only: Collection[str]) -> str:
+    n = len(_to_set(found, only))
     return f"Set {_n(n, 'parameter')} of {found.vehicle}? [y/N] "
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import Callable, Coroutine
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from companion.daemon.flights.recording_recovery import RecordingRecovery
 from companion.daemon.health_watch import HealthWatch
 from companion.daemon.link_watch import LinkWatch
 from companion.daemon.loop_delay import measure_loop_delay
+from companion.daemon.page_child import PageChild, SettingsSource
 from companion.daemon.periodic_checks import PeriodicChecks
 from companion.daemon.pose.flow_sender import FlowSender
 from companion.daemon.pose.kept_counter import counter_path
@@ -58,6 +60,8 @@ from drivers.system.status_socket import StatusSocket, own_socket_path
 
 LEAST_WAIT_S = 0.005
 NOT_WRITTEN = "the results so far could not be written"
+MOST_WARNINGS = 20
+"""Kinds of warnings in the status document, the newest."""
 WRITE_S = 0.2
 """Time to write the armed settings at the end."""
 END_S = 2.6
@@ -67,7 +71,7 @@ END_S = 2.6
 class Daemon:
     """All parts of the daemon; `run` gives the exit status. Create it within the event loop."""
 
-    def __init__(self, load: Callable[[], Config], start: Start) -> None:
+    def __init__(self, load: Callable[[], Config], start: Start, source: SettingsSource) -> None:
         self._clock = clock = FlightClock()
         self._journal = journal = Journal()
         self._loop = asyncio.get_running_loop()
@@ -140,6 +144,12 @@ class Daemon:
             settings, clock, journal, self._service, self._feed, self._link, link_watch, flights,
             dates, watch, starts, self._stop,
         )  # fmt: skip
+        self._page: PageChild | None = None
+        if config.page.listen:
+            self._page = PageChild(
+                config, source, own_socket_path(config.daemon.socket), self._service.is_there,
+                journal, lambda: settings.armed, self._checks.reload, self._stop,
+            )  # fmt: skip
         self._recovery = RecordingRecovery(
             Path(config.daemon.flights), clock, self._on_warned, lambda: starts.reported_armed
         )
@@ -150,9 +160,7 @@ class Daemon:
         loop.add_signal_handler(signal.SIGINT, self._stop.interrupt)
         loop.add_signal_handler(signal.SIGTERM, self._stop.stop)
         loop.add_signal_handler(signal.SIGHUP, self._checks.reload)
-        socket = StatusSocket(
-            own_socket_path(config.daemon.socket), self._watch.document, self._problem
-        )
+        socket = StatusSocket(own_socket_path(config.daemon.socket), self._document, self._problem)
         metrics = Metrics(config.daemon.prometheus_port, self._watch.health, self._problem)
         await socket.start()
         if config.daemon.prometheus_port:
@@ -199,7 +207,7 @@ class Daemon:
             self._recovery.run(),
         ]
         feedback = self._settings.config.feedback
-        for part in (self._link, self._sender, self._reports, self._ground):
+        for part in (self._link, self._sender, self._reports, self._ground, self._page):
             if part is not None:
                 work.append(part.run())
         if self._link is not None and feedback.set_origin:
@@ -210,6 +218,30 @@ class Daemon:
             )  # fmt: skip
             work.append(keeper.run())
         return work
+
+    def _document(self) -> dict[str, Any]:
+        """Status document: health, and what the page shows besides."""
+        now_ns, flight = self._clock.now_ns(), self._flights.current
+        camera, origin = self._starts.camera, self._link.origin if self._link is not None else None
+        warnings = [
+            {
+                "what": each.what, "detail": each.detail, "good": each.good,
+                "age_s": round((now_ns - each.t_ns) * 1e-9, 1),
+            }
+            for each in reversed(self._journal.newest.values())
+        ]  # fmt: skip
+        return {
+            **self._watch.document(),
+            "armed": self._settings.armed,
+            "page": self._settings.config.page.listen,
+            "kept": flight is not None and flight.kept,
+            "flights": str(Path(self._settings.config.daemon.flights).resolve()),
+            "viewers_port": flight.viewing.port if flight and flight.viewing else 0,
+            "mount_known": camera is not None and camera.body_from_camera is not None,
+            "size": [camera.width, camera.height] if camera is not None else None,
+            "origin": asdict(origin) if origin is not None else None,
+            "warnings": warnings[:MOST_WARNINGS],
+        }
 
     # -- what comes in --------------------------------------------------------------------------
 
@@ -340,13 +372,13 @@ class Daemon:
             pass
 
 
-async def _run(load: Callable[[], Config], start: Start) -> int:
-    return await Daemon(load, start).run()
+async def _run(load: Callable[[], Config], start: Start, source: SettingsSource) -> int:
+    return await Daemon(load, start, source).run()
 
 
-def run(load: Callable[[], Config], start: Start) -> int:
-    """Run the daemon with the configuration that `load` reads; the exit status.
+def run(load: Callable[[], Config], start: Start, source: SettingsSource) -> int:
+    """Run the daemon with the configuration that `load` reads from `source`; the exit status.
 
     `start` starts processes of stages.
     """
-    return asyncio.run(_run(load, start))
+    return asyncio.run(_run(load, start, source))

@@ -6,8 +6,8 @@ import asyncio
 
 from drivers.system.journal import ERROR, Journal
 
-FAULT, BAD_INPUT = 1, 2
-"""Exit statuses."""
+FAULT, BAD_INPUT, RESTART = 1, 2, 75
+"""Exit statuses; the last asks the service manager for another start (sysexits.h, EX_TEMPFAIL)."""
 
 
 class StopRequest:
@@ -40,6 +40,11 @@ class StopRequest:
         if self.status == 0:
             self._journal.say(f"error: {why}", ERROR)
             self.status = status
+        self.stop()
+
+    def restart(self) -> None:
+        """End the daemon soon, so that the service manager starts it again."""
+        self.status = self.status or RESTART
         self.stop()
 
     async def wait(self) -> None:

@@ -23,6 +23,8 @@ class Journal:
         self._with_priority = "JOURNAL_STREAM" in environment
         self._lock = threading.Lock()
         self.n_warnings: Counter[str] = Counter()
+        self.newest: dict[str, Warned] = {}
+        """Newest warning of each kind, the newest kind last."""
 
     def say(self, text: str, priority: int = INFO) -> None:
         """Write one line."""
@@ -39,6 +41,8 @@ class Journal:
         with self._lock:
             self.n_warnings[warning.what] += 1
             n = self.n_warnings[warning.what]
+            self.newest.pop(warning.what, None)
+            self.newest[warning.what] = warning
         written = n <= MAX_SAME_IN_A_ROW or n % EVERY == 0
         if written:
             often = f" (for the {n}th time)" if n > MAX_SAME_IN_A_ROW else ""

@@ -33,6 +33,11 @@ class ServiceManager:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.setblocking(False)
 
+    @property
+    def is_there(self) -> bool:
+        """True where a service manager has started this process."""
+        return self._socket is not None
+
     def ready(self, status: str = "") -> None:
         """READY=1; also at the end of a reload."""
         self._send("READY=1", _status(status))

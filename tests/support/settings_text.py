@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
 import textwrap
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import get_type_hints
 
-from msgspec import Meta
-
-from companion.config import EXPERT, Config
-from companion.config_file import toml_value
+from companion.config import Config
+from companion.page.setting_texts import PURPOSES, Setting, settings
 
 ROOT = Path(__file__).parents[2]
-PURPOSES = {
-    "Camera": ("camera", "mount"),
-    "Autopilot": ("link", "router", "telemetry", "feedback", "control"),
-    "Flights, and what is kept of them": ("daemon", "recorder", "export"),
-    "Dense map": ("depth", "cloud", "opencl"),
-    "Looking on, other machines": ("stream", "distributed"),
-}
-"""Sections with public keys."""
 TOML_HEAD = """\
 # Settings, with their defaults. Take the "#" away before a key to change it; a file needs only what
 # it changes. The same keys go on the command line: --set depth.enabled=false. Keys that few drones
@@ -53,28 +40,6 @@ code that uses them.
 TABLE_HEAD = "\n| key | default | values | |\n|---|---|---|---|"
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """One key, and its text."""
-
-    name: str
-    default: str
-    values: str
-    text: str
-
-
-def settings(section: str, expert: bool) -> Iterator[Setting]:
-    """Those of a section, in the order of its class."""
-    kind = get_type_hints(Config)[section]
-    texts = _texts(kind)
-    for key, hint in get_type_hints(kind, include_extras=True).items():
-        marks = getattr(hint, "__metadata__", ())
-        if (EXPERT in marks) == expert:
-            name = f"{EXPERT}.{section}.{key}" if expert else f"{section}.{key}"
-            default = toml_value(getattr(getattr(Config(), section), key))
-            yield Setting(name, default, _values(hint, marks), texts.get(key, ""))
-
-
 def described_toml() -> str:
     """The public keys, each commented out below its text."""
     blocks = [TOML_HEAD]
@@ -100,33 +65,6 @@ def settings_page() -> str:
     lines += [EXPERT_HEAD[1:] + TABLE_HEAD]
     lines += [_row(each) for section in get_type_hints(Config) for each in settings(section, True)]
     return "\n".join(lines) + "\n"
-
-
-def _texts(kind: type) -> dict[str, str]:
-    """The text below each key; Python itself forgets it."""
-    (class_,) = ast.parse(inspect.getsource(kind)).body
-    assert isinstance(class_, ast.ClassDef)
-    return {
-        above.target.id: " ".join(str(below.value.value).split())
-        for above, below in zip(class_.body, class_.body[1:], strict=False)
-        if isinstance(above, ast.AnnAssign)
-        and isinstance(above.target, ast.Name)
-        and isinstance(below, ast.Expr)
-        and isinstance(below.value, ast.Constant)
-    }
-
-
-def _values(hint: Any, marks: tuple[Any, ...]) -> str:
-    kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-    of_each = get_args(kind)[0] if get_origin(kind) is tuple else kind
-    if get_origin(of_each) is Literal:
-        return ", ".join(get_args(of_each))
-    if get_origin(kind) is Union:
-        return ", ".join(
-            _values(each, getattr(each, "__metadata__", ())) for each in get_args(kind)
-        )
-    limits = next((mark for mark in marks if isinstance(mark, Meta)), None)
-    return "" if limits is None else f"{limits.ge:.15g} to {limits.le:.15g}"
 
 
 def _row(it: Setting) -> str:

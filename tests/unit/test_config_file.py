@@ -19,12 +19,13 @@ from companion.config_file import (
     without_passwords,
 )
 from companion.errors import ConfigError
-from tests.support.settings_text import described_toml, settings, settings_page
+from companion.page.setting_texts import settings
+from tests.support.settings_text import described_toml, settings_page
 
 ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
-SINCE = {"camera.readout_ms", "feedback.flow", "telemetry.use"}
+SINCE = {"camera.readout_ms", "feedback.flow", "page.listen", "telemetry.use"}
 """Keys that version did not have."""
 
 

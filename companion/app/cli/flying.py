@@ -36,8 +36,9 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
     with ForkServer(copy=True) as server:  # before there are threads and what only the daemon needs
         from companion.daemon.daemon import run
+        from companion.daemon.page_child import SettingsSource
 
-        return run(load, server.start)
+        return run(load, server.start, SettingsSource(arguments.config, tuple(arguments.set)))
 
 
 def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -49,6 +50,13 @@ def _status(arguments: argparse.Namespace, signals: StopSignals) -> int:
         found_socket_path(setting), sys.stdout, as_json=arguments.json, watch=arguments.watch,
         stop=threading.Event(),
     )  # fmt: skip
+    return 0
+
+
+def _page(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.app.page_command import show_page
+
+    show_page(load_config(arguments.config, arguments.set), sys.stdout, arguments.new_codes)
     return 0
 
 
@@ -77,6 +85,7 @@ def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
 COMMANDS: dict[str, Command] = {
     "run": _run,
     "status": _status,
+    "page": _page,
     "view": _view,
     "check-config": _check_config,
 }
@@ -104,6 +113,16 @@ def add_parsers(commands: Any) -> None:
         "status", parents=[configuration(), json_option()], help="ask the running daemon how it is"
     )
     status.add_argument("--watch", action="store_true", help="again every second, until Ctrl-C")
+
+    page = commands.add_parser(
+        "page", parents=[configuration()],
+        help="show where the drone's page is, and the codes that pair a device with it",
+        description="The page is served by `companion run` at page.listen. A browser on another "
+        "machine needs one of the codes: the first to look on, the second to change things.",
+    )  # fmt: skip
+    page.add_argument(
+        "--new-codes", action="store_true", help="draw other codes: every paired device is out"
+    )
 
     view = commands.add_parser(
         "view", help="watch a flight on the ground, over whatever link there is",

@@ -57,7 +57,10 @@ def _doctor(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.doctor_command import doctor
 
     config = load_config(arguments.config, arguments.set)
-    return doctor(config, write=arguments.write, yes=arguments.yes, as_json=arguments.json)
+    return doctor(
+        config, write=arguments.write, yes=arguments.yes, only=arguments.only,
+        as_json=arguments.json,
+    )  # fmt: skip
 
 
 COMMANDS: dict[str, Command] = {"devices": _devices, "calibrate": _calibrate, "doctor": _doctor}
@@ -114,4 +117,8 @@ def add_parsers(commands: Any) -> None:
         "stands in the way. Exit status 1 where there is one.",
     )  # fmt: skip
     doctor.add_argument("--write", action="store_true", help="set them, after asking")
+    doctor.add_argument(
+        "--only", action="append", default=[], metavar="NAME",
+        help="with --write, set this parameter and no others; can be given again",
+    )  # fmt: skip
     doctor.add_argument("--yes", action="store_true", help="do not ask")

@@ -344,7 +344,7 @@ class LiveFlight:
 def stages_of(config: Config) -> list[Stage]:
     """Stages of a live flight."""
     left_out = set()
-    if config.daemon.viewer == NOWHERE and not config.stream.listen:
+    if config.daemon.viewer == NOWHERE and not (config.stream.listen or config.page.listen):
         left_out.add(VIEWERS)
     if not config.recorder.enabled:
         left_out.add("recorder")

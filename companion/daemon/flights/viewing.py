@@ -79,6 +79,11 @@ class Viewing:
             detail += f"; closed: {report['closed']}"
         return detail
 
+    @property
+    def port(self) -> int:
+        """Port of the exporter for viewers of this machine; 0 before it has told."""
+        return self._port
+
     def take_port(self, port: int) -> None:
         """Take the port where an exporter that has just started serves viewers here."""
         self._port = port

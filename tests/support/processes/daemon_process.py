@@ -61,7 +61,7 @@ class Daemon:
         self.lines: list[Line] = []
         own = [
             f"expert.daemon.socket={self.socket}", f"daemon.flights={self.flights}",
-            "stream.listen=",
+            "stream.listen=", "page.listen=",
         ]  # fmt: skip
         self.settings = [*own, *settings]
         self._command = [sys.executable, *program, "run"]

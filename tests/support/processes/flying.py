@@ -72,7 +72,7 @@ class Flying:
         # a rangefinder would tell the scale sooner, but no place to compare with the truth; and an
         # IMU is a tenth of a core, here and in the daemon, that what is measured does not need
         self.autopilot = FakeAutopilot(
-            "ardupilot", url, _flight(path), lacks=RANGE + IMU * (not has_imu)
+            "ardupilot", url, flight_of(path), lacks=RANGE + IMU * (not has_imu)
         )
         # the flight's clock is the monotonic one, and so is what the camera films
         self.autopilot.fly(at_monotonic_ns=0, arm=False)
@@ -249,5 +249,6 @@ def stage(health: dict[str, Any], name: str) -> dict[str, Any] | None:
     return next((each for each in health["stages"] if each["name"] == name), None)
 
 
-def _flight(path: PathOf) -> MadeUpFlight:
+def flight_of(path: PathOf) -> MadeUpFlight:
+    """A flight along a path, without end."""
     return MadeUpFlight(lambda t_s: path(round(t_s * 1e9)), duration_s=math.inf)

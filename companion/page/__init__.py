@@ -1,0 +1,1 @@
+"""The page on the drone: a process of its own, which asks the daemon as `companion status` does."""

@@ -1,0 +1,49 @@
+"""The page's ASGI application: all views behind one gate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from companion.page.access import Access
+from companion.page.daemon_watch import DaemonWatch
+from companion.page.facts import Facts
+from companion.page.flight_views import FlightViews
+from companion.page.gate import Gate
+from companion.page.now_views import NowViews
+from companion.page.pairing_views import PairingViews
+from companion.page.scene import Scene
+from companion.page.setting_views import SettingViews
+from companion.page.setup_views import SetupViews
+from companion.page.site import Site
+
+
+def application(
+    facts: Facts, watch: DaemonWatch, scene: Scene, clock: Callable[[], float],
+    say: Callable[[str], None],
+) -> Gate:  # fmt: skip
+    """The application; `clock` gives seconds, `say` takes a line for the journal."""
+    flights = Path(facts.config.daemon.flights).resolve()
+    site = Site(facts, flights, Access(flights, clock, say), watch, scene)
+    settings = SettingViews(site)
+    routes: list[Route | Mount] = [
+        *NowViews(site).routes(),
+        *FlightViews(site).routes(),
+        *settings.routes(),
+        *SetupViews(site, settings).routes(),
+        *PairingViews(site).routes(),
+        Mount("/static", StaticFiles(directory=str(files("companion.page") / "static"))),
+    ]
+
+    async def fault(request: Request, error: Exception) -> Response:
+        say(f"the page: {request.url.path}: {type(error).__name__}: {error}")
+        return PlainTextResponse("the page has a fault; the journal says which", 500)
+
+    return Gate(Starlette(routes=routes, exception_handlers={Exception: fault}), clock)

@@ -1,0 +1,100 @@
+"""View Flights: the list, one flight with its report and downloads, keep and delete."""
+
+from __future__ import annotations
+
+import asyncio
+from urllib.parse import quote
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Route
+
+from companion.errors import FlightError
+from companion.page.flown import FlownFlights
+from companion.page.site import Form, Site
+
+SANDBOX = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:;"
+    " style-src 'unsafe-inline'; img-src data: blob:; connect-src data: blob:; font-src data:"
+)
+"""A report is a page of its own, without the session and the network."""
+MOST_SHOWN = 200
+
+
+class FlightViews:
+    """See the module."""
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self._flown = FlownFlights(site.flights)
+
+    def routes(self) -> list[Route]:
+        """Routes of this view."""
+        looking, changing = self._site.looking, self._site.changing
+        return [
+            Route("/flights", looking(self._list)),
+            Route("/flights/{name}", looking(self._one)),
+            Route("/flights/{name}/file/{file:path}", looking(self._file)),
+            Route("/flights/{name}/keep", changing(self._keep), methods=["POST"]),
+            Route("/flights/{name}/release", changing(self._release), methods=["POST"]),
+            Route("/flights/{name}/delete", changing(self._delete), methods=["POST"]),
+        ]
+
+    async def _list(self, request: Request) -> Response:
+        try:
+            flights = await asyncio.to_thread(self._flown.all)
+        except FlightError as error:
+            return await self._site.refused(request, str(error), 404)
+        free_mb = await asyncio.to_thread(self._flown.free_mb)
+        return await self._site.render(
+            request, "flights.html.j2", flights=flights[:MOST_SHOWN],
+            n_more=max(0, len(flights) - MOST_SHOWN), free_mb=free_mb,
+        )  # fmt: skip
+
+    async def _one(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        try:
+            flight = await asyncio.to_thread(self._flown.one, name)
+            files = await asyncio.to_thread(self._flown.files, name)
+        except FlightError as error:
+            return await self._site.refused(request, str(error), 404)
+        return await self._site.render(
+            request, "flight.html.j2", flight=flight,
+            files=[(file, quote(file), mb) for file, mb in files],
+        )  # fmt: skip
+
+    async def _file(self, request: Request) -> Response:
+        name, file = request.path_params["name"], request.path_params["file"]
+        try:
+            path = await asyncio.to_thread(self._flown.file, name, file)
+        except FlightError as error:
+            return await self._site.refused(request, str(error), 404)
+        if path.suffix == ".html":
+            headers = {"Content-Security-Policy": SANDBOX}
+            return FileResponse(path, media_type="text/html", headers=headers)
+        return FileResponse(
+            path, media_type="application/octet-stream", filename=f"{name}-{path.name}"
+        )
+
+    async def _keep(self, request: Request, form: Form) -> Response:
+        return await self._mark(request, True)
+
+    async def _release(self, request: Request, form: Form) -> Response:
+        return await self._mark(request, False)
+
+    async def _mark(self, request: Request, kept: bool) -> Response:
+        name = request.path_params["name"]
+        try:
+            await asyncio.to_thread(self._flown.keep, name, kept)
+        except FlightError as error:
+            return await self._site.refused(request, str(error), 409)
+        said = f"{name} is kept." if kept else f"{name} may be deleted when the disk is full."
+        return self._site.done(request, f"/flights/{name}", said)
+
+    async def _delete(self, request: Request, form: Form) -> Response:
+        name = request.path_params["name"]
+        try:
+            await asyncio.to_thread(self._flown.delete, name)
+        except FlightError as error:
+            return await self._site.refused(request, str(error), 409)
+        return self._site.done(request, "/flights", f"{name} was deleted.")

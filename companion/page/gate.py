@@ -1,0 +1,100 @@
+"""Gate before all requests: rates, sizes, names of this machine, and headers of answers."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Callable
+from typing import Any
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from companion.page.access import ALL, is_here
+from companion.page.token_buckets import TokenBuckets
+
+MOST_BODY_BYTES = 65536
+"""The longest form is that of all settings, some 10 kB."""
+PEER_HZ, PEER_BURST = 60.0, 120.0
+"""One open view asks seven times a second, and loads four files at once."""
+ALL_HZ, ALL_BURST = 120.0, 240.0
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; "
+    "base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+class Gate:
+    """ASGI application around the page's own; `clock` gives seconds."""
+
+    def __init__(self, inner: ASGIApp, clock: Callable[[], float]) -> None:
+        self._inner = inner
+        self._by_peer = TokenBuckets(PEER_HZ, PEER_BURST, clock)
+        self._by_all = TokenBuckets(ALL_HZ, ALL_BURST, clock)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through, or refuse it."""
+        if scope["type"] != "http":
+            return
+        headers, peer = Headers(scope=scope), (scope.get("client") or ("",))[0]
+        if not (self._by_peer.take(peer) and self._by_all.take(ALL)):
+            answer = PlainTextResponse("too many requests", 429, {"Retry-After": "2"})
+        elif not _is_short(headers):
+            answer = PlainTextResponse("longer than any form here", 413, {"Connection": "close"})
+        elif is_here(peer) and not is_own_name(headers.get("host", "")):
+            # a page elsewhere whose name leads here: it would be taken for somebody on this machine
+            answer = PlainTextResponse("ask by an address of this machine, not by this name", 421)
+        else:
+            await self._inner(scope, _bounded(receive), _with_headers(send))
+            return
+        await answer(scope, receive, _with_headers(send))
+
+
+def is_own_name(host: str) -> bool:
+    """True of an address, and of the names that this machine itself has."""
+    name = host.rpartition(":")[0] if not host.endswith("]") and ":" in host else host
+    name = name.strip("[]").lower().rstrip(".")
+    own = socket.gethostname().lower()
+    if name in ("localhost", own, f"{own}.local"):
+        return True
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_short(headers: Headers) -> bool:
+    length = headers.get("content-length", "0")
+    return length.isdecimal() and int(length) <= MOST_BODY_BYTES
+
+
+def _bounded(receive: Receive) -> Receive:
+    n_bytes = 0
+
+    async def bounded() -> Message:
+        nonlocal n_bytes
+        message = await receive()
+        n_bytes += len(message.get("body", b""))
+        if n_bytes > MOST_BODY_BYTES:
+            return {"type": "http.disconnect"}
+        return message
+
+    return bounded
+
+
+def _with_headers(send: Send) -> Send:
+    async def sending(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in HEADERS.items():
+                headers.setdefault(name, value)
+        await send(message)
+
+    return sending

@@ -1,0 +1,160 @@
+"""View Now: the state in one line, the live picture, the map from above, warnings."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from companion.page.remedies import OF_REASON, OTHER, remedy
+from companion.page.setup_steps import source
+from companion.page.site import Site
+
+RECENT_S = 600.0
+"""Age of warnings that are shown here; Health in the journal has all."""
+WORDS = {
+    "tracking": "Tracking", "standing": "Standing", "coasting": "Coasting",
+    "initialising": "The map is being begun", "lost": "Lost", "starting": "Starting",
+}  # fmt: skip
+RERUN_PORT, RERUN_GRPC_PORT = 9090, 9876
+
+
+class NowViews:
+    """See the module."""
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+
+    def routes(self) -> list[Route]:
+        """Routes of this view."""
+        looking = self._site.looking
+        return [
+            Route("/", looking(self._now)),
+            Route("/now/panel", looking(self._panel)),
+            Route("/now/picture", looking(self._picture)),
+            Route("/now/above", looking(self._above)),
+            Route("/map", looking(self._map)),
+        ]
+
+    async def _now(self, request: Request) -> Response:
+        return await self._site.render(request, "now.html.j2", **await self._values())
+
+    async def _panel(self, request: Request) -> Response:
+        return await self._site.render(request, "now_panel.html.j2", **await self._values())
+
+    async def _picture(self, request: Request) -> Response:
+        await self._site.watch.status()  # which tells where the exporter is
+        after = request.query_params.get("after", "")
+        found = self._site.scene.picture_after(int(after) if after.isdecimal() else -1)
+        if found is None:
+            return Response(status_code=204)
+        return Response(found, media_type="application/json")
+
+    async def _above(self, request: Request) -> Response:
+        await self._site.watch.status()
+        found = await asyncio.to_thread(self._site.scene.from_above)
+        return Response(found, media_type="application/json")
+
+    async def _map(self, request: Request) -> Response:
+        host = request.url.hostname or "127.0.0.1"
+        host = f"[{host}]" if ":" in host else host
+        shown = f"rerun%2Bhttp://{host}:{RERUN_GRPC_PORT}/proxy"
+        is_web = self._site.facts.config.daemon.viewer == "web"
+        rerun = f"http://{host}:{RERUN_PORT}/?url={shown}&theme=dark" if is_web else ""
+        return await self._site.render(request, "map.html.j2", rerun=rerun)
+
+    async def _values(self) -> dict[str, Any]:
+        status = await self._site.watch.status()
+        good, line = headline(status, self._site.watch.problem)
+        return {
+            "good": good, "line": line, "rows": rows(status), "advice": advice(status),
+            "warnings": warnings(status),
+        }  # fmt: skip
+
+
+def headline(status: Mapping[str, Any], problem: str) -> tuple[bool, str]:
+    """State in one line, and whether it is well."""
+    if not status:
+        return False, f"companion does not answer: {problem}"
+    tracker = str(status.get("tracker", ""))
+    parts = [WORDS.get(tracker, tracker.capitalize())]
+    feedback = status.get("feedback") or {}
+    good = tracker in ("tracking", "standing")
+    if feedback.get("mode", "off") == "off":
+        parts.append("poses are not sent (feedback.mode is off)")
+    elif feedback.get("sending"):
+        parts.append(f"{feedback.get('rate_hz') or 0:.0f} poses a second go to the autopilot")
+    else:
+        good = False
+        parts.append(f"no pose is sent: {feedback.get('why_not') or 'not yet'}")
+    for each in status.get("sources") or ():
+        if each.get("state") != "running":
+            good = False
+            parts.append(f"{each.get('name')} {each.get('state')}")
+    return good, ", ".join(parts) + "."
+
+
+def advice(status: Mapping[str, Any]) -> str:
+    """Advice on why no pose is sent; "" where one is, or none is wanted."""
+    feedback = status.get("feedback") or {}
+    if not status or feedback.get("mode", "off") == "off" or feedback.get("sending"):
+        return ""
+    return OF_REASON.get(feedback.get("why_not") or "no pose yet", OTHER)
+
+
+def rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and values of the state, the most important first."""
+    if not status:
+        return []
+    load, feedback = status.get("load") or {}, status.get("feedback") or {}
+    quality = status.get("quality") or -1
+    out = [
+        ("Motors", "armed" if status.get("armed") else "disarmed"),
+        ("Quality", f"{quality} of 100" if quality > 0 else "none"),
+        ("Scale", str(status.get("scale") or "not known yet")),
+        ("Pose age", _number(status.get("pose_latency_p95_ms"), " ms (p95)")),
+    ]  # fmt: skip
+    if feedback.get("sending"):
+        out.append(("Sent", f"{feedback['rate_hz']:.0f}/s, {feedback.get('n_resets', 0)} resets"))
+    for name in ("camera", "autopilot"):
+        found = source(status, name)
+        if found:
+            rate = f", {found['rate_hz']:.0f}/s" if found.get("rate_hz") else ""
+            out.append((f"{name.capitalize()}", f"{found.get('state')}{rate}"))
+    out += [
+        ("Processor", _number(_times(load.get("cpu_share"), 100), " %")),
+        ("Memory", _number(_times(load.get("memory_share"), 100), " %")),
+        ("Temperature", _number(load.get("temperature_c"), " °C")),
+        ("Disk free", _number(_times(load.get("disk_free_mib"), 1 / 1024), " GiB", 1)),
+        ("Left out", str(status.get("degraded") or "nothing")),
+        ("Flight", str(status.get("flight") or "not kept before arming")),
+    ]  # fmt: skip
+    return out
+
+
+def warnings(status: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Recent warnings with what to do, the newest first."""
+    return [
+        {**each, "remedy": remedy(each["what"]), "ago": ago(each["age_s"])}
+        for each in status.get("warnings") or ()
+        if each["age_s"] < RECENT_S and not each["good"]
+    ]
+
+
+def ago(age_s: float) -> str:
+    """Age in words."""
+    if age_s < 90:
+        return f"{max(age_s, 0):.0f} s ago"
+    return f"{age_s / 60:.0f} min ago"
+
+
+def _number(value: Any, unit: str, digits: int = 0) -> str:
+    return "unknown" if value is None else f"{value:.{digits}f}{unit}"
+
+
+def _times(value: Any, factor: float) -> Any:
+    return None if value is None else value * factor
