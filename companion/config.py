@@ -168,6 +168,20 @@ class FeedbackConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class LandingConfig:
+    """A marker to land on, seen by the flight's camera; see docs/landing.md."""
+
+    marker: Literal["off", "apriltag_36h11", "aruco_4x4_50", "aruco_5x5_100", "aruco_6x6_250"] = (
+        "off"
+    )
+    """Family of the marker; off looks for none."""
+    id: Annotated[int, Meta(ge=0, le=586)] = 0
+    """Number of the marker within its family; others are ignored."""
+    size_m: Annotated[float, Meta(ge=0, le=20)] = 0.0
+    """Length of an edge of its black square, metres; must be stated where a marker is set."""
+
+
+@dataclass(frozen=True, slots=True)
 class ControlConfig:
     """Commands and parameters of ground stations over MAVLink; see docs/control.md."""
 
@@ -410,6 +424,7 @@ class Config:
     link: LinkConfig = field(default_factory=LinkConfig)
     router: RouterConfig = field(default_factory=RouterConfig)
     feedback: FeedbackConfig = field(default_factory=FeedbackConfig)
+    landing: LandingConfig = field(default_factory=LandingConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     daemon: DaemonConfig = field(default_factory=DaemonConfig)
     recorder: RecorderConfig = field(default_factory=RecorderConfig)

@@ -94,6 +94,19 @@ class FlowHealth:
 
 
 @dataclass(frozen=True, slots=True)
+class LandingHealth:
+    """Landing marker sent to the autopilot; `why_not` says why the last frame is not."""
+
+    marker: str = "off"
+    sending: bool = False
+    why_not: str = ""
+    rate_hz: float = 0.0
+    distance_m: float | None = None
+    latency_p50_ms: float | None = None
+    n_sent: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessLoad:
     """One of our processes. `cpu_cores` is 1.5 where it keeps one and a half cores busy."""
 
@@ -164,6 +177,7 @@ class Health:
     set_by_ground: Mapping[str, Any] = field(default_factory=dict)
     """Keys of the configuration set over MAVLink, and their values."""
     flow: FlowHealth = field(default_factory=FlowHealth)
+    landing: LandingHealth = field(default_factory=LandingHealth)
 
     def to_json(self) -> dict[str, Any]:
         """Plain types; a number that is not finite is null."""
@@ -175,7 +189,7 @@ class Health:
 
     def line(self) -> str:
         """One line for the journal, the most important first."""
-        parts = [self._pose(), self._feedback(), self._flow()]
+        parts = [self._pose(), self._feedback(), self._flow(), self._landing()]
         parts += [_source(source) for source in self.sources]
         parts += [_stage(stage) for stage in self.stages if not stage.alive or stage.n_restarted]
         parts.append(self._computer())
@@ -193,6 +207,7 @@ class Health:
             tuple((stage.name, stage.alive, stage.n_restarted) for stage in self.stages),
             (self.feedback.mode, self.feedback.sending, self.feedback.why_not),
             (self.flow.message, self.flow.sending),
+            (self.landing.marker, self.landing.sending),
             self.flight,
             self.degradation,
         )
@@ -221,6 +236,13 @@ class Health:
         if flow.sending:
             return f"flow {flow.rate_hz:.0f}/s"
         return f"no flow: {flow.why_not or 'not yet'}"
+
+    def _landing(self) -> str:
+        if self.landing.marker == "off":
+            return ""
+        if self.landing.sending:
+            return f"landing marker {self.landing.rate_hz:.0f}/s"
+        return f"no landing marker: {self.landing.why_not or 'not yet'}"
 
     def _computer(self) -> str:
         load = self.load

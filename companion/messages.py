@@ -139,6 +139,25 @@ class OpticalFlow:
     why_not: str = ""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LandingTarget:
+    """The landing marker in one image, or why there is none.
+
+    `position_body_m` (3,) is its centre from the origin of the body, FRD; `sigma_body_m` (3,) one
+    standard deviation along each axis. `normals_body` (N, 3) are unit vectors out of its face, of
+    each pose that the image allows: two, where it is small (Schweighofer and Pinz 2006). `size_px`
+    is its mean edge. All but `why_not` are empty where there is none.
+    """
+
+    seq: int
+    t_ns: int
+    position_body_m: Array | None = None
+    sigma_body_m: Array | None = None
+    normals_body: Array | None = None
+    size_px: float = 0.0
+    why_not: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class FrameTracked:
     """Inputs beside the image that the pose of a frame depended on; given after it.
@@ -362,4 +381,5 @@ class ClockReport:
 Message = (
     Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
     | PointChunk | Warned | Georeferenced | FrameTracked | FrameOverdue | OpticalFlow
+    | LandingTarget
 )  # fmt: skip

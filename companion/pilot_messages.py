@@ -67,6 +67,11 @@ IMU_USED = PilotMessage(INFO, "autopilot IMU data used again")
 VELOCITY_NOT_USED = PilotMessage(NOTICE, "autopilot velocity not used")
 VELOCITY_USED = PilotMessage(INFO, "autopilot velocity used again")
 
+# -- landing marker -----------------------------------------------------------------
+
+MARKER_SEEN = PilotMessage(INFO, "landing marker in sight")
+MARKER_LOST = PilotMessage(NOTICE, "landing marker lost")
+
 # -- camera and autopilot -----------------------------------------------------------------
 
 CAMERA_NOT_FOUND = PilotMessage(WARNING, "camera not found")
@@ -165,7 +170,7 @@ SWITCHED_OFF = ("off", "switched off")
 """Reasons for which the pilot or the ground has switched poses off: not reported as a loss."""
 PARTS: Mapping[str, str] = {
     "depth": "dense map", "recorder": "recording", "results": "results",
-    "topics": "remote map link",
+    "topics": "remote map link", "landing": "landing marker",
 }  # fmt: skip
 
 OF_WARNING: Mapping[str, PilotMessage] = {

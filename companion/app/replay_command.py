@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+from companion.app.landing_sent import LandingSent
 from companion.app.poses_sent import PosesSent
 from companion.app.progress import Progress
 from companion.config import Config
@@ -97,13 +98,18 @@ def replay(
     """
     camera, log = given.flight.camera, given.log
     watched, sent = Watched(), PosesSent(config)
+    landing = LandingSent(config) if config.landing.marker != "off" else None
     live: LiveViewer | None = None
     names = ("localisation", "depth", "results") if config.depth.enabled else LEAST
+    if landing is not None:
+        names = (*names, "landing")
     setup = Setup(config, camera, out, origin=log.origin, is_live=False)
 
     def watch(message: Message) -> None:
         watched.take(message)
         sent.take(message)
+        if landing is not None:
+            landing.take(message)
         if live is not None:
             live.take(message)
 
@@ -153,6 +159,8 @@ def replay(
                 stages.finish(finish)
             finally:
                 sent.write(out)
+                if landing is not None:
+                    landing.write(out)
     if depth is not None and depth.details()["failures"]:
         notify(f"dense map: {depth.device}")
     if stages.depth_fault is not None:

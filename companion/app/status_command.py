@@ -77,6 +77,7 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         *_belief(document.get("believed", MEASUREMENTS)),
         ("feedback", _feedback(document.get("feedback") or {})),
         *_flow(document.get("flow") or {}),
+        *_landing(document.get("landing") or {}),
         ("flight", document.get("flight") or "none"),
         ("reduced", document.get("degraded") or "nothing"),
         ("set", _settings(document.get("set_by_ground") or {})),
@@ -127,6 +128,20 @@ def _flow(flow: Mapping[str, Any]) -> list[tuple[str, str]]:
         f"{_number(flow.get('latency_p50_ms'), ' ms')} after exposure",
     ]  # fmt: skip
     return [("flow", ", ".join(parts))]
+
+
+def _landing(landing: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Row of the landing marker, unless none is looked for."""
+    if landing.get("marker", "off") == "off":
+        return []
+    if not landing.get("sending"):
+        return [("landing", f"not sent: {landing.get('why_not') or 'not yet'}")]
+    parts = [
+        str(landing["marker"]), _number(landing.get("rate_hz"), "/s"),
+        f"{_number(landing.get('distance_m'), ' m', 1)} away",
+        f"{_number(landing.get('latency_p50_ms'), ' ms')} after exposure",
+    ]  # fmt: skip
+    return [("landing", ", ".join(parts))]
 
 
 def _source(source: Mapping[str, Any]) -> tuple[str, ...]:

@@ -32,13 +32,14 @@ from companion.daemon.page_child import PageChild, SettingsSource
 from companion.daemon.periodic_checks import PeriodicChecks
 from companion.daemon.pose.flow_sender import FlowSender
 from companion.daemon.pose.kept_counter import counter_path
+from companion.daemon.pose.landing_sender import LandingSender
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.daemon.recorder_notes import RecorderNotes
 from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import LatencyMeter
-from companion.messages import NO_PICTURE, Frame, Odometry, OpticalFlow, Warned
+from companion.messages import NO_PICTURE, Frame, LandingTarget, Odometry, OpticalFlow, Warned
 from companion.pilot_messages import PilotText, of_warning
 from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import ResultsWritten, Snapshot
@@ -93,6 +94,7 @@ class Daemon:
         self._link: AutopilotLink | None = None
         self._sender: PoseSender | None = None
         self._flow_sender: FlowSender | None = None
+        self._landing_sender: LandingSender | None = None
         self._reports: VehicleReports | None = None
         self._ground: GroundControl | None = None
         link_watch: LinkWatch | None = None
@@ -108,6 +110,10 @@ class Daemon:
                 self._on_warned, lambda step: self._flights.take(step),
             )  # fmt: skip
             self._flow_sender = FlowSender(config.feedback, self._link, clock)
+            if config.landing.marker != "off":
+                self._landing_sender = LandingSender(
+                    config.landing, self._link, clock, config.telemetry.use
+                )
             date = AutopilotDate(self._link)
         dates = FlightDates(
             clock, lambda: date.ahead_ns if date is not None else None, clock_is_set
@@ -121,6 +127,7 @@ class Daemon:
             self._link,
             self._sender,
             self._flow_sender,
+            self._landing_sender,
             flights,
             self._loop_delay,
         )
@@ -280,6 +287,8 @@ class Daemon:
                 self._sender.take_attitude(sample)
             if self._flow_sender is not None:
                 self._flow_sender.take_attitude(sample)
+            if self._landing_sender is not None:
+                self._landing_sender.take_attitude(sample)
         elif isinstance(sample, ArmedSample):
             self._starts.set_armed(sample.armed)
 
@@ -297,6 +306,7 @@ class Daemon:
         return Listener(
             odometry=current(self._on_odometry),
             flow=current(self._on_flow),
+            landing=current(self._on_landing),
             georeferenced=current(self._watch.take_georeference),
             warned=self._on_warned,
             localisation_died=lambda: self._soon(self._starts.localisation_died, flight),
@@ -316,6 +326,10 @@ class Daemon:
     def _on_flow(self, flow: OpticalFlow) -> None:
         if self._flow_sender is not None:
             self._flow_sender.take(flow)
+
+    def _on_landing(self, target: LandingTarget) -> None:
+        if self._landing_sender is not None:
+            self._landing_sender.take(target)
 
     def _on_snapshot(self, snapshot: Snapshot) -> None:
         if self._ground is not None:

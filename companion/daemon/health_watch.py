@@ -17,12 +17,14 @@ from companion.config import Config
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.viewing import VIEWERS
 from companion.daemon.pose.flow_sender import FlowSender
+from companion.daemon.pose.landing_sender import LandingSender
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.health import (
     ComputerLoad,
     FeedbackHealth,
     FlowHealth,
     Health,
+    LandingHealth,
     LatencyMeter,
     StageHealth,
     StageMeter,
@@ -72,12 +74,13 @@ class HealthWatch:
         link: AutopilotLink | None,
         sender: PoseSender | None,
         flow_sender: FlowSender | None,
+        landing_sender: LandingSender | None,
         flights: Flights,
         loop_delay: LatencyMeter,
     ) -> None:
         self._clock, self._journal, self._flights = clock, journal, flights
         self._feed, self._link, self._sender = feed, link, sender
-        self._flow_sender = flow_sender
+        self._flow_sender, self._landing_sender = flow_sender, landing_sender
         self._loop_delay = loop_delay
         self._began_ns = clock.now_ns()
         self._config, self._believed = config.daemon, config.telemetry.use
@@ -261,6 +264,11 @@ class HealthWatch:
             pose_latency_p95_ms=pose.latency_p95_ms,
             feedback=self._sender.health() if self._sender is not None else FeedbackHealth(),
             flow=self._flow_sender.health() if self._flow_sender is not None else FlowHealth(),
+            landing=(
+                self._landing_sender.health()
+                if self._landing_sender is not None
+                else LandingHealth()
+            ),
             flight=flight.folder.name if flight and flight.folder and flight.kept else "",
             load=self.load,
             degradation=self._governor.level.number,

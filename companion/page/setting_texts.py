@@ -16,7 +16,7 @@ from companion.config_file import toml_value
 
 PURPOSES = {
     "Camera": ("camera", "mount"),
-    "Autopilot": ("link", "router", "telemetry", "feedback", "control"),
+    "Autopilot": ("link", "router", "telemetry", "feedback", "landing", "control"),
     "Flights, and what is kept of them": ("daemon", "recorder", "export"),
     "Dense map": ("depth", "cloud", "opencl"),
     "Looking on, other machines": ("page", "stream", "distributed"),

@@ -19,6 +19,7 @@ from companion.messages import (
     FrameOverdue,
     FrameTracked,
     KeyframeAdded,
+    LandingTarget,
     LoopClosed,
     MapUpdate,
     Odometry,
@@ -87,10 +88,13 @@ STAGES = (
         "depth", (Frame, Track, KeyframeAdded, MapUpdate), nice=20, answer_s=120.0, is_source=True,
     ),
     Stage(
+        "landing", (Frame,), nice=2, frames=Frames.NEWEST, answer_s=30.0, is_source=True,
+    ),
+    Stage(
         "recorder",
         (
             Frame, *TELEMETRY, LinkReads, HealthNote, Warned, FrameTracked, GateStep, Odometry,
-            MapUpdate, PointChunk,
+            LandingTarget, MapUpdate, PointChunk,
         ),
         nice=5, frames=Frames.EVERY, answer_s=60.0, hurried_s=0.3, with_flight=True, in_folder=True,
     ),

@@ -14,7 +14,16 @@ from companion.errors import StageError
 from companion.flight_notes import FlightNote, GateStep, HealthNote, LinkBytes
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Similarity
-from companion.messages import Frame, FrameTracked, MapUpdate, Message, Odometry, PointChunk, Warned
+from companion.messages import (
+    Frame,
+    FrameTracked,
+    LandingTarget,
+    MapUpdate,
+    Message,
+    Odometry,
+    PointChunk,
+    Warned,
+)
 from companion.telemetry import Telemetry
 from drivers.mavlink.wire.packet_stream import MavlinkStream, Packet
 from drivers.recording.camera_document import calibration_bytes, camera_document
@@ -40,6 +49,7 @@ from drivers.recording.recording_topics import (
     EVENTS,
     GATE,
     HEALTH,
+    LANDING,
     ODOMETRY,
     POSE,
     PROFILE,
@@ -123,6 +133,8 @@ class Recorder:
         elif isinstance(message, FrameTracked | GateStep):
             topic = TRACKING if isinstance(message, FrameTracked) else GATE
             self._put(topic, message.t_ns, decision_bytes(message))
+        elif isinstance(message, LandingTarget):
+            self._put(LANDING, message.t_ns, decision_bytes(message), message.seq)
         elif isinstance(message, Warned):
             self._put(EVENTS, message.t_ns, event_bytes(message))
         elif isinstance(message, HealthNote):

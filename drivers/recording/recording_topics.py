@@ -34,9 +34,10 @@ TIMESYNC = "/mavlink/timesync"
 POSE, ODOMETRY, CLOUD = "/pose", "/odometry", "/cloud"
 EVENTS, HEALTH = "/events", "/health"
 TRACKING, GATE = "/decisions/tracking", "/decisions/pose_gate"
+LANDING = "/landing_target"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
 """Topics of images, of which a flight has one."""
-FROM_PICTURES = frozenset({GREY, POSE, ODOMETRY, CLOUD, TRACKING, GATE})
+FROM_PICTURES = frozenset({GREY, POSE, ODOMETRY, CLOUD, TRACKING, GATE, LANDING})
 """Topics of what was made of images."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
@@ -146,6 +147,15 @@ TOPICS: dict[str, Any] = {
         {
             "what": TEXT, "n_attitudes": INTEGER, "counter": INTEGER, "counter_sent": FLAG,
             "sent": FLAG, "values": OBJECT,
+        },
+    ),
+    LANDING: _Json(
+        "companion.LandingTarget",
+        "The landing marker in one image: centre from the body, its standard deviations, and the "
+        "normals of its face, body axes (FRD), metres; null where it is not seen",
+        {
+            "seq": INTEGER, "position_body_m": NUMBERS, "sigma_body_m": NUMBERS,
+            "normals_body": {"type": ["array", "null"]}, "size_px": NUMBER, "why_not": TEXT,
         },
     ),
     CLOUD: PointCloud,

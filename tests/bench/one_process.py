@@ -92,6 +92,7 @@ class Flown:
             None,
             None,
             None,
+            None,
             self.flights,
             LatencyMeter(),
         )

@@ -25,7 +25,11 @@ from tests.support.settings_text import described_toml, settings_page
 ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
-SINCE = {"camera.readout_ms", "feedback.flow", "page.listen", "telemetry.use"}
+SINCE = {
+    "camera.readout_ms", "feedback.flow",
+    "landing.id", "landing.marker", "landing.size_m",
+    "page.listen", "telemetry.use",
+}  # fmt: skip
 """Keys that version did not have."""
 
 

@@ -20,6 +20,7 @@ from companion.messages import (
     Frame,
     FrameOverdue,
     Georeferenced,
+    LandingTarget,
     MapUpdate,
     Odometry,
     OpticalFlow,
@@ -70,6 +71,7 @@ class Listener:
     unusable: Callable[[str], None]
     """A stage could never start because of the user's input."""
     flow: Callable[[OpticalFlow], None] = lambda _: None
+    landing: Callable[[LandingTarget], None] = lambda _: None
     snapshot: Callable[[Snapshot], None] = lambda _: None
     results_written: Callable[[ResultsWritten], None] = lambda _: None
     points_made: Callable[[int], None] = lambda _: None
@@ -309,6 +311,8 @@ class LiveFlight:
                 self._viewing.take_port(parcel.open().port)
         elif parcel.kind == OpticalFlow.__name__:
             self._listener.flow(parcel.open())
+        elif parcel.kind == LandingTarget.__name__:
+            self._listener.landing(parcel.open())
         elif parcel.kind == Snapshot.__name__:
             self._listener.snapshot(parcel.open())
         elif parcel.kind == ResultsWritten.__name__:
@@ -350,6 +354,8 @@ def stages_of(config: Config) -> list[Stage]:
         left_out.add("recorder")
     if not makes_depth(config):
         left_out.add("depth")
+    if config.landing.marker == "off":
+        left_out.add("landing")
     if not config.distributed.enabled:
         left_out.add("topics")
     rows = [stage for stage in STAGES if stage.name not in left_out]

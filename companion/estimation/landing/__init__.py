@@ -1,0 +1,1 @@
+"""Precision landing: where a marker on the ground is, seen by the flight's own camera."""
