@@ -139,6 +139,10 @@ class FeedbackConfig:
 
     mode: Literal["off", "odometry", "vision_position"] = "off"
     """ODOMETRY, or for older firmware VISION_POSITION_ESTIMATE."""
+    global_position: Literal["off", "sensor", "estimate", "gps_input"] = "off"
+    """Send latitude and longitude while satellites are not in use, and mode is off: sensor is
+    GLOBAL_POSITION_SENSOR for PX4, estimate MAV_CMD_EXTERNAL_POSITION_ESTIMATE for ArduPilot,
+    gps_input GPS_INPUT for others; see docs/global_position.md."""
     rate_hz: Annotated[float, Meta(ge=4, le=100)] = 30.0
     """Least rate of poses, Hz; between frames they are predicted."""
     max_sigma_m: Annotated[float, Meta(ge=0.01, le=100)] = 1.0
@@ -165,6 +169,11 @@ class FeedbackConfig:
     for ArduPilot, OPTICAL_FLOW_RAD for PX4."""
     obstacle_distance: bool = False
     """Send OBSTACLE_DISTANCE from the newest part of the cloud."""
+
+    @property
+    def gives_position(self) -> bool:
+        """True if the autopilot may fly on our position: its own estimates may then be ours."""
+        return self.mode != "off" or self.global_position != "off"
 
 
 @dataclass(frozen=True, slots=True)

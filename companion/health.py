@@ -178,6 +178,8 @@ class Health:
     """Keys of the configuration set over MAVLink, and their values."""
     flow: FlowHealth = field(default_factory=FlowHealth)
     landing: LandingHealth = field(default_factory=LandingHealth)
+    global_position: FeedbackHealth = field(default_factory=FeedbackHealth)
+    """Of the positions in latitude and longitude; `detail` is their standard deviation."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain types; a number that is not finite is null."""
@@ -189,7 +191,7 @@ class Health:
 
     def line(self) -> str:
         """One line for the journal, the most important first."""
-        parts = [self._pose(), self._feedback(), self._flow(), self._landing()]
+        parts = [self._pose(), self._feedback(), self._flow(), self._landing(), self._global()]
         parts += [_source(source) for source in self.sources]
         parts += [_stage(stage) for stage in self.stages if not stage.alive or stage.n_restarted]
         parts.append(self._computer())
@@ -208,6 +210,7 @@ class Health:
             (self.feedback.mode, self.feedback.sending, self.feedback.why_not),
             (self.flow.message, self.flow.sending),
             (self.landing.marker, self.landing.sending),
+            (self.global_position.mode, self.global_position.sending),
             self.flight,
             self.degradation,
         )
@@ -243,6 +246,14 @@ class Health:
         if self.landing.sending:
             return f"landing marker {self.landing.rate_hz:.0f}/s"
         return f"no landing marker: {self.landing.why_not or 'not yet'}"
+
+    def _global(self) -> str:
+        given = self.global_position
+        if given.mode == "off":
+            return ""
+        if given.sending:
+            return f"global position {given.rate_hz:.0f}/s" + _in_brackets(given.detail)
+        return f"no global position: {given.why_not or 'not yet'}"
 
     def _computer(self) -> str:
         load = self.load

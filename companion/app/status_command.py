@@ -78,6 +78,7 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         ("feedback", _feedback(document.get("feedback") or {})),
         *_flow(document.get("flow") or {}),
         *_landing(document.get("landing") or {}),
+        *_global(document.get("global_position") or {}),
         ("flight", document.get("flight") or "none"),
         ("reduced", document.get("degraded") or "nothing"),
         ("set", _settings(document.get("set_by_ground") or {})),
@@ -142,6 +143,17 @@ def _landing(landing: Mapping[str, Any]) -> list[tuple[str, str]]:
         f"{_number(landing.get('latency_p50_ms'), ' ms')} after exposure",
     ]  # fmt: skip
     return [("landing", ", ".join(parts))]
+
+
+def _global(given: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Row of the global position, unless it is off."""
+    if given.get("mode", "off") == "off":
+        return []
+    if not given.get("sending"):
+        return [("global", f"not sent: {given.get('why_not') or 'not yet'}")]
+    return [
+        ("global", f"{given['mode']}, {_number(given.get('rate_hz'), '/s')}, {given['detail']}")
+    ]
 
 
 def _source(source: Mapping[str, Any]) -> tuple[str, ...]:

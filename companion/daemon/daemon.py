@@ -31,6 +31,7 @@ from companion.daemon.loop_delay import measure_loop_delay
 from companion.daemon.page_child import PageChild, SettingsSource
 from companion.daemon.periodic_checks import PeriodicChecks
 from companion.daemon.pose.flow_sender import FlowSender
+from companion.daemon.pose.global_sender import GlobalSender
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.landing_sender import LandingSender
 from companion.daemon.pose.pose_sender import PoseSender
@@ -39,12 +40,26 @@ from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import LatencyMeter
-from companion.messages import NO_PICTURE, Frame, LandingTarget, Odometry, OpticalFlow, Warned
+from companion.messages import (
+    NO_PICTURE,
+    Frame,
+    Georeferenced,
+    LandingTarget,
+    Odometry,
+    OpticalFlow,
+    Warned,
+)
 from companion.pilot_messages import PilotText, of_warning
 from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import ResultsWritten, Snapshot
 from companion.runtime.stage_start import Start
-from companion.telemetry import ArmedSample, AttitudeSample, Telemetry, belief_in_words
+from companion.telemetry import (
+    ArmedSample,
+    AttitudeSample,
+    PositionSample,
+    Telemetry,
+    belief_in_words,
+)
 from companion.timing.clock import FlightClock
 from companion.timing.overdue_frames import OVERDUE_NS, OverdueFrames
 from drivers.camera.camera_feed import CameraFeed
@@ -95,6 +110,7 @@ class Daemon:
         self._sender: PoseSender | None = None
         self._flow_sender: FlowSender | None = None
         self._landing_sender: LandingSender | None = None
+        self._global_sender: GlobalSender | None = None
         self._reports: VehicleReports | None = None
         self._ground: GroundControl | None = None
         link_watch: LinkWatch | None = None
@@ -114,6 +130,10 @@ class Daemon:
                 self._landing_sender = LandingSender(
                     config.landing, self._link, clock, config.telemetry.use
                 )
+            if config.feedback.global_position != "off":
+                self._global_sender = GlobalSender(
+                    config.feedback, self._link, clock, config.telemetry.use
+                )
             date = AutopilotDate(self._link)
         dates = FlightDates(
             clock, lambda: date.ahead_ns if date is not None else None, clock_is_set
@@ -128,6 +148,7 @@ class Daemon:
             self._sender,
             self._flow_sender,
             self._landing_sender,
+            self._global_sender,
             flights,
             self._loop_delay,
         )
@@ -289,6 +310,11 @@ class Daemon:
                 self._flow_sender.take_attitude(sample)
             if self._landing_sender is not None:
                 self._landing_sender.take_attitude(sample)
+            if self._global_sender is not None:
+                self._global_sender.take_attitude(sample)
+        elif isinstance(sample, PositionSample):
+            if self._global_sender is not None:
+                self._global_sender.take_position(sample)
         elif isinstance(sample, ArmedSample):
             self._starts.set_armed(sample.armed)
 
@@ -307,7 +333,7 @@ class Daemon:
             odometry=current(self._on_odometry),
             flow=current(self._on_flow),
             landing=current(self._on_landing),
-            georeferenced=current(self._watch.take_georeference),
+            georeferenced=current(self._on_georeferenced),
             warned=self._on_warned,
             localisation_died=lambda: self._soon(self._starts.localisation_died, flight),
             unusable=lambda why: self._soon(self._starts.stage_unusable, why),
@@ -322,6 +348,13 @@ class Daemon:
             self._watch.take_odometry(odometry)
         if self._sender is not None:
             self._sender.take(odometry)
+        if self._global_sender is not None:
+            self._global_sender.take(odometry)
+
+    def _on_georeferenced(self, told: Georeferenced) -> None:
+        self._watch.take_georeference(told)
+        if self._global_sender is not None:
+            self._global_sender.take_georeference(told)
 
     def _on_flow(self, flow: OpticalFlow) -> None:
         if self._flow_sender is not None:
@@ -348,6 +381,8 @@ class Daemon:
             self._sender.reconfigure(config.feedback)
         if self._flow_sender is not None:
             self._flow_sender.reconfigure(config.feedback)
+        if self._global_sender is not None:
+            self._global_sender.reconfigure(config.feedback)
         self._starts.reconfigure(old, config)
 
     # -- what the parts ask for -----------------------------------------------------------------

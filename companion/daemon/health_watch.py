@@ -17,6 +17,7 @@ from companion.config import Config
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.viewing import VIEWERS
 from companion.daemon.pose.flow_sender import FlowSender
+from companion.daemon.pose.global_sender import GlobalSender
 from companion.daemon.pose.landing_sender import LandingSender
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.health import (
@@ -75,12 +76,14 @@ class HealthWatch:
         sender: PoseSender | None,
         flow_sender: FlowSender | None,
         landing_sender: LandingSender | None,
+        global_sender: GlobalSender | None,
         flights: Flights,
         loop_delay: LatencyMeter,
     ) -> None:
         self._clock, self._journal, self._flights = clock, journal, flights
         self._feed, self._link, self._sender = feed, link, sender
         self._flow_sender, self._landing_sender = flow_sender, landing_sender
+        self._global_sender = global_sender
         self._loop_delay = loop_delay
         self._began_ns = clock.now_ns()
         self._config, self._believed = config.daemon, config.telemetry.use
@@ -268,6 +271,11 @@ class HealthWatch:
                 self._landing_sender.health()
                 if self._landing_sender is not None
                 else LandingHealth()
+            ),
+            global_position=(
+                self._global_sender.health()
+                if self._global_sender is not None
+                else FeedbackHealth()
             ),
             flight=flight.folder.name if flight and flight.folder and flight.kept else "",
             load=self.load,

@@ -77,7 +77,7 @@ def fingerprint(config: Config, camera: Camera) -> str:
     identity = (
         camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
         camera.distortion.value, camera.coefficients, features.n_levels, features.scale_factor,
-        None if mount is None else mount.matrix().tolist(), config.feedback.mode != "off",
+        None if mount is None else mount.matrix().tolist(), config.feedback.gives_position,
         sorted(config.telemetry.use),
     )  # fmt: skip
     return hashlib.sha256(repr(identity).encode()).hexdigest()

@@ -83,7 +83,9 @@ class LocalisationStage:
         self._attitude = CameraAttitude(camera.body_from_camera)
         self._motion = CameraMotion()
         self._georeferencer = Georeferencer(
-            config.georeference, camera.body_from_camera, sensors_only=config.feedback.mode != "off"
+            config.georeference,
+            camera.body_from_camera,
+            sensors_only=config.feedback.gives_position,
         )
         self._acceleration = AccelerationIntegral()
         self._navigation = InertialNavigation(self._acceleration)

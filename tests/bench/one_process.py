@@ -93,6 +93,7 @@ class Flown:
             None,
             None,
             None,
+            None,
             self.flights,
             LatencyMeter(),
         )

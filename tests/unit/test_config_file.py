@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
 SINCE = {
-    "camera.readout_ms", "feedback.flow",
+    "camera.readout_ms", "feedback.flow", "feedback.global_position",
     "landing.id", "landing.marker", "landing.size_m",
     "page.listen", "telemetry.use",
 }  # fmt: skip

@@ -8,6 +8,7 @@ from companion.config_file import dump, with_values
 FIXED_SECTIONS = frozenset({"camera", "mount", "link", "router", "page", "distributed", "landing"})
 FIXED_KEYS = frozenset({
     "expert.daemon.socket", "expert.daemon.prometheus_port", "feedback.mode",
+    "feedback.global_position",
     "feedback.obstacle_distance", "telemetry.use",
 })  # fmt: skip
 """Keys read at the start only. All others take effect at once or with the next flight."""

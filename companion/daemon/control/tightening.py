@@ -43,6 +43,7 @@ def _freely(now: Any, wanted: Any) -> bool:
 
 WHILE_ARMED: Mapping[str, MayChange] = {
     "feedback.mode": _to_off,
+    "feedback.global_position": _to_off,
     # how often, not what is believed; every value that it can have is one that autopilots take
     "feedback.rate_hz": _freely,
     "feedback.max_sigma_m": _to_less,

@@ -21,18 +21,20 @@ from companion.daemon.control.reload import reloaded
 from companion.daemon.control.tightening import WHILE_ARMED, may_change, tightened
 
 FLYING = Config(
-    feedback=FeedbackConfig(mode="odometry", flow="optical_flow"),
+    feedback=FeedbackConfig(mode="odometry", global_position="sensor", flow="optical_flow"),
     telemetry=TelemetryConfig(use=("attitude", "imu")),
 )
 TIGHTER: dict[str, Any] = {
-    "feedback.mode": "off", "feedback.flow": "off", "feedback.max_sigma_m": 0.5,
+    "feedback.mode": "off", "feedback.global_position": "off", "feedback.flow": "off",
+    "feedback.max_sigma_m": 0.5,
     "feedback.min_quality": 40, "feedback.max_gap_ms": 100.0, "feedback.resume_after_s": 2.0,
     "feedback.max_jump_m": 0.5,
     "expert.georeference.min_travel_m": 6.0, "expert.georeference.max_sigma_scale": 0.05,
     "expert.tracking.min_inliers": 30, "telemetry.use": ("attitude",),
 }  # fmt: skip
 LOOSER: dict[str, Any] = {
-    "feedback.mode": "vision_position", "feedback.flow": "optical_flow_rad",
+    "feedback.mode": "vision_position", "feedback.global_position": "gps_input",
+    "feedback.flow": "optical_flow_rad",
     "feedback.max_sigma_m": 2.0, "feedback.min_quality": 10,
     "feedback.max_gap_ms": 300.0, "feedback.resume_after_s": 0.5, "feedback.max_jump_m": 2.0,
     "expert.georeference.min_travel_m": 1.0, "expert.georeference.max_sigma_scale": 0.3,

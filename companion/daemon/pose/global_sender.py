@@ -1,0 +1,105 @@
+"""Global positions to the autopilot, where no satellites place the map.
+
+Runs in the event loop. A pose passes the same gate as one for ODOMETRY, and then
+`companion.estimation.gate.global_gate`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from companion.config import FeedbackConfig, Measurement
+from companion.estimation.gate.global_gate import GlobalGate
+from companion.estimation.gate.pose_gate import PoseGate
+from companion.health import FeedbackHealth, RateMeter
+from companion.messages import Georeferenced, Odometry
+from companion.pilot_messages import GLOBAL_OFF, GLOBAL_ON
+from companion.telemetry import AttitudeSample, PositionSample
+from companion.timing.clock import FlightClock
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.global_messages import RATES_HZ, global_message
+
+LOST_NS = 3_000_000_000
+"""The pilot is told after this long without a position."""
+UNHEARD = "the autopilot is silent"
+
+
+class GlobalSender:
+    """Odometry of the current flight in; the message of `feedback.global_position` out."""
+
+    def __init__(
+        self,
+        config: FeedbackConfig,
+        link: AutopilotLink,
+        clock: FlightClock,
+        use: Collection[Measurement],
+    ) -> None:
+        self._config, self._link, self._clock = config, link, clock
+        self._poses, self._gate = PoseGate(config, use=use), GlobalGate(config, use)
+        self._rate = RateMeter()
+        self._n_sent, self._sent_ns, self._sigma_m = 0, 0, 0.0
+        self._why_not = ""
+        self._is_told = False
+
+    def reconfigure(self, config: FeedbackConfig) -> None:
+        """Apply other limits, from the next position on."""
+        self._config = config
+        self._poses.reconfigure(config)
+        self._gate.reconfigure(config)
+
+    def take_attitude(self, sample: AttitudeSample) -> None:
+        """Take an attitude of the autopilot."""
+        self._poses.take_attitude(sample)
+
+    def take_position(self, sample: PositionSample) -> None:
+        """Take a position of the autopilot."""
+        self._gate.take_position(sample)
+
+    def take_georeference(self, told: Georeferenced) -> None:
+        """Take the newest place of the map."""
+        self._gate.take_georeference(told.georeference)
+
+    def doubt_satellites(self, doubted: bool) -> None:
+        """Satellites are doubted, or are not any more."""
+        self._gate.doubted = doubted
+
+    def take(self, odometry: Odometry) -> None:
+        """Take the odometry of a frame, and send its position if due and allowed."""
+        if self._config.global_position == "off":
+            return
+        now_ns = self._clock.now_ns()
+        self._why_not = self._send(odometry, now_ns)
+        sent_lately = now_ns - self._sent_ns < LOST_NS
+        if sent_lately != self._is_told:
+            if self._link.say(GLOBAL_ON() if sent_lately else GLOBAL_OFF()):
+                self._is_told = sent_lately
+
+    def health(self) -> FeedbackHealth:
+        """Health of the global position now."""
+        now_ns = self._clock.now_ns()
+        return FeedbackHealth(
+            mode=self._config.global_position,
+            sending=now_ns - self._sent_ns < LOST_NS and self._link.alive,
+            why_not=self._why_not,
+            detail=f"within {self._sigma_m:.1f} m",
+            rate_hz=self._rate.hz(now_ns),
+            n_sent=self._n_sent,
+        )
+
+    def _send(self, odometry: Odometry, now_ns: int) -> str:
+        """Send a position; else why not."""
+        pose = self._poses.take(odometry, now_ns)
+        if pose is None:
+            return self._poses.why_not
+        given, vehicle = self._gate.take(pose, self._link.origin, now_ns), self._link.vehicle
+        if given is None:
+            return self._gate.why_not
+        if vehicle is None or not self._link.alive:
+            return UNHEARD
+        message = self._config.global_position
+        if now_ns - self._sent_ns >= 1e9 / RATES_HZ[message]:
+            self._link.send(global_message(given, message, vehicle.system_id, now_ns))
+            self._n_sent, self._sent_ns = self._n_sent + 1, now_ns
+            self._sigma_m = given.sigma_horizontal_m
+            self._rate.add(now_ns)
+        return ""
