@@ -11,7 +11,6 @@ found where the cloud has one within 0.5 m. Frames a second are those of the who
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -23,36 +22,35 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from tests.support.reference.scoring import Array, Trajectory, read_ply, read_tum, score
+from tests.support.reference.scoring import (
+    Array,
+    Trajectory,
+    read_lens,
+    read_ply,
+    read_tum,
+    score,
+    true_depths,
+)
 
 EVERY_PIXEL = 3
 """Of the true depth images, in both directions: 0.02 m on the ground from 5 m."""
 MOST_POINTS = 200_000
 """Of cloud and surface that are looked up, drawn at random: shares within 0.1 %."""
 NEAR, FOUND_M = 0.02, 0.5
-METRES_PER_UNIT = 0.005
-"""Of true depth images."""
 
 
 def true_surface(flight: Path, truth: Trajectory) -> tuple[Array, Array]:
     """Points (N, 3) of the true surface in the true world, and their distances to the camera."""
-    camera = json.loads((flight / "camera.json").read_text())
-    matrix = np.array(
-        [[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1.0]]
-    )
-    lens = np.array([camera[name] for name in ("k1", "k2", "p1", "p2", "k3")])
+    matrix, lens = read_lens(flight)
     points, ranges_m = [], []
-    for path in sorted((flight / "truth" / "depth").glob("*.png")):
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        assert image is not None, path
-        depth_m = np.asarray(image, np.float64)[::EVERY_PIXEL, ::EVERY_PIXEL] * METRES_PER_UNIT
+    for at, whole_m in true_depths(flight):
+        depth_m = whole_m[::EVERY_PIXEL, ::EVERY_PIXEL]
         v, u = np.nonzero(depth_m)
         if not len(v):
             continue  # the sky, or a camera inside of a house
         pixels = np.stack([u, v], 1)[:, None].astype(np.float64) * EVERY_PIXEL
         rays = np.asarray(cv2.undistortPoints(pixels, matrix, lens), np.float64)[:, 0]
         seen = np.c_[rays, np.ones(len(rays))] * depth_m[v, u, None]
-        at = int(path.stem)
         points.append(seen @ truth.rotations[at].T + truth.centres[at])
         ranges_m.append(np.linalg.norm(seen, axis=1))
     return np.concatenate(points), np.concatenate(ranges_m)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+
+DEPTH_UNIT_M = 0.005
+"""Of the true depth images of rendered flights."""
 
 
 @dataclass(frozen=True)
@@ -86,29 +90,38 @@ def read_ply(path: Path) -> NDArray[np.void]:
     return vertices
 
 
+def read_lens(flight: Path) -> tuple[Array, Array]:
+    """A flight's camera matrix (3, 3) and its distortion `k1 k2 p1 p2 k3`, as OpenCV has them."""
+    camera = json.loads((flight / "camera.json").read_text())
+    matrix = np.array(
+        [[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1.0]]
+    )
+    return matrix, np.array([camera[name] for name in ("k1", "k2", "p1", "p2", "k3")])
+
+
+def true_depths(flight: Path) -> Iterator[tuple[int, Array]]:
+    """Frame number and true depth (H, W) along z of the distorted image, metres, 0 for none."""
+    for path in sorted((flight / "truth" / "depth").glob("*.png")):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert image is not None, path
+        yield int(path.stem), np.asarray(image, np.float64) * DEPTH_UNIT_M
+
+
 def depth_errors(points: Array, flight: Path, truth: Trajectory) -> Array:
     """How far points (N, 3) in the true world lie off the truth depth images, as share of depth.
 
     A point counts in every image that has it and that has a truth depth there.
     """
-    camera = json.loads((flight / "camera.json").read_text())
-    matrix = np.array(
-        [[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1.0]]
-    )
-    lens = np.array([camera[name] for name in ("k1", "k2", "p1", "p2", "k3")])
+    matrix, lens = read_lens(flight)
     errors = []
-    for path in sorted((flight / "truth" / "depth").glob("*.png")):
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        assert image is not None
-        true_z = np.asarray(image, np.float64) * 0.005
-        index = int(path.stem)
+    for index, depth_m in true_depths(flight):
         p = (points - truth.centres[index]) @ truth.rotations[index]
         p = p[(p[:, 2] > 0.1) & (np.abs(p[:, :2]) < p[:, 2:]).all(1)]
         if not len(p):
             continue
         pixels, _ = cv2.projectPoints(p, np.zeros(3), np.zeros(3), matrix, lens)
         u, v = np.rint(np.asarray(pixels)[:, 0]).astype(int).T
-        inside = (u >= 0) & (u < true_z.shape[1]) & (v >= 0) & (v < true_z.shape[0])
-        wanted = true_z[v[inside], u[inside]]
-        errors.append(np.abs(p[inside, 2] / np.maximum(wanted, 1e-9) - 1)[wanted > 0])
+        inside = (u >= 0) & (u < depth_m.shape[1]) & (v >= 0) & (v < depth_m.shape[0])
+        wanted_m = depth_m[v[inside], u[inside]]
+        errors.append(np.abs(p[inside, 2] / np.maximum(wanted_m, 1e-9) - 1)[wanted_m > 0])
     return np.concatenate(errors)
