@@ -271,6 +271,8 @@ class LiveFlight:
                 save = SaveSiteMap(self.folder / SITE_MAP, self.folder.name, self._origin)
             return Finish(hurried, of_flight, self.keep_map, n_viewers=int(is_shown), save_map=save)
 
+        if self._viewing is not None:
+            self._viewing.open_no_more()
         self._publish_reads()
         for name, why in self._processes.finish(finish_of).items():
             if name != VIEWERS:  # of what they did not see all is in the results

@@ -49,6 +49,7 @@ class Viewing:
         """Of the exporter for viewers of this machine; of the one that the viewer looks at."""
         self._onboard: OnboardViewer | None = None
         self._last_warning = ""
+        self._opens = True
         self._over = threading.Event()
         self._patience_s = PATIENCE_S
         self._thread = threading.Thread(target=self._run, name="viewing", daemon=True)
@@ -92,6 +93,10 @@ class Viewing:
         """Take that the exporter has ended, and why; another is started."""
         self._tell(GONE, f"its exporter has ended: {why}")
 
+    def open_no_more(self) -> None:
+        """Take that the flight ends: a viewer that has ended with its exporter is not missed."""
+        self._opens = False
+
     def close(self, hurry: bool) -> None:
         """End at the end of the flight; data that viewers lack by then is lost."""
         self._patience_s = HURRIED_S if hurry else PATIENCE_S
@@ -108,7 +113,8 @@ class Viewing:
         while not self._over.wait(wait_s):
             wait_s = LOOK_S
             is_old = self._onboard_port != self._port
-            if self._where != NOWHERE and self._port and (is_old or not self.is_shown):
+            wanted = self._opens and self._where != NOWHERE and self._port
+            if wanted and (is_old or not self.is_shown):
                 wait_s = self._show()
             self._look()
         if self._onboard is not None:

@@ -48,6 +48,7 @@ class RemoteViewing:
         """End; data that viewers lack by then is lost."""
         if hurry:
             self._processes.hurry()
+        self._viewing.open_no_more()
         shown = int(self._viewing.is_shown)
         self._processes.finish(lambda stage: Finish(hurry, n_viewers=shown))
         self._viewing.close(hurry)
