@@ -60,9 +60,9 @@ def batch(
 
     progress.start(len(names))
     progress.update(len(results), "done", 0)
-    write_index()
     if todo:
         with _cluster(scheduler, n_workers or len(todo)) as run:
+            write_index()
             for result in run(out, todo, config):
                 results[result.name] = result
                 progress.update(len(results), "done", 0)

@@ -88,8 +88,8 @@ def list_flights(folder: Path, as_json: bool) -> str:
             f"{row['flight']!s:<34}{float(str(row['duration_s'])) / 60:>8.1f}{row['pictures']:>10}"
             f"{row['mb']:>9}  {row['state']}"
         )
-    free = free_bytes(folder) / MB
-    return "\n".join([*lines, f"{len(rows)} recordings in {folder}, {free:.0f} MB free"])
+    free, plural = free_bytes(folder) / MB, "" if len(rows) == 1 else "s"
+    return "\n".join([*lines, f"{len(rows)} recording{plural} in {folder}, {free:.0f} MB free"])
 
 
 def show_flight(path: Path, as_json: bool) -> str:

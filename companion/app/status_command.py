@@ -204,7 +204,7 @@ def _processes(processes: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _warnings(n_warnings: Mapping[str, Any]) -> list[str]:
     rows = [(str(what), _number(n)) for what, n in sorted(n_warnings.items())]
-    return ["", *_table(("warned of", "times"), rows)] if rows else []
+    return ["", *_table(("event", "times"), rows)] if rows else []
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:

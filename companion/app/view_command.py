@@ -19,7 +19,8 @@ END_S = 1.0
 def view(host: str, where: str, bind: str, colours: str, notify: Callable[[str], None]) -> int:
     """View the companion at `host` until Ctrl-C or until its window is closed.
 
-    Returns the exit status. InputError where nothing can be shown here.
+    Returns the exit status: 2 where its window has ended by a fault, as without a display.
+    InputError where nothing can be shown here.
     """
     try:
         link = GroundLink(*host_and_port(host), notify)
@@ -48,11 +49,15 @@ def view(host: str, where: str, bind: str, colours: str, notify: Callable[[str],
         until_s = monotonic_s() + END_S
         while worker.is_alive() and monotonic_s() < until_s:
             worker.join(LOOK_S)
+        fault = screen.fault
         screen.close()
         hangs = worker.is_alive()
-    if faults:
+    if fault:
+        notify(fault)
+    elif faults:
         raise faults[0]
+    status = 2 if fault else 0
     if hangs:  # in a call into a viewer that is gone, for which the interpreter would wait
         sys.stderr.flush()
-        os._exit(0)
-    return 0
+        os._exit(status)
+    return status

@@ -34,7 +34,7 @@ def carry_out(steps: Sequence[Step], notify: Callable[[str], None], dry_run: boo
     begun: list[Step] = []
     for step in steps:
         if step.is_done():
-            notify(f"already there: {step.what}")
+            notify(f"already done: {step.what}")
             continue
         if dry_run:
             notify(f"would do: {step.what}")

@@ -36,7 +36,7 @@ def login_consoles(root: Path = Path("/")) -> list[LoginConsole]:
     """All login consoles, by port."""
     found: dict[str, LoginConsole] = {}
     for name in _kernel_consoles(root):
-        found[name] = LoginConsole(name, "take console= for it from the kernel's command line")
+        found[name] = LoginConsole(name, "remove its console= from the kernel's command line")
     for folder in WANTS:
         for unit in sorted((root / folder).glob("*.wants/*.service")):
             match = GETTY.match(unit.name)

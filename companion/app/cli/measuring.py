@@ -32,7 +32,8 @@ def _depth(arguments: argparse.Namespace, signals: StopSignals) -> int:
         arguments.dataset, arguments.out, load_config(arguments.config, sets), wanted,
         signals.between_frames(progress_on(sys.stderr)),
     )  # fmt: skip
-    print(f"{len(maps)} depth maps and cloud.ply: {arguments.out}")
+    plural = "" if len(maps) == 1 else "s"
+    print(f"{len(maps)} depth map{plural} and cloud.ply: {arguments.out}")
     signals.take()
     return 0
 

@@ -77,6 +77,14 @@ def number(text: str) -> int:
     return value
 
 
+def count(text: str) -> int:
+    """A whole number, 1 or more."""
+    value = int(text) if text.isascii() and text.isdigit() else 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"wanted a number from 1 on, given is {text}")
+    return value
+
+
 def amount(text: str) -> float:
     """A number, 0 or more."""
     try:

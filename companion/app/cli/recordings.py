@@ -12,6 +12,7 @@ from companion.app.cli.options import (
     Command,
     amount,
     configuration,
+    count,
     json_option,
     made_folder,
     number,
@@ -111,7 +112,8 @@ def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
     for result in failed:
         print(f"companion: {result.name}: {result.error}", file=sys.stderr)
     before = sum(result.done_before for result in results)
-    print(f"{len(results)} flights, {before} done before, {len(failed)} failed")
+    plural = "" if len(results) == 1 else "s"
+    print(f"{len(results)} flight{plural}, {before} done before, {len(failed)} failed")
     print(f"index: {arguments.out / INDEX}")
     signals.take()
     return 1 if failed else 0
@@ -132,11 +134,12 @@ def add_parsers(commands: Any) -> None:
     compare.add_argument("run_b", type=Path, metavar="RUN_B")
     compare.add_argument("--out", type=Path, metavar="DIR", help="write a report with plots there")
     compare.add_argument(
-        "--max-apart", type=float, metavar="M", help="poses at most so far apart, RMS"
+        "--max-apart", type=amount, metavar="M", help="poses at most so far apart, RMS"
     )
     compare.add_argument(
-        "--max-cloud", type=float, metavar="M", help="95 %% of points at most so far from the other"
-    )
+        "--max-cloud", type=amount, metavar="M",
+        help="95 %% of points at most so far from the other",
+    )  # fmt: skip
 
     batch = commands.add_parser(
         "batch", parents=[configuration()], help="replay an archive of flights on many cores",
@@ -145,7 +148,9 @@ def add_parsers(commands: Any) -> None:
     )  # fmt: skip
     batch.add_argument("flights", type=Path, nargs="+", metavar="FLIGHT")
     batch.add_argument("--out", type=Path, required=True, metavar="DIR")
-    batch.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    batch.add_argument(
+        "--workers", type=count, metavar="N", help="processes (default: one per core)"
+    )
     batch.add_argument(
         "--scheduler", metavar="ADDRESS",
         help="a Dask cluster that sees the same files, as tcp://192.168.1.5:8786",

@@ -51,7 +51,10 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     progress = signals.between_frames(progress_on(sys.stderr))
     if arguments.as_flown:
         if arguments.paced or (arguments.start, arguments.stop) != (None, None):
-            raise InputError("--as-flown replays a whole flight, in the order in which it came")
+            raise InputError(
+                "--as-flown replays a whole flight, in the order in which it came: leave out "
+                "--paced, --start and --stop"
+            )
         from companion.app.as_flown import replay_as_flown
 
         made_folder(arguments.out)

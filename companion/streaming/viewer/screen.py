@@ -22,6 +22,7 @@ MEMORY = "50%"
 
 SERVER_MEMORY = "256MB"
 """Buffer for browsers that join late; the static map stays."""
+ENDED = "the viewer has ended (status {}): a window wants a display, a page for a browser none"
 
 
 class Screen:
@@ -80,6 +81,12 @@ class Screen:
         """True once a viewer that was started here has ended."""
         return self.process is not None and self.process.poll() is not None
 
+    @property
+    def fault(self) -> str:
+        """Words for a viewer that was started here and ended by a fault of its own; else ""."""
+        status = self.process.poll() if self.process is not None else None
+        return ENDED.format(status) if status is not None and status > 0 else ""
+
     def close(self) -> None:
         """End what was started for this flight."""
         if self.proxy is not None:
@@ -116,9 +123,7 @@ def _start(port: int, *arguments: str, detached: bool = False) -> subprocess.Pop
     until_s, never = monotonic_s() + START_S, threading.Event()
     while not listens(LOOPBACK, port):
         if process.poll() is not None:
-            raise InputError(
-                f"the viewer ended at once (status {process.returncode}); is there a display?"
-            )
+            raise InputError(ENDED.format(process.returncode))
         if monotonic_s() > until_s:
             process.kill()
             raise InputError(f"the viewer did not start within {START_S:.0f} s")

@@ -97,6 +97,9 @@ def test_out_that_cannot_be_written(command: tuple[str | Path, ...]) -> None:
         (["replay", "flight", "--out", "out", "--start", "soon"], "--start"),
         (["replay", "flight", "--out", "out", "--viewer", "http://x"], "--viewer"),
         (["replay", "flight", "--out", "out", "--start", "5", "--stop", "5"], "--stop"),
+        (["replay", "flight", "--out", "out", "--as-flown", "--paced"], "leave out --paced"),
+        (["compare", "a", "b", "--max-apart", "nan"], "--max-apart"),
+        (["batch", "flight", "--out", "out", "--workers", "0"], "--workers"),
     ],
 )
 def test_usage(arguments: list[str], named: str) -> None:

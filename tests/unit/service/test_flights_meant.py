@@ -56,4 +56,4 @@ def test_list_says_where_it_looked(service: Places, capsys: pytest.CaptureFixtur
     assert str(own) in capsys.readouterr().err
     record(own / "2026-01-01T00-00-00Z", 3)
     assert main(["flights", "list"]) == 0
-    assert f"1 recordings in {own}," in capsys.readouterr().out
+    assert f"1 recording in {own}," in capsys.readouterr().out

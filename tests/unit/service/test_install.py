@@ -23,13 +23,13 @@ def test_what_is_done_is_left_and_the_rest_is_done(tmp_path: Path) -> None:
     told: list[str] = []
     steps = [file_written(here, b"as it is"), file_written(there, b"new", 0o640)]
     carry_out(steps, told.append, dry_run=True)
-    assert told == [f"already there: {here}", f"would do: {there}"]
+    assert told == [f"already done: {here}", f"would do: {there}"]
     assert not there.parent.exists()
     told.clear()
     for _ in range(2):
         carry_out(steps, told.append, dry_run=False)
     assert told[1] == f"done: {there}"
-    assert told[3] == f"already there: {there}"
+    assert told[3] == f"already done: {there}"
     assert (there.read_bytes(), there.stat().st_mode & 0o777) == (b"new", 0o640)
 
 

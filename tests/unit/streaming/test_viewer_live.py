@@ -200,6 +200,18 @@ def test_view_refuses_what_is_no_host_and_what_is_no_viewer() -> None:
         assert said in run.stderr and run.stderr.count("\n") == 1
 
 
+@pytest.mark.skipif(not free(GRPC_PORT), reason="a viewer runs here")
+def test_view_without_a_display_says_so() -> None:
+    display = "DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"
+    run = subprocess.run(
+        [sys.executable, "-m", "companion", "view", "127.0.0.1:1"],
+        env={name: value for name, value in os.environ.items() if name not in display},
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert run.returncode == 2
+    assert "a window wants a display" in run.stderr and "Traceback" not in run.stderr
+
+
 def test_inbox_blocks_until_there_is_capacity_or_it_is_closed() -> None:
     inbox = Inbox(10)
     inbox.put(image(0))
