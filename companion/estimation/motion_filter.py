@@ -23,10 +23,10 @@ ACCELERATION, SIGMA_POSITION = 0.3, 0.003
 ACCELERATION_NO_ATTITUDE, SIGMA_POSITION_NO_ATTITUDE = 1.5, 0.002
 """Process and measurement noise in map units, one of which is about the scene distance, with and
 without attitude."""
-
 MAX_RATE_SPAN_NS = 300_000_000
 """Over longer spans a drone may turn this way and back."""
-
+NORMALISED_TAU_S = 0.5
+"""Over which innovations are averaged: a copter brakes and turns within two seconds."""
 VARIANCE_ALIGNMENT_RAD2 = 1e-4
 """Variance of `map_from_ned` after one image: 0.6 degrees."""
 
@@ -48,6 +48,8 @@ class MotionFilter:
         self._map_from_ned = np.eye(3)
         self._aligned = False
         """True once `map_from_ned` is known."""
+        self._normalised = 1.0
+        """Mean squared innovation of the position per degree of freedom, of late."""
 
     def reset(self) -> None:
         """Reset all but the attitude alignment itself."""
@@ -61,10 +63,14 @@ class MotionFilter:
 
     @property
     def velocity(self) -> tuple[Array, float] | None:
-        """Velocity (3,) in map units per second and its standard deviation; None until known."""
+        """Velocity (3,) in map units per second and its standard deviation; None until known.
+
+        A map that began near the ground has a unit that is small beside what the camera sees from
+        above, and its motion and noise are larger in it than assumed: as much as innovations show.
+        """
         if self._filter is None:
             return None
-        variance = float(np.diag(self._filter.P)[3:6].max())
+        variance = max(1.0, self._normalised) * float(np.diag(self._filter.P)[3:6].max())
         return self._filter.x.ravel()[3:6].copy(), float(np.sqrt(max(variance, 0.0)))
 
     @property
@@ -132,7 +138,7 @@ class MotionFilter:
         if ned_from_camera is not None:
             seen = nearest_rotation(map_from_camera.rotation @ ned_from_camera.T)
         if self._filter is None or self._t_ns is None or t_ns - self._t_ns > 2_000_000_000:
-            self._filter = self._initial_filter(map_from_camera.translation)
+            self._filter, self._normalised = self._initial_filter(map_from_camera.translation), 1.0
             self._map_from_ned, self._aligned = seen, ned_from_camera is not None
         else:
             dt = max((t_ns - self._t_ns) * 1e-9, 1e-3)
@@ -164,6 +170,11 @@ class MotionFilter:
                 correction = vector_from_rotation(seen @ self._map_from_ned.T)
                 z = np.r_[z, correction]
             f.update(z.reshape(-1, 1), R=r, H=h)
+            innovation = f.y[:3, 0]
+            squared = float(innovation @ np.linalg.solve(f.S[:3, :3], innovation)) / 3.0
+            self._normalised += (1.0 - np.exp(-dt / NORMALISED_TAU_S)) * (
+                squared - self._normalised
+            )
             rotated = rotation_from_vector(f.x[6:9, 0])
             self._map_from_ned = nearest_rotation(rotated @ self._map_from_ned)
             f.x[6:9] = 0.0

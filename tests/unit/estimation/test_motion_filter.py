@@ -147,3 +147,23 @@ def test_attitude_extrapolation_is_limited() -> None:
     assert history.at(100_000_000) is not None
     assert history.at(-100_000_000) is not None
     assert history.at(150_000_000) is None
+
+
+@pytest.mark.parametrize(
+    "unit", [1.0, 0.05], ids=["unit of the scene", "unit of a start near the ground"]
+)
+def test_velocity_is_stated_as_uncertain_as_it_is(unit: float) -> None:
+    """Braking and turning with centimetres of noise, twenty metres away."""
+    rng, motion, squares = np.random.default_rng(4), MotionFilter(), []
+    for k in range(600):
+        t_s = 0.1 * k
+        place = 3.0 * np.array([np.sin(0.8 * t_s), np.cos(0.6 * t_s), 0.2 * np.sin(t_s)])
+        true = 3.0 * np.array(
+            [0.8 * np.cos(0.8 * t_s), -0.6 * np.sin(0.6 * t_s), 0.2 * np.cos(t_s)]
+        )
+        seen = (place + rng.normal(scale=0.03, size=3)) / 20.0 / unit
+        motion.correct(round(t_s * 1e9), Pose(np.eye(3), seen), np.eye(3))
+        if k > 50 and motion.velocity is not None:
+            velocity, sigma = motion.velocity
+            squares.append(((velocity - true / 20.0 / unit) ** 2).sum() / sigma**2 / 3.0)
+    assert 0.1 < np.mean(squares) < 2.0
