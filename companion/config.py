@@ -305,6 +305,15 @@ class GeoreferenceConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class MapConfig:
+    """Maps of earlier flights; see docs/maps.md."""
+
+    use: str = ""
+    """Site map of an earlier flight, in which the camera is located as soon as it sees something
+    known; "" for none."""
+
+
+@dataclass(frozen=True, slots=True)
 class OpenclConfig:
     """OpenCL device of the dense map; see docs/opencl.md."""
 
@@ -441,6 +450,7 @@ class Config:
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     georeference: GeoreferenceConfig = field(default_factory=GeoreferenceConfig)
+    map: MapConfig = field(default_factory=MapConfig)
     opencl: OpenclConfig = field(default_factory=OpenclConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)

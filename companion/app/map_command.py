@@ -14,9 +14,9 @@ from companion.products.cloud import Cloud
 from companion.products.cloud_ply import ply_parts
 from companion.products.flight_result import WorldPose
 from companion.products.site_map_file import (
-    SITE_MAP,
     ReadSiteMap,
     SiteHead,
+    map_path,
     read_head,
     read_site_map,
     write_site_map,
@@ -27,14 +27,9 @@ from companion.slam.map.site_map import SiteMap
 BYTES_PER_MB = 1e6
 
 
-def map_meant(path: Path) -> Path:
-    """The site map that a file, or the folder of a run, stands for."""
-    return path / SITE_MAP if path.is_dir() else path
-
-
 def show(path: Path, as_json: bool) -> str:
     """The head of a map: what it is of, how well it is placed, its parts."""
-    path = map_meant(path)
+    path = map_path(path)
     head = read_head(path)
     if as_json:
         return json.dumps(_head_numbers(path, head), indent=2)
@@ -65,7 +60,7 @@ def show(path: Path, as_json: bool) -> str:
 
 def verify(path: Path) -> tuple[str, bool]:
     """A line for each damaged part of a map, or that it is whole; True if it is."""
-    path = map_meant(path)
+    path = map_path(path)
     read = read_site_map(path)
     if not read.damaged:
         return f"{path}: whole", True
@@ -74,7 +69,7 @@ def verify(path: Path) -> tuple[str, bool]:
 
 def export(path: Path, out: Path) -> list[Path]:
     """Write points.ply, keyframes.tum and map.json of a map into a folder; their paths."""
-    path = map_meant(path)
+    path = map_path(path)
     read = read_site_map(path)
     origin = read.site.georeference.origin
     poses = [
@@ -93,7 +88,7 @@ def export(path: Path, out: Path) -> list[Path]:
 
 def save(path: Path, out: Path) -> ReadSiteMap:
     """Keep the map of a run as a file of its own, as far as it is whole."""
-    read = read_site_map(map_meant(path))
+    read = read_site_map(map_path(path))
     write_site_map(out, read.site)
     return read
 

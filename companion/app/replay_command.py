@@ -13,6 +13,7 @@ from companion.app.progress import Progress
 from companion.config import Config
 from companion.config_file import command_shown, shown
 from companion.errors import FlightError, StageError
+from companion.geometry.geodesy import GeoOrigin
 from companion.messages import (
     DepthMap,
     Frame,
@@ -23,7 +24,7 @@ from companion.messages import (
     TrackState,
 )
 from companion.products.flight_result import RunFacts
-from companion.products.site_map_file import SITE_MAP
+from companion.products.site_map_file import SITE_MAP, map_path, read_head
 from companion.products.surroundings import peak_memory_mb, versions
 from companion.runtime.gaps import with_gap_warnings
 from companion.runtime.in_order import InOrder, in_order_of_time, in_words
@@ -103,7 +104,8 @@ def replay(
     names = ("localisation", "depth", "results") if config.depth.enabled else LEAST
     if landing is not None:
         names = (*names, "landing")
-    setup = Setup(config, camera, out, origin=log.origin, is_live=False)
+    origin = log.origin or map_origin(config)
+    setup = Setup(config, camera, out, origin=origin, is_live=False)
 
     def watch(message: Message) -> None:
         watched.take(message)
@@ -121,7 +123,7 @@ def replay(
 
         def finish(stage: Stage) -> Finish:
             if stage.name == "localisation":
-                save = SaveSiteMap(out / SITE_MAP, given.flight.path.name, log.origin)
+                save = SaveSiteMap(out / SITE_MAP, given.flight.path.name, origin)
                 return Finish(hurry=False, save_map=save)
             if stage.name != "results":
                 return Finish(hurry=False)
@@ -130,7 +132,7 @@ def replay(
                 dropped["viewer messages"] = live.n_dropped
             return Finish(hurry=False, facts=RunFacts(
                 stage_times=stages.times, wall_s=monotonic_s() - began_s, clock=log.clock,
-                origin=log.origin if watched.has_origin else None,
+                origin=origin if watched.has_origin else None,
                 device=depth.device if depth is not None else NO_DEPTH,
                 config=shown(config), versions=versions(), command=command_shown(sys.argv),
                 peak_memory_mb=peak_memory_mb(), camera=camera, n_frames_total=given.n_frames,
@@ -140,9 +142,7 @@ def replay(
 
         try:
             if viewer != "none":
-                live = stack.enter_context(
-                    LiveViewer(config.viewer, camera, viewer, origin=log.origin)
-                )
+                live = stack.enter_context(LiveViewer(config.viewer, camera, viewer, origin=origin))
                 if live.page:
                     notify(f"viewer: open {live.page}")
             progress.start(given.n_frames)
@@ -168,6 +168,11 @@ def replay(
             f"the dense map failed after {watched.n_depth_maps} depth maps: "
             f"{in_words(stages.depth_fault)}; path, report and the cloud so far are in {out}"
         ) from stages.depth_fault
+
+
+def map_origin(config: Config) -> GeoOrigin | None:
+    """Origin of the world of a flight that has none of its own: that of the map in use."""
+    return read_head(map_path(config.map.use)).georeference.origin if config.map.use else None
 
 
 def _span(flight: Flight, start_s: float | None, stop_s: float | None) -> tuple[int, int]:

@@ -30,9 +30,10 @@ from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.resumption import Resumption, Verdict
 from companion.estimation.shutter.frame_unrolling import FrameUnrolling
 from companion.estimation.site.site_of_flight import site_of_flight
+from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
-from companion.geometry.transforms import Array, Pose
+from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import (
     Frame,
     FrameOverdue,
@@ -67,14 +68,14 @@ class LocalisationStage:
     """Localises the camera.
 
     With `background` keyframes are mapped in another thread, so that no frame waits; `order` is
-    then that of mapping and frames, as FrameTracked told it in an earlier flight. Of telemetry it
-    believes what `telemetry.use` names, but no position estimates of an autopilot that flies on
-    ours.
+    then that of mapping and frames, as FrameTracked told it in an earlier flight. In the map of a
+    `site` it is located as soon as that is seen again. Of telemetry it believes what
+    `telemetry.use` names, but no position estimates of an autopilot that flies on ours.
     """
 
     def __init__(
         self, config: Config, camera: Camera, times: Timer, *, background: bool = False,
-        order: Iterable[int] | None = None,
+        order: Iterable[int] | None = None, site: SiteUse | None = None,
     ) -> None:  # fmt: skip
         self._config = config
         self._camera = camera
@@ -109,6 +110,11 @@ class LocalisationStage:
         self._tracker.atlas.loop_allowed = self._loop_allowed
         self._georeferences.reckoned_at = self._odometry.reckoning.path.at
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
+        self._site = site
+        if site is not None:
+            self._tracker.use_site(site.slam_map)
+            self._tracker.atlas.on_merge = self._merged
+            self._georeferences.hold(site.slam_map, site.georeference)
 
     @property
     def state(self) -> TrackState:
@@ -225,7 +231,8 @@ class LocalisationStage:
         """
         segments = ((s, self._georeferences.of(s)) for s in self._segments())
         metric = [(segment, placed) for segment, placed in segments if placed is not None]
-        return site_of_flight(metric, self._camera, flight, origin, None)
+        used = None if self._site is None else self._site.site
+        return site_of_flight(metric, self._camera, flight, origin, used)
 
     def _segments(self) -> list[SlamMap]:
         return [s for s in self._tracker.segments if s.keyframes]
@@ -340,6 +347,8 @@ class LocalisationStage:
             yield update
         if self._resumption is not None:
             yield from self._check_resumption(self._resumption, frame.t_ns)
+        if self._site is not None:
+            yield from self._site.warnings(frame.t_ns)
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
         yield from self._check_attitude(frame.t_ns)
@@ -480,5 +489,15 @@ class LocalisationStage:
                 if keyframe.ned_from_camera is not None:
                     keyframe.ned_from_camera = keyframe.ned_from_camera @ rotation.T
 
+    def _merged(self, here: SlamMap, there: SlamMap, here_from_there: Similarity) -> None:
+        self._georeferences.merged(here, there, here_from_there)
+        if self._site is not None and there is self._site.slam_map:
+            self._site.locate(self._t_ns, len(there.keyframes))
+
     def _loop_allowed(self, keyframe: Keyframe, other: Keyframe, found: LoopClosure) -> bool:
+        if self._site is not None and found.there is self._site.slam_map:
+            return self._site.allowed(
+                found, self._georeferences.of(self._tracker.map),
+                self._georeferencer.place_at(keyframe.t_ns),
+            )  # fmt: skip
         return self._georeferences.loop_allowed(self._tracker.map, keyframe, other, found)

@@ -98,6 +98,12 @@ class SiteHead:
     n_levels: int
 
 
+def map_path(given: str | Path) -> Path:
+    """The site map that a file, or the folder of a run, stands for."""
+    path = Path(given).expanduser()
+    return path / SITE_MAP if path.is_dir() else path
+
+
 def write_site_map(path: Path, site: SiteMap) -> None:
     """Write a site map, durably and in one step; OSError where it cannot be."""
     part = path.with_name(f".{path.name}.part")

@@ -12,8 +12,14 @@ import numpy as np
 
 from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
+from companion.estimation.site.site_use import SiteUse
 from companion.messages import Frame, Georeferenced, MapUpdate, Message, Warned
-from companion.products.site_map_file import write_site_map
+from companion.products.site_map_file import (
+    SiteMapError,
+    map_path,
+    read_site_map,
+    write_site_map,
+)
 from companion.runtime.stage_protocol import Finish, KeepMap, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.slam.compiled.compiling import cache_errors
@@ -24,6 +30,8 @@ from drivers.system.heap import give_back_heap
 
 KEEP_EVERY_NS = 1_000_000_000
 NO_COLOUR = np.zeros((0, 0, 3), np.uint8)
+MAP_NOT_USED = "the map of an earlier flight cannot be read"
+MAP_DAMAGED = "the map of an earlier flight is damaged"
 NOT_KEPT = "the map cannot be kept for a restart in flight"
 
 
@@ -38,8 +46,9 @@ class _Localisation(Work):
                 file=sys.stderr,
             )
         self._setup = setup
+        self._said: list[tuple[str, str]] = []
         self._stage = LocalisationStage(
-            setup.config, setup.camera, self.times, background=setup.is_live
+            setup.config, setup.camera, self.times, background=setup.is_live, site=self._site(setup)
         )
         if setup.is_live:  # in a process of its own; of the compiler of loops nothing is needed now
             give_back_heap()
@@ -48,6 +57,30 @@ class _Localisation(Work):
         self._to_take_up: Kept | None = None
         self._reported_fault = ""
         self._kept_ns = 0
+
+    def _site(self, setup: Setup) -> SiteUse | None:
+        """The site map to be used; SiteMapError of a replay, while a flight goes on without."""
+        if not setup.config.map.use:
+            return None
+        try:
+            read = read_site_map(map_path(setup.config.map.use))
+            features = setup.config.features
+            if (read.site.scale_factor, read.site.n_levels) != (
+                features.scale_factor, features.n_levels,
+            ):  # fmt: skip
+                raise SiteMapError(
+                    f"{setup.config.map.use}: it was made with features.scale_factor = "
+                    f"{read.site.scale_factor:g} and n_levels = {read.site.n_levels}, and now they "
+                    f"are {features.scale_factor:g} and {features.n_levels}"
+                )
+        except SiteMapError as error:
+            if not setup.is_live:
+                raise
+            self._said.append((MAP_NOT_USED, str(error)))
+            return None
+        if read.damaged:
+            self._said.append((MAP_DAMAGED, f"{len(read.damaged)} parts are left out"))
+        return SiteUse(read.site, setup.camera, setup.origin)
 
     def step(self, message: Any) -> Iterable[Message]:
         if isinstance(message, SetLoadLevel):
@@ -91,6 +124,9 @@ class _Localisation(Work):
             kept, tracked_ns = self._to_take_up
             self._to_take_up = None
             self._stage.resume(kept, frame.t_ns, since_boot_ns() - tracked_ns)
+        for what, detail in self._said:
+            yield Warned(frame.t_ns, what, detail)
+        self._said.clear()
         for out in self._stage.step(frame):
             yield out
             if isinstance(out, MapUpdate):

@@ -19,7 +19,7 @@ from companion.app.cli.options import (
 )
 from companion.app.progress import progress_on
 from companion.app.stopping import StopSignals
-from companion.config import Config, ExportConfig
+from companion.config import Config, ExportConfig, MapConfig
 from companion.config_file import load_config
 from companion.errors import InputError
 
@@ -40,6 +40,8 @@ def _with_telemetry(arguments: argparse.Namespace) -> Config:
 
 def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     config = _with_telemetry(arguments)
+    if arguments.map is not None:
+        config = dataclasses.replace(config, map=MapConfig(use=str(arguments.map)))
     if None not in (arguments.start, arguments.stop) and arguments.stop <= arguments.start:
         raise InputError(f"--stop {arguments.stop:g} is not after --start {arguments.start:g}")
     if arguments.out.exists() and not arguments.out.is_dir():
@@ -154,6 +156,10 @@ def add_parsers(commands: Any) -> None:
         help="in the flight's own time, dropping what a live run would drop",
     )  # fmt: skip
 
+    replay.add_argument(
+        "--map", type=Path, metavar="MAP",
+        help="locate it in this site map of an earlier flight; over [map] use",
+    )  # fmt: skip
     replay.add_argument(
         "--as-flown", action="store_true",
         help="of a recording: do again what was decided in flight, and compare the poses sent",

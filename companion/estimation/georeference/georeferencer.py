@@ -125,6 +125,15 @@ class Georeferencer:
                     return np.asarray(where[1] - where[0], np.float64)
         return None
 
+    def place_at(self, t_ns: int) -> Array | None:
+        """Measured place (3,) of the body, NED metres; None where unknown."""
+        for source in self._sources:
+            if len(self._positions[source]) >= 4:
+                where, ok = self._positions[source].at(np.array([t_ns]))
+                if ok.all():
+                    return np.asarray(where[0], np.float64)
+        return None
+
     def integrated_velocity(self, t_ns: Array) -> Array | None:
         """Integrated velocity (N, 3) at times (N,), NED metres.
 

@@ -53,6 +53,8 @@ class SegmentGeoreferences:
         self._known: dict[int, Georeference] = {}
         self._kept: tuple[int, Georeference] | None = None
         """A resumed segment and its stored georeference."""
+        self._held: dict[int, Georeference] = {}
+        """Of maps that are, or have taken over, that of an earlier flight; nothing moves them."""
         self._main: int | None = None
         self._revision = 0
         self._acceleration = acceleration
@@ -74,6 +76,18 @@ class SegmentGeoreferences:
         """Georeference a resumed segment as stored."""
         self._known[segment.first_keyframe_id] = kept
         self._kept = segment.first_keyframe_id, kept
+
+    def hold(self, segment: SlamMap, kept: Georeference) -> None:
+        """Georeference the map of an earlier flight."""
+        self._held[segment.first_keyframe_id] = kept
+
+    def merged(self, here: SlamMap, there: SlamMap, here_from_there: Similarity) -> None:
+        """A map has taken over another: it lies where that of an earlier flight does."""
+        kept = self._held.pop(there.first_keyframe_id, None)
+        if kept is not None:
+            world_from_here = kept.world_from_map @ here_from_there.inverse()
+            placed = replace(kept, world_from_map=world_from_here)
+            self._held[here.first_keyframe_id] = self._known[here.first_keyframe_id] = placed
 
     def _more_certain(self, segment: SlamMap, found: Georeference) -> Georeference:
         """The found or the stored georeference of a segment, whichever is more certain.
@@ -104,6 +118,8 @@ class SegmentGeoreferences:
         """The map with all segments in the frame of the main one."""
         self._revision += 1
         for segment in segments:
+            if segment.first_keyframe_id in self._held:
+                continue
             if final or (segment is segments[-1] and _due(segment)):
                 found = self._georeferencer.solve(
                     self._samples(segment, _subsample(segment, final)),

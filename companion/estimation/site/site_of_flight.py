@@ -37,7 +37,7 @@ def site_of_flight(
     if times:
         parts = (*parts, SitePart(flight, min(times), camera, revision))
     georeference = SiteGeoreference(
-        origin if placed.has_origin else None,
+        (origin or (before and before.georeference.origin)) if placed.has_origin else None,
         _sigma_m(times) if before is None else before.georeference.sigma_m,
         placed.sigma_yaw_rad, placed.sigma_scale, placed.method,
     )  # fmt: skip

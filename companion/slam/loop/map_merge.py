@@ -35,6 +35,7 @@ def merge_maps(here: SlamMap, there: SlamMap, here_from_there: Similarity) -> No
         here.retired[key] = retired.scaled(here_from_there.scale)
         here.unit_of[key] = there.unit_of.get(key, 1.0) * here_from_there.scale
     here.level = here.level and there.level
+    here.held |= there.held
     ordered = sorted(here.keyframes.items())
     here.keyframes.clear()
     here.keyframes.update(ordered)
@@ -52,10 +53,12 @@ class LoopGraph:
     oldest: int
     """Rows of the two keyframes of the loop; the second is held."""
     level: bool
+    held: tuple[int, ...]
+    """Rows of keyframes of an earlier flight; where there are any, these are held instead."""
 
     def relaxed(self) -> list[Similarity]:
         """Nodes that agree with the loop. Takes long, and needs nothing of the map."""
-        return relax(self.nodes, self.edges, self.oldest, self.level)
+        return relax(self.nodes, self.edges, self.held or (self.oldest,), self.level)
 
 
 def loop_graph(
@@ -71,7 +74,8 @@ def loop_graph(
     edges.append(
         Edge(row[newest], row[oldest], corrected.inverse() @ nodes[row[oldest]], LOOP_WEIGHT)
     )
-    return LoopGraph(keys, nodes, edges, row[newest], row[oldest], slam_map.level)
+    held = tuple(row[key] for key in keys if key in slam_map.held)
+    return LoopGraph(keys, nodes, edges, row[newest], row[oldest], slam_map.level, held)
 
 
 def close_loop(slam_map: SlamMap, graph: LoopGraph, relaxed: list[Similarity]) -> float:
@@ -97,7 +101,8 @@ def _edges(
     pairs: dict[tuple[int, int], float] = {}
     keys = list(slam_map.keyframes)
     for before, key in pairwise(keys):
-        pairs[before, key] = 1.0
+        if before not in slam_map.held:  # else the next is of another day, or held as well
+            pairs[before, key] = 1.0
     for n, (key, keyframe) in enumerate(slam_map.keyframes.items()):
         if n % YIELD_EVERY == 0:
             yield_point()

@@ -20,7 +20,7 @@ from companion.slam.features.matching import (
     mutual_matches,
 )
 from companion.slam.features.orb_features import Features, Ints
-from companion.slam.map.local_map import Projector
+from companion.slam.map.local_map import Projector, Visible
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.optimisation.pose_refinement import refine_pose
 from companion.slam.optimisation.upright_pose import upright_pose
@@ -34,6 +34,10 @@ MIN_FOUND, MIN_FOUND_RATIO = 30, 0.35
 MANY_INLIERS, LOW_FOUND_RATIO = 25, 0.2
 """Without known gravity: with so many inliers a lower found ratio suffices."""
 N_COVISIBLE = 6
+CHANCE_RATIO, CHANCE_SHIFT_PX = 3.0, 40.0
+"""On another day (sun, leaves, direction) 5 to 10 % of the predicted points are found at a right
+pose and 1 % at a wrong one: that many times more must be found than on the image shifted by this,
+in each of four directions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +89,8 @@ class Relocalizer:
     ) -> Relocalised | None:  # fmt: skip
         """Match the points predicted around a keyframe; None where less than `share` is found.
 
-        For images with few features the number required is capped at half of them.
+        For images with few features the number required is capped at half of them. Of a keyframe
+        of an earlier flight the number required is a multiple of what chance finds instead.
         """
         ids = covisible_points(slam_map, keyframe)
         points, found = np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -101,9 +106,22 @@ class Relocalizer:
                 features.normalised[found], features.whitening[found],
             )  # fmt: skip
             points, found = points[inlier], found[inlier]
-        if len(points) < max(MIN_FOUND, share * min(n_due, len(features) // 2)):
+        if keyframe.keyframe_id in slam_map.held:
+            n_required = CHANCE_RATIO * self._found_by_chance(features, slam_map, pose, ids)
+        else:
+            n_required = share * min(n_due, len(features) // 2)
+        if len(points) < max(MIN_FOUND, n_required):
             return None
         return Relocalised(pose, points, found, keyframe)
+
+    def _found_by_chance(self, features: Features, slam_map: SlamMap, pose: Pose, ids: Ints) -> int:
+        """Number of points found where they are not predicted, at most."""
+        due = self._projector.visible(slam_map, pose, ids)
+        counts = []
+        for step in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+            shifted = Visible(due.ids, due.pixels + CHANCE_SHIFT_PX * np.array(step), due.octaves)
+            counts.append(len(self._projector.search(slam_map, shifted, features, 5.0)[0]))
+        return max(counts)
 
     def _solve(
         self, points: Array, features: Features, found: Ints, level_from_camera: Array | None,

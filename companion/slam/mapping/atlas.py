@@ -8,7 +8,7 @@ import numpy as np
 
 from companion.config import FeaturesConfig
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, angle_between
+from companion.geometry.transforms import Array, Similarity, angle_between
 from companion.messages import LoopClosed
 from companion.slam.features.orb_features import Features
 from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
@@ -39,6 +39,8 @@ MIN_LOOP_SHIFT, MIN_LOOP_ROTATION_RAD, MIN_LOOP_LOG_SCALE = 0.01, np.radians(0.2
 LOOP_ITERATIONS = 5
 
 LoopCheck = Callable[[Keyframe, Keyframe, LoopClosure], bool]
+MIN_KEYFRAMES_LOCATED = 3
+"""Keyframes of a map that is looked for in that of an earlier flight: neighbours confirm it."""
 
 
 class Atlas:
@@ -58,6 +60,11 @@ class Atlas:
         self._finder = LoopDetector(self._database, self._relocalizer)
         self._cooldown = 0
         self._pending: SlamMap | None = None
+        self.site: SlamMap | None = None
+        """Map of an earlier flight, until the active one is found in it."""
+        self._site_finder = LoopDetector(KeyframeDatabase(), self._relocalizer)
+        self.on_merge: Callable[[SlamMap, SlamMap, Similarity], None] = lambda here, there, by: None
+        """Called when `here` takes over `there`; `by` is here_from_there."""
         self.segments: list[SlamMap] = []
         self.loop_allowed: LoopCheck = lambda keyframe, other, loop: True
         """Accepts or rejects a loop closure by information other than the images."""
@@ -92,6 +99,13 @@ class Atlas:
         self.segments = [kept]
         for keyframe in kept.keyframes.values():
             self.index_keyframe(keyframe)
+
+    def use_site(self, site: SlamMap) -> None:
+        """Look for the active map in that of an earlier flight, until it is found there."""
+        database = KeyframeDatabase()
+        for keyframe in site.keyframes.values():
+            database.add(keyframe.keyframe_id, keyframe.features.descriptors)
+        self.site, self._site_finder = site, LoopDetector(database, self._relocalizer)
 
     def drop_map(self, first_keyframe_id: int) -> bool:
         """Remove a map by its first keyframe; whether it was active, and a new one is now."""
@@ -159,6 +173,10 @@ class Atlas:
             found = self._finder.find(
                 keyframe, segment, self.segments, self._plausible, self._map_lock.yield_to_tracking
             )
+        if found is None and self.site and len(segment.keyframes) >= MIN_KEYFRAMES_LOCATED:
+            found = self._site_finder.find(
+                keyframe, segment, [self.site], self._plausible, self._map_lock.yield_to_tracking
+            )
         self._database.add(keyframe.keyframe_id, keyframe.features.descriptors)
         if found is None or segment is not self.map:  # another map may be active by now
             return None
@@ -178,6 +196,7 @@ class Atlas:
         if not same:
             offset = segment.n_points
             merge_maps(segment, found.there, here_from_there)
+            self.on_merge(segment, found.there, here_from_there)
             self.segments = [s for s in self.segments if s is not found.there]
             seen_there = seen_there + offset
         elif _needs_pose_graph(found):
@@ -189,6 +208,8 @@ class Atlas:
             moved = close_loop(segment, graph, relaxed)
         self.n_loops += 1
         mapper.fuse(keyframe, other, seen_there)
+        if found.there is self.site:
+            self._take_over_site(segment, mapper)
         if self._background:
             mapper.adjust_locally(other)
             self._pending = segment if not same or moved else self._pending
@@ -202,6 +223,15 @@ class Atlas:
             moved,
             here_from_there.scale,
         )
+
+    def _take_over_site(self, segment: SlamMap, mapper: Mapper) -> None:
+        """Know the map of an earlier flight as part of the active one."""
+        self.site = None
+        for key, keyframe in segment.keyframes.items():
+            if key in segment.held:
+                self.index_keyframe(keyframe)
+            else:
+                mapper.fuse_held(keyframe)
 
     def adjust_pending(self, yield_point: Callable[[], None]) -> None:
         """Globally adjust maps with closed loops while they go on; an `IdleWork`."""

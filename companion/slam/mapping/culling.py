@@ -28,7 +28,7 @@ def cull_keyframes(slam_map: SlamMap, newest: Keyframe, spacing_deg: float) -> l
     """
     spacing = float(np.tan(np.radians(spacing_deg)))
     keys = list(slam_map.keyframes)
-    protected = {*keys[:N_OLDEST_KEPT], *keys[-N_NEWEST_KEPT:], newest.keyframe_id}
+    protected = {*keys[:N_OLDEST_KEPT], *keys[-N_NEWEST_KEPT:], newest.keyframe_id, *slam_map.held}
     _, points = slam_map.observations_of(newest)
     near = [
         k for _, k in slam_map.covisible(points, MIN_SHARED)[:MAX_CANDIDATES] if k not in protected

@@ -184,17 +184,19 @@ def _remove_outliers(
 def partition(slam_map: SlamMap) -> Iterator[tuple[list[Keyframe], list[Keyframe], Bools]]:
     """Variable keyframes, fixed keyframes and point mask of each problem of a global adjustment.
 
-    The first two keyframes fix the gauge. A long flight is adjusted in overlapping windows, each
-    held by covisible keyframes.
+    The first two keyframes fix the gauge, or those of an earlier flight. A long flight is adjusted
+    in overlapping windows, each held by covisible keyframes.
     """
     ordered = sorted(slam_map.keyframes.values(), key=lambda k: k.keyframe_id)
-    if len(ordered) < 3:
+    held = [k for k in ordered if k.keyframe_id in slam_map.held] or ordered[:2]
+    free = [k for k in ordered[2:] if k.keyframe_id not in slam_map.held]
+    if not free:
         return
     if len(ordered) <= MAX_VARIABLE:
-        yield ordered[2:], ordered[:2], slam_map.alive[: slam_map.n_points].copy()
+        yield free, held, slam_map.alive[: slam_map.n_points].copy()
         return
-    for start in range(2, len(ordered), MAX_VARIABLE // 2):
-        part = ordered[start : start + MAX_VARIABLE]
+    for start in range(0, len(free), MAX_VARIABLE // 2):
+        part = free[start : start + MAX_VARIABLE]
         mask = np.zeros(slam_map.n_points, bool)
         for k in part:
             mask[slam_map.observations_of(k)[1]] = True
@@ -203,4 +205,4 @@ def partition(slam_map: SlamMap) -> Iterator[tuple[list[Keyframe], list[Keyframe
         shared = [int(np.count_nonzero(mask[slam_map.observations_of(k)[1]])) for k in rest]
         order = np.argsort(-np.array(shared), kind="stable")[:MAX_FIXED]
         holding = [rest[int(i)] for i in np.sort(order) if shared[int(i)] >= 3]
-        yield part, holding or ordered[:2], mask
+        yield part, holding or held[:2], mask

@@ -6,6 +6,7 @@ rotated about the vertical only.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,8 +36,10 @@ class Edge:
     weight: float = 1.0
 
 
-def relax(nodes: list[Similarity], edges: list[Edge], fixed: int, level: bool) -> list[Similarity]:
-    """Nodes `map_from_node` of least squared error over all edges; node `fixed` is held.
+def relax(
+    nodes: list[Similarity], edges: list[Edge], fixed: Collection[int], level: bool
+) -> list[Similarity]:
+    """Nodes `map_from_node` of least squared error over all edges; nodes `fixed` are held.
 
     With `level` nodes rotate about the z axis of the map only.
     """
@@ -104,7 +107,7 @@ def _solve(
     i: Ints,
     j: Ints,
     n: int,
-    fixed: int,
+    fixed: Collection[int],
 ) -> Array:
     """One Gauss-Newton step (n, D)."""
     size = of_i.shape[2]
@@ -121,7 +124,7 @@ def _solve(
     jacobian = coo_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape
     ).tocsc()
-    free = np.flatnonzero(np.arange(n * size) // size != fixed)
+    free = np.flatnonzero(~np.isin(np.arange(n * size) // size, list(fixed)))
     jacobian = jacobian[:, free]
     normal = (jacobian.T @ jacobian).tocsc()
     normal.setdiag(normal.diagonal() + 1e-9)

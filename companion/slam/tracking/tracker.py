@@ -130,6 +130,11 @@ class Tracker:
         self._next_keyframe_id = next_keyframe_id
         self.state, self._lost_since_ns = TrackState.LOST, until_ns
 
+    def use_site(self, site: SlamMap) -> None:
+        """Look for the camera in the map of an earlier flight; before the first frame."""
+        self.atlas.use_site(site)
+        self._next_keyframe_id = max(site.keyframes) + 1
+
     def drop_map(self, first_keyframe_id: int) -> None:
         """Drop a map; where it is active, initialise another."""
         if self.atlas.drop_map(first_keyframe_id):

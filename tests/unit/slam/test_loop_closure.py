@@ -105,7 +105,7 @@ def test_pose_graph_removes_the_drift_of_a_closed_square() -> None:
         for a, b in zip(drifted, truth, strict=True)
     )
     edges.append(Edge(len(truth) - 1, 0, truth[-1].inverse() @ truth[0], 100.0))
-    relaxed = relax(drifted, edges, fixed=0, level=True)
+    relaxed = relax(drifted, edges, fixed=(0,), level=True)
     errors = [
         float(np.linalg.norm(a.translation - b.translation))
         for a, b in zip(relaxed, truth, strict=True)

@@ -1,0 +1,119 @@
+"""The map of an earlier flight in use: where it lies in the world of now; contradictions to it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.geometry.camera import Camera
+from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned, ned_from_geodetic
+from companion.geometry.transforms import Array, Similarity
+from companion.messages import Georeference, Warned
+from companion.slam.loop.loop_closure import LoopClosure
+from companion.slam.map.site_map import SiteMap, slam_map_of
+from companion.slam.map.sparse_map import SlamMap
+
+MAX_OFF_M = 20.0
+"""Satellites and a right map differ by the errors of both, some metres each."""
+MIN_SCALE_OFF, SIGMAS_OFF = 0.1, 4.0
+"""Relative difference of scales that contradict, at least, and in standard deviations."""
+MAX_FOCAL_OFF = 0.01
+"""Relative difference of focal lengths of the same camera, calibrated twice."""
+LOCATED = "located in the map of an earlier flight"
+CONTRADICTED = "the map of an earlier flight is not used"
+OTHER_CAMERA = "the map of an earlier flight was made with another camera"
+
+
+class SiteUse:
+    """A site map in use, for a flight whose local NED has an origin, None where unknown."""
+
+    def __init__(self, site: SiteMap, camera: Camera, origin: GeoOrigin | None) -> None:
+        self.site = site
+        self.slam_map: SlamMap = slam_map_of(site, camera.focal_px)
+        self.located = False
+        self._has_both = origin is not None and site.georeference.origin is not None
+        """True where places of now and of the map can be compared."""
+        self._world_from_site = world_from_site(site.georeference.origin, origin)
+        self._warnings: list[Warned] = []
+        self._said: set[str] = set()
+        theirs = site.parts[-1].camera
+        self._other_camera = ""
+        if abs(np.log(theirs.focal_px / camera.focal_px)) > MAX_FOCAL_OFF:
+            self._other_camera = (
+                f"its focal length was {theirs.focal_px:.0f} pixels, and is {camera.focal_px:.0f}; "
+                "directions are compared, not pixels"
+            )
+
+    @property
+    def georeference(self) -> Georeference:
+        """Georeference of the site map in the world of this flight."""
+        found = self.site.georeference
+        return Georeference(
+            self._world_from_site, found.sigma_scale, found.sigma_yaw_rad,
+            f"the map of {self.site.parts[0].flight} ({found.method})", len(self.site.keyframes),
+            found.sigma_m, has_origin=found.origin is not None,
+        )  # fmt: skip
+
+    def warnings(self, t_ns: int) -> list[Warned]:
+        """What is to be said since the last call."""
+        if self._other_camera:
+            self._say(t_ns, OTHER_CAMERA, self._other_camera)
+            self._other_camera = ""
+        out, self._warnings = self._warnings, []
+        return out
+
+    def allowed(
+        self, found: LoopClosure, placed: Georeference | None, measured_m: Array | None
+    ) -> bool:
+        """True if scale and place of now do not contradict a keyframe found in the site map.
+
+        `placed` is the georeference of its map by measurements of this flight, `measured_m` (3,)
+        the place of the camera by satellites, NED metres, None where unknown.
+        """
+        t_ns = found.keyframe.t_ns
+        if placed is not None:
+            units = self._world_from_site.scale / found.here_from_there.scale
+            off = abs(float(np.log(placed.world_from_map.scale / units)))
+            sigma = float(np.hypot(placed.sigma_scale, self.site.georeference.sigma_scale))
+            if off > max(MIN_SCALE_OFF, SIGMAS_OFF * sigma):
+                self._say(
+                    t_ns, CONTRADICTED, f"its scale is off by {100 * (np.exp(off) - 1):.0f} % from "
+                    f"that by {placed.method}",
+                )  # fmt: skip
+                return False
+        if measured_m is not None and self._has_both:
+            there = found.relocalised.camera_from_map.inverse().translation
+            off_m = float(np.linalg.norm(self._world_from_site.apply(there) - measured_m))
+            if off_m > MAX_OFF_M:
+                self._say(
+                    t_ns, CONTRADICTED, f"its place is {off_m:.0f} m from that by the autopilot"
+                )
+                return False
+        return True
+
+    def locate(self, t_ns: int, n_matches: int) -> None:
+        """Note that the flight was found in the map."""
+        self.located = True
+        parts = ", ".join(part.flight for part in self.site.parts)
+        self._warnings.append(Warned(t_ns, LOCATED, f"{parts}: {n_matches} points", good=True))
+
+    def _say(self, t_ns: int, what: str, detail: str) -> None:
+        if what not in self._said:
+            self._said.add(what)
+            self._warnings.append(Warned(t_ns, what, detail))
+
+
+def world_from_site(site: GeoOrigin | None, world: GeoOrigin | None) -> Similarity:
+    """Transform between local NEDs of two origins; the identity where one is unknown.
+
+    Their verticals differ by a second of arc in 30 m: in a site's size that is rounding.
+    """
+    if site is None or world is None or site == world:
+        return Similarity.identity()
+    zero = ned_from_geodetic(site.latitude_deg, site.longitude_deg, site.altitude_m, world)
+    # the axes of the other tangent plane, by where one metre along each ends
+    ends = [
+        ned_from_geodetic(latitude_deg, longitude_deg, altitude_m, world) - zero
+        for latitude_deg, longitude_deg, altitude_m in geodetic_from_ned(1000.0 * np.eye(3), site)
+    ]
+    u, _, vt = np.linalg.svd(np.stack(ends, 1) / 1000.0)
+    return Similarity(1.0, u @ vt, zero)
