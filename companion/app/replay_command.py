@@ -13,6 +13,7 @@ from companion.app.progress import Progress
 from companion.config import Config
 from companion.config_file import command_shown, shown
 from companion.errors import FlightError, StageError
+from companion.estimation.site.site_use import LOCATED
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import (
     DepthMap,
@@ -22,6 +23,7 @@ from companion.messages import (
     PointChunk,
     Track,
     TrackState,
+    Warned,
 )
 from companion.products.flight_result import RunFacts
 from companion.products.site_map_file import SITE_MAP, map_path, read_head
@@ -48,8 +50,8 @@ class Watched:
     def __init__(self) -> None:
         self.state = TrackState.INITIALISING
         self.n_points = self.n_depth_maps = 0
-        self.has_origin = False
-        """True once the map is georeferenced to the log's origin."""
+        self.has_origin = self.located = False
+        """True once the map is georeferenced, and once it was found in that of another flight."""
 
     def take(self, message: Message) -> None:
         """Take a message of any kind."""
@@ -62,6 +64,14 @@ class Watched:
         elif isinstance(message, Georeferenced):
             found = message.georeference
             self.has_origin = found is not None and found.has_origin
+        elif isinstance(message, Warned) and message.what == LOCATED:
+            self.located = True
+
+    def origin(self, of_log: GeoOrigin | None, of_map: GeoOrigin | None) -> GeoOrigin | None:
+        """Origin of the map's world: of the log, else of the map in use, if it was found there."""
+        if not self.has_origin:
+            return None
+        return of_log or (of_map if self.located else None)
 
 
 class RecordedInput:
@@ -104,8 +114,8 @@ def replay(
     names = ("localisation", "depth", "results") if config.depth.enabled else LEAST
     if landing is not None:
         names = (*names, "landing")
-    origin = log.origin or map_origin(config)
-    setup = Setup(config, camera, out, origin=origin, is_live=False)
+    of_map = map_origin(config)
+    setup = Setup(config, camera, out, origin=log.origin, is_live=False)
 
     def watch(message: Message) -> None:
         watched.take(message)
@@ -123,7 +133,7 @@ def replay(
 
         def finish(stage: Stage) -> Finish:
             if stage.name == "localisation":
-                save = SaveSiteMap(out / SITE_MAP, given.flight.path.name, origin)
+                save = SaveSiteMap(out / SITE_MAP, given.flight.path.name, log.origin)
                 return Finish(hurry=False, save_map=save)
             if stage.name != "results":
                 return Finish(hurry=False)
@@ -132,7 +142,7 @@ def replay(
                 dropped["viewer messages"] = live.n_dropped
             return Finish(hurry=False, facts=RunFacts(
                 stage_times=stages.times, wall_s=monotonic_s() - began_s, clock=log.clock,
-                origin=origin if watched.has_origin else None,
+                origin=watched.origin(log.origin, of_map),
                 device=depth.device if depth is not None else NO_DEPTH,
                 config=shown(config), versions=versions(), command=command_shown(sys.argv),
                 peak_memory_mb=peak_memory_mb(), camera=camera, n_frames_total=given.n_frames,
@@ -142,7 +152,9 @@ def replay(
 
         try:
             if viewer != "none":
-                live = stack.enter_context(LiveViewer(config.viewer, camera, viewer, origin=origin))
+                live = stack.enter_context(
+                    LiveViewer(config.viewer, camera, viewer, origin=log.origin)
+                )
                 if live.page:
                     notify(f"viewer: open {live.page}")
             progress.start(given.n_frames)

@@ -17,7 +17,7 @@ from companion.config_file import toml_value
 PURPOSES = {
     "Camera": ("camera", "mount"),
     "Autopilot": ("link", "router", "telemetry", "feedback", "landing", "control"),
-    "Flights, and what is kept of them": ("daemon", "recorder", "export"),
+    "Flights, and what is kept of them": ("daemon", "recorder", "map", "export"),
     "Dense map": ("depth", "cloud", "opencl"),
     "Looking on, other machines": ("page", "stream", "distributed"),
 }

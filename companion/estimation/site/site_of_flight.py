@@ -36,8 +36,10 @@ def site_of_flight(
     revision = 1 if before is None else before.revision + 1
     if times:
         parts = (*parts, SitePart(flight, min(times), camera, revision))
+    if origin is None and before is not None:
+        origin = before.georeference.origin
     georeference = SiteGeoreference(
-        (origin or (before and before.georeference.origin)) if placed.has_origin else None,
+        origin if placed.has_origin else None,
         _sigma_m(times) if before is None else before.georeference.sigma_m,
         placed.sigma_yaw_rad, placed.sigma_scale, placed.method,
     )  # fmt: skip
