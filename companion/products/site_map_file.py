@@ -355,13 +355,13 @@ def _keyframe(
     point_ids = rows["point_ids"].astype(np.int64)
     if point_ids.max() >= n_points:
         return None
-    pixels = rows["pixels"].copy()
+    # not of the pixels: refined, and with the rotation during a readout undone
+    normalised: Array = rows["normalised"].astype(np.float64)
     features = features_of(
-        camera, head.scale_factor, pixels, camera.normalise(pixels),
+        camera, head.scale_factor, rows["pixels"].copy(), normalised.copy(),
         rows["octaves"].astype(np.int64), rows["angles_deg"].copy(), rows["descriptors"].copy(),
     )  # fmt: skip
     refined = rows["refined"] > 0
-    normalised: Array = rows["normalised"].astype(np.float64)
     whitening = features.whitening * rows["sharpness"][:, None, None].astype(np.float64)
     attitude = said["ned_from_camera"]
     return Keyframe(
