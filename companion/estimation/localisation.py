@@ -322,6 +322,8 @@ class LocalisationStage:
                     # angular rates are held without attitude; those of backfilled frames are rough
                     self._motion.filter.correct(message.t_ns, message.map_from_camera, measured)
                 self._attitude.compare(message, message.map_from_camera.rotation)
+                mount = self._attitude.correction[0]
+                self._georeferences.take(message, None if measured is None else measured @ mount.T)
                 if message.seq == frame.seq:
                     self._motion.last = message
                     yield self._odometry_of(message)

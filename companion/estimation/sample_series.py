@@ -62,7 +62,7 @@ class SampleSeries:
         """Drop samples from a time on."""
         self._n = int(np.searchsorted(self._times[: self._n], t_ns))
 
-    def at(self, t_ns: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def at(self, t_ns: Array | NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
         """Interpolated values, and a mask of times with samples near enough on both sides."""
         times, values = self._times[: self._n], self._values[: self._n]
         i = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)

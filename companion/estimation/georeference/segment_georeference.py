@@ -13,13 +13,14 @@ from companion.estimation.georeference.displacement_by_velocity import displacem
 from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
 from companion.estimation.georeference.height_above_ground import HeightAboveGround
 from companion.estimation.georeference.inertial_scale import InertialScale, settled
+from companion.estimation.georeference.tracked_places import TrackedPlaces
 from companion.estimation.georeference.trajectory_alignment import DISAGREE, Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.judged_acceleration import ByAcceleration
 from companion.estimation.inertial.reckoned_path import BodyPlace
 from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Array, Pose, Similarity
-from companion.messages import Georeference, MapUpdate
+from companion.messages import Georeference, MapUpdate, Track
 from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.optimisation.displacement_factor import DisplacementFactor
@@ -29,10 +30,8 @@ MAX_LOOP_ERROR_M = 6.0
 MAX_SAMPLES, MAX_SAMPLES_FINAL = 120, 400
 MAX_GROUND_DISTANCES = 40
 """Half a millisecond each, on the way to a pose; their median is no more certain of more."""
-INERTIAL_EVERY_NS = 400_000_000
-"""Between keyframes for the inertial scale: with closer ones it is no more certain."""
 SETTLED_AFTER = 2
-"""Keyframes after which one has been adjusted."""
+"""Keyframes after which one has been adjusted, and so the frames before it are placed well."""
 
 
 class SegmentGeoreferences:
@@ -60,9 +59,8 @@ class SegmentGeoreferences:
         self._acceleration = acceleration
         self._by_acceleration = ByAcceleration()
         self._inertial: dict[int, InertialScale] = {}
-        """By first keyframe of a segment, as is:"""
-        self._spaced: dict[int, list[tuple[int, int]]] = {}
-        """Ids and times of the keyframes that the inertial scale takes."""
+        """By first keyframe of a segment."""
+        self._places = TrackedPlaces()
         self.reckoned_at: Callable[[int], BodyPlace | None] = lambda _t_ns: None
         """Place of the body by inertial navigation at a recent frame."""
         self._reckoned: dict[int, tuple[BodyPlace, Georeference | None]] = {}
@@ -168,35 +166,31 @@ class SegmentGeoreferences:
         mount = self._body_from_camera
         if mount is None or not self._attitude.used or not self._acceleration.has_samples:
             return None
-        key = segment.first_keyframe_id
-        spaced = self._spaced.setdefault(key, [])
-        newest_ns = spaced[-1][1] if spaced else -INERTIAL_EVERY_NS
-        in_time = sorted(
-            (k.t_ns, k.keyframe_id) for k in segment.keyframes.values() if k.t_ns > newest_ns
-        )
-        for t_ns, keyframe_id in in_time[: len(in_time) - SETTLED_AFTER * (not final)]:
-            if t_ns >= newest_ns + INERTIAL_EVERY_NS:
-                spaced.append((keyframe_id, t_ns))
-                newest_ns = t_ns
-
-        def sample_at(index: int) -> AlignmentSample | None:
-            keyframe_id, t_ns = spaced[index]
-            pose = segment.pose_of(keyframe_id)
-            attitude = self._attitude.of_keyframe(keyframe_id, t_ns)
-            if pose is None or attitude is None:
-                return None
-            return AlignmentSample(t_ns, pose.inverse(), attitude)
-
-        lever_m, delay_ns = mount.rotation.T @ mount.translation, self._attitude.correction[1]
-        begun = self._begun_by_navigation(segment, next(iter(segment.keyframes.values())))
+        key, table = segment.first_keyframe_id, segment.poses()
+        first = next(iter(segment.keyframes.values()))
+        begun = self._begun_by_navigation(segment, first)
         start = None if begun is None else begun[0].start
-        if final and self._acceleration.believed:
-            return settled(len(spaced), sample_at, self._acceleration, lever_m, delay_ns, start)
+        lever_m, delay_ns = mount.rotation.T @ mount.translation, self._attitude.correction[1]
         estimate = self._inertial.get(key)
         if estimate is None:
             estimate = self._inertial[key] = InertialScale(lever_m, start)
-        found = estimate.update(len(spaced), sample_at, self._acceleration, delay_ns)
+        newest = sorted(k.t_ns for k in segment.keyframes.values())
+        whole = final and self._acceleration.believed
+        until_ns = newest[-1] + 1 if whole else newest[-min(SETTLED_AFTER, len(newest))]
+        since_ns = 0 if whole else until_ns - estimate.window_ns
+        places = self._places.of(
+            table, segment.unit_of, self._attitude.correction[0], since_ns, until_ns
+        )
+        if whole:
+            return settled(places, self._acceleration, lever_m, delay_ns, start)
+        found = estimate.update(places, self._acceleration, delay_ns)
         return found if self._acceleration.believed else None
+
+    def take(self, track: Track, ned_from_body: Array | None) -> None:
+        """Add a tracked frame with its attitude (3, 3) by the autopilot."""
+        relative, keyframe_id = track.keyframe_from_camera, track.keyframe_id
+        if relative is not None and keyframe_id is not None and ned_from_body is not None:
+            self._places.add(track.t_ns, keyframe_id, relative, ned_from_body)
 
     def withdraw_accelerations(self, since_ns: int) -> None:
         """Take back what accelerations since a time gave; scales begin anew with those before."""

@@ -11,6 +11,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.estimation.sample_series import SampleSeries
 from companion.geometry.transforms import Array, rotation_from_quaternion
@@ -94,14 +95,7 @@ class AccelerationIntegral:
 
     def between(self, from_ns: int, to_ns: int) -> Change | None:
         """Integrals between two times; None where measurements are missing."""
-        if not self.has_samples:
-            return None
-        sums, known = self._series.at(np.array([from_ns, to_ns]))
-        newest = self._series.newest
-        for n, t_ns in enumerate((from_ns, to_ns)):
-            if newest is not None and newest[0] < t_ns <= self.newest_ns:  # the series is sparse
-                share = (t_ns - newest[0]) / (self.newest_ns - newest[0])
-                sums[n], known[n] = newest[1] + share * (self._sums - newest[1]), True
+        sums, known = self.at(np.array([from_ns, to_ns]))
         start, end = sums
         if not known.all() or abs(start[8, 0] - end[8, 0]) > NO_GAP:
             return None
@@ -111,6 +105,21 @@ class AccelerationIntegral:
             dt_s, change[0], change[1] - dt_s * start[0],
             change[2:5], change[5:8] - dt_s * start[2:5],
         )  # fmt: skip
+
+    def at(self, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        """Integrals (N, 9, 3) up to times (N,), and a mask of times where they are known.
+
+        Rows: velocity, displacement, their derivatives by the bias, and the number of gaps so far.
+        """
+        if not self.has_samples:
+            return np.zeros((len(t_ns), 9, 3)), np.zeros(len(t_ns), bool)
+        sums, known = self._series.at(t_ns)
+        newest = self._series.newest
+        if newest is not None:  # the series is sparse
+            for n in np.flatnonzero((t_ns > newest[0]) & (t_ns <= self.newest_ns)):
+                share = (t_ns[n] - newest[0]) / (self.newest_ns - newest[0])
+                sums[n], known[n] = newest[1] + share * (self._sums - newest[1]), True
+        return sums, known
 
     def _see_noise(self, sample: ImuSample) -> None:
         """White noise by second differences, in which motion hardly shows at 100 Hz."""
