@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import socket
 import subprocess
 import threading
@@ -22,7 +23,9 @@ MEMORY = "50%"
 
 SERVER_MEMORY = "256MB"
 """Buffer for browsers that join late; the static map stays."""
-ENDED = "the viewer has ended (status {}): a window wants a display, a page for a browser none"
+DISPLAYS = "WAYLAND_DISPLAY", "WAYLAND_SOCKET", "DISPLAY"
+WANTS = "a window wants one, a page for a browser (web) does not"
+ENDED = f"the viewer has ended (status {{}}): is there a display? {WANTS}"
 
 
 class Screen:
@@ -45,6 +48,8 @@ class Screen:
             self._serve(bind)
         elif where == "native":
             if not listens(LOOPBACK, GRPC_PORT):
+                if not any(map(os.environ.get, DISPLAYS)):
+                    raise InputError(f"there is no display; {WANTS}")
                 self.process = _start(GRPC_PORT, detached=True)
         else:
             parts = urlsplit(where.removeprefix("rerun+"))
