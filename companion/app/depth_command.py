@@ -149,7 +149,7 @@ def reconstruct(
     device = choose_device(config.opencl)
     work = Reconstruction(images, config, device)
     positions = _positions(images, wanted.frames)
-    first = positions[0] if wanted.reference is None else _position(images, wanted.reference)
+    first = positions[0] if wanted.reference is None else images.position(wanted.reference)
     range_m = wanted.range_m or work.found_range(first, positions)
     if range_m is None:
         raise FlightError(
@@ -220,15 +220,6 @@ def _positions(images: PosedImages, frames: tuple[int | None, int | None]) -> li
     if len(out) < 2:
         raise FlightError(f"{images.path}: --frames names fewer than two images with a pose")
     return out
-
-
-def _position(images: PosedImages, number: int) -> int:
-    if number not in images.numbers:
-        raise FlightError(f"{images.path}: there is no frame {number}")
-    position = images.numbers.index(number)
-    if images.poses[position] is None:
-        raise FlightError(f"{images.path}: frame {number} has no pose")
-    return position
 
 
 def _references(

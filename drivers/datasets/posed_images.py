@@ -49,6 +49,16 @@ class PosedImages:
     def __len__(self) -> int:
         return len(self.numbers)
 
+    def position(self, number: int) -> int:
+        """Position in `numbers` of a frame with a pose; FlightError where it is none."""
+        if number not in self.numbers:
+            known = f"they are {min(self.numbers)} to {max(self.numbers)}"
+            raise FlightError(f"{self.path}: there is no frame {number}; {known}")
+        position = self.numbers.index(number)
+        if self.poses[position] is None:
+            raise FlightError(f"{self.path}: frame {number} has no pose")
+        return position
+
 
 def read_rgb(path: Path) -> Bytes:
     """Image file as RGB (H, W, 3); FlightError if invalid."""

@@ -154,13 +154,10 @@ def _judged(depth_map: DepthMap, truth: Floats) -> tuple[Accuracy, Accuracy]:
 
 
 def _scene(images: PosedImages, reference: int, frames: tuple[int | None, int | None]) -> _Scene:
-    if reference not in images.numbers:
-        raise FlightError(f"{images.path}: there is no frame {reference}")
-    at = images.numbers.index(reference)
-    truth = images.truth(at)
-    pose = images.poses[at]
+    at = images.position(reference)
+    truth, pose = images.truth(at), images.poses[at]
     if truth is None or pose is None:
-        raise FlightError(f"{images.path}: frame {reference} has no true depth, or no pose")
+        raise FlightError(f"{images.path}: frame {reference} has no true depth")
     first = 0 if frames[0] is None else frames[0]
     beyond = math.inf if frames[1] is None else frames[1]
     positions = [

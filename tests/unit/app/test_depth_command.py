@@ -156,6 +156,17 @@ def test_folders_that_are_none_of_these_are_named(tmp_path: Path) -> None:
         open_posed_images(tmp_path)
 
 
+def test_a_frame_that_is_not_there_is_told_with_those_that_are(
+    rendered: list[tuple[Bytes, Floats]], tmp_path: Path
+) -> None:
+    write_remode(tmp_path / "images", rendered)
+    images = open_posed_images(tmp_path / "images")
+    last = images.numbers[-1]
+    assert images.position(last) == N - 1
+    with pytest.raises(FlightError, match=f"there is no frame 900; they are .* to {last}"):
+        images.position(900)
+
+
 def test_depth_is_written(rendered: list[tuple[Bytes, Floats]], tmp_path: Path) -> None:
     write_posed_video(tmp_path / "set", rendered)
     out = tmp_path / "out"
