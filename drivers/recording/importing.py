@@ -1,4 +1,4 @@
-"""Imports any flight as a recording: its frames and samples, without loss."""
+"""Imports any flight as a recording: its frames and samples, without loss unless asked."""
 
 from __future__ import annotations
 
@@ -20,15 +20,19 @@ from drivers.recording.recorder import CAMERA_JSON, NOTES
 from drivers.recording.recording_topics import CALIBRATION, EVENTS, HEALTH, PROFILE, open_channels
 
 CHUNK_BYTES = 4_000_000
+LOSSLESS = RecorderConfig(codec="png")
 RATE_HZ = 30.0
 """Frame rate given to the encoder; irrelevant for still images."""
 
 
-def write_recording(flight: Flight, out: Path, on_progress: Callable[[int], None]) -> int:
+def write_recording(
+    flight: Flight, out: Path, on_progress: Callable[[int], None],
+    encoding: RecorderConfig = LOSSLESS,
+) -> int:  # fmt: skip
     """Write a flight as the recording `out`, which must not exist; return the number of frames.
 
-    `on_progress` takes the number of frames done. FlightError where it cannot be written; then
-    nothing is left.
+    `on_progress` takes the number of frames done; `encoding` is that of the pictures. FlightError
+    where it cannot be written; then nothing is left.
     """
     if out.exists():
         raise FlightError(f"{out}: is there already; give another name")
@@ -38,7 +42,7 @@ def write_recording(flight: Flight, out: Path, on_progress: Callable[[int], None
         part.unlink(missing_ok=True)
         file = GrowingFile(part)
         try:
-            n = _write(flight, file, on_progress)
+            n = _write(flight, file, on_progress, encoding)
             file.sync()
             part.rename(out)
         except BaseException:
@@ -50,10 +54,12 @@ def write_recording(flight: Flight, out: Path, on_progress: Callable[[int], None
     return n
 
 
-def _write(flight: Flight, file: GrowingFile, on_progress: Callable[[int], None]) -> int:
+def _write(
+    flight: Flight, file: GrowingFile, on_progress: Callable[[int], None], encoding: RecorderConfig
+) -> int:
     log = flight.telemetry()
     camera, start_ns = flight.camera, flight.start_ns
-    encoder = picture_encoder(RecorderConfig(codec="png"), camera.width, camera.height, RATE_HZ)
+    encoder = picture_encoder(encoding, camera.width, camera.height, RATE_HZ)
     writer = McapWriter(file.append, PROFILE)
     channels = open_channels(writer)
     writer.attach(CAMERA_JSON, "application/json", camera_document(camera), 0)
@@ -80,12 +86,14 @@ def _write(flight: Flight, file: GrowingFile, on_progress: Callable[[int], None]
     for message in in_order_of_time(log.samples, flight.frames()):
         if isinstance(message, Frame):
             for picture in encoder.encode(message):
-                put(picture.topic, message.t_ns, picture.data, message.seq)
+                put(picture.topic, picture.t_ns, picture.data, picture.seq)
             n += 1
             on_progress(n)
         elif isinstance(message, Warned):
             put(EVENTS, message.t_ns, event_bytes(message))
         else:
             put(sample_topic(message), message.t_ns, sample_bytes(message))  # type: ignore[arg-type]
+    for picture in encoder.finish():
+        put(picture.topic, picture.t_ns, picture.data, picture.seq)
     writer.finish()
     return n
