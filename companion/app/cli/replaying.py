@@ -19,7 +19,7 @@ from companion.app.cli.options import (
 )
 from companion.app.progress import progress_on
 from companion.app.stopping import StopSignals
-from companion.config import Config, ExportConfig, MapConfig
+from companion.config import Config, MapConfig
 from companion.config_file import load_config
 from companion.errors import InputError
 
@@ -79,7 +79,7 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     made_folder(arguments.out)
     replay(given, arguments.out, config, arguments.viewer, progress, print)
     if config.export.formats:
-        _export_into(arguments.out, arguments.out, config.export)
+        _export_into(arguments.out, arguments.out, config, arguments.flight)
     print(f"report: {arguments.out / 'report.html'}")
     signals.take()
     return 0
@@ -98,24 +98,32 @@ def _import(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
 
 def _export(arguments: argparse.Namespace, signals: StopSignals) -> int:
-    settings = load_config(arguments.config, arguments.set).export
+    config = load_config(arguments.config, arguments.set)
     if arguments.formats is not None:
-        settings = dataclasses.replace(settings, formats=names(arguments.formats.lower()))
-    if not settings.formats:
+        export = dataclasses.replace(config.export, formats=names(arguments.formats.lower()))
+        config = dataclasses.replace(config, export=export)
+    if not config.export.formats:
         raise InputError("nothing to export: --as las,gpx,… says what")
-    _export_into(arguments.run, arguments.out or arguments.run, settings)
+    _export_into(arguments.run, arguments.out or arguments.run, config, arguments.flight)
     return 0
 
 
-def _export_into(run: Path, out: Path, settings: ExportConfig) -> None:
+def _export_into(run: Path, out: Path, config: Config, flight: Path | None) -> None:
+    from companion.app.run_pictures import pictures_of
     from companion.products.export.exports import export_run
     from companion.products.run_folder import read_run
 
-    for path in export_run(read_run(run), out, settings):
+    finished = read_run(run)
+    pictures = None if flight is None else pictures_of(finished, flight, config)
+    for path in export_run(finished, out, config.export, pictures):
         print(f"export: {path}")
 
 
-COMMANDS: dict[str, Command] = {"replay": _replay, "import": _import, "export": _export}
+COMMANDS: dict[str, Command] = {
+    "replay": _replay,
+    "import": _import,
+    "export": _export,
+}
 
 
 def add_parsers(commands: Any) -> None:
@@ -184,6 +192,11 @@ def add_parsers(commands: Any) -> None:
     export.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
     export.add_argument(
         "--as", dest="formats", metavar="FORMATS",
-        help="any of ply,pcd,las,laz,dsm,ortho,tum,kitti,euroc,gpx,kml,geojson; see [export]",
+        help="any of ply,pcd,las,laz,copc,dsm,ortho,mosaic,glb,mesh,colmap,nerfstudio,tum,kitti,"
+        "euroc,gpx,kml,geojson; see [export]",
+    )  # fmt: skip
+    export.add_argument(
+        "--flight", type=Path, metavar="FLIGHT",
+        help="what was replayed: its pictures, which mosaic, colmap and nerfstudio need",
     )  # fmt: skip
     export.add_argument("--out", type=Path, metavar="DIR", help="folder for them (default: RUN)")

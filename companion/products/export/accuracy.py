@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Any
 
@@ -24,16 +24,23 @@ class Axes(Enum):
 
     LOCAL = "local north, east, down in metres"
     FIRST_CAMERA = "right, down, forward of the first camera that was placed, in metres from it"
+    EAST_NORTH_UP = "local east, north, up in metres"
+    GLTF = "x east, y up, z south, in metres from the local zero"
     EARTH = "latitude and longitude in degrees, WGS84"
     MAP = "those of a map's frame"
 
 
-def accuracy_statement(run: FinishedRun, file: str, axes: Axes | MapFrame) -> bytes:
-    """Text beside an export; `axes` is the map frame of exports in map coordinates."""
+def accuracy_statement(
+    run: FinishedRun, file: str, axes: Axes | MapFrame, remarks: Sequence[str] = ()
+) -> bytes:
+    """Text beside an export; `axes` is the map frame of exports in map coordinates.
+
+    `remarks` are lines about this kind of export.
+    """
     report = run.report
     lines = [f"{file}: how it was placed, and how far that can be trusted", ""]
     lines += _placed(run, axes)
-    lines += ["", *_scale(run, report.get("scale"))]
+    lines += ["", *remarks, *_scale(run, report.get("scale"))]
     camera = report.get("camera") or {}
     if camera.get("assumed"):
         lines.append(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import InputError
+from companion.products.export.image_mosaic import Mosaic
 from companion.products.export.map_frame import MapFrame
 from companion.products.export.surface import Surface
 
@@ -31,7 +32,16 @@ def orthomosaic_tiff(surface: Surface, frame: MapFrame) -> bytes:
     return _tiff(bands, surface, frame, photometric="RGB", alpha="YES", predictor=2)
 
 
-def _tiff(bands: NDArray[Any], surface: Surface, frame: MapFrame, **options: object) -> bytes:
+def mosaic_tiff(mosaic: Mosaic, frame: MapFrame) -> bytes:
+    """Red, green, blue and alpha of the pictures; transparent where none showed the place."""
+    alpha = np.where(mosaic.seen, 255, 0).astype(np.uint8)
+    bands = np.concatenate([np.moveaxis(mosaic.rgb, 2, 0), alpha[None]])
+    return _tiff(bands, mosaic, frame, photometric="RGB", alpha="YES", predictor=2)
+
+
+def _tiff(
+    bands: NDArray[Any], surface: Surface | Mosaic, frame: MapFrame, **options: object
+) -> bytes:
     try:
         from rasterio import Affine
         from rasterio.io import MemoryFile

@@ -1,0 +1,110 @@
+"""Pictures with poses, and the cloud, in the layouts of COLMAP and of nerfstudio.
+
+COLMAP's text model: colmap.github.io/format.html; nerfstudio's transforms.json:
+docs.nerf.studio/quickstart/data_conventions.html.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from companion.geometry.transforms import Array, quaternion_from_rotation
+from companion.messages import Bytes
+from companion.products.cloud import Cloud
+from companion.products.export.flight_pictures import FlightPictures, PlacedPicture, enu
+
+STEP = 0.15
+"""Pictures apart by this share of the distance: neighbours overlap by 80 % or so."""
+JPEG_QUALITY = 95
+PLY_POINT = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+
+
+def colmap_files(pictures: FlightPictures) -> Iterator[tuple[str, bytes]]:
+    """images/ and sparse/0 with cameras.txt, images.txt and points3D.txt: names and contents.
+
+    Axes are local NED. Points have no tracks: which feature was seen where is not kept. COLMAP's
+    centre of the first pixel is (0.5, 0.5), ours (0, 0).
+    """
+    k = pictures.camera
+    camera = (
+        f"1 PINHOLE {k.width} {k.height} {k.fx:.9g} {k.fy:.9g} {k.cx + 0.5:.9g} {k.cy + 0.5:.9g}"
+    )
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[]: none"]
+    for n, picture in enumerate(pictures.spaced(STEP), 1):
+        name = _name(picture)
+        camera_from_world = picture.pose.world_from_camera.inverse()
+        turn = quaternion_from_rotation(camera_from_world.rotation)
+        numbers = " ".join(f"{v:.12g}" for v in (*turn, *camera_from_world.translation))
+        lines += [f"{n} {numbers} 1 {name}", ""]
+        yield f"images/{name}", _jpeg(picture.rgb)
+    cloud = pictures.run.cloud
+    points = [
+        f"{n} {x:.6g} {y:.6g} {z:.6g} {red} {green} {blue} 0"
+        for n, ((x, y, z), (red, green, blue)) in enumerate(
+            zip(cloud.points.tolist(), cloud.rgb.tolist(), strict=True), 1
+        )
+    ]
+    yield "sparse/0/cameras.txt", _text(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", camera])
+    yield "sparse/0/images.txt", _text(lines)
+    yield (
+        "sparse/0/points3D.txt",
+        _text(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]: none", *points]),
+    )
+
+
+def nerfstudio_files(pictures: FlightPictures) -> Iterator[tuple[str, bytes]]:
+    """images/, transforms.json and points.ply: names and contents.
+
+    The world is local east, north, up in metres; cameras look along their own -z with y up, as in
+    OpenGL.
+    """
+    k, frames = pictures.camera, []
+    for picture in pictures.spaced(STEP):
+        name = f"images/{_name(picture)}"
+        yield name, _jpeg(picture.rgb)
+        frames.append({"file_path": name, "transform_matrix": opengl_pose(picture).tolist()})
+    transforms = {
+        "camera_model": "OPENCV", "w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy,
+        "cx": k.cx + 0.5, "cy": k.cy + 0.5, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
+        "ply_file_path": "points.ply", "frames": frames,
+    }  # fmt: skip
+    yield "points.ply", enu_ply(pictures.run.cloud)
+    yield "transforms.json", (json.dumps(transforms, indent=1) + "\n").encode()
+
+
+def opengl_pose(picture: PlacedPicture) -> Array:
+    """world_from_camera (4, 4): world east, north, up; camera right, up, backward."""
+    pose = picture.pose.world_from_camera
+    out = np.eye(4)
+    out[:3, :3] = enu(pose.rotation.T).T * [1, -1, -1]
+    out[:3, 3] = enu(pose.translation)
+    return out
+
+
+def enu_ply(cloud: Cloud) -> bytes:
+    """Points and colours alone, east, north, up, as a binary PLY."""
+    points = np.zeros(len(cloud), PLY_POINT)
+    points["xyz"], points["rgb"] = enu(cloud.points.astype(np.float64)), cloud.rgb
+    head = [
+        "ply", "format binary_little_endian 1.0", "comment local east, north, up",
+        f"element vertex {len(cloud)}", *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {channel}" for channel in ("red", "green", "blue")), "end_header",
+    ]  # fmt: skip
+    return ("\n".join(head) + "\n").encode() + points.tobytes()
+
+
+def _name(picture: PlacedPicture) -> str:
+    return f"frame_{picture.pose.t_ns}.jpg"
+
+
+def _jpeg(rgb: Bytes) -> bytes:
+    _, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return data.tobytes()
+
+
+def _text(lines: list[str]) -> bytes:
+    return ("\n".join(lines) + "\n").encode("ascii")
