@@ -85,6 +85,30 @@ def count(text: str) -> int:
     return value
 
 
+def within(low: float, high: float) -> Callable[[str], float]:
+    """Parser of numbers from `low` to `high`."""
+
+    def parsed(text: str) -> float:
+        value = float(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"wanted {low:g} to {high:g}, given is {text}")
+        return value
+
+    return parsed
+
+
+def whole_within(low: int, high: int) -> Callable[[str], int]:
+    """Parser of whole numbers from `low` to `high`."""
+
+    def parsed(text: str) -> int:
+        value = int(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"wanted {low} to {high}, given is {text}")
+        return value
+
+    return parsed
+
+
 def amount(text: str) -> float:
     """A number, 0 or more."""
     try:

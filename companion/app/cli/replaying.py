@@ -16,6 +16,8 @@ from companion.app.cli.options import (
     seconds,
     shift,
     viewer,
+    whole_within,
+    within,
 )
 from companion.app.progress import progress_on
 from companion.app.stopping import StopSignals
@@ -108,6 +110,20 @@ def _export(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 0
 
 
+def _film(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.app.film_command import film
+    from companion.products.film.flight_film import FilmSize
+
+    height = arguments.height
+    size = FilmSize(round(height * 16 / 9), height, arguments.rate, arguments.seconds)
+    progress = signals.between_frames(progress_on(sys.stderr, ""))
+    config = load_config(arguments.config, arguments.set)
+    n = film(arguments.run, arguments.flight, arguments.out, size, config, progress)
+    print(f"film: {arguments.out}, {n} frames")
+    signals.take()
+    return 0
+
+
 def _export_into(run: Path, out: Path, config: Config, flight: Path | None) -> None:
     from companion.app.run_pictures import pictures_of
     from companion.products.export.exports import export_run
@@ -123,6 +139,7 @@ COMMANDS: dict[str, Command] = {
     "replay": _replay,
     "import": _import,
     "export": _export,
+    "film": _film,
 }
 
 
@@ -200,3 +217,23 @@ def add_parsers(commands: Any) -> None:
         help="what was replayed: its pictures, which mosaic, colmap and nerfstudio need",
     )  # fmt: skip
     export.add_argument("--out", type=Path, metavar="DIR", help="folder for them (default: RUN)")
+
+    film = commands.add_parser(
+        "film", parents=[configuration()], help="a film of a flight, to be shown",
+        description="Path and cloud as they grow, beside the picture: FILE.mp4 or FILE.webp.",
+    )  # fmt: skip
+    film.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
+    film.add_argument("--out", type=Path, required=True, metavar="FILE")
+    film.add_argument(
+        "--flight", type=Path, metavar="FLIGHT", help="what was replayed: its pictures"
+    )
+    film.add_argument(
+        "--seconds", type=within(1, 600), default=30.0, metavar="S", help="its length (default: 30)"
+    )
+    film.add_argument(
+        "--height", type=whole_within(120, 2160), default=720, metavar="PX", help="(default: 720)"
+    )
+    film.add_argument(
+        "--rate", type=whole_within(1, 60), default=25, metavar="HZ",
+        help="frames a second (default: 25)",
+    )  # fmt: skip

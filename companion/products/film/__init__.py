@@ -1,0 +1,1 @@
+"""Film of a flight: path and cloud growing, beside the picture."""
