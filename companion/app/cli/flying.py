@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
+from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import Command, configuration, json_option, names, viewer
+from companion.app.cli.options import Command, configuration, json_option, names, viewer, within
 from companion.app.stopping import StopSignals
 from companion.config import Config
 from companion.config_file import load_config, to_toml
@@ -70,6 +71,18 @@ def _view(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return view(arguments.host, where, arguments.bind, arguments.colours, notify)
 
 
+def _support(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.app.support_command import support
+    from companion.service.flights_meant import flights_meant, installed_services
+
+    flights = arguments.flights
+    if flights is None:
+        flights = flights_meant(arguments.config, arguments.set, installed_services())
+    config = load_config(arguments.config, arguments.set)
+    support(config, flights, arguments.out, arguments.seconds, print)
+    return 0
+
+
 def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
     if not arguments.migrate:
         print(to_toml(load_config(arguments.config, arguments.set)), end="")
@@ -86,6 +99,7 @@ COMMANDS: dict[str, Command] = {
     "run": _run,
     "status": _status,
     "page": _page,
+    "support": _support,
     "view": _view,
     "check-config": _check_config,
 }
@@ -112,6 +126,23 @@ def add_parsers(commands: Any) -> None:
     status = commands.add_parser(
         "status", parents=[configuration(), json_option()], help="ask the running daemon how it is"
     )
+    support = commands.add_parser(
+        "support", parents=[configuration()],
+        help="pack what a maintainer needs to help into one file",
+        description="Versions, settings without passwords, health, journal, list of flights and "
+        "the end of the newest recording, in one .zip. Says what is in it, and what that shows.",
+    )  # fmt: skip
+    support.add_argument(
+        "--out", type=Path, default=Path("companion-support.zip"), metavar="FILE",
+        help="(default: %(default)s)",
+    )  # fmt: skip
+    support.add_argument(
+        "--flights", type=Path, metavar="DIR", help="folder of all flights (default: as `flights`)"
+    )
+    support.add_argument(
+        "--seconds", type=within(0, 300), default=10.0, metavar="S",
+        help="of the newest recording, its pictures too; 0 for none (default: 10)",
+    )  # fmt: skip
     status.add_argument("--watch", action="store_true", help="again every second, until Ctrl-C")
 
     page = commands.add_parser(

@@ -87,6 +87,15 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
     return 0
 
 
+def _demo(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    """The sample flight, as any other is replayed."""
+    from companion.app.sample_flight import sample_flight
+
+    arguments.flight = arguments.flight or sample_flight()
+    print(f"flight: {arguments.flight}", flush=True)
+    return _replay(arguments, signals)
+
+
 def _import(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.import_command import import_flight
 
@@ -137,6 +146,7 @@ def _export_into(run: Path, out: Path, config: Config, flight: Path | None) -> N
 
 COMMANDS: dict[str, Command] = {
     "replay": _replay,
+    "demo": _demo,
     "import": _import,
     "export": _export,
     "film": _film,
@@ -154,8 +164,32 @@ def add_parsers(commands: Any) -> None:
         help="seconds added to the log's times, instead of finding them by rotation",
     )  # fmt: skip
 
+    how = argparse.ArgumentParser(add_help=False, parents=[configuration(), timing])
+    how.add_argument(
+        "--start", type=seconds, metavar="S", help="leave out what comes before this second"
+    )
+    how.add_argument(
+        "--stop", type=seconds, metavar="S", help="leave out what comes from this second on"
+    )
+    how.add_argument(
+        "--viewer", type=viewer, default="none", metavar="WHERE",
+        help="show it live: none, web, native, or the rerun+http://… of a running viewer",
+    )  # fmt: skip
+    how.add_argument(
+        "--paced", action="store_true",
+        help="in the flight's own time, dropping what a live run would drop",
+    )  # fmt: skip
+    how.add_argument(
+        "--map", type=Path, metavar="MAP",
+        help="locate it in this site map of an earlier flight; over [map] use",
+    )  # fmt: skip
+    how.add_argument(
+        "--as-flown", action="store_true",
+        help="of a recording: do again what was decided in flight, and compare the poses sent",
+    )  # fmt: skip
+
     replay = commands.add_parser(
-        "replay", parents=[configuration(), timing], help="turn a logged flight into a metric map",
+        "replay", parents=[how], help="turn a logged flight into a metric map",
         description="Track the camera of a logged flight, reconstruct what it saw, report on it.",
     )  # fmt: skip
     replay.add_argument(
@@ -166,28 +200,16 @@ def add_parsers(commands: Any) -> None:
     replay.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder for the results"
     )
-    replay.add_argument(
-        "--start", type=seconds, metavar="S", help="leave out what comes before this second"
-    )
-    replay.add_argument(
-        "--stop", type=seconds, metavar="S", help="leave out what comes from this second on"
-    )
-    replay.add_argument(
-        "--viewer", type=viewer, default="none", metavar="WHERE",
-        help="show it live: none, web, native, or the rerun+http://… of a running viewer",
-    )  # fmt: skip
-    replay.add_argument(
-        "--paced", action="store_true",
-        help="in the flight's own time, dropping what a live run would drop",
-    )  # fmt: skip
 
-    replay.add_argument(
-        "--map", type=Path, metavar="MAP",
-        help="locate it in this site map of an earlier flight; over [map] use",
+    demo = commands.add_parser(
+        "demo", parents=[how], help="replay the sample flight: a first look",
+        description="Replay the sample flight that comes with the program, or another. It needs an "
+        "OpenCL device, as every dense map does, and takes a minute or two.",
     )  # fmt: skip
-    replay.add_argument(
-        "--as-flown", action="store_true",
-        help="of a recording: do again what was decided in flight, and compare the poses sent",
+    demo.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT")
+    demo.add_argument(
+        "--out", type=Path, default=Path("out/demo"), metavar="DIR",
+        help="folder for the results (default: %(default)s)",
     )  # fmt: skip
 
     imported = commands.add_parser(
