@@ -386,6 +386,16 @@ class PageConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class VideoConfig:
+    """The camera's pictures as video for pilots, as the map sees them; see docs/viewing.md."""
+
+    listen: str = ""
+    """HOST:PORT of an RTSP server, whose path is /camera; "" for none. 0.0.0.0 is every network."""
+    kbit_s: Annotated[int, Meta(ge=50, le=50000)] = 2000
+    """Bit rate of the video, kbit/s."""
+
+
+@dataclass(frozen=True, slots=True)
 class DistributedConfig:
     """Stages on several machines, joined by topics over Zenoh; see docs/topics.md."""
 
@@ -460,6 +470,7 @@ class Config:
     cloud: CloudConfig = field(default_factory=CloudConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
     page: PageConfig = field(default_factory=PageConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
     distributed: DistributedConfig = field(default_factory=DistributedConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
     export: ExportConfig = field(default_factory=ExportConfig)

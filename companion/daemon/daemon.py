@@ -155,9 +155,7 @@ class Daemon:
         watch.set_by_ground = settings.by_ground
         self._notes = RecorderNotes(clock, flights, watch, self._link)
         if self._link is not None:
-            self._reports = VehicleReports(
-                self._link, clock, watch, config.feedback.obstacle_distance
-            )
+            self._reports = VehicleReports(self._link, clock, watch, config)
         self._starts = starts = FlightStarts(
             settings, self._feed, flights, self._sender, self._reports, watch, journal, self._stop,
             lambda why: self._on_warned(Warned(clock.now_ns(), NOT_BEGUN, why)),

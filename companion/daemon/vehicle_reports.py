@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable, Mapping
 
-from companion.config import FeedbackConfig
+from companion.config import Config, FeedbackConfig
 from companion.daemon.health_watch import HealthWatch
 from companion.dense.obstacles import RecentCloud, obstacles_around
 from companion.geometry.camera import Camera
@@ -13,6 +14,16 @@ from companion.geometry.transforms import Pose
 from companion.messages import MapUpdate, PointChunk, Track, TrackState
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.camera_messages import (
+    INFORMATION,
+    STREAM,
+    STREAM_STATUS,
+    CameraStream,
+    camera_commands,
+    camera_information,
+    stream_information,
+    stream_status,
+)
 from drivers.mavlink.command_server import Command
 from drivers.mavlink.computer_status import computer_status
 from drivers.mavlink.message_requests import (
@@ -24,19 +35,23 @@ from drivers.mavlink.message_requests import (
     MessageRequests,
 )
 from drivers.mavlink.obstacle_distance import obstacle_distance
+from drivers.system.own_addresses import own_addresses
+from drivers.video.rtsp_server import PATH
 
 OBSTACLES_HZ, COMPUTER_HZ = 5.0, 1.0
 MAX_AGE_NS = 500_000_000
+EVERY_NETWORK = ("0.0.0.0", "::", "")
 
 
 class VehicleReports:
     """Sends ONBOARD_COMPUTER_STATUS, by default each second, and OBSTACLE_DISTANCE."""
 
     def __init__(
-        self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, obstacles: bool
+        self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, config: Config
     ) -> None:
         self._link, self._clock, self._watch = link, clock, watch
-        self._obstacles = obstacles
+        self._config, self._obstacles = config, config.feedback.obstacle_distance
+        self._camera: Camera | None = None
         self.computer_hz = COMPUTER_HZ
         """Rate of the computer's status, at most 5 Hz; 0: none."""
         self._camera_from_body = Pose.identity()
@@ -47,6 +62,7 @@ class VehicleReports:
         self._cloud = RecentCloud()
         self._track: Track | None = None
         self._map: MapUpdate | None = None
+        self._camera = camera or self._camera
         if camera is not None and camera.body_from_camera is not None:
             self._camera_from_body = camera.body_from_camera.inverse()
 
@@ -100,12 +116,41 @@ class VehicleReports:
             }
 
         began_ns = self._clock.now_ns()
-        return MessageRequests(
-            {HEARTBEAT: self._link.heartbeat, COMPUTER_STATUS: self.computer_status},
-            rates_hz,
-            {COMPUTER_STATUS: set_computer_rate},
-            lambda: (self._clock.now_ns() - began_ns) // 1_000_000,
-        ).commands
+
+        def boot_ms() -> int:
+            return (self._clock.now_ns() - began_ns) // 1_000_000
+
+        of_camera: dict[int, Callable[[], object]] = {}
+        if self._config.video.listen:
+            of_camera = {
+                INFORMATION: lambda: camera_information(self._stream(), boot_ms()),
+                STREAM: lambda: stream_information(self._stream()),
+                STREAM_STATUS: lambda: stream_status(self._stream()),
+            }
+        asked = MessageRequests(
+            {
+                HEARTBEAT: self._link.heartbeat, COMPUTER_STATUS: self.computer_status,
+                **of_camera,
+            },
+            rates_hz, {COMPUTER_STATUS: set_computer_rate}, boot_ms,
+        )  # fmt: skip
+        return {**asked.commands, **(camera_commands(of_camera) if of_camera else {})}
+
+    def _stream(self) -> CameraStream:
+        """The video stream as it is."""
+        config, camera = self._config.camera, self._camera
+        host, _, port = self._config.video.listen.rpartition(":")
+        if host.strip("[]") in EVERY_NETWORK:
+            host = next(iter(own_addresses()), "127.0.0.1")
+        return CameraStream(
+            f"rtsp://{host}:{port}{PATH}",
+            camera.width if camera is not None else config.width,
+            camera.height if camera is not None else config.height,
+            config.rate_hz, self._config.video.kbit_s,
+            math.degrees(2 * math.atan(camera.width / 2 / camera.fx)) if camera is not None
+            else config.assumed_hfov_deg,
+            is_running=camera is not None,
+        )  # fmt: skip
 
     def _obstacle_distance(self) -> object | None:
         """OBSTACLE_DISTANCE now, from the map's own pose; None while that is unknown."""

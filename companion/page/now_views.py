@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from companion.page.remedies import OF_REASON, OTHER, remedy
@@ -35,6 +35,7 @@ class NowViews:
         return [
             Route("/", looking(self._now)),
             Route("/now/panel", looking(self._panel)),
+            Route("/now/armed", looking(self._armed)),
             Route("/now/picture", looking(self._picture)),
             Route("/now/above", looking(self._above)),
             Route("/map", looking(self._map)),
@@ -45,6 +46,11 @@ class NowViews:
 
     async def _panel(self, request: Request) -> Response:
         return await self._site.render(request, "now_panel.html.j2", **await self._values())
+
+    async def _armed(self, request: Request) -> Response:
+        """true, false, or none where nobody knows: what a view may do changes with it."""
+        status = await self._site.watch.status()
+        return PlainTextResponse(str(status.get("armed")).lower())
 
     async def _picture(self, request: Request) -> Response:
         await self._site.watch.status()  # which tells where the exporter is

@@ -19,7 +19,7 @@ PURPOSES = {
     "Autopilot": ("link", "router", "telemetry", "feedback", "landing", "control"),
     "Flights, and what is kept of them": ("daemon", "recorder", "map", "export"),
     "Dense map": ("depth", "cloud", "opencl"),
-    "Looking on, other machines": ("page", "stream", "distributed"),
+    "Looking on, other machines": ("page", "stream", "video", "distributed"),
 }
 """Sections with public keys."""
 

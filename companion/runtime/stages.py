@@ -112,6 +112,10 @@ STAGES = (
         frame_every_ns=60_000_000,
     ),
     Stage(
+        "video", (Frame,), nice=10, answer_s=30.0, finish_s=3.0, with_flight=True,
+        frame_every_ns=30_000_000,
+    ),
+    Stage(
         "results",
         (
             Frame, *TELEMETRY, Warned, Health, GeoOrigin, Track, KeyframeAdded, LoopClosed,

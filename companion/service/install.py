@@ -52,6 +52,8 @@ def install(
     environment, more = _environment(user, venv)
     steps += more
     steps += _configuration(places, config)
+    if not user:
+        steps.append(_settings_of_service(places))
     steps.append(file_written(places.unit, unit_for(environment / "bin/companion", user).encode()))
     if places.rules is not None:
         steps.append(file_written(places.rules, shipped(RULES).encode()))
@@ -176,6 +178,21 @@ def _configuration(places: Places, given: Path | None) -> list[Step]:
         old = places.config.with_name(places.config.name + ".old")
         steps.append(file_written(old, places.config.read_bytes()))
     return [*steps, file_written(places.config, content)]
+
+
+def _settings_of_service(places: Places) -> Step:
+    """Step that lets the service write its settings, for its page."""
+    paths = places.config.parent, places.config
+
+    def is_done() -> bool:
+        own = pwd.getpwnam(ACCOUNT).pw_uid if _has_account() else None
+        return all(path.exists() and path.stat().st_uid == own for path in paths)
+
+    def do() -> None:
+        for path in paths:
+            shutil.chown(path, ACCOUNT, ACCOUNT)
+
+    return Step(f"{places.config.parent} is the service's", is_done, do)
 
 
 def _have_opencl_device(environment: Path, notify: Notify) -> None:

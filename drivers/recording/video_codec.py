@@ -144,7 +144,7 @@ class VideoDecoder:
         waiting: list[int] = []
         broken = False
         for number, data, lost in messages:
-            video = _video(data)
+            video = h264_of(data)
             broken = (broken or lost or video is None) and not is_intra(video or b"")
             waiting.append(number)
             if broken or video is None:
@@ -169,7 +169,8 @@ class VideoDecoder:
                 yield waiting.pop(0), None if rgb is None else np.asarray(rgb, np.uint8)
 
 
-def _video(data: bytes) -> bytes | None:
+def h264_of(data: bytes) -> bytes | None:
+    """Video of one message; None where there is none in it."""
     try:
         video: bytes = CompressedVideo.FromString(data).data
     except (ValueError, DecodeError):

@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+from urllib.parse import urlsplit
 
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = (
@@ -28,6 +29,8 @@ class Browser:
         self._width, self._height = width, height
         self.complaints: list[str] = []
         """Errors and warnings of the console, and faults of scripts."""
+        self.asked: set[str] = set()
+        """Hosts that were asked for anything."""
         self._open = ExitStack()
         self.page: Any = None
 
@@ -45,6 +48,7 @@ class Browser:
             self.page = context.pages[0]
             self.page.set_default_timeout(20_000)
             self.page.on("console", self._said)
+            self.page.on("request", lambda request: self.asked.add(urlsplit(request.url).netloc))
             self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
             self._open = entering.pop_all()
         return self

@@ -28,7 +28,7 @@ BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
 SINCE = {
     "camera.readout_ms", "feedback.flow", "feedback.global_position",
     "landing.id", "landing.marker", "landing.size_m",
-    "page.listen", "telemetry.use",
+    "page.listen", "telemetry.use", "video.kbit_s", "video.listen",
 }  # fmt: skip
 """Keys that version did not have."""
 

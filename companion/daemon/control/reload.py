@@ -5,7 +5,9 @@ from __future__ import annotations
 from companion.config import Config
 from companion.config_file import dump, with_values
 
-FIXED_SECTIONS = frozenset({"camera", "mount", "link", "router", "page", "distributed", "landing"})
+FIXED_SECTIONS = frozenset({
+    "camera", "mount", "link", "router", "page", "video", "distributed", "landing",
+})  # fmt: skip
 FIXED_KEYS = frozenset({
     "expert.daemon.socket", "expert.daemon.prometheus_port", "feedback.mode",
     "feedback.global_position",

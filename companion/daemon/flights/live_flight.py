@@ -51,6 +51,9 @@ from companion.runtime.stages import STAGES, Stage, stage_named
 from companion.telemetry import Telemetry
 from companion.timing.clock import FlightClock, monotonic_s
 
+VIDEO = "video"
+SHOWN = (VIEWERS, VIDEO)
+"""Stages whose pictures are left out first."""
 RESTARTED = "a stage has died and is started again"
 LOCALISATION_DIED = "localisation has died: the flight ends, and another begins"
 NOT_DENSE = "the dense map cannot be begun now; switch it off and on to try again"
@@ -193,9 +196,9 @@ class LiveFlight:
     def set_load_levels(self, features: float, dense: float, viewer: bool) -> None:
         """Set the share of work of the stages; see companion.runtime.governor."""
         if viewer:
-            self._processes.without_frames.discard(VIEWERS)
+            self._processes.without_frames.difference_update(SHOWN)
         else:
-            self._processes.without_frames.add(VIEWERS)
+            self._processes.without_frames.update(SHOWN)
         self._dense_share = dense
         self._processes.order("localisation", SetLoadLevel(features))
         self._processes.order("depth", SetLoadLevel(dense))
@@ -358,6 +361,8 @@ def stages_of(config: Config) -> list[Stage]:
         left_out.add("depth")
     if config.landing.marker == "off":
         left_out.add("landing")
+    if not config.video.listen:
+        left_out.add(VIDEO)
     if not config.distributed.enabled:
         left_out.add("topics")
     rows = [stage for stage in STAGES if stage.name not in left_out]

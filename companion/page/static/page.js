@@ -67,6 +67,20 @@ for (const form of document.forms) {
   });
 }
 
+// What may be changed depends on the motors: the view is loaded anew when they are armed or
+// disarmed, unless somebody is filling in a form.
+let typed = false;
+document.addEventListener("input", () => { typed = true; });
+if (document.body.dataset.armed) {
+  again(2500, async () => {
+    const armed = await (await ask("/now/armed")).text();
+    if (armed === document.body.dataset.armed) { return; }
+    if (!typed) { location.reload(); return; }
+    document.body.dataset.armed = armed;
+    for (const button of document.querySelectorAll("main form button")) { button.disabled = armed !== "false"; }
+  });
+}
+
 // A link to a key opens the section that has it.
 function openTarget() {
   const target = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)));

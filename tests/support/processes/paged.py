@@ -48,8 +48,9 @@ class Paged:
     def __init__(self, folder: Path, *settings: str, depth: bool = False) -> None:
         self.camera = HttpCamera(world_from_body=world_from_body)
         self.autopilot = FakeAutopilot(
-            "ardupilot", "udpin:127.0.0.1:0", flight_of(world_from_body), lacks=RANGE + IMU
-        )
+            "ardupilot", f"udpout:127.0.0.1:{free_port()}", flight_of(world_from_body),
+            lacks=RANGE + IMU,
+        )  # fmt: skip
         self.autopilot.fly(at_monotonic_ns=0, arm=False)
         self.config = folder / "companion.toml"
         self.config.write_text(
@@ -60,9 +61,8 @@ class Paged:
         )  # fmt: skip
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
-        self.daemon = Daemon(
-            folder, f"page.listen=127.0.0.1:{self.port}", *settings, config=self.config
-        )
+        self._folder, self._settings = folder, settings
+        self.daemon = self._daemon()
         self._open = ExitStack()
 
     def __enter__(self) -> Paged:
@@ -77,6 +77,17 @@ class Paged:
         trace: TracebackType | None,
     ) -> None:  # fmt: skip
         self._open.close()
+
+    def start_again(self) -> None:
+        """End the daemon, and start it again, as a service manager would."""
+        self.daemon.stop()
+        self.daemon = self._daemon()
+        self._open.enter_context(self.daemon)
+        self.until_served()
+
+    def _daemon(self) -> Daemon:
+        page = f"page.listen=127.0.0.1:{self.port}"
+        return Daemon(self._folder, page, *self._settings, config=self.config)
 
     def until_served(self, timeout_s: float = 30.0) -> None:
         """Wait until the page answers."""

@@ -1,0 +1,1 @@
+"""Live video of the camera for pilots: RTSP."""
