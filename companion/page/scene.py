@@ -10,6 +10,7 @@ import base64
 import json
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -128,13 +129,17 @@ class Scene:
                 wait_s(self._stop, AGAIN_S)
                 continue
             link = GroundLink(LOOPBACK, port, lambda text: None, again=False)
-            over = _Until(self._stop, self._is_looked_at)
+            over = _Until(self._stop, partial(self._is_wanted, port))
             try:
                 for item in link.items(over):
                     self._take(item)
             except StreamError:
                 pass  # of another version: there is nothing to show
             wait_s(self._stop, AGAIN_S)
+
+    def _is_wanted(self, port: int) -> bool:
+        """False once nobody looks, or another flight is served at another port."""
+        return self._is_looked_at() and self._port() == port
 
     def _is_looked_at(self) -> bool:
         return monotonic_s() - self._looked_s < LOOKED_S
@@ -185,15 +190,15 @@ class Scene:
 
 
 class _Until(threading.Event):
-    """An event that is also set once nobody looks any more."""
+    """An event that is also set once a link is not wanted any more."""
 
-    def __init__(self, stop: threading.Event, is_looked_at: Callable[[], bool]) -> None:
+    def __init__(self, stop: threading.Event, is_wanted: Callable[[], bool]) -> None:
         super().__init__()
-        self._stop, self._is_looked_at = stop, is_looked_at
+        self._stop, self._is_wanted = stop, is_wanted
 
     def is_set(self) -> bool:
-        """True at the end of the page, or where nobody looks."""
-        return self._stop.is_set() or not self._is_looked_at()
+        """True at the end of the page, or where the link is not wanted."""
+        return self._stop.is_set() or not self._is_wanted()
 
 
 def _thinned_lines(lines: list[Array]) -> list[list[int]]:
