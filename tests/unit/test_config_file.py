@@ -26,8 +26,8 @@ ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
 SINCE = {
-    "camera.readout_ms", "feedback.flow", "feedback.global_position",
-    "landing.id", "landing.marker", "landing.size_m",
+    "camera.readout_ms", "expert.export.mesh_m", "feedback.flow", "feedback.global_position",
+    "landing.id", "landing.marker", "landing.size_m", "map.use",
     "page.listen", "telemetry.use", "video.kbit_s", "video.listen",
 }  # fmt: skip
 """Keys that version did not have."""
