@@ -26,7 +26,7 @@ from companion.messages import (
     Warned,
 )
 from companion.products.flight_result import RunFacts
-from companion.products.site_map_file import SITE_MAP, map_path, read_head
+from companion.products.site_map_file import map_path, read_head
 from companion.products.surroundings import peak_memory_mb, versions
 from companion.runtime.gaps import with_gap_warnings
 from companion.runtime.in_order import InOrder, in_order_of_time, in_words
@@ -133,7 +133,7 @@ def replay(
 
         def finish(stage: Stage) -> Finish:
             if stage.name == "localisation":
-                save = SaveSiteMap(out / SITE_MAP, given.flight.path.name, log.origin)
+                save = SaveSiteMap(out, given.flight.path.name, log.origin)
                 return Finish(hurry=False, save_map=save)
             if stage.name != "results":
                 return Finish(hurry=False)

@@ -34,12 +34,12 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class SaveSiteMap:
-    """Localisation writes the map of the site at the end: where, by which name of the flight.
+    """Localisation writes the map of the site into `folder` at the end, by the flight's name.
 
     `origin` is that of local NED, None where unknown.
     """
 
-    path: Path
+    folder: Path
     flight: str
     origin: GeoOrigin | None
 

@@ -15,6 +15,7 @@ from companion.estimation.localisation import LocalisationStage
 from companion.estimation.site.site_use import SiteUse
 from companion.messages import Frame, Georeferenced, MapUpdate, Message, Warned
 from companion.products.site_map_file import (
+    SITE_MAP,
     SiteMapError,
     map_path,
     read_site_map,
@@ -104,11 +105,12 @@ class _Localisation(Work):
         site = self._stage.site_map(save.flight, save.origin)
         if site is None:
             return
+        path = save.folder / SITE_MAP
         try:
-            write_site_map(save.path, site)
+            write_site_map(path, site)
         except OSError as error:
             why = error.strerror or str(error)
-            print(f"companion: {save.path}: cannot be written: {why}", file=sys.stderr)
+            print(f"companion: {path}: cannot be written: {why}", file=sys.stderr)
 
     def _begin_keeping(self, message: KeepMap) -> None:
         self._keeper = MapKeeper(message.path, self._setup)

@@ -29,7 +29,6 @@ from companion.messages import (
     Warned,
 )
 from companion.products.flight_result import RunFacts
-from companion.products.site_map_file import SITE_MAP
 from companion.runtime.parcel import Parcel
 from companion.runtime.processes import Processes, Supervisor, in_words
 from companion.runtime.stage_process import GATHER_S, StageProcess
@@ -271,7 +270,7 @@ class LiveFlight:
             is_shown = self._viewing is not None and self._viewing.is_shown
             save = None
             if stage.name == "localisation" and self.folder is not None:
-                save = SaveSiteMap(self.folder / SITE_MAP, self.folder.name, self._origin)
+                save = SaveSiteMap(self.folder, self.folder.name, self._origin)
             return Finish(hurried, of_flight, self.keep_map, n_viewers=int(is_shown), save_map=save)
 
         if self._viewing is not None:
