@@ -240,6 +240,9 @@ JOURNAL_ONLY = frozenset({
     "the flight can be seen", "the viewer cannot be shown", "the viewer has gone",
     "the viewer does not keep up", "viewers cannot connect",
     "recordings that were cut short cannot be looked for now",
+    "rolling shutter is undone by the rotation between images alone",
+    "looks like a rolling shutter: set camera.readout_ms",
+    "the rolling shutter looks slower or faster than camera.readout_ms",
 })  # fmt: skip
 """Kinds of `Warned` that do not concern a pilot."""
 

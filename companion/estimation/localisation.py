@@ -28,7 +28,7 @@ from companion.estimation.lift_off.standing import Standing
 from companion.estimation.odometry.odometry_frame import MapView
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.resumption import Resumption, Verdict
-from companion.estimation.shutter.frame_unrolling import FrameUnrolling
+from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_of_flight import site_of_flight
 from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera
@@ -99,7 +99,7 @@ class LocalisationStage:
         )
         self._imu = JudgedAcceleration(self._acceleration, self._withdraw_accelerations)
         self._flow = FlowMeter(camera)
-        self._unrolling = FrameUnrolling(camera) if camera.readout_ms else None
+        self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
         self._t_ns = 0
         self._samples: list[Telemetry] = []
         """Telemetry since the last frame: taken with the next, while nothing is mapped."""
@@ -242,18 +242,19 @@ class LocalisationStage:
         with self._tracker.map_lock.tracking():
             self._t_ns = frame.t_ns
             self._take_samples()
-            rates = None
-            if self._unrolling is not None:
-                with self._times("rolling shutter"):
-                    frame, rates = self._unrolling.unrolled(
-                        frame, self._attitude, self._motion.filter
-                    )
-                yield from self._unrolling.warnings()
-            for out in self._tracked(frame):
-                if rates is not None and isinstance(out, Track) and out.seq == frame.seq:
-                    yield replace(out, rates_camera_rad_s=rates)
-                else:
+            shutter = self._shutter
+            if shutter is None:
+                yield from self._tracked(frame)
+            else:
+                with self._times("shutter"):
+                    frame = shutter.begin(frame, self._attitude, self._motion.filter)
+                for out in self._tracked(frame):
+                    if isinstance(out, Track) and out.seq == frame.seq:
+                        out = shutter.of(out)
                     yield out
+                with self._times("shutter"):
+                    said = shutter.end(self._tracker.view_of(frame.seq), self._tracker.map)
+                yield from said
             yield FrameTracked(
                 frame.t_ns, frame.seq, self._n_samples, self._tracker.map_lock.point,
                 self._tracker.feature_ratio,

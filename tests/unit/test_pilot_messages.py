@@ -17,6 +17,7 @@ from companion.daemon.pose import pose_sender
 from companion.estimation import localisation
 from companion.estimation.gate import pose_gate
 from companion.estimation.inertial import imu_verdict
+from companion.estimation.shutter import shutter_of_frames
 from companion.messages import Warned
 from companion.pilot_messages import (
     INFO,
@@ -131,6 +132,7 @@ def test_every_warning_has_its_words() -> None:
         link_watch.NO_MAVLINK, live_flight.RESTARTED, live_flight.LOCALISATION_DIED,
         live_flight.NOT_FINISHED,
         imu_verdict.NOT_USED, imu_verdict.USED_AGAIN,
+        shutter_of_frames.BY_IMAGES, shutter_of_frames.ROLLING, shutter_of_frames.OTHER_READOUT,
         viewing.SHOWN, viewing.NO_VIEWER, viewing.GONE, viewing.BEHIND, viewing.CLOSED,
         recording_recovery.CUT_SHORT, recording_recovery.NOT_REPAIRED,
         recording_recovery.NOT_WRITABLE, ground_requests.TOO_MANY,

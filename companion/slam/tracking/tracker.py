@@ -113,6 +113,10 @@ class Tracker:
         """Time since which the reference, an older keyframe, has been equivalent"""
         self._frame_tracker.reset()
 
+    def view_of(self, seq: int) -> View | None:
+        """The view of frame `seq`, if that is the last one that was tracked."""
+        return self._last if self._last is not None and self._last.seq == seq else None
+
     def step(self, frame: Frame, prior: Prior) -> list[TrackerOutput]:
         """Process one frame, with the map lock held; frames come in order of time."""
         with self._times("features"):

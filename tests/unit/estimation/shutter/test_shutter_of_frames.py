@@ -1,12 +1,14 @@
-"""Frames of a rolling shutter: by attitude, or said by images alone."""
+"""Frames of a rolling shutter, undone by attitude, or by images alone, which is said."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.motion_filter import MotionFilter
-from companion.estimation.shutter.frame_unrolling import BY_IMAGES, FrameUnrolling
+from companion.estimation.shutter.shutter_of_frames import BY_IMAGES, ShutterOfFrames
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (
     Array,
@@ -14,7 +16,8 @@ from companion.geometry.transforms import (
     quaternion_from_rotation,
     rotation_from_vector,
 )
-from companion.messages import Frame
+from companion.messages import Frame, Track, TrackState
+from companion.slam.map.sparse_map import SlamMap
 from companion.telemetry import AttitudeSample
 from tests.support.flights.rolling_scene import rolled
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld
@@ -55,33 +58,46 @@ def difference(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(a.astype(float) - b)[20:-20, 20:-20].mean())
 
 
+def track() -> Track:
+    return Track(0, T_NS, TrackState.TRACKING)
+
+
 def test_by_attitude_also_where_later_ones_have_not_come() -> None:
     seen, still = image()
     frame = Frame(0, T_NS, seen, np.zeros((0, 0, 3), np.uint8))
     before = difference(seen, still)
     for until_s in (1.0, 0.001):
-        unrolling = FrameUnrolling(CAMERA)
-        found, rates = unrolling.unrolled(frame, attitude(until_s), MotionFilter())
+        shutter = ShutterOfFrames(CAMERA)
+        found = shutter.begin(frame, attitude(until_s), MotionFilter())
+        rates = shutter.of(track()).rates_camera_rad_s
         assert rates is not None
         np.testing.assert_allclose(rates, RATES_CAMERA, atol=2e-3)
         assert difference(found.grey, still) < 0.25 * before
-        assert not unrolling.warnings()
+        assert not shutter.end(None, SlamMap(1.2, 8))
 
 
 def test_without_attitude_by_images_which_is_said_once() -> None:
     seen, still = image()
     frame = Frame(0, T_NS, seen, np.zeros((0, 0, 3), np.uint8))
-    unrolling, motion = FrameUnrolling(CAMERA), MotionFilter()
+    shutter, motion, slam_map = ShutterOfFrames(CAMERA), MotionFilter(), SlamMap(1.2, 8)
     nothing = CameraAttitude(None)
-    same, rates = unrolling.unrolled(frame, nothing, motion)
-    assert same is frame and rates is None, "nothing is known yet"
+    assert shutter.begin(frame, nothing, motion) is frame, "nothing is known yet"
+    assert shutter.of(track()).rates_camera_rad_s is None
     for t_s in (-0.1, -0.05):
         pose = Pose(body_at(t_s) @ BODY_FROM_CAMERA.rotation, np.zeros(3))
         motion.correct(T_NS + round(t_s * 1e9), pose, None)
-    found, rates = unrolling.unrolled(frame, nothing, motion)
+    found = shutter.begin(frame, nothing, motion)
+    rates = shutter.of(track()).rates_camera_rad_s
     assert rates is not None
     np.testing.assert_allclose(rates, RATES_CAMERA, atol=1e-6)
     assert difference(found.grey, still) < 0.25 * difference(seen, still)
-    assert [w.what for w in unrolling.warnings()] == [BY_IMAGES]
-    unrolling.unrolled(frame, nothing, motion)
-    assert not unrolling.warnings()
+    assert [w.what for w in shutter.end(None, slam_map)] == [BY_IMAGES]
+    shutter.begin(frame, nothing, motion)
+    assert not shutter.end(None, slam_map)
+
+
+def test_of_a_shutter_that_is_not_known_frames_stay_as_they_are() -> None:
+    frame = Frame(0, T_NS, image()[0], np.zeros((0, 0, 3), np.uint8))
+    shutter = ShutterOfFrames(replace(CAMERA, readout_ms=None))
+    assert shutter.begin(frame, attitude(1.0), MotionFilter()) is frame
+    assert shutter.of(track()).rates_camera_rad_s is None

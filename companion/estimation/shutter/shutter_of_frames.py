@@ -1,0 +1,110 @@
+"""The shutter of the camera: rolling frames become those of a global one, and it is watched.
+
+A readout that is not known, or is stated wrongly, is found by what the images show, and said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from companion.estimation.attitude.camera_attitude import CameraAttitude
+from companion.estimation.motion_filter import MotionFilter
+from companion.estimation.shutter.readout_estimation import ReadoutEstimate, ReadoutEstimator
+from companion.geometry.camera import Camera
+from companion.geometry.rolling_shutter import Unrolling
+from companion.geometry.transforms import Array
+from companion.messages import Frame, Track, Warned
+from companion.slam.features.view import View
+from companion.slam.map.sparse_map import SlamMap
+
+LEAST_HALF_SPAN_NS = 10_000_000
+"""Attitudes are rounded, and stamped to a millisecond or two: over less their difference is mostly
+that. In such a time a drone turns steadily."""
+NOTICED_S, MAX_SIGMA_RATIO = 0.004, 0.1
+"""Readout beyond the one that is stated that is said, and the largest ratio of its standard
+deviation to it. At 100 degrees/s 4 ms are 0.2 degrees at the top and the bottom of the image."""
+
+BY_IMAGES = "rolling shutter is undone by the rotation between images alone"
+BY_IMAGES_WHY = (
+    "the autopilot's attitude is not that of the camera, or none comes: quick starts and stops of "
+    "a turn are undone late"
+)
+ROLLING = "looks like a rolling shutter: set camera.readout_ms"
+OTHER_READOUT = "the rolling shutter looks slower or faster than camera.readout_ms"
+
+
+class ShutterOfFrames:
+    """Undoes the rotation of the camera while a frame is read out.
+
+    By the autopilot's attitude, or where that is not the camera's by the rotation between the last
+    two images, which is said once; while neither is known a frame stays as it is. Without a readout
+    frames stay as they are, and only the shutter is watched.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._readout_ms = camera.readout_ms or 0.0
+        self._unrolling = (
+            Unrolling(camera, 1e-3 * self._readout_ms) if self._readout_ms > 0 else None
+        )
+        self._half_span_ns = max(round(0.5e6 * self._readout_ms), LEAST_HALF_SPAN_NS)
+        self._estimator = ReadoutEstimator(camera.height)
+        self._map: SlamMap | None = None
+        self._rates: Array | None = None
+        self._warnings: list[Warned] = []
+        self._said_by_images = self._said_readout = False
+
+    def begin(self, frame: Frame, attitude: CameraAttitude, motion: MotionFilter) -> Frame:
+        """The frame as a global shutter would have taken it."""
+        rates = attitude.rates_at(frame.t_ns, self._half_span_ns)
+        by_images = rates is None
+        if by_images:
+            rates = motion.rates_camera_rad_s
+        self._rates = None if rates is None or not np.isfinite(rates).all() else rates
+        if self._unrolling is None or self._rates is None:
+            return frame
+        if by_images and not self._said_by_images:
+            self._said_by_images = True
+            self._warnings.append(Warned(frame.t_ns, BY_IMAGES, BY_IMAGES_WHY))
+        return replace(frame, grey=self._unrolling.image(frame.grey, self._rates))
+
+    def of(self, track: Track) -> Track:
+        """The track of this frame, with the rate by which its image was corrected."""
+        if self._unrolling is None or self._rates is None:
+            return track
+        return replace(track, rates_camera_rad_s=self._rates)
+
+    def end(self, view: View | None, slam_map: SlamMap) -> list[Warned]:
+        """Compare what was seen in this frame, if it was tracked; warnings since the last call."""
+        if slam_map is not self._map:
+            self._map = slam_map
+            self._estimator.reset()
+        if view is not None and self._rates is not None and not self._said_readout:
+            self._estimator.take(view, slam_map.positions, self._rates)
+            self._judge(view.t_ns)
+        said, self._warnings = self._warnings, []
+        return said
+
+    @property
+    def estimate(self) -> ReadoutEstimate | None:
+        """The readout beyond the one that is stated; None while unknown."""
+        return self._estimator.estimate
+
+    def _judge(self, t_ns: int) -> None:
+        found = self._estimator.estimate
+        if found is None or abs(found.readout_s) < NOTICED_S:
+            return
+        if found.sigma_s > MAX_SIGMA_RATIO * abs(found.readout_s):
+            return
+        self._said_readout = True
+        readout_ms, sigma_ms = self._readout_ms + 1e3 * found.readout_s, 1e3 * found.sigma_s
+        if readout_ms < 0:
+            detail = (
+                f"its rows seem to be exposed from the bottom up, within {-readout_ms:.0f} ms: "
+                "turn the image by 180 degrees, and the mount with it"
+            )
+        else:
+            detail = f"its rows seem to be exposed over {readout_ms:.0f} +- {sigma_ms:.0f} ms"
+        what = OTHER_READOUT if self._unrolling is not None else ROLLING
+        self._warnings.append(Warned(t_ns, what, detail))
