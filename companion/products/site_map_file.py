@@ -33,6 +33,7 @@ from companion.slam.map.site_map import (
     SiteGeoreference,
     SiteMap,
     SitePart,
+    pixels_of,
 )
 from companion.slam.map.sparse_map import Keyframe, PointArrays
 
@@ -49,10 +50,11 @@ MAX_POINTS, MAX_FEATURES, MAX_KEYFRAMES = 5_000_000, 20_000, 100_000
 """More are no map of ours."""
 
 FEATURE = np.dtype([
-    ("pixels", "<f4", 2), ("octaves", "u1"), ("angles_deg", "<f4"), ("descriptors", "u1", 32),
-    ("point_ids", "<i4"), ("normalised", "<f4", 2), ("sharpness", "<f4"), ("refined", "u1"),
+    ("normalised", "<f4", 2), ("octaves", "u1"), ("angles_deg", "<f4"), ("descriptors", "u1", 32),
+    ("point_ids", "<i4"), ("sharpness", "<f4"), ("refined", "u1"),
 ])  # fmt: skip
-"""A feature of a keyframe; `sharpness` is its whitening relative to that of a detected corner."""
+"""A feature of a keyframe; `sharpness` is its whitening relative to that of a detected corner.
+Of its pixels only the direction is kept: refined, and with the rotation during a readout undone."""
 POINT = np.dtype([
     ("positions", "<f8", 3), ("covariance", "<f4", 6), ("descriptors", "u1", 32),
     ("normals", "<f4", 3), ("base_distance", "<f8"), ("n_visible", "<i4"), ("n_found", "<i4"),
@@ -207,7 +209,7 @@ def _part_json(part: SitePart) -> str:
         "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
         "distortion": camera.distortion.value, "coefficients": list(camera.coefficients),
         "body_from_camera": None if mount is None else mount.matrix().tolist(),
-        "assumed": camera.assumed,
+        "assumed": camera.assumed, "readout_ms": camera.readout_ms,
     }, sort_keys=True)  # fmt: skip
 
 
@@ -223,7 +225,7 @@ def _keyframe_json(keyframe: Keyframe) -> str:
 def _feature_rows(keyframe: Keyframe) -> NDArray[np.void]:
     features = keyframe.features
     rows = np.zeros(len(features), FEATURE)
-    for name in ("pixels", "octaves", "angles_deg", "descriptors"):
+    for name in ("octaves", "angles_deg", "descriptors"):
         rows[name] = getattr(features, name)
     rows["point_ids"], rows["normalised"] = keyframe.point_ids, keyframe.normalised
     # refinement changes the size of a whitening only
@@ -305,6 +307,7 @@ def _part(said: dict[str, Any]) -> SitePart:
         width, height, fx, fy, cx, cy, Distortion(said["distortion"]),
         tuple(said["coefficients"]),
         None if mount is None else Pose.from_matrix(np.array(mount)), said["assumed"],
+        said["readout_ms"],
     )  # fmt: skip
     return SitePart(said["flight"], said["began_ns"], camera, said["revision"])
 
@@ -355,10 +358,9 @@ def _keyframe(
     point_ids = rows["point_ids"].astype(np.int64)
     if point_ids.max() >= n_points:
         return None
-    # not of the pixels: refined, and with the rotation during a readout undone
     normalised: Array = rows["normalised"].astype(np.float64)
     features = features_of(
-        camera, head.scale_factor, rows["pixels"].copy(), normalised.copy(),
+        camera, head.scale_factor, pixels_of(camera, normalised), normalised.copy(),
         rows["octaves"].astype(np.int64), rows["angles_deg"].copy(), rows["descriptors"].copy(),
     )  # fmt: skip
     refined = rows["refined"] > 0

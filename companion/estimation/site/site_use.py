@@ -28,7 +28,7 @@ class SiteUse:
 
     def __init__(self, site: SiteMap, camera: Camera, origin: GeoOrigin | None) -> None:
         self.site = site
-        self.slam_map: SlamMap = slam_map_of(site, camera.focal_px)
+        self.slam_map: SlamMap = slam_map_of(site, camera)
         self.located = False
         self._has_both = origin is not None and site.georeference.origin is not None
         """True where places of now and of the map can be compared."""

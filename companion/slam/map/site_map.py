@@ -14,6 +14,7 @@ import numpy as np
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose, Similarity
+from companion.messages import Floats
 from companion.slam.features.orb_features import Ints
 from companion.slam.map.map_part import MapPart, map_of, part_of
 from companion.slam.map.sparse_map import Keyframe, PointArrays, SlamMap
@@ -24,6 +25,7 @@ also where both flights' clocks begin at nought."""
 BORN_EARLIER = -1000
 """Keyframe at which a saved point counts as created: one long before any of now."""
 NO_KEYFRAME = -1
+BESIDE_PX = 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,22 +110,20 @@ def site_map_of(
     )  # fmt: skip
 
 
-def slam_map_of(site: SiteMap, focal_px: float | None = None) -> SlamMap:
+def slam_map_of(site: SiteMap, camera: Camera) -> SlamMap:
     """A map that holds its keyframes, as of an earlier flight; ids are those of the site map.
 
-    For a camera of this focal length, else those of the site map.
+    All is as seen by a camera, by directions where another one saw it.
     """
-    points = site.points
-    if focal_px is not None:
-        # a corner is seen at the pyramid level that fits its distance and the focal length
-        points = points._replace(
-            base_distance=points.base_distance * (focal_px / site.parts[-1].camera.focal_px)
-        )
+    # a corner is seen at the pyramid level that fits its distance and the focal length
+    longer = camera.focal_px / site.parts[-1].camera.focal_px
+    points = site.points._replace(base_distance=site.points.base_distance * longer)
     # attitudes of another flight had another mount and heading: what is known now corrects none
     earlier = tuple(
         replace(
             k, ned_from_camera=None, normalised=k.normalised.copy(), whitening=k.whitening.copy(),
             refined_for=k.refined_for.copy(),
+            features=replace(k.features, pixels=pixels_of(camera, k.normalised)),
         )
         for k in site.keyframes
     )  # fmt: skip
@@ -134,6 +134,13 @@ def slam_map_of(site: SiteMap, focal_px: float | None = None) -> SlamMap:
     counted = slam_map.n_observers[: slam_map.n_points]
     slam_map.alive[: slam_map.n_points] = counted >= 2  # of a map that was read in part
     return slam_map
+
+
+def pixels_of(camera: Camera, normalised: Array) -> Floats:
+    """Pixels (N, 2) of directions; of those far out of the image some place beside it."""
+    seen = camera.project(np.c_[normalised, np.ones(len(normalised))])
+    size = np.array([camera.width, camera.height])
+    return np.asarray(np.clip(seen, -BESIDE_PX, size + BESIDE_PX), np.float32)
 
 
 def covariances_of(keyframes: tuple[Keyframe, ...], positions: Array) -> Array:

@@ -32,7 +32,7 @@ def kept(slam_map: SlamMap) -> SlamMap:
     part = SitePart("before", 0, CAMERA, 1)
     georeference = SiteGeoreference(None, 1.0, 0.01, 0.01, "gps")
     site = site_map_of(slam_map, Similarity.identity(), (part,), {}, georeference, 1)
-    return slam_map_of(site)
+    return slam_map_of(site, CAMERA)
 
 
 def line(start: tuple[float, float], end: tuple[float, float], yaw: float) -> list[Pose]:
