@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from companion.errors import InputError
+from companion.estimation.site.site_use import world_from_site
 from companion.geometry.geodesy import GeoOrigin
+from companion.geometry.transforms import Similarity
 from companion.products.atomic_file import write_atomically
 from companion.products.cloud import Cloud
 from companion.products.cloud_ply import ply_parts
@@ -23,6 +27,7 @@ from companion.products.site_map_file import (
 )
 from companion.products.trajectory_file import trajectory_tum
 from companion.slam.map.site_map import SiteMap
+from companion.slam.mapping.site_merge import merge_sites
 
 BYTES_PER_MB = 1e6
 
@@ -91,6 +96,46 @@ def save(path: Path, out: Path) -> ReadSiteMap:
     read = read_site_map(map_path(path))
     write_site_map(out, read.site)
     return read
+
+
+def merge(paths: Sequence[Path], out: Path) -> list[str]:
+    """Merge maps, in this order, into a new file; a line about each that was added.
+
+    InputError where one shows no place that is seen in those before it.
+    """
+    merged = read_site_map(map_path(paths[0])).site
+    lines = []
+    for path in paths[1:]:
+        other = read_site_map(map_path(path)).site
+        if (other.scale_factor, other.n_levels) != (merged.scale_factor, merged.n_levels):
+            raise InputError(f"{path}: it was made with other features.scale_factor or n_levels")
+        apart = world_from_site(other.georeference.origin, merged.georeference.origin)
+        both = merge_sites(merged, other, apart)
+        if both is None:
+            raise InputError(f"{path}: no place in it is seen in {', '.join(map(str, paths[:1]))}")
+        lines.append(f"{path}: {_moved(merged, other, both, apart)}")
+        merged = both
+    write_site_map(out, merged)
+    return lines
+
+
+def _moved(before: SiteMap, other: SiteMap, both: SiteMap, apart: Similarity) -> str:
+    """Agreement of two maps: how far the keyframes of each moved as they became one."""
+    now = np.stack([k.camera_from_map.inverse().translation for k in both.keyframes])
+    parts = []
+    for site, in_world, places in (
+        (before, Similarity.identity(), now[: len(before.keyframes)]),
+        (other, apart, now[len(before.keyframes) :]),
+    ):
+        then = in_world.apply(
+            np.stack([k.camera_from_map.inverse().translation for k in site.keyframes])
+        )
+        off = places - then
+        whole_m = float(np.linalg.norm(off.mean(0)))
+        rest_m = float(np.sqrt(((off - off.mean(0)) ** 2).sum(1).mean()))
+        names = ", ".join(part.flight for part in site.parts)
+        parts.append(f"{names} moved by {whole_m:.2f} m as a whole, {rest_m:.2f} m RMS besides")
+    return "; ".join(parts)
 
 
 def _head_numbers(path: Path, head: SiteHead) -> dict[str, Any]:

@@ -9,10 +9,11 @@ from typing import Any
 
 from companion.app.cli.options import Command, json_option, made_folder
 from companion.app.stopping import StopSignals
+from companion.errors import InputError
 
 
 def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
-    """Show, verify, export or save; 1 where a map is damaged."""
+    """Show, verify, export, merge or save; 1 where a map is damaged."""
     from companion.app import map_command as maps
 
     if arguments.what == "show":
@@ -25,6 +26,11 @@ def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
         made_folder(arguments.out)
         for path in maps.export(arguments.map, arguments.out):
             print(path)
+    elif arguments.what == "merge":
+        if len(arguments.maps) < 2:
+            raise InputError("merge wants two maps or more")
+        print("\n".join(maps.merge(arguments.maps, arguments.out)))
+        print(arguments.out)
     else:
         for each in maps.save(arguments.map, arguments.out).damaged:
             print(f"companion: {arguments.map}: {each} is damaged, and left out", file=sys.stderr)
@@ -55,5 +61,10 @@ def add_parsers(commands: Any) -> None:
         "export", parents=[given], help="points.ply, keyframes.tum and map.json for other programs"
     )
     exported.add_argument("--out", type=Path, required=True, metavar="DIR")
+    merged = whats.add_parser(
+        "merge", help="one map of several flights over a site, adjusted as one"
+    )
+    merged.add_argument("maps", type=Path, nargs="+", metavar="MAP")
+    merged.add_argument("--out", type=Path, required=True, metavar="FILE")
     saved = whats.add_parser("save", parents=[given], help="keep the map of a run elsewhere")
     saved.add_argument("--out", type=Path, required=True, metavar="FILE")

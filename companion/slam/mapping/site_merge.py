@@ -1,0 +1,150 @@
+"""Merging of site maps: one is found in the other, and all keyframes are adjusted together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array, Pose, Similarity, nearest_rotation
+from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
+from companion.slam.loop.map_merge import merge_maps
+from companion.slam.loop.place_recognition import KeyframeDatabase
+from companion.slam.loop.relocalizer import Relocalizer
+from companion.slam.map.site_map import (
+    SiteGeoreference,
+    SiteMap,
+    site_map_of,
+    slam_map_of,
+)
+from companion.slam.map.sparse_map import SlamMap
+from companion.slam.mapping.mapper import Mapper
+from companion.slam.mapping.mapping_worker import MapLock
+
+ENOUGH_FOUND = 8
+"""Confirmed keyframes of which the one with most points places a map: more are no better."""
+BINDING_ROUNDS, ITERATIONS = 3, 12
+"""Rounds in which keyframes far from where the maps were joined come near enough to be bound."""
+
+
+def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> SiteMap | None:
+    """One map of two, in the world of the first; None where no place of one is seen in the other.
+
+    `other_in_first` takes the second's world to the first's, as their origins have it. Both maps
+    are adjusted as one, which then is placed as the two were, each weighted by its variance.
+    """
+    camera = first.parts[0].camera
+    here, there = slam_map_of(first, camera), slam_map_of(_numbered(other, first), camera)
+    here.held = frozenset()
+    found = _found(here, there, camera)
+    if found is None:
+        return None
+    before = _places(first, Similarity.identity()) | {
+        key + _n_ids(first): place for key, place in _places(other, other_in_first).items()
+    }
+    merge_maps(here, there, found.here_from_there)
+    mapper = Mapper(camera, here, MapLock())
+    for _ in range(BINDING_ROUNDS):
+        for key, keyframe in here.keyframes.items():
+            if key not in here.held:
+                mapper.fuse_held(keyframe)
+        mapper.adjust_all(ITERATIONS)
+    here.held = frozenset()
+    mapper.adjust_all(ITERATIONS)
+    n_first = len(first.parts)
+    part_of_id = dict(zip(_ids(first), first.part_of.tolist(), strict=True)) | {
+        key + _n_ids(first): n_first + part
+        for key, part in zip(_ids(other), other.part_of.tolist(), strict=True)
+    }
+    georeference = _both(first.georeference, other.georeference)
+    weights = {
+        key: 1.0 / (first if key < _n_ids(first) else other).georeference.sigma_m ** 2
+        / len((first if key < _n_ids(first) else other).keyframes)
+        for key in part_of_id
+    }  # fmt: skip
+    revision = max(first.revision, other.revision) + 1
+    newer = tuple(replace(part, revision=revision) for part in other.parts)
+    return site_map_of(
+        here, _placed(here, before, weights), (*first.parts, *newer), part_of_id, georeference,
+        revision,
+    )  # fmt: skip
+
+
+def _ids(site: SiteMap) -> list[int]:
+    return [k.keyframe_id for k in site.keyframes]
+
+
+def _n_ids(site: SiteMap) -> int:
+    return max(_ids(site)) + 1
+
+
+def _numbered(other: SiteMap, first: SiteMap) -> SiteMap:
+    """A site map with ids behind those of another."""
+    offset = _n_ids(first)
+    points = other.points
+    seen = np.where(points.first_seen >= 0, points.first_seen + offset, points.first_seen)
+    keyframes = tuple(
+        replace(k, keyframe_id=k.keyframe_id + offset, point_ids=k.point_ids.copy())
+        for k in other.keyframes
+    )
+    return replace(other, keyframes=keyframes, points=points._replace(first_seen=seen))
+
+
+def _found(here: SlamMap, there: SlamMap, camera: Camera) -> LoopClosure | None:
+    """The keyframe of one map that is found best in the other."""
+    database = KeyframeDatabase()
+    for keyframe in there.keyframes.values():
+        database.add(keyframe.keyframe_id, keyframe.features.descriptors)
+    detector = LoopDetector(database, Relocalizer(camera))
+    best: LoopClosure | None = None
+    n_found = 0
+    for keyframe in here.keyframes.values():
+        found = detector.find(keyframe, here, [there], lambda _found, _same: True)
+        if found is None:
+            continue
+        n_found += 1
+        if best is None or len(found.relocalised.points) > len(best.relocalised.points):
+            best = found
+        if n_found == ENOUGH_FOUND:
+            break
+    return best
+
+
+def _places(site: SiteMap, in_world: Similarity) -> dict[int, Pose]:
+    """`world_from_camera` of the keyframes of a site, by id."""
+    return {
+        k.keyframe_id: in_world.apply_to_pose(k.camera_from_map.inverse()) for k in site.keyframes
+    }
+
+
+def _placed(slam_map: SlamMap, before: dict[int, Pose], weights: dict[int, float]) -> Similarity:
+    """`world_from_map` for which its keyframes are where they were, by least squares.
+
+    Its rotation is by their attitudes, of which all are level; the scale by their distances.
+    """
+    keys = list(slam_map.keyframes)
+    weight: Array = np.array([weights[key] for key in keys])
+    weight /= weight.sum()
+    now = [slam_map.keyframes[key].camera_from_map.inverse() for key in keys]
+    then = [before[key] for key in keys]
+    turns = [w * a.rotation @ b.rotation.T for w, a, b in zip(weight, then, now, strict=True)]
+    rotation = nearest_rotation(np.sum(turns, axis=0))
+    a = np.stack([p.translation for p in then])
+    b = np.stack([p.translation for p in now]) @ rotation.T
+    mean_a, mean_b = weight @ a, weight @ b
+    spread_a, spread_b = (weight @ (p**2).sum(1) for p in (a - mean_a, b - mean_b))
+    scale = float(np.sqrt(spread_a / spread_b))
+    return Similarity(scale, rotation, mean_a - scale * mean_b)
+
+
+def _both(a: SiteGeoreference, b: SiteGeoreference) -> SiteGeoreference:
+    """Georeference by two independent ones, about the origin of the first."""
+    return SiteGeoreference(
+        a.origin, _less(a.sigma_m, b.sigma_m), _less(a.sigma_yaw_rad, b.sigma_yaw_rad),
+        _less(a.sigma_scale, b.sigma_scale), f"{a.method}; {b.method}",
+    )  # fmt: skip
+
+
+def _less(sigma_a: float, sigma_b: float) -> float:
+    return float((sigma_a**-2 + sigma_b**-2) ** -0.5)
