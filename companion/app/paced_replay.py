@@ -69,6 +69,8 @@ def replay_paced(
     try:
         _wait(flight, over)
         flight.begin(out)
+        if given.log.origin is not None:
+            flight.set_origin(given.log.origin)
         _wait(flight, over)
         progress.start(given.n_frames)
         _play(

@@ -137,7 +137,7 @@ class LocalisationStage:
         mount = self._camera.body_from_camera
         return mount.inverse() if mount is not None else Pose.identity()
 
-    def step(self, message: Message) -> Iterable[Message]:
+    def step(self, message: Message | GeoOrigin) -> Iterable[Message]:
         """Process one message; messages come in order of time.
 
         The outputs of a frame are computed lazily, the pose first: exhaust the iterator.
@@ -146,9 +146,18 @@ class LocalisationStage:
             return self._frame(message)
         if isinstance(message, FrameOverdue):
             return self._without_frame(message)
-        if isinstance(message, Telemetry):
+        if isinstance(message, GeoOrigin):
+            self._take_origin(message)
+        elif isinstance(message, Telemetry):
             self._samples.append(message)
         return []
+
+    def _take_origin(self, origin: GeoOrigin) -> None:
+        """Place the map of an earlier flight about the origin of local NED."""
+        with self._tracker.map_lock.reading():
+            moved = None if self._site is None else self._site.set_origin(origin)
+            if moved is not None:
+                self._georeferences.move_held(moved)
 
     def _take_samples(self) -> None:
         for sample in self._samples:

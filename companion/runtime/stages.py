@@ -81,7 +81,7 @@ class Stage:
 
 STAGES = (
     Stage(
-        "localisation", (Frame, FrameOverdue, *TELEMETRY), nice=0, frames=Frames.NEWEST,
+        "localisation", (Frame, FrameOverdue, GeoOrigin, *TELEMETRY), nice=0, frames=Frames.NEWEST,
         finish_s=120.0, hurried_s=0.7, death=Death.ENDS_FLIGHT, is_source=True,
     ),
     Stage(

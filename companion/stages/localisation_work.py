@@ -81,7 +81,7 @@ class _Localisation(Work):
             return None
         if read.damaged:
             self._said.append((MAP_DAMAGED, f"{len(read.damaged)} parts are left out"))
-        return SiteUse(read.site, setup.camera, setup.origin)
+        return SiteUse(read.site, setup.camera, setup.origin, setup.is_live)
 
     def step(self, message: Any) -> Iterable[Message]:
         if isinstance(message, SetLoadLevel):

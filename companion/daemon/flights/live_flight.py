@@ -183,7 +183,12 @@ class LiveFlight:
             return
         self._health_ns = health.t_ns
         self._processes.publish(Parcel.of(health))
-        if origin is not None and origin != self._origin:
+        if origin is not None:
+            self.set_origin(origin)
+
+    def set_origin(self, origin: GeoOrigin) -> None:
+        """Tell the stages the world's origin, where it has changed."""
+        if origin != self._origin:
             self._origin = origin
             self._processes.publish(Parcel.of(origin))
 

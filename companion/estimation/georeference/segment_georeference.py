@@ -87,6 +87,15 @@ class SegmentGeoreferences:
             placed = replace(kept, world_from_map=world_from_here)
             self._held[here.first_keyframe_id] = self._known[here.first_keyframe_id] = placed
 
+    def move_held(self, by: Similarity) -> None:
+        """The origin of the world has come: maps of an earlier flight lie in that from now on."""
+        for key, kept in self._held.items():
+            self._held[key] = replace(
+                kept, world_from_map=by @ kept.world_from_map, has_origin=True
+            )
+            if key in self._known:
+                self._known[key] = self._held[key]
+
     def _more_certain(self, segment: SlamMap, found: Georeference) -> Georeference:
         """The found or the stored georeference of a segment, whichever is more certain.
 

@@ -24,14 +24,19 @@ OTHER_CAMERA = "the map of an earlier flight was made with another camera"
 
 
 class SiteUse:
-    """A site map in use, for a flight whose local NED has an origin, None where unknown."""
+    """A site map in use, for a flight whose local NED has an origin, None where unknown.
 
-    def __init__(self, site: SiteMap, camera: Camera, origin: GeoOrigin | None) -> None:
+    Of a recorded flight without an origin the map's is its own. One in the air may be told of its
+    origin later: until then the map gives it scale and heading only, and is not taken for a place.
+    """
+
+    def __init__(
+        self, site: SiteMap, camera: Camera, origin: GeoOrigin | None, is_live: bool = False
+    ) -> None:
         self.site = site
         self.slam_map: SlamMap = slam_map_of(site, camera)
         self.located = False
-        self._has_both = origin is not None and site.georeference.origin is not None
-        """True where places of now and of the map can be compared."""
+        self._origin, self._is_live = origin, is_live
         self._world_from_site = world_from_site(site.georeference.origin, origin)
         self._warnings: list[Warned] = []
         self._said: set[str] = set()
@@ -50,8 +55,22 @@ class SiteUse:
         return Georeference(
             self._world_from_site, found.sigma_scale, found.sigma_yaw_rad,
             f"the map of {self.site.parts[0].flight} ({found.method})", len(self.site.keyframes),
-            found.sigma_m, has_origin=found.origin is not None,
+            found.sigma_m, has_origin=self._has_both
+            or (found.origin is not None and not self._is_live),
         )  # fmt: skip
+
+    @property
+    def _has_both(self) -> bool:
+        """True where places of now and of the map can be compared."""
+        return self._origin is not None and self.site.georeference.origin is not None
+
+    def set_origin(self, origin: GeoOrigin) -> Similarity | None:
+        """Take the origin of the flight's local NED, once; by what the map's world moves."""
+        if self._origin is not None or self.site.georeference.origin is None:
+            return None
+        self._origin = origin
+        self._world_from_site = world_from_site(self.site.georeference.origin, origin)
+        return self._world_from_site
 
     def warnings(self, t_ns: int) -> list[Warned]:
         """What is to be said since the last call."""
@@ -80,6 +99,8 @@ class SiteUse:
                     f"that by {placed.method}",
                 )  # fmt: skip
                 return False
+        if measured_m is not None and self._is_live and self._origin is None:
+            return False  # its place is compared as soon as the origin of what is measured is known
         if measured_m is not None and self._has_both:
             there = found.relocalised.camera_from_map.inverse().translation
             off_m = float(np.linalg.norm(self._world_from_site.apply(there) - measured_m))

@@ -95,8 +95,11 @@ class Atlas:
         self.segments.append(fresh)
 
     def resume(self, kept: SlamMap) -> None:
-        """Activate a stored map and index its keyframes; no other may have been initialised."""
-        self.segments = [kept]
+        """Activate a stored map and index its keyframes; no other may have been initialised.
+
+        It may hold keyframes of an earlier flight already, which is therefore not looked for.
+        """
+        self.segments, self.site = [kept], None
         for keyframe in kept.keyframes.values():
             self.index_keyframe(keyframe)
 

@@ -113,6 +113,23 @@ def test_places_about_unknown_origins_are_not_compared(slam_map: SlamMap, site: 
     assert use.allowed(found_in(use, slam_map), None, np.array([5000.0, 0, 0]))
 
 
+def test_in_the_air_a_map_has_a_place_once_the_origin_is_known(
+    slam_map: SlamMap, site: SiteMap
+) -> None:
+    use = SiteUse(site, CAMERA, None, is_live=True)
+    assert not use.georeference.has_origin
+    found = found_in(use, slam_map)
+    assert use.allowed(found, None, None)
+    there = found.relocalised.camera_from_map.inverse().translation
+    assert not use.allowed(found, None, there)
+    origin = GeoOrigin(47.1001, 8.5, 400.0)
+    moved = use.set_origin(origin)
+    assert moved is not None and use.set_origin(ORIGIN) is None
+    assert use.georeference.has_origin
+    assert use.allowed(found, None, moved.apply(there))
+    assert moved.translation[0] == pytest.approx(-11.1, abs=0.1)
+
+
 def test_another_camera_is_said(site: SiteMap) -> None:
     use = SiteUse(site, replace(CAMERA, fx=600.0, fy=600.0), ORIGIN)
     (warning,) = use.warnings(7)
