@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose, Similarity, nearest_rotation
+from companion.geometry.transforms import Pose, Similarity, nearest_rotation
 from companion.slam.loop.loop_closure import LoopClosure, LoopDetector
 from companion.slam.loop.map_merge import merge_maps
 from companion.slam.loop.place_recognition import KeyframeDatabase
@@ -40,9 +41,9 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
     found = _found(here, there, camera)
     if found is None:
         return None
-    before = _places(first, Similarity.identity()) | {
-        key + _n_ids(first): place for key, place in _places(other, other_in_first).items()
-    }
+    before = [
+        _before(first, 0, Similarity.identity()), _before(other, _n_ids(first), other_in_first)
+    ]  # fmt: skip
     merge_maps(here, there, found.here_from_there)
     mapper = Mapper(camera, here, MapLock())
     for _ in range(BINDING_ROUNDS):
@@ -58,15 +59,10 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
         for key, part in zip(_ids(other), other.part_of.tolist(), strict=True)
     }
     georeference = _both(first.georeference, other.georeference)
-    weights = {
-        key: 1.0 / (first if key < _n_ids(first) else other).georeference.sigma_m ** 2
-        / len((first if key < _n_ids(first) else other).keyframes)
-        for key in part_of_id
-    }  # fmt: skip
     revision = max(first.revision, other.revision) + 1
     newer = tuple(replace(part, revision=revision) for part in other.parts)
     return site_map_of(
-        here, _placed(here, before, weights), (*first.parts, *newer), part_of_id, georeference,
+        here, _placed(here, before), (*first.parts, *newer), part_of_id, georeference,
         revision,
     )  # fmt: skip
 
@@ -111,31 +107,51 @@ def _found(here: SlamMap, there: SlamMap, camera: Camera) -> LoopClosure | None:
     return best
 
 
-def _places(site: SiteMap, in_world: Similarity) -> dict[int, Pose]:
-    """`world_from_camera` of the keyframes of a site, by id."""
-    return {
-        k.keyframe_id: in_world.apply_to_pose(k.camera_from_map.inverse()) for k in site.keyframes
+class _Before(NamedTuple):
+    """A map before it was merged: `world_from_camera` by keyframe, and standard deviations."""
+
+    places: dict[int, Pose]
+    sigma_m: float
+    sigma_yaw_rad: float
+    sigma_scale: float
+
+
+def _before(site: SiteMap, offset: int, in_world: Similarity) -> _Before:
+    """A site map with an offset to its ids, in the world of another."""
+    places = {
+        k.keyframe_id + offset: in_world.apply_to_pose(k.camera_from_map.inverse())
+        for k in site.keyframes
     }
+    found = site.georeference
+    return _Before(places, found.sigma_m, found.sigma_yaw_rad, found.sigma_scale)
 
 
-def _placed(slam_map: SlamMap, before: dict[int, Pose], weights: dict[int, float]) -> Similarity:
-    """`world_from_map` for which its keyframes are where they were, by least squares.
+def _placed(slam_map: SlamMap, before: list[_Before]) -> Similarity:
+    """`world_from_map` for which the keyframes are where they were, by least squares.
 
-    Its rotation is by their attitudes, of which all are level; the scale by their distances.
+    Its scale is by the distances within each of the maps before, its rotation by their attitudes,
+    of which all are level, and its place by the mean of each, weighted by their variances.
     """
-    keys = list(slam_map.keyframes)
-    weight: Array = np.array([weights[key] for key in keys])
-    weight /= weight.sum()
-    now = [slam_map.keyframes[key].camera_from_map.inverse() for key in keys]
-    then = [before[key] for key in keys]
-    turns = [w * a.rotation @ b.rotation.T for w, a, b in zip(weight, then, now, strict=True)]
-    rotation = nearest_rotation(np.sum(turns, axis=0))
-    a = np.stack([p.translation for p in then])
-    b = np.stack([p.translation for p in now]) @ rotation.T
-    mean_a, mean_b = weight @ a, weight @ b
-    spread_a, spread_b = (weight @ (p**2).sum(1) for p in (a - mean_a, b - mean_b))
-    scale = float(np.sqrt(spread_a / spread_b))
-    return Similarity(scale, rotation, mean_a - scale * mean_b)
+    log_scales, turns, shifts = [], [], []
+    for each in before:
+        now = [slam_map.keyframes[key].camera_from_map.inverse() for key in each.places]
+        then = list(each.places.values())
+        a, b = (np.stack([p.translation for p in poses]) for poses in (then, now))
+        spread_a, spread_b = (float(((p - p.mean(0)) ** 2).sum()) for p in (a, b))
+        log_scales.append(0.5 * np.log(spread_a / spread_b))
+        turns.append(
+            nearest_rotation(
+                np.sum([p.rotation @ q.rotation.T for p, q in zip(then, now, strict=True)], axis=0)
+            )
+        )
+        shifts.append((a.mean(0), b.mean(0)))
+    scale = float(np.exp(np.average(log_scales, weights=[e.sigma_scale**-2 for e in before])))
+    weighted = [turn * e.sigma_yaw_rad**-2 for turn, e in zip(turns, before, strict=True)]
+    rotation = nearest_rotation(np.sum(weighted, axis=0))
+    origins = [a - scale * rotation @ b for a, b in shifts]
+    return Similarity(
+        scale, rotation, np.average(origins, axis=0, weights=[e.sigma_m**-2 for e in before])
+    )
 
 
 def _both(a: SiteGeoreference, b: SiteGeoreference) -> SiteGeoreference:

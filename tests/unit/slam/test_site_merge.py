@@ -1,0 +1,93 @@
+"""Site maps of several flights as one: bound by what both saw, placed as both were."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.app.cli import main
+from companion.geometry.transforms import Array, Pose, Similarity, yaw_rotation
+from companion.products.site_map_file import read_site_map, write_site_map
+from companion.slam.map.site_map import SiteGeoreference, SiteMap, SitePart, site_map_of
+from companion.slam.mapping.site_merge import merge_sites
+from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
+
+IN_ITSELF = Similarity.identity()
+
+
+def kept(ground: Ground, path: list[Pose], name: str, off_m: float, scale: float) -> SiteMap:
+    """A site map off by some metres to the north, and by a scale."""
+    made = mapped(ground, path, Similarity(0.4, yaw_rotation(1.1), np.array([3.0, -7.0, 2.0])))
+    world_from_map = (
+        Similarity(scale, np.eye(3), np.array([off_m, 0.0, 0.0]))
+        @ Similarity(0.4, yaw_rotation(1.1), np.array([3.0, -7.0, 2.0])).inverse()
+    )
+    georeference = SiteGeoreference(None, 1.0, 0.02, 0.01, "gps")
+    part = SitePart(name, 0, CAMERA, 1)
+    return site_map_of(made, world_from_map, (part,), {}, georeference, 1)
+
+
+def line(start: tuple[float, float], end: tuple[float, float], yaw: float) -> list[Pose]:
+    return [flown(p, yaw) for p in np.linspace(start, end, 9)]
+
+
+PATHS = line((-6, 0), (6, 0), 0.0), line((6, 3), (0, -3), 2.6)
+
+
+def places(site: SiteMap) -> Array:
+    return np.stack([k.camera_from_map.inverse().translation for k in site.keyframes])
+
+
+@pytest.fixture(scope="module")
+def sites() -> tuple[SiteMap, SiteMap]:
+    ground = Ground(np.random.default_rng(5))
+    return (
+        kept(ground, PATHS[0], "first", 1.0, 1.01),
+        kept(ground, PATHS[1], "second", -1.0, 0.99),
+    )
+
+
+def test_two_maps_become_one_between_them(sites: tuple[SiteMap, SiteMap]) -> None:
+    merged = merge_sites(*sites, IN_ITSELF)
+    assert merged is not None
+    assert [p.flight for p in merged.parts] == ["first", "second"]
+    assert merged.part_of.tolist() == [0] * 9 + [1] * 9
+    assert [k.keyframe_id for k in merged.keyframes] == list(range(18))
+    assert [k.t_ns for k in merged.keyframes[9:]] == [k.t_ns for k in sites[1].keyframes]
+    true = np.stack([p.translation for path in PATHS for p in path])
+    off = places(merged) - true
+    assert np.abs(off).max() < 0.1  # of 1 m each, the other way
+    assert merged.georeference.sigma_m == pytest.approx(1 / np.sqrt(2))
+    of_first = np.unique(np.concatenate([k.point_ids for k in merged.keyframes[:9]]))
+    shared = [np.isin(k.point_ids[k.point_ids >= 0], of_first).sum() for k in merged.keyframes[9:]]
+    assert np.median(shared) > 50
+
+
+def test_the_better_placed_map_counts_more(sites: tuple[SiteMap, SiteMap]) -> None:
+    first, second = sites
+    surer = replace(first, georeference=replace(first.georeference, sigma_m=0.1))
+    merged = merge_sites(surer, second, IN_ITSELF)
+    assert merged is not None
+    true = np.stack([p.translation for path in PATHS for p in path])
+    assert (places(merged) - true)[:, 0].mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_maps_of_two_sites_are_not_merged(sites: tuple[SiteMap, SiteMap]) -> None:
+    elsewhere = kept(Ground(np.random.default_rng(6)), PATHS[0], "elsewhere", 0.0, 1.0)
+    assert merge_sites(sites[0], elsewhere, IN_ITSELF) is None
+
+
+def test_the_command_merges_files(
+    sites: tuple[SiteMap, SiteMap], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for n, site in enumerate(sites):
+        write_site_map(tmp_path / f"{n}.map", site)
+    out = tmp_path / "both.map"
+    paths = [str(tmp_path / "0.map"), str(tmp_path / "1.map")]
+    assert main(["map", "merge", *paths, "--out", str(out)]) == 0
+    assert "second moved by" in capsys.readouterr().out
+    assert len(read_site_map(out).site.keyframes) == 18
+    assert main(["map", "merge", paths[0], "--out", str(out)]) == 2
