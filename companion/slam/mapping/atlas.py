@@ -230,7 +230,8 @@ class Atlas:
     def _take_over_site(self, segment: SlamMap, mapper: Mapper) -> None:
         """Know the map of an earlier flight as part of the active one."""
         self.site = None
-        for key, keyframe in segment.keyframes.items():
+        for key, keyframe in list(segment.keyframes.items()):
+            self._map_lock.yield_to_tracking()
             if key in segment.held:
                 self.index_keyframe(keyframe)
             else:

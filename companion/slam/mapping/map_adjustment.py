@@ -161,7 +161,9 @@ def _moves(
     }
     last = moves[max(moves)]
     for key, keyframe in slam_map.keyframes.items():
-        if key not in moves:
+        if key in slam_map.held:
+            moves[key] = Pose.identity()
+        elif key not in moves:
             _, points = slam_map.observations_of(keyframe)
             covisible = (k for _, k in slam_map.covisible(points) if k in moves and k != key)
             moves[key] = moves.get(next(covisible, -1), last)
