@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import Callable, Coroutine
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.landing_sender import LandingSender
 from companion.daemon.pose.pose_sender import PoseSender
 from companion.daemon.recorder_notes import RecorderNotes
+from companion.daemon.status_document import StatusDocument
 from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.geometry.geodesy import GeoOrigin
@@ -76,8 +76,6 @@ from drivers.system.status_socket import StatusSocket, own_socket_path
 
 LEAST_WAIT_S = 0.005
 NOT_WRITTEN = "the results so far could not be written"
-MOST_WARNINGS = 20
-"""Kinds of warnings in the status document, the newest."""
 WRITE_S = 0.2
 """Time to write the armed settings at the end."""
 END_S = 2.6
@@ -140,18 +138,9 @@ class Daemon:
         )
         self._flights = flights = Flights(clock, journal, self._listener, self._facts, dates, start)
         self._watch = watch = HealthWatch(
-            config,
-            clock,
-            journal,
-            self._feed,
-            self._link,
-            self._sender,
-            self._flow_sender,
-            self._landing_sender,
-            self._global_sender,
-            flights,
-            self._loop_delay,
-        )
+            config, clock, journal, self._feed, self._link, self._sender, self._flow_sender,
+            self._landing_sender, self._global_sender, flights, self._loop_delay,
+        )  # fmt: skip
         watch.set_by_ground = settings.by_ground
         self._notes = RecorderNotes(clock, flights, watch, self._link)
         if self._link is not None:
@@ -170,6 +159,7 @@ class Daemon:
             settings, clock, journal, self._service, self._feed, self._link, link_watch, flights,
             dates, watch, starts, self._stop,
         )  # fmt: skip
+        self._status = StatusDocument(watch, settings, flights, starts, self._link, journal, clock)
         self._page: PageChild | None = None
         if config.page.listen:
             self._page = PageChild(
@@ -186,7 +176,7 @@ class Daemon:
         loop.add_signal_handler(signal.SIGINT, self._stop.interrupt)
         loop.add_signal_handler(signal.SIGTERM, self._stop.stop)
         loop.add_signal_handler(signal.SIGHUP, self._checks.reload)
-        socket = StatusSocket(own_socket_path(config.daemon.socket), self._document, self._problem)
+        socket = StatusSocket(own_socket_path(config.daemon.socket), self._status, self._problem)
         metrics = Metrics(config.daemon.prometheus_port, self._watch.health, self._problem)
         await socket.start()
         if config.daemon.prometheus_port:
@@ -244,30 +234,6 @@ class Daemon:
             )  # fmt: skip
             work.append(keeper.run())
         return work
-
-    def _document(self) -> dict[str, Any]:
-        """Status document: health, and what the page shows besides."""
-        now_ns, flight = self._clock.now_ns(), self._flights.current
-        camera, origin = self._starts.camera, self._link.origin if self._link is not None else None
-        warnings = [
-            {
-                "what": each.what, "detail": each.detail, "good": each.good,
-                "age_s": round((now_ns - each.t_ns) * 1e-9, 1),
-            }
-            for each in reversed(self._journal.newest.values())
-        ]  # fmt: skip
-        return {
-            **self._watch.document(),
-            "armed": self._settings.armed,
-            "page": self._settings.config.page.listen,
-            "kept": flight is not None and flight.kept,
-            "flights": str(Path(self._settings.config.daemon.flights).resolve()),
-            "viewers_port": flight.viewing.port if flight and flight.viewing else 0,
-            "mount_known": camera is not None and camera.body_from_camera is not None,
-            "size": [camera.width, camera.height] if camera is not None else None,
-            "origin": asdict(origin) if origin is not None else None,
-            "warnings": warnings[:MOST_WARNINGS],
-        }
 
     # -- what comes in --------------------------------------------------------------------------
 
