@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -29,6 +29,10 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 
+STATIC = "/static/"
+STATIC_HEADERS = {**HEADERS, "Cache-Control": "no-cache"}
+"""Style and script are kept by the browser, which asks whether they are still the same."""
+
 
 class Gate:
     """ASGI application around the page's own; `clock` gives seconds."""
@@ -51,9 +55,10 @@ class Gate:
             # a page elsewhere whose name leads here: it would be taken for somebody on this machine
             answer = PlainTextResponse("ask by an address of this machine, not by this name", 421)
         else:
-            await self._inner(scope, _bounded(receive), _with_headers(send))
+            own = STATIC_HEADERS if scope["path"].startswith(STATIC) else HEADERS
+            await self._inner(scope, _bounded(receive), _with_headers(send, own))
             return
-        await answer(scope, receive, _with_headers(send))
+        await answer(scope, receive, _with_headers(send, HEADERS))
 
 
 def is_own_name(host: str) -> bool:
@@ -89,11 +94,11 @@ def _bounded(receive: Receive) -> Receive:
     return bounded
 
 
-def _with_headers(send: Send) -> Send:
+def _with_headers(send: Send, headers_wanted: Mapping[str, str]) -> Send:
     async def sending(message: Any) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
-            for name, value in HEADERS.items():
+            for name, value in headers_wanted.items():
                 headers.setdefault(name, value)
         await send(message)
 

@@ -11,6 +11,7 @@ from typing import Any
 import tomlkit
 
 from companion.config_file import (
+    config_of_text,
     dump,
     load_config,
     toml_value,
@@ -97,9 +98,6 @@ class SettingsFile:
 
     def _check(self, text: str) -> None:
         """Refuse text that `companion check-config` would refuse."""
-        assert self.path is not None
-        from companion.config_file import config_of_text
-
         config_of_text(text, str(self.path), lambda _: None)
 
     def _note(

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from companion.errors import ConfigError
-from companion.page.programs import Doctor
+from companion.page.doctor_process import Doctor
 from companion.page.setting_views import SettingViews
 from companion.page.setup_steps import steps
 from companion.page.site import Form, Site

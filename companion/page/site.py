@@ -26,7 +26,8 @@ NOT_KNOWN = "companion does not answer, so that nobody knows whether the motors 
 LOOKS_ON = "This device may look on only. Pair it with the code to change things."
 MOST_SAID = 64
 """Messages that wait for the view that shows them."""
-ADDRESSES_APART = ("same-origin", "none")
+OWN_SITE = ("same-origin", "none")
+"""Values of Sec-Fetch-Site for forms of this page."""
 
 
 class Site:
@@ -123,7 +124,7 @@ def is_same_origin(request: Request) -> bool:
     origin = request.headers.get("origin")
     if origin is not None:
         return urlsplit(origin).netloc == request.headers.get("host")
-    return request.headers.get("sec-fetch-site", "same-origin") in ADDRESSES_APART
+    return request.headers.get("sec-fetch-site", "same-origin") in OWN_SITE
 
 
 def local_path(to: str) -> str:

@@ -1,4 +1,4 @@
-"""Commands of this program that the page runs for whoever looks at it, one at a time."""
+"""`companion doctor` run for the page, in a process of its own, one at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_BYTES = 1 << 20
 
 
 class Doctor:
-    """`companion doctor`, in a process of its own: what it found last."""
+    """Runs it, and keeps what it found last."""
 
     def __init__(self, facts: Facts) -> None:
         self._facts = facts
