@@ -81,6 +81,11 @@ OF_WARNING: Mapping[str, str] = {
     "questions came over the network that cannot be read": "Another version is on the network.",
     "the autopilot is not asked for its IMU": "Raise the baud: see what is said.",
     "the autopilot's IMU is asked for less often": "Raise the baud: see what is said.",
+    "looks like a rolling shutter: set camera.readout_ms": "Set camera.readout_ms as is said.",
+    "the rolling shutter looks slower or faster than camera.readout_ms":
+        "Correct camera.readout_ms as is said.",
+    "rolling shutter is undone by the rotation between images alone":
+        "With the autopilot's IMU it is undone better: see its stream rates.",
     "the flight can be seen": NOTHING,
     "the viewer cannot be shown": "See what is said; nothing else depends on it.",
     "the viewer has gone": "It is opened again; nothing else depends on it.",
