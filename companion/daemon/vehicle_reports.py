@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 
 from companion.config import Config, FeedbackConfig
 from companion.daemon.health_watch import HealthWatch
-from companion.dense.obstacles import RecentCloud, obstacles_around
+from companion.dense.obstacles import Obstacles, RecentCloud, obstacles_around, unknown
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
-from companion.messages import MapUpdate, PointChunk, Track, TrackState
+from companion.messages import DepthMap, MapUpdate, PointChunk, Track, TrackState
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.camera_messages import (
@@ -38,9 +39,13 @@ from drivers.mavlink.obstacle_distance import obstacle_distance
 from drivers.system.own_addresses import own_addresses
 from drivers.video.rtsp_server import PATH
 
-OBSTACLES_HZ, COMPUTER_HZ = 5.0, 1.0
-MAX_AGE_NS = 500_000_000
 EVERY_NETWORK = ("0.0.0.0", "::", "")
+OBSTACLES_HZ, COMPUTER_HZ = 10.0, 1.0
+MAX_AGE_NS = 200_000_000
+"""Age of the image that the pose is from, since its exposure; beyond it nothing is known: at 5 m/s
+all distances are a metre off."""
+UNKNOWN_AFTER_NS = 3_000_000_000
+"""That nothing is known is said for so long after the last that was: then nothing is sent."""
 
 
 class VehicleReports:
@@ -63,15 +68,20 @@ class VehicleReports:
         self._track: Track | None = None
         self._map: MapUpdate | None = None
         self._camera = camera or self._camera
+        self._waiting: deque[DepthMap] = deque(maxlen=2)
+        """Depth maps that the next round takes up: it has a thread for it."""
+        self._known_ns = 0
         if camera is not None and camera.body_from_camera is not None:
             self._camera_from_body = camera.body_from_camera.inverse()
 
-    def take(self, message: Track | MapUpdate | PointChunk) -> None:
-        """Take a track, a map update or points."""
+    def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
+        """Take a track, a map update, a depth map or points."""
         if isinstance(message, Track):
             self._track = message
         elif isinstance(message, MapUpdate):
             self._map = message
+        elif isinstance(message, DepthMap):
+            self._waiting.append(message)
         elif self._obstacles:
             self._cloud.add(message)
 
@@ -153,8 +163,21 @@ class VehicleReports:
         )  # fmt: skip
 
     def _obstacle_distance(self) -> object | None:
-        """OBSTACLE_DISTANCE now, from the map's own pose; None while that is unknown."""
-        track, update, now_ns = self._track, self._map, self._clock.now_ns()
+        """OBSTACLE_DISTANCE now; None where nothing was known for long."""
+        now_ns = self._clock.now_ns()
+        while self._waiting:
+            self._cloud.add_map(self._waiting.popleft())
+        found = self._obstacles_now(now_ns)
+        if found is not None:
+            self._known_ns = now_ns
+        elif now_ns - self._known_ns > UNKNOWN_AFTER_NS:
+            return None
+        message: object = obstacle_distance(unknown(now_ns) if found is None else found)
+        return message
+
+    def _obstacles_now(self, now_ns: int) -> Obstacles | None:
+        """Obstacles from the map's own pose; None while that is unknown or old."""
+        track, update = self._track, self._map
         if (
             track is None or track.state is not TrackState.TRACKING
             or track.map_from_camera is None or now_ns - track.t_ns > MAX_AGE_NS
@@ -168,5 +191,4 @@ class VehicleReports:
         world_from_body = (
             world_from_map.apply_to_pose(track.map_from_camera) @ self._camera_from_body
         )
-        message: object = obstacle_distance(obstacles_around(track.t_ns, world_from_body, *seen))
-        return message
+        return obstacles_around(track.t_ns, world_from_body, *seen)

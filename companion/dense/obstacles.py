@@ -2,7 +2,9 @@
 
 Sectors are horizontal, around the vehicle, the first centred on straight ahead, clockwise in plan
 view. Unseen space is unknown, not free: a sector is free only where lines of sight pass through it,
-at the height of the vehicle, to something farther away.
+at the height of the vehicle, to something farther away, and only where that was seen just now.
+Obstacles stay for longer: they stand where they were seen. So a vehicle that hovers, of which depth
+knows nothing new, sees what is free turn to unknown.
 
 Static textured obstacles are detected; moving or untextured ones are not.
 """
@@ -15,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.dense.fusion import MAX_SIGMA, chunk_alone, measured_only
 from companion.geometry.transforms import Array, Pose
-from companion.messages import MapUpdate, PointChunk
+from companion.messages import DepthMap, MapUpdate, PointChunk
 
 N_SECTORS = 72
 SECTOR_DEG = 5.0
@@ -29,6 +32,11 @@ MIN_M, MAX_M = 0.3, 20.0
 """Horizontal distances searched for obstacles; what is nearer is the vehicle itself."""
 ABOVE_M, BELOW_M = 1.0, 0.75
 """Heights searched, relative to the vehicle, along the vertical."""
+FREE_S = 2.0
+"""Age of what is seen, from its exposure, up to which it shows that nothing is in between. Depth of
+a keyframe is known a second after it."""
+STAYS_S = 15.0
+"""Age up to which an obstacle stays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,23 +49,31 @@ class Obstacles:
     max_cm: int
 
 
+def unknown(t_ns: int) -> Obstacles:
+    """Nothing is known."""
+    nothing = np.full(N_SECTORS, UNKNOWN_CM, np.uint16)
+    return Obstacles(t_ns, nothing, round(MIN_M * 100), round(MAX_M * 100))
+
+
 def obstacles_around(
-    t_ns: int, world_from_body: Pose, points_world_m: Array, seen_from_world_m: Array
-) -> Obstacles:
-    """Distances from a pose to points (N, 3) seen from camera positions (N, 3).
+    t_ns: int, world_from_body: Pose, points_world_m: Array, seen_from_world_m: Array,
+    ages_s: Array,
+) -> Obstacles:  # fmt: skip
+    """Distances from a pose to points (N, 3) seen from camera positions (N, 3), (N,) seconds ago.
 
     The pose must be by the map of the points: a slewed one is offset.
     """
     position = world_from_body.translation
     finite = np.isfinite(points_world_m).all(1) & np.isfinite(seen_from_world_m).all(1)
     points, eyes = points_world_m[finite] - position, seen_from_world_m[finite] - position
+    is_new = ages_s[finite] <= FREE_S
     distance_m = np.hypot(points[:, 0], points[:, 1])
     sector = _sector(points, world_from_body)
 
     max_cm = round(MAX_M * 100)
     min_cm = round(MIN_M * 100)
     distances_cm = np.full(N_SECTORS, UNKNOWN_CM, np.uint16)
-    far = distance_m > MAX_M
+    far = (distance_m > MAX_M) & is_new
     through = _seen_through(points[far], eyes[far])
     distances_cm[np.bincount(sector[far][through], minlength=N_SECTORS) >= MIN_POINTS] = max_cm + 1
 
@@ -106,15 +122,22 @@ def _seen_through(points: Array, eyes: Array) -> NDArray[np.bool_]:
 
 
 class RecentCloud:
-    """The newest chunks of the cloud, subsampled; older than `max_age_s` are ignored."""
+    """The newest parts of the cloud, subsampled; older than `max_age_s` are ignored.
+
+    A depth map counts as it comes; its fused chunk, two keyframes later, replaces it.
+    """
 
     def __init__(
-        self, max_age_s: float = 15.0, max_chunks: int = 12, max_points: int = 2000
+        self, max_age_s: float = STAYS_S, max_chunks: int = 12, max_points: int = 4000
     ) -> None:
         self._max_age_ns = round(max_age_s * 1e9)
         self._max_chunks = max_chunks
         self._max_points = max_points
         self._chunks: OrderedDict[int, PointChunk] = OrderedDict()
+
+    def add_map(self, depth_map: DepthMap) -> None:
+        """Add what a depth map has measured for certain."""
+        self.add(chunk_alone(measured_only(depth_map, MAX_SIGMA)))
 
     def add(self, chunk: PointChunk) -> None:
         """Add a chunk, replacing one of the same keyframe."""
@@ -133,14 +156,14 @@ class RecentCloud:
         while len(self._chunks) > self._max_chunks:
             self._chunks.popitem(last=False)
 
-    def in_world(self, t_ns: int, update: MapUpdate) -> tuple[Array, Array] | None:
-        """Points (N, 3) and the camera positions (N, 3) that saw them, in metres.
+    def in_world(self, t_ns: int, update: MapUpdate) -> tuple[Array, Array, Array] | None:
+        """Points (N, 3), the camera positions (N, 3) that saw them, metres, and ages (N,), seconds.
 
         None without a metric scale.
         """
         if update.georeference is None:
             return None
-        points, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        points, eyes, ages = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
         for chunk in self._chunks.values():
             place = update.place_of(chunk.keyframe_id)
             if place is None or t_ns - chunk.t_ns > self._max_age_ns:
@@ -148,4 +171,5 @@ class RecentCloud:
             world_from_camera = update.georeference.world_from_map @ place
             points.append(world_from_camera.apply(chunk.points_camera.astype(np.float64)))
             eyes.append(np.broadcast_to(world_from_camera.translation, points[-1].shape))
-        return np.concatenate(points), np.concatenate(eyes)
+            ages.append(np.full(len(points[-1]), 1e-9 * (t_ns - chunk.t_ns)))
+        return np.concatenate(points), np.concatenate(eyes), np.concatenate(ages)

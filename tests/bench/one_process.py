@@ -40,7 +40,7 @@ from companion.daemon.flights.live_flight import Listener, LiveFlight
 from companion.daemon.health_watch import HealthWatch
 from companion.geometry.camera import Camera
 from companion.health import LatencyMeter
-from companion.messages import Frame, MapUpdate, Odometry, PointChunk, Track, Warned
+from companion.messages import DepthMap, Frame, MapUpdate, Odometry, PointChunk, Track, Warned
 from companion.products.flight_result import RunFacts
 from companion.runtime.fork_server import ForkServer
 from companion.telemetry import Telemetry
@@ -125,7 +125,7 @@ class Flown:
         if odometry.seq >= self._seq:
             self._answered.set()
 
-    def _mapped(self, message: Track | MapUpdate | PointChunk) -> None:
+    def _mapped(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         if isinstance(message, MapUpdate):
             self._seen.update = message
 

@@ -17,6 +17,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import Health
 from companion.messages import (
+    DepthMap,
     Frame,
     FrameOverdue,
     Georeferenced,
@@ -59,7 +60,7 @@ NOT_DENSE = "the dense map cannot be begun now; switch it off and on to try agai
 NOT_FINISHED = "a stage did not give its last results in time"
 HEALTH_EVERY_NS = 1_000_000_000
 GATHER_NS = round(GATHER_S * 1e9)
-MAPPED = {kind.__name__ for kind in (Track, MapUpdate, PointChunk)}
+MAPPED = {kind.__name__ for kind in (Track, MapUpdate, DepthMap, PointChunk)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +79,7 @@ class Listener:
     results_written: Callable[[ResultsWritten], None] = lambda _: None
     points_made: Callable[[int], None] = lambda _: None
     """Time of the keyframe whose points they are."""
-    mapped: Callable[[Track | MapUpdate | PointChunk], None] | None = None
+    mapped: Callable[[Track | MapUpdate | DepthMap | PointChunk], None] | None = None
     """None where nobody needs them: they are large."""
 
 

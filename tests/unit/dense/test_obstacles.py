@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.dense.obstacles import UNKNOWN_CM, RecentCloud, obstacles_around
+from companion.dense.obstacles import (
+    FREE_S,
+    UNKNOWN_CM,
+    RecentCloud,
+    obstacles_around,
+)
 from companion.geometry.transforms import (
     Array,
     Pose,
@@ -38,10 +43,12 @@ def at(bearing_deg: float, distance_m: float, down_m: float = 0.0, n: int = 10) 
     return out
 
 
-def distances(pose: Pose, points: Array, eyes: Array | None = None) -> dict[int, int]:
+def distances(
+    pose: Pose, points: Array, eyes: Array | None = None, age_s: float = 0.5
+) -> dict[int, int]:
     """Sectors that are known."""
     seen_from = np.broadcast_to(pose.translation, points.shape) if eyes is None else eyes
-    found = obstacles_around(7, pose, points, seen_from)
+    found = obstacles_around(7, pose, points, seen_from, np.full(len(points), age_s))
     assert found.distances_cm.shape == (72,)
     return {i: int(d) for i, d in enumerate(found.distances_cm) if d != UNKNOWN_CM}
 
@@ -120,6 +127,13 @@ def test_nadir_view_frees_nothing() -> None:
     assert distances(vehicle(0), at(0, 40.0, down_m=12.0)) == {}
 
 
+def test_free_space_turns_to_unknown_and_an_obstacle_stays() -> None:
+    """As over one spot, where depth learns nothing new."""
+    both = np.concatenate([at(0, 40.0), at(90, 10.0)])
+    assert set(distances(vehicle(0), both, age_s=FREE_S)) == {0, 18}
+    assert set(distances(vehicle(0), both, age_s=FREE_S + 0.1)) == {18}
+
+
 def test_obstacle_in_front_of_free_space() -> None:
     found = distances(vehicle(0), np.concatenate([at(0, 40.0), at(0, 10.0)]))
     assert found == {0: pytest.approx(1000, abs=4)}
@@ -136,7 +150,7 @@ def test_message_is_as_autopilots_read_it() -> None:
     points = np.concatenate([at(170, 8.0), at(130, 40.0)])
     pose = vehicle(130)
     eyes = np.broadcast_to(PLACE, points.shape)
-    found = obstacles_around(1_790_000_000_123_456_789, pose, points, eyes)
+    found = obstacles_around(1_790_000_000_123_456_789, pose, points, eyes, np.zeros(len(points)))
     link = mavlink.MAVLink(None, 1, 197)
     message = link.parse_buffer(obstacle_distance(found).pack(link))[0]
     assert message.get_type() == "OBSTACLE_DISTANCE"
@@ -185,6 +199,7 @@ def test_recent_cloud_follows_map_updates() -> None:
     np.testing.assert_allclose(placed[0], wanted, atol=1e-9)
     eye = 4.0 * turn @ camera.translation + PLACE
     np.testing.assert_allclose(placed[1], [eye, eye], atol=1e-9)
+    np.testing.assert_allclose(placed[2], [5.0, 5.0])
     old = cloud.in_world(111 * 10**9, update)
     assert old is not None
     assert len(old[0]) == 0

@@ -1,0 +1,179 @@
+"""OBSTACLE_DISTANCE before a wall and a pole of known depth, on a link without a wire."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.config import Config, FeedbackConfig
+from companion.daemon.vehicle_reports import MAX_AGE_NS, UNKNOWN_AFTER_NS, VehicleReports
+from companion.dense.obstacles import FREE_S, STAYS_S
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Array, Pose, Similarity
+from companion.messages import DepthMap, Georeference, MapUpdate, PixelState, Track, TrackState
+from tests.support.autopilot.memory_link import SetClock, memory_link
+from tests.support.autopilot.memory_port import MemoryPort
+
+S = 1_000_000_000
+FORWARD = Pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.zeros(3))
+"""`body_from_camera` of a camera that looks ahead."""
+CAMERA = Camera(160, 120, 110.0, 110.0, 79.5, 59.5, body_from_camera=FORWARD)
+UNKNOWN, FREE = 65535, 2001
+METRES_PER_UNIT = 2.5
+Pole = tuple[float, float, float]
+"""North, east and radius, metres."""
+PLACED = Georeference(
+    Similarity(METRES_PER_UNIT, np.eye(3), np.array([0.0, 0.0, -10.0])), 0.01, 0.01, "", 9, 0.1
+)
+
+
+def depth_of(position_m: Array, wall_north_m: float, pole: Pole) -> Array:
+    """z-depth (H, W), metres, of a wall across the north, and a pole (north, east, radius)."""
+    x = np.tile((np.arange(CAMERA.width) - CAMERA.cx) / CAMERA.fx, (CAMERA.height, 1))
+    depth = np.full(x.shape, wall_north_m - position_m[0])
+    north, east, radius = pole
+    ahead = north - position_m[0]
+    hit = np.abs(x * ahead - (east - position_m[1])) < radius
+    return np.where(hit & (ahead > 0.2), np.minimum(ahead, depth), depth)
+
+
+class Approach:
+    """North at 2 m/s towards a wall and a pole; a keyframe each 0.5 s, its depth 0.6 s later."""
+
+    def __init__(self, wall_m: float = 12.0, pole: Pole = (9, 2, 0.1)) -> None:
+        self.wall_m, self.pole = wall_m, pole
+        self.clock, self.port = SetClock(), MemoryPort()
+        self.began_ns = self.clock.t_ns
+        self.link = memory_link(self.port, self.clock, lambda _: None)
+        watch: Any = None
+        self.reports = VehicleReports(
+            self.link, self.clock, watch, Config(feedback=FeedbackConfig(obstacle_distance=True))
+        )
+        self.reports.restart(CAMERA)
+        self.keyframes: dict[int, Pose] = {}
+        self.late: list[tuple[int, DepthMap]] = []
+        self.position = np.zeros(3)
+
+    @property
+    def map_from_camera(self) -> Pose:
+        return Pose(FORWARD.rotation, self.position / METRES_PER_UNIT)
+
+    def fly(self, seconds: float, speed_m_s: float = 2.0, tracked: bool = True) -> list[int]:
+        """Distances of the last message, cm."""
+        for _ in range(round(seconds * 20)):
+            self.clock.t_ns += S // 20
+            self.position = self.position + [speed_m_s / 20, 0, 0]
+            now_ns = self.clock.t_ns
+            since = round((now_ns - self.began_ns) / (S / 20))
+            if tracked:
+                self.reports.take(
+                    Track(since, now_ns - S // 20, TrackState.TRACKING, self.map_from_camera)
+                )
+            if speed_m_s and tracked and since % 10 == 0:
+                self.add_keyframe(since // 10, now_ns)
+            while self.late and self.late[0][0] <= now_ns:
+                self.reports.take(self.late.pop(0)[1])
+        return self.now()
+
+    def add_keyframe(self, keyframe_id: int, t_ns: int) -> None:
+        self.keyframes[keyframe_id] = self.map_from_camera
+        self.reports.take(MapUpdate(1, t_ns, dict(self.keyframes), np.zeros((0, 3)), PLACED))
+        depth = (depth_of(self.position, self.wall_m, self.pole) / METRES_PER_UNIT).astype(
+            np.float32
+        )
+        state = np.full(depth.shape, PixelState.CONVERGED.value, np.uint8)
+        rgb = np.zeros((*depth.shape, 3), np.uint8)
+        made = DepthMap(
+            keyframe_id, t_ns, (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), depth, 0.002 * depth,
+            state, np.ones_like(depth), rgb, 7, {},
+        )  # fmt: skip
+        self.late.append((t_ns + round(0.6 * S), made))
+
+    def now(self) -> list[int]:
+        message: Any = self.reports._obstacle_distance()
+        return [] if message is None else list(message.distances)
+
+
+def truth_cm(approach: Approach, sector: int) -> float:
+    """Nearest in a sector, horizontally, whatever part of it is seen."""
+    bearings = np.radians(
+        5.0 * (sector - 72 if sector > 36 else sector) + np.linspace(-2.5, 2.5, 41)
+    )
+    ahead = approach.wall_m - approach.position[0]
+    wall = ahead / np.cos(bearings)
+    north, east = approach.pole[0] - approach.position[0], approach.pole[1]
+    pole_bearing = np.arctan2(east, north)
+    nearest = float(wall.min())
+    if bearings[0] <= pole_bearing <= bearings[-1] and north > 0.3:
+        nearest = min(nearest, float(np.hypot(north, east)))
+    return 100 * nearest
+
+
+IN_VIEW = [(sector % 72) for sector in range(-5, 6)]
+
+
+def test_distances_on_the_way_to_a_wall_and_a_pole() -> None:
+    """Within 5 % and 0.3 m, and none in view is called free: down to 3 m before the wall."""
+    approach = Approach()
+    approach.fly(1.5)
+    n = off = 0
+    while approach.position[0] < 9.0:
+        found = approach.fly(0.1)
+        for sector in IN_VIEW:
+            truth = truth_cm(approach, sector)
+            assert not (found[sector] == FREE and truth < 800)
+            n += 1
+            off += not abs(found[sector] - truth) <= 0.05 * truth + 30
+    assert n > 300
+    assert off / n < 0.05
+    behind = {found[sector] for sector in range(20, 52)}
+    assert behind == {UNKNOWN}
+
+
+def test_hovering_turns_free_to_unknown_and_then_all() -> None:
+    approach = Approach(wall_m=45.0, pole=(15, 2.2, 0.1))
+    found = approach.fly(3.0)
+    assert found[0] == FREE and 0 < found[3] < 2000  # the pole
+    assert approach.fly(FREE_S + 0.1, 0.0)[0] == UNKNOWN
+    assert 0 < approach.now()[3] < 2000
+    assert set(approach.fly(STAYS_S, 0.0)) == {UNKNOWN}
+
+
+def test_an_old_image_makes_everything_unknown_and_then_silent() -> None:
+    """So that an autopilot does not hold what it was told before."""
+    approach = Approach()
+    assert set(approach.fly(2.0)) != {UNKNOWN}
+    assert set(approach.fly(1e-9 * MAX_AGE_NS - 0.1, tracked=False)) != {UNKNOWN}
+    assert set(approach.fly(0.2, tracked=False)) == {UNKNOWN}
+    assert approach.fly(1e-9 * UNKNOWN_AFTER_NS, tracked=False) == []
+
+
+def test_nothing_is_sent_before_anything_is_known() -> None:
+    assert Approach().now() == []
+
+
+@pytest.mark.parametrize("radius_m", [0.05, 0.1])
+def test_how_thin_a_pole_is_found(radius_m: float) -> None:
+    """A pole of 10 cm, 5 m ahead, is two pixels wide with 110 pixels of focal length."""
+    approach = Approach(pole=(9.0, 0.0, radius_m))
+    found = approach.fly(2.0)
+    assert found[0] == pytest.approx(500, abs=55)
+
+
+def test_it_goes_out_ten_times_a_second() -> None:
+    async def fly() -> int:
+        approach = Approach()
+        approach.fly(2.0)
+        approach.link.alive = True
+        approach.reports.computer_hz = 0.0
+        task = asyncio.create_task(approach.reports.run())
+        while len(approach.port.of("OBSTACLE_DISTANCE")) < 3:
+            await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        return len(approach.port.of("OBSTACLE_DISTANCE"))
+
+    assert asyncio.run(asyncio.wait_for(fly(), 5.0)) >= 3
