@@ -191,6 +191,18 @@ class LandingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class GpsConfig:
+    """Satellites that vision contradicts; see docs/satellites.md."""
+
+    switch_source: bool = False
+    """Switch ArduPilot's EKF to other sources while satellites are doubted and poses are sent."""
+    vision_set: Annotated[int, Meta(ge=1, le=3)] = 2
+    """Source set (EK3_SRC2_… is 2) without satellites, switched to when they are doubted."""
+    satellites_set: Annotated[int, Meta(ge=1, le=3)] = 1
+    """Source set with satellites, switched back to when they agree again."""
+
+
+@dataclass(frozen=True, slots=True)
 class ControlConfig:
     """Commands and parameters of ground stations over MAVLink; see docs/control.md."""
 
@@ -457,6 +469,7 @@ class Config:
     router: RouterConfig = field(default_factory=RouterConfig)
     feedback: FeedbackConfig = field(default_factory=FeedbackConfig)
     landing: LandingConfig = field(default_factory=LandingConfig)
+    gps: GpsConfig = field(default_factory=GpsConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     daemon: DaemonConfig = field(default_factory=DaemonConfig)
     recorder: RecorderConfig = field(default_factory=RecorderConfig)

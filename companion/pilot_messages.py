@@ -69,6 +69,20 @@ IMU_USED = PilotMessage(INFO, "autopilot IMU data used again")
 VELOCITY_NOT_USED = PilotMessage(NOTICE, "autopilot velocity not used")
 VELOCITY_USED = PilotMessage(INFO, "autopilot velocity used again")
 
+# -- satellites -----------------------------------------------------------------
+
+GPS_JUMP = PilotMessage(WARNING, "GPS position jump: not used")
+GPS_PULL = PilotMessage(WARNING, "GPS drifts from vision: not used")
+GPS_HEIGHT = PilotMessage(WARNING, "GPS height drifts: not used")
+GPS_STANDS = PilotMessage(WARNING, "GPS position frozen: not used")
+GPS_TURNED = PilotMessage(WARNING, "GPS track wrong: not used")
+GPS_GONE = PilotMessage(WARNING, "GPS lost or jammed")
+GPS_POOR = PilotMessage(WARNING, "GPS accuracy poor: not used")
+GPS_AGAIN = PilotMessage(INFO, "GPS agrees with vision: used again")
+SOURCE_VISION = PilotMessage(WARNING, "EKF sources switched: no GPS")
+SOURCE_SATELLITES = PilotMessage(NOTICE, "EKF sources switched: GPS again")
+SOURCE_NOT = PilotMessage(WARNING, "EKF sources not switched, see its log")
+
 # -- landing marker -----------------------------------------------------------------
 
 MARKER_SEEN = PilotMessage(INFO, "landing marker in sight")
@@ -190,6 +204,17 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "the autopilot's IMU is used again": IMU_USED,
     "the autopilot's velocity contradicts its positions and is not used": VELOCITY_NOT_USED,
     "the autopilot's velocity agrees with its positions again": VELOCITY_USED,
+    "satellite positions jump and are not used": GPS_JUMP,
+    "satellite positions drift away from vision and are not used": GPS_PULL,
+    "satellite height drifts away from vision and is not used": GPS_HEIGHT,
+    "satellite positions stand still and are not used": GPS_STANDS,
+    "satellite positions go another way than vision and are not used": GPS_TURNED,
+    "no satellite positions any more": GPS_GONE,
+    "satellite positions are too inaccurate and are not used": GPS_POOR,
+    "satellite positions agree with vision again and are used": GPS_AGAIN,
+    "the EKF's sources are switched to vision": SOURCE_VISION,
+    "the EKF's sources are switched to satellites": SOURCE_SATELLITES,
+    "the EKF's sources could not be switched": SOURCE_NOT,
     "settings cannot be kept": SETTINGS_NOT_SAVED,
     "reset counter is not kept": SETTINGS_NOT_SAVED,
     "dense map on another OpenCL device": MAP_OTHER_DEVICE,

@@ -34,10 +34,12 @@ from companion.daemon.pose.global_sender import GlobalSender
 from companion.daemon.pose.kept_counter import counter_path
 from companion.daemon.pose.landing_sender import LandingSender
 from companion.daemon.pose.pose_sender import PoseSender
+from companion.daemon.pose.source_switch import SourceSwitch
 from companion.daemon.recorder_notes import RecorderNotes
 from companion.daemon.status_document import StatusDocument
 from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
+from companion.estimation.satellites.satellite_watch import doubts
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import LatencyMeter
 from companion.messages import (
@@ -109,6 +111,7 @@ class Daemon:
         self._flow_sender: FlowSender | None = None
         self._landing_sender: LandingSender | None = None
         self._global_sender: GlobalSender | None = None
+        self._source_switch: SourceSwitch | None = None
         self._reports: VehicleReports | None = None
         self._ground: GroundControl | None = None
         link_watch: LinkWatch | None = None
@@ -131,6 +134,10 @@ class Daemon:
             if config.feedback.global_position != "off":
                 self._global_sender = GlobalSender(
                     config.feedback, self._link, clock, config.telemetry.use
+                )
+            if config.gps.switch_source:
+                self._source_switch = SourceSwitch(
+                    config.gps, self._link, clock, self._sends_poses, self._on_warned
                 )
             date = AutopilotDate(self._link)
         dates = FlightDates(
@@ -226,6 +233,8 @@ class Daemon:
         for part in (self._link, self._sender, self._reports, self._ground, self._page):
             if part is not None:
                 work.append(part.run())
+        if self._source_switch is not None:
+            work.append(self._source_switch.run())
         if self._link is not None and feedback.set_origin:
             keeper = OriginKeeper(
                 feedback, self._link, self._journal.say,
@@ -262,7 +271,18 @@ class Daemon:
             text = of_warning(warning.what, warning.detail, warning.good)
             if text is not None:
                 self._soon(self._tell_pilot, text)
+        self._soon(self._take_doubt, warning)
         self._soon(self._flights.take, warning)
+
+    def _take_doubt(self, warning: Warned) -> None:
+        """Take a change of the verdict on satellites; in the event loop."""
+        doubted = doubts(warning)
+        if doubted is None:
+            return
+        if self._global_sender is not None:
+            self._global_sender.doubt_satellites(doubted)
+        if self._source_switch is not None:
+            self._source_switch.doubt_satellites(doubted)
 
     def _on_telemetry(self, sample: Telemetry) -> None:
         """Take a sample; in the event loop."""
@@ -366,6 +386,9 @@ class Daemon:
         """Boot time of the autopilot, CLOCK_MONOTONIC; None while its clock is unknown."""
         report = self._link.clock_filter.report() if self._link is not None else None
         return None if report is None else report.offset_s - self._clock.epoch_ns * 1e-9
+
+    def _sends_poses(self) -> bool:
+        return self._sender is not None and self._sender.health().sending
 
     def _is_heard(self) -> bool:
         return self._link is not None and self._link.alive

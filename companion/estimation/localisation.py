@@ -28,6 +28,7 @@ from companion.estimation.lift_off.standing import Standing
 from companion.estimation.odometry.odometry_frame import MapView
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.resumption import Resumption, Verdict
+from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_of_flight import site_of_flight
 from companion.estimation.site.site_use import SiteUse
@@ -51,7 +52,14 @@ from companion.slam.map.map_part import map_of, part_around
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
-from companion.telemetry import AttitudeSample, HeightSample, ImuSample, Telemetry, is_believed
+from companion.telemetry import (
+    AttitudeSample,
+    HeightSample,
+    ImuSample,
+    PositionSample,
+    Telemetry,
+    is_believed,
+)
 from companion.timing.clock import Timer
 
 FINAL_ITERATIONS = 8
@@ -99,6 +107,7 @@ class LocalisationStage:
         )
         self._imu = JudgedAcceleration(self._acceleration, self._withdraw_accelerations)
         self._flow = FlowMeter(camera)
+        self._satellites = SatelliteWatch(self.camera_from_body)
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
         self._t_ns = 0
         self._samples: list[Telemetry] = []
@@ -163,6 +172,8 @@ class LocalisationStage:
         for sample in self._samples:
             if not is_believed(sample, self._config.telemetry.use):
                 continue
+            if isinstance(sample, PositionSample) and not self._satellites.may_use(sample):
+                continue
             self._standing.take(sample)
             self._flow.take(sample)
             if isinstance(sample, HeightSample):
@@ -172,6 +183,7 @@ class LocalisationStage:
             if isinstance(sample, AttitudeSample | ImuSample):
                 self._imu.take(sample)
             if isinstance(sample, AttitudeSample):
+                self._satellites.take_time(sample.t_ns)
                 self._attitude.add(sample)
             else:
                 self._georeferencer.take(sample)
@@ -336,6 +348,10 @@ class LocalisationStage:
                 self._georeferences.take(message, None if measured is None else measured @ mount.T)
                 if message.seq == frame.seq:
                     self._motion.last = message
+                    self._satellites.take_pose(
+                        message.t_ns, self._tracker.map.first_keyframe_id, message.map_from_camera,
+                        self._georeferences.of(self._tracker.map),
+                    )  # fmt: skip
                     yield self._odometry_of(message)
                 placed = self._georeferences.main_from_newest.apply_to_pose(message.map_from_camera)
                 yield replace(message, map_from_camera=placed)
@@ -363,6 +379,7 @@ class LocalisationStage:
             yield from self._site.warnings(frame.t_ns)
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
+        yield from self._satellites.warnings()
         yield from self._check_attitude(frame.t_ns)
         self._prune(frame.t_ns)
 

@@ -11,6 +11,10 @@ ATTITUDE = (
     "itself once it fits."
 )
 CLOSE_OTHERS = "The others on this drone go on. Look at what that program sends."
+SPOOFED = (
+    "Leave modes that fly by GPS, or switch the EKF's sources: it may be spoofed. It is used again "
+    "by itself once it agrees."
+)
 OF_WARNING: Mapping[str, str] = {
     "localisation has died: the flight ends, and another begins":
         "Fly by other means until the position is back, some seconds later.",
@@ -32,6 +36,19 @@ OF_WARNING: Mapping[str, str] = {
     "the autopilot's velocity contradicts its positions and is not used":
         "Check compass, and mount and lens of a flow sensor.",
     "the autopilot's velocity agrees with its positions again": NOTHING,
+    "satellite positions jump and are not used": SPOOFED,
+    "satellite positions drift away from vision and are not used": SPOOFED,
+    "satellite height drifts away from vision and is not used": SPOOFED,
+    "satellite positions stand still and are not used": SPOOFED,
+    "satellite positions go another way than vision and are not used": SPOOFED,
+    "no satellite positions any more": "Leave modes that fly by GPS. Look for what jams it.",
+    "satellite positions are too inaccurate and are not used":
+        "Leave modes that fly by GPS; give its antenna a free sky.",
+    "satellite positions agree with vision again and are used": NOTHING,
+    "the EKF's sources are switched to vision": "The vehicle flies without GPS (gps.vision_set).",
+    "the EKF's sources are switched to satellites": NOTHING,
+    "the EKF's sources could not be switched":
+        "Switch by hand. Only ArduPilot has source sets; see EK3_SRC2_POSXY and others.",
     "settings cannot be kept": "Make room on the disk; land before you rely on what was set.",
     "reset counter is not kept": "Make room on the disk; land before you rely on the position.",
     "dense map on another OpenCL device": "After the flight: look at that device's driver.",

@@ -16,7 +16,7 @@ from companion.config_file import toml_value
 
 PURPOSES = {
     "Camera": ("camera", "mount"),
-    "Autopilot": ("link", "router", "telemetry", "feedback", "landing", "control"),
+    "Autopilot": ("link", "router", "telemetry", "feedback", "landing", "gps", "control"),
     "Flights, and what is kept of them": ("daemon", "recorder", "map", "export"),
     "Dense map": ("depth", "cloud", "opencl"),
     "Looking on, other machines": ("page", "stream", "video", "distributed"),

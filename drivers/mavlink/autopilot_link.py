@@ -199,6 +199,10 @@ class AutopilotLink:
 
         return await self._commands.ask(command, make, ANSWER_S, TRIES)
 
+    async def set_source_set(self, number: int) -> int:
+        """Fly on a source set of ArduPilot's EKF3 (EK3_SRC1_… is 1): likewise."""
+        return await self.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, float(number))
+
     async def request_message(self, message_id: int) -> Any | None:
         """Request a message that is not streamed; None if it does not come."""
         came: asyncio.Future[Any] = asyncio.get_running_loop().create_future()

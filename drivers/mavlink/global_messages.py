@@ -23,7 +23,7 @@ WRAP_S = 36000.0
 GPS_EPOCH_UNIX_S, LEAP_S, WEEK_S = 315_964_800, 18, 604_800
 """GPS time began 1980-01-06, and has been ahead of UTC by so many seconds since 2017."""
 FIX_3D, N_SATELLITES = 3, 10
-"""What a receiver has to state before autopilots take its position; its accuracy is true."""
+"""Fix and satellites without which autopilots take no position; its accuracy is the true one."""
 COMMAND = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
 RATES_HZ = {"sensor": 5.0, "estimate": 1.0, "gps_input": 5.0}
 

@@ -27,6 +27,7 @@ DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
 SINCE = {
     "camera.readout_ms", "expert.export.mesh_m", "feedback.flow", "feedback.global_position",
+    "gps.satellites_set", "gps.switch_source", "gps.vision_set",
     "landing.id", "landing.marker", "landing.size_m", "map.use",
     "page.listen", "telemetry.use", "video.kbit_s", "video.listen",
 }  # fmt: skip

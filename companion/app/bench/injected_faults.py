@@ -32,6 +32,9 @@ BLUR_PX = 9
 LOW_CONTRAST_GAIN, LOW_CONTRAST_NOISE = 0.15, 1.5
 VELOCITY_SCALE, VELOCITY_TURN_RAD = 1.1, np.radians(8.0)
 
+PULL_M_S, JUMP_M = np.array([0.6, 0.8, 0.0]), np.array([30.0, -40.0, 0.0])
+"""Of satellites that are spoofed: 1 m/s, and 50 m; the autopilot's own estimate follows them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Span:
@@ -99,6 +102,46 @@ def _wrong_velocity(samples: Samples, span: Span) -> Samples:
         return sample if velocity is None else replace(sample, velocity_ned_m_s=turn @ velocity)
 
     return [wrong(s) if isinstance(s, PositionSample) else s for s in samples]
+
+
+def _pulled(samples: Samples, span: Span) -> Samples:
+    """Satellites pulled away from the middle of the flight on, with their velocity."""
+
+    def pulled(sample: Telemetry) -> Telemetry:
+        if not isinstance(sample, PositionSample) or sample.t_ns < span.fault_ns:
+            return sample
+        velocity = sample.velocity_ned_m_s
+        off_m = PULL_M_S * (1e-9 * (sample.t_ns - span.fault_ns))
+        return replace(
+            sample, position_ned_m=sample.position_ned_m + off_m,
+            velocity_ned_m_s=None if velocity is None else velocity + PULL_M_S,
+        )  # fmt: skip
+
+    return [pulled(s) for s in samples]
+
+
+def _jumped(samples: Samples, span: Span) -> Samples:
+    """Satellites elsewhere from the middle of the flight on."""
+    return [
+        replace(s, position_ned_m=s.position_ned_m + JUMP_M)
+        if isinstance(s, PositionSample) and s.t_ns >= span.fault_ns
+        else s
+        for s in samples
+    ]
+
+
+def _frozen(samples: Samples, span: Span) -> Samples:
+    """Satellites that stand from the middle of the flight on, as if nothing moved."""
+    last: dict[object, PositionSample] = {}
+    out: Samples = []
+    for sample in samples:
+        if isinstance(sample, PositionSample):
+            if sample.t_ns < span.fault_ns:
+                last[sample.source] = sample
+            elif sample.source in last:
+                sample = replace(last[sample.source], t_ns=sample.t_ns)
+        out.append(sample)
+    return out
 
 
 def _edited(
@@ -180,4 +223,7 @@ FAULTS = (
     Fault("exposure steps", pictures=_edited(_exposed)),
     Fault("motion blur", pictures=_edited(_blurred)),
     Fault("faint pictures", pictures=_edited(_low_contrast)),
+    Fault("satellites pulled by 1 m/s", telemetry=_pulled),
+    Fault("satellites jump by 50 m", telemetry=_jumped),
+    Fault("satellites frozen", telemetry=_frozen),
 )

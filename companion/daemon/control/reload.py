@@ -6,7 +6,7 @@ from companion.config import Config
 from companion.config_file import dump, with_values
 
 FIXED_SECTIONS = frozenset({
-    "camera", "mount", "link", "router", "page", "video", "distributed", "landing",
+    "camera", "mount", "link", "router", "page", "video", "distributed", "landing", "gps",
 })  # fmt: skip
 FIXED_KEYS = frozenset({
     "expert.daemon.socket", "expert.daemon.prometheus_port", "feedback.mode",

@@ -1,0 +1,73 @@
+"""Switches the sources of ArduPilot's EKF while satellites are doubted, where that is allowed.
+
+It is done while poses are sent only: else the EKF would be left with nothing. Runs in the event
+loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from companion.config import GpsConfig
+from companion.messages import Warned
+from companion.timing.clock import FlightClock
+from drivers.mavlink.autopilot_link import AutopilotLink
+
+TICK_S, AGAIN_NS = 0.1, 5_000_000_000
+"""Interval of looks, and of tries after a refusal."""
+TO_VISION = "the EKF's sources are switched to vision"
+TO_SATELLITES = "the EKF's sources are switched to satellites"
+ACCEPTED = 0
+"""MAV_RESULT."""
+NOT_SWITCHED = "the EKF's sources could not be switched"
+
+
+class SourceSwitch:
+    """Changes the EKF source set by the verdict on satellites; `sending` is True with poses."""
+
+    def __init__(
+        self,
+        config: GpsConfig,
+        link: AutopilotLink,
+        clock: FlightClock,
+        sending: Callable[[], bool],
+        warn: Callable[[Warned], None],
+    ) -> None:
+        self._config, self._link, self._clock = config, link, clock
+        self._sending, self._warn = sending, warn
+        self._doubted = False
+        self._switched = False
+        """True while the EKF is on the set without satellites, by our command."""
+        self._not_before_ns = 0
+
+    def doubt_satellites(self, doubted: bool) -> None:
+        """Satellites are doubted, or are not any more."""
+        self._doubted = doubted
+
+    async def run(self) -> None:
+        """Switch when due; until cancelled."""
+        while True:
+            await asyncio.sleep(TICK_S)
+            await self.step()
+
+    async def step(self) -> None:
+        """Switch if due."""
+        now_ns, vehicle = self._clock.now_ns(), self._link.vehicle
+        if self._doubted == self._switched or now_ns < self._not_before_ns:
+            return
+        if vehicle is None or vehicle.firmware != "ardupilot" or not self._link.alive:
+            return
+        to_vision = self._doubted
+        if to_vision and not self._sending():
+            return
+        number = self._config.vision_set if to_vision else self._config.satellites_set
+        result = await self._link.set_source_set(number)
+        if result == ACCEPTED:
+            self._switched = to_vision
+            what = TO_VISION if to_vision else TO_SATELLITES
+            self._warn(Warned(self._clock.now_ns(), what, f"set {number}", good=not to_vision))
+            return
+        self._not_before_ns = self._clock.now_ns() + AGAIN_NS
+        detail = f"set {number}: MAV_RESULT {result}" if result >= 0 else f"set {number}: no answer"
+        self._warn(Warned(self._clock.now_ns(), NOT_SWITCHED, detail))

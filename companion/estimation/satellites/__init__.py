@@ -1,0 +1,1 @@
+"""Satellites against vision: whether a receiver's positions may place the map."""

@@ -1,0 +1,238 @@
+"""Positions of satellites less those of vision, and how they change over windows of time.
+
+Vision knows how far the body went, not where it is: what is compared are displacements since the
+beginning of a window, each with the standard deviation that both have together.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.geometry.transforms import Array, Pose
+from companion.messages import Georeference
+from companion.telemetry import PositionSample
+
+KEPT_S = 25.0
+WINDOWS_S = (1.0, 1.6, 2.2, 3.0, 5.0, 10.0, 20.0)
+"""The shorter, the sooner; the longer, the smaller a speed that is found."""
+BASE_S, NOW_S = 1.0, 0.45
+"""Means are taken over these at the beginning and at the end of a window."""
+MAX_AHEAD_S = 0.35
+"""Longest extrapolation of vision to the time of a position, and longest gap between two poses."""
+SPEED_OVER_S = 0.5
+WHITE_M = (0.25, 0.5)
+"""Noise from one position to the next, horizontal and vertical, at least; more where they show
+more."""
+RATE_M_S = (0.1, 0.25)
+"""By which the errors of a receiver wander: with satellites that come and go by 0.1 m/s in the
+open; twice that, and vertically twice that again."""
+PATH = 0.01
+"""Drift of vision, as a share of the way."""
+LAG_S = 0.12
+"""By which stamps of receivers and of an autopilot's link are off: counts where speed changes. A
+doubt takes 3.8 times as much, 0.45 s."""
+SIGMA_SPEED_M_S = 0.2
+N_STAND, STANDS_M, MOVES_M = 3, 0.03, 0.2
+"""So many positions are the same, to a step of their last digit, while vision moves so far."""
+JUMP_OVER_S = 0.7
+"""A jump is against the mean of the positions before it within this."""
+TILT_RAD = 0.02
+"""Of the map against the vertical: a share of a level way that looks like height."""
+
+
+class _Pair(NamedTuple):
+    """A position of satellites, and the body in the map at its time."""
+
+    t_s: float
+    gps_m: Array
+    gps_speed_m_s: Array
+    place_map: Array
+    speed_map: Array
+
+
+class Change(NamedTuple):
+    """Change of the residual over a window, m, with its standard deviations.
+
+    `horizontal_m` (2,), `speed_m_s` (2,) of velocities alone, nan where there are none. `flown_m`
+    (3,) is vision's displacement, `base_m` (3,) the residual at the beginning of the window;
+    `gps_stands` is True where the last positions are all the same while vision moves.
+    """
+
+    window_s: float
+    horizontal_m: Array
+    sigma_horizontal_m: float
+    vertical_m: float
+    sigma_vertical_m: float
+    speed_m_s: Array
+    sigma_speed_m_s: float
+    flown_m: Array
+    base_m: Array
+    gps_stands: bool
+
+
+class SatelliteResiduals:
+    """Pairs of the map that is tracked in; another map begins anew."""
+
+    def __init__(self, camera_from_body: Pose) -> None:
+        self._camera_from_body = camera_from_body
+        self._poses: deque[tuple[float, Array]] = deque(maxlen=64)
+        self._pairs: deque[_Pair] = deque()
+        self._map_id: int | None = None
+        self._placed: Georeference | None = None
+        self.path_m = 0.0
+        """Length of vision's way since the first pose, metres."""
+
+    def take_pose(
+        self, t_ns: int, map_id: int, map_from_camera: Pose, placed: Georeference | None
+    ) -> None:
+        """Take the pose of a frame that was tracked."""
+        if placed is None:
+            self.clear()
+            return
+        if map_id != self._map_id:
+            self.clear()
+        self._map_id, self._placed = map_id, placed
+        scale = placed.world_from_map.scale
+        t_s, place = 1e-9 * t_ns, map_from_camera.apply(self._camera_from_body.translation / scale)
+        if self._poses:
+            self.path_m += scale * float(np.linalg.norm(place - self._poses[-1][1]))
+            if t_s - self._poses[-1][0] > MAX_AHEAD_S:
+                self._poses.clear()
+        self._poses.append((t_s, place))
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._poses.clear()
+        self._pairs.clear()
+        self._map_id = self._placed = None
+
+    def take_position(self, sample: PositionSample) -> bool:
+        """Pair a position with vision; False where vision is not known at its time."""
+        at = self._vision_at(1e-9 * sample.t_ns)
+        if at is None:
+            return False
+        speed = sample.velocity_ned_m_s
+        self._pairs.append(
+            _Pair(
+                1e-9 * sample.t_ns, sample.position_ned_m,
+                np.full(2, np.nan) if speed is None else speed[:2], *at,
+            )
+        )  # fmt: skip
+        while self._pairs[-1].t_s - self._pairs[0].t_s > KEPT_S:
+            self._pairs.popleft()
+        return True
+
+    def drop_newest(self) -> None:
+        """Forget the last pair."""
+        self._pairs.pop()
+
+    def keep_since(self, t_s: float) -> None:
+        """Forget pairs before a time."""
+        while self._pairs and self._pairs[0].t_s < t_s:
+            self._pairs.popleft()
+
+    def offset_m(self, over_s: float) -> Array | None:
+        """Mean residual (3,) over the last seconds; None without pairs."""
+        if not self._pairs or self._placed is None:
+            return None
+        times, residual, *_ = self._arrays()
+        mean: Array = residual[times >= times[-1] - over_s].mean(0)
+        return mean
+
+    def changes(self) -> list[Change]:
+        """Change of the residual over each window that the pairs reach back to."""
+        if len(self._pairs) < 4 or self._placed is None:
+            return []
+        times, residual, world, gps, speeds, own_speeds = self._arrays()
+        white = self._white(residual)
+        now = times >= times[-1] - NOW_S
+        out = []
+        for window_s in WINDOWS_S:
+            base = (times <= times[-1] - window_s) & (times >= times[-1] - window_s - BASE_S)
+            n_base, n_now = int(np.count_nonzero(base)), int(np.count_nonzero(now))
+            if not n_base:
+                continue
+            inside = times >= times[-1] - window_s
+            change = residual[now].mean(0) - residual[base].mean(0)
+            flown = world[now].mean(0) - world[base].mean(0)
+            span_s = float(times[now].mean() - times[base].mean())
+            level_m = float(np.hypot(*flown[:2]))
+            way_m = float(np.linalg.norm(np.diff(world[inside], axis=0), axis=1).sum())
+            faster = float(np.linalg.norm(own_speeds[now].mean(0) - own_speeds[base].mean(0)))
+            shared = np.sqrt(1.0 / n_base + 1.0 / n_now)
+            placed = self._placed
+            of_vision = np.array([
+                PATH * way_m, placed.sigma_scale * level_m, placed.sigma_yaw_rad * level_m,
+                LAG_S * faster,
+            ])  # fmt: skip
+            horizontal = np.linalg.norm([white[0] * shared, RATE_M_S[0] * span_s, *of_vision])
+            vertical = np.linalg.norm([
+                white[1] * shared, RATE_M_S[1] * span_s, PATH * way_m, TILT_RAD * way_m,
+                placed.sigma_scale * abs(flown[2]), LAG_S * faster,
+            ])  # fmt: skip
+            speed = speeds[inside].mean(0) - own_speeds[inside].mean(0)[:2]
+            sigma_speed = np.linalg.norm([SIGMA_SPEED_M_S, *(of_vision[1:] / span_s)])
+            out.append(
+                Change(
+                    window_s, change[:2], float(horizontal), float(change[2]), float(vertical),
+                    speed, float(sigma_speed), flown, residual[base].mean(0),
+                    bool(
+                        np.ptp(gps[-N_STAND:, :2], axis=0).max() <= STANDS_M
+                        and np.ptp(world[-N_STAND:, :2], axis=0).max() > MOVES_M
+                    ),
+                )
+            )  # fmt: skip
+        return out
+
+    def newest_jump(self) -> tuple[Array, float, float] | None:
+        """Last residual against those just before: (3,) m, and what is expected of it.
+
+        Standard deviations, horizontal and vertical. None without one before.
+        """
+        if len(self._pairs) < 3 or self._placed is None:
+            return None
+        times, residual, *_, own_speeds = self._arrays()
+        before = (times < times[-1]) & (times >= times[-1] - JUMP_OVER_S)
+        if not before.any():
+            return None
+        white = self._white(residual[:-1])
+        lag_m = LAG_S * float(np.linalg.norm(own_speeds[-1] - own_speeds[before].mean(0)))
+        moved: Array = residual[-1] - residual[before].mean(0)
+        return moved, float(np.hypot(1.5 * white[0], lag_m)), float(np.hypot(1.5 * white[1], lag_m))
+
+    def _arrays(self) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Times, residuals, vision's places and positions of satellites; speeds of these."""
+        assert self._placed is not None
+        to_world = self._placed.world_from_map
+        t_s, gps, speeds, places, own = (np.array(each) for each in zip(*self._pairs, strict=True))
+        world = to_world.apply(places)
+        return t_s, gps - world, world, gps, speeds, to_world.scale * own @ to_world.rotation.T
+
+    def _white(self, residual: Array) -> tuple[float, float]:
+        """Noise of single positions, horizontal and vertical, by their differences in a row."""
+        steps = np.abs(np.diff(residual, axis=0))
+        if len(steps) < 8:
+            return WHITE_M
+        # 1.48 medians are a standard deviation, which a difference has sqrt(2) times
+        level = 1.05 * float(np.median(steps[:, :2]))
+        return max(WHITE_M[0], level), max(WHITE_M[1], 1.05 * float(np.median(steps[:, 2])))
+
+    def _vision_at(self, t_s: float) -> tuple[Array, Array] | None:
+        """Place and speed of the body in the map; None where vision is not known."""
+        if len(self._poses) < 2 or self._placed is None:
+            return None
+        times = [t for t, _ in self._poses]
+        if not times[0] <= t_s <= times[-1] + MAX_AHEAD_S:
+            return None
+        i = int(np.clip(np.searchsorted(times, t_s), 1, len(times) - 1))
+        first = max(0, int(np.searchsorted(times, times[i] - SPEED_OVER_S)) - 1)
+        first = min(first, i - 1)
+        (t0, p0), (t1, p1), (tb, pb) = self._poses[first], self._poses[i], self._poses[i - 1]
+        speed = (p1 - p0) / (t1 - t0)
+        if t_s <= t1:
+            share = (t_s - tb) / (t1 - tb)
+            return pb + share * (p1 - pb), speed
+        return p1 + (t_s - t1) * speed, speed

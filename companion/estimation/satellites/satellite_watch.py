@@ -1,0 +1,245 @@
+"""Verdict on satellites: whether a receiver's positions go where vision goes.
+
+What is found is a change of the difference between both over a window, in position, velocity and
+height, against the standard deviations of both: a jump at once, a slow pull within seconds, a
+position that stands while the vehicle moves, a track that is turned, a receiver that has gone
+silent. While satellites are doubted no position of the autopilot places the map: its own estimate
+follows them. They are used again once the difference is what it was before, but for what vision
+may have drifted by since; a position that stays elsewhere stays doubted.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import Enum
+
+import numpy as np
+
+from companion.estimation.satellites.satellite_residuals import (
+    PATH,
+    RATE_M_S,
+    WHITE_M,
+    Change,
+    SatelliteResiduals,
+)
+from companion.geometry.transforms import Array, Pose
+from companion.messages import Georeference, Warned
+from companion.telemetry import PositionSample, PositionSource
+
+SIGMAS = 3.8
+"""Change that is doubted, in standard deviations. They are stated amply: see `RATE_M_S`."""
+SPEED_SIGMAS, WITH_SPEED_SIGMAS = 3.0, 2.2
+"""The same of a velocity, and of the position that then must go the same way."""
+ALONG = 0.8
+"""Cosine of the angle between both."""
+JUMP_SIGMAS, JUMP_M, JUMP_UP_M = 7.0, 4.0, 8.0
+"""Change from one position to the next that is a jump; receivers correct themselves by a metre or
+two."""
+N_JUMPED, N_MOVED = 2, 2
+"""Positions in a row that must say so: single ones are left out without a word."""
+TURNED_RAD, LENGTH_RATIO, TURNED_M = np.radians(20.0), 0.15, 8.0
+"""A track that is turned by more, and as long as vision's within the second, over this way."""
+GONE_NS, N_KNOWN, HEARD_NS = 3_000_000_000, 10, 500_000_000
+"""Without any position for so long, after so many, satellites are gone, where the autopilot was
+heard all the time, without longer gaps than the last."""
+GONE_INTERVALS = 4
+"""And for so many of the longest of the last intervals: slow links carry one in some seconds."""
+POOR_M = 10.0
+"""Stated standard deviation of a position that is none."""
+ANCHOR_S = 10.0
+"""Longest time before a doubt at which satellites were where they should be."""
+AGAIN_S = 5.0
+"""For so long satellites must agree before they are used again."""
+AGAIN_M = 2.0
+"""Difference from before that is no difference."""
+AGAIN_SIGMAS = 4.0
+WANDER_S = 60.0
+"""For so long errors of a receiver wander away; they are bounded."""
+FREE_S = 30.0
+"""Without the map of before nobody knows where satellites should be: then they are used again after
+this long, if they go where vision goes."""
+
+
+class Doubt(Enum):
+    """Reasons to doubt satellites: what a `Warned` says."""
+
+    JUMP = "satellite positions jump and are not used"
+    PULL = "satellite positions drift away from vision and are not used"
+    HEIGHT = "satellite height drifts away from vision and is not used"
+    STANDS = "satellite positions stand still and are not used"
+    TURNED = "satellite positions go another way than vision and are not used"
+    GONE = "no satellite positions any more"
+    POOR = "satellite positions are too inaccurate and are not used"
+
+
+USED_AGAIN = "satellite positions agree with vision again and are used"
+
+
+class SatelliteWatch:
+    """Takes poses of vision and positions of satellites, in order of time."""
+
+    def __init__(self, camera_from_body: Pose) -> None:
+        self._residuals = SatelliteResiduals(camera_from_body)
+        self._doubt: Doubt | None = None
+        self._map_id: int | None = None
+        self._n_jumped = self._n_moved = self._n_seen = 0
+        self._anchor: Array | None = None
+        """Residual (3,) before the doubt began; None where that map is gone."""
+        self._anchor_path_m = self._doubt_s = self._agrees_since_s = 0.0
+        self._newest_ns = self._heard_ns = 0
+        self._intervals_ns: deque[int] = deque(maxlen=N_KNOWN)
+        self._warnings: list[Warned] = []
+
+    @property
+    def doubted(self) -> bool:
+        """True while satellites are not used."""
+        return self._doubt is not None
+
+    def changes(self) -> list[Change]:
+        """Changes over windows up to the newest position, for figures."""
+        return self._residuals.changes()
+
+    def warnings(self) -> list[Warned]:
+        """Changes of the verdict since the last call."""
+        out, self._warnings = self._warnings, []
+        return out
+
+    def take_pose(
+        self, t_ns: int, map_id: int, map_from_camera: Pose, placed: Georeference | None
+    ) -> None:
+        """Take the pose of a frame that was tracked, with the place of its map if known."""
+        if map_id != self._map_id:
+            self._map_id, self._anchor = map_id, None
+        self._residuals.take_pose(t_ns, map_id, map_from_camera, placed)
+
+    def take_time(self, t_ns: int) -> None:
+        """The autopilot is heard at this time: satellites may have gone silent."""
+        if t_ns - self._heard_ns > HEARD_NS:
+            self._newest_ns = max(self._newest_ns, t_ns)
+        self._heard_ns = t_ns
+        if self._n_seen >= N_KNOWN and self._doubt is None:
+            wait_ns = max(GONE_NS, GONE_INTERVALS * max(self._intervals_ns))
+            if t_ns - self._newest_ns > wait_ns:
+                self._begin(t_ns, Doubt.GONE, self._residuals.offset_m(3.0), "")
+
+    def may_use(self, sample: PositionSample) -> bool:
+        """True if a position may place the map."""
+        if sample.source is not PositionSource.GPS:  # the autopilot goes on by other sensors
+            return self._doubt in (None, Doubt.GONE)
+        if self._doubt is not Doubt.GONE:
+            self._intervals_ns.append(sample.t_ns - self._newest_ns if self._newest_ns else 0)
+        self._newest_ns, self._n_seen = sample.t_ns, self._n_seen + 1
+        stated_m = sample.sigma_horizontal_m
+        if stated_m is not None and stated_m > POOR_M:
+            if self._doubt is None and self._n_seen >= N_KNOWN:
+                anchor = self._residuals.offset_m(3.0)
+                self._begin(sample.t_ns, Doubt.POOR, anchor, f"{stated_m:.0f} m are stated")
+            return not self.doubted
+        if not self._residuals.take_position(sample):
+            return not self.doubted
+        if self._doubt is not None:
+            self._look_for_end(sample.t_ns)
+            return not self.doubted
+        if self._jumped(sample.t_ns):
+            return False
+        self._compare(sample.t_ns)
+        return not self.doubted
+
+    def _jumped(self, t_ns: int) -> bool:
+        """True if the newest position is elsewhere than those of the second before."""
+        jump = self._residuals.newest_jump()
+        if jump is None:
+            self._n_jumped = 0
+            return False
+        moved, sigma_m, sigma_up_m = jump
+        off_m = float(np.hypot(*moved[:2]))
+        far = off_m > max(JUMP_M, JUMP_SIGMAS * sigma_m)
+        high = abs(moved[2]) > max(JUMP_UP_M, JUMP_SIGMAS * sigma_up_m)
+        if not (far or high):
+            self._n_jumped = 0
+            return False
+        self._residuals.drop_newest()
+        self._n_jumped += 1
+        if self._n_jumped >= N_JUMPED:
+            detail = f"by {off_m:.0f} m, {-moved[2]:+.0f} m up"
+            self._begin(t_ns, Doubt.JUMP, self._residuals.offset_m(3.0), detail)
+        return True
+
+    def _compare(self, t_ns: int) -> None:
+        """Doubt what has moved away over any of the windows."""
+        changes = self._residuals.changes()
+        found = next(filter(None, map(_doubt_of, changes)), None)
+        self._n_moved = 0 if found is None else self._n_moved + 1
+        if found is not None and self._n_moved >= N_MOVED:
+            doubt, change, detail = found
+            # of a slow change the beginning of a short window is off, too
+            longer = [c.base_m for c in changes if change.window_s <= c.window_s <= ANCHOR_S]
+            self._begin(t_ns, doubt, [change.base_m, *longer][-1], detail)
+
+    def _begin(self, t_ns: int, doubt: Doubt, anchor: Array | None, detail: str) -> None:
+        self._doubt, self._anchor = doubt, anchor
+        self._anchor_path_m, self._doubt_s = self._residuals.path_m, 1e-9 * t_ns
+        self._agrees_since_s = 0.0
+        self._n_jumped = self._n_moved = 0
+        self._warnings.append(Warned(t_ns, doubt.value, detail))
+
+    def _look_for_end(self, t_ns: int) -> None:
+        """End a doubt once satellites are where they should be, for long enough."""
+        t_s, offset = 1e-9 * t_ns, self._residuals.offset_m(1.0)
+        recent = [c for c in self._residuals.changes() if c.window_s <= AGAIN_S]
+        agrees = offset is not None and not any(map(_doubt_of, recent))
+        if agrees and offset is not None and self._anchor is not None:
+            off_m = float(np.hypot(*(offset - self._anchor)[:2]))
+            since_m, since_s = self._residuals.path_m - self._anchor_path_m, t_s - self._doubt_s
+            sigma_m = np.linalg.norm(
+                [WHITE_M[0], 2 * PATH * since_m, RATE_M_S[0] * min(since_s, WANDER_S) / 4]
+            )
+            agrees = off_m < max(AGAIN_M, AGAIN_SIGMAS * float(sigma_m))
+        if not agrees:
+            self._agrees_since_s = 0.0
+        elif not self._agrees_since_s:
+            self._agrees_since_s = t_s
+        wait_s = AGAIN_S if self._anchor is not None else FREE_S
+        if self._agrees_since_s and t_s - self._agrees_since_s >= wait_s:
+            self._doubt = None
+            self._residuals.keep_since(self._agrees_since_s)
+            self._warnings.append(
+                Warned(t_ns, USED_AGAIN, f"after {t_s - self._doubt_s:.0f} s", good=True)
+            )
+
+
+def _doubt_of(change: Change) -> tuple[Doubt, Change, str] | None:
+    """Reason to doubt a change over a window; None without one."""
+    off_m = float(np.hypot(*change.horizontal_m))
+    sigmas = off_m / change.sigma_horizontal_m
+    speed_m_s = float(np.hypot(*change.speed_m_s))
+    with_speed = (
+        speed_m_s > SPEED_SIGMAS * change.sigma_speed_m_s
+        and sigmas > WITH_SPEED_SIGMAS
+        and float(change.speed_m_s @ change.horizontal_m) > ALONG * speed_m_s * off_m
+    )
+    if sigmas > SIGMAS or with_speed:
+        return _named(change, off_m)
+    if abs(change.vertical_m) > SIGMAS * change.sigma_vertical_m:
+        return Doubt.HEIGHT, change, f"by {-change.vertical_m:+.1f} m in {change.window_s:.0f} s"
+    return None
+
+
+def _named(change: Change, off_m: float) -> tuple[Doubt, Change, str]:
+    """Kind of a change in the horizontal."""
+    if change.gps_stands:
+        return Doubt.STANDS, change, f"by {off_m:.1f} m in {change.window_s:.0f} s"
+    flown = complex(*change.flown_m[:2])
+    if abs(flown) > TURNED_M:
+        gone = (flown + complex(*change.horizontal_m)) / flown
+        turned_rad = float(np.angle(gone))
+        if abs(turned_rad) > TURNED_RAD and abs(abs(gone) - 1.0) < LENGTH_RATIO:
+            return Doubt.TURNED, change, f"turned by {np.degrees(turned_rad):+.0f} degrees"
+    return Doubt.PULL, change, f"by {off_m:.1f} m in {change.window_s:.0f} s"
+
+
+def doubts(warning: Warned) -> bool | None:
+    """True where a warning begins a doubt, False where it ends one; None for any other."""
+    if warning.what == USED_AGAIN:
+        return False
+    return True if any(warning.what == doubt.value for doubt in Doubt) else None

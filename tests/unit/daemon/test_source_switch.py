@@ -1,0 +1,133 @@
+"""EKF source sets switched by the verdict on satellites, on a link without a wire."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.config import GpsConfig
+from companion.daemon.pose.source_switch import (
+    AGAIN_NS,
+    NOT_SWITCHED,
+    TO_SATELLITES,
+    TO_VISION,
+    SourceSwitch,
+)
+from companion.messages import Warned
+from tests.support.autopilot.memory_link import SetClock, listen, memory_link
+from tests.support.autopilot.memory_port import MemoryPort
+
+SWITCH = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
+
+
+class Vehicle:
+    """Answers commands at once, as told."""
+
+    def __init__(self, autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA) -> None:
+        self.clock, self.port = SetClock(), MemoryPort()
+        self.link = memory_link(self.port, self.clock, lambda _: None)
+        self.warned: list[Warned] = []
+        self.sending, self.result = True, mavlink.MAV_RESULT_ACCEPTED
+        self.switch = SourceSwitch(
+            GpsConfig(True, 3, 1), self.link, self.clock, lambda: self.sending, self.warned.append
+        )
+        self.autopilot = autopilot
+
+    async def begin(self) -> None:
+        await listen(self.link)
+        self.port.hear(
+            mavlink.MAVLink_heartbeat_message(2, self.autopilot, 0, 0, 4, 3), self.clock.t_ns
+        )
+
+    async def step(self) -> None:
+        step = asyncio.create_task(self.switch.step())
+        n_before = len(self.commands)
+        for _ in range(5):
+            await asyncio.sleep(0)
+            for command in self.commands[n_before:]:
+                acknowledgement = mavlink.MAVLink_command_ack_message(command.command, self.result)
+                self.port.hear(acknowledgement, self.clock.t_ns)
+            n_before = len(self.commands)
+        await step
+        self.clock.t_ns += 100_000_000
+
+    @property
+    def commands(self) -> list[Any]:
+        return [each for each in self.port.of("COMMAND_LONG") if each.command == SWITCH]
+
+    @property
+    def sets(self) -> list[float]:
+        return [each.param1 for each in self.commands]
+
+
+def test_it_switches_to_vision_and_back() -> None:
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+        await vehicle.step()
+        assert vehicle.sets == []
+        vehicle.switch.doubt_satellites(True)
+        await vehicle.step()
+        await vehicle.step()
+        assert vehicle.sets == [3]
+        vehicle.switch.doubt_satellites(False)
+        await vehicle.step()
+        await vehicle.step()
+        assert vehicle.sets == [3, 1]
+        assert [each.what for each in vehicle.warned] == [TO_VISION, TO_SATELLITES]
+
+    asyncio.run(fly())
+
+
+def test_without_poses_it_waits() -> None:
+    """The EKF would be left with nothing to fly on."""
+
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+        vehicle.sending = False
+        vehicle.switch.doubt_satellites(True)
+        await vehicle.step()
+        assert vehicle.sets == []
+        vehicle.sending = True
+        await vehicle.step()
+        assert vehicle.sets == [3]
+
+    asyncio.run(fly())
+
+
+def test_a_refusal_is_said_and_tried_again_later() -> None:
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+        vehicle.result = mavlink.MAV_RESULT_UNSUPPORTED
+        vehicle.switch.doubt_satellites(True)
+        for _ in range(5):
+            await vehicle.step()
+        assert vehicle.sets == [3]
+        assert [each.what for each in vehicle.warned] == [NOT_SWITCHED]
+        vehicle.clock.t_ns += AGAIN_NS
+        vehicle.result = mavlink.MAV_RESULT_ACCEPTED
+        await vehicle.step()
+        assert vehicle.sets == [3, 3]
+        assert vehicle.warned[-1].what == TO_VISION
+
+    asyncio.run(fly())
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_nothing_for_another_firmware_or_a_silent_one(silent: bool) -> None:
+    async def fly() -> None:
+        vehicle = Vehicle(
+            mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA if silent else mavlink.MAV_AUTOPILOT_PX4
+        )
+        await vehicle.begin()
+        vehicle.link.alive = not silent
+        vehicle.switch.doubt_satellites(True)
+        await vehicle.step()
+        assert vehicle.sets == []
+
+    asyncio.run(fly())

@@ -1,0 +1,228 @@
+"""Satellites against vision on made-up flights: what is doubted, how soon, and what is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from companion.estimation.satellites.satellite_watch import (
+    GONE_NS,
+    POOR_M,
+    USED_AGAIN,
+    Doubt,
+    SatelliteWatch,
+    doubts,
+)
+from companion.geometry.transforms import Array, Pose, Similarity, rotation_from_vector
+from companion.messages import Georeference, Warned
+from companion.pilot_messages import OF_WARNING
+from companion.telemetry import PositionSample, PositionSource
+
+S = 1_000_000_000
+START_NS = 10**18
+FAULT_S = 30.0
+WORLD_FROM_MAP = Similarity(
+    4.0, rotation_from_vector(np.array([0.1, -0.05, 2.0])), np.array([50.0, -20.0, 7.0])
+)
+PLACED = Georeference(WORLD_FROM_MAP, 0.008, 0.01, "GPS and velocity", 60, 0.6)
+CAMERA_FROM_BODY = Pose(rotation_from_vector(np.array([1.2, 0.3, 0.0])), np.array([0.2, 0.1, -0.1]))
+Path = Callable[[float], Array]
+
+
+def circle(t_s: float) -> Array:
+    """At 5 m/s, 25 m wide, 20 m high."""
+    return np.array([25 * np.cos(0.2 * t_s), 25 * np.sin(0.2 * t_s), -20.0])
+
+
+def hover(t_s: float) -> Array:
+    return np.array([3.0, 4.0, -20.0])
+
+
+def line(t_s: float) -> Array:
+    """There and back at 8 m/s, turning in a second."""
+    phase = ((t_s + 3.0) % 20.0) - 10.0
+    return np.array([8.0 * (10.0 - abs(phase)), 0.0, -30.0 + 2.0 * np.sin(0.3 * t_s)])
+
+
+def departure(t_s: float) -> Array:
+    """Over one spot, then north at 8 m/s."""
+    return np.array([8.0 * max(t_s - FAULT_S, 0.0), 0.0, -20.0])
+
+
+class Flown:
+    """Frames at 20 Hz, GPS at 5 Hz with an error that wanders by a metre, 0.2 s late."""
+
+    def __init__(self, path: Path, seed: int = 0) -> None:
+        self.path, self.rng = path, np.random.default_rng(seed)
+        self.watch = SatelliteWatch(CAMERA_FROM_BODY)
+        self.wander = np.zeros(3)
+        self.t_s = 0.0
+        self.map_id = 0
+        self.used: list[tuple[float, bool]] = []
+        self.frozen: Array | None = None
+
+    def fly(
+        self, seconds: float, off: Path = lambda _: np.zeros(3), *, stands: bool = False,
+        silent: bool = False, sigma_m: float = 1.2, heard: bool = True, drift: float = 0.0,
+    ) -> list[Warned]:  # fmt: skip
+        """`off` is by seconds since this began; `drift` that of vision, as a share of the way."""
+        said: list[Warned] = []
+        began_s = self.t_s
+        for step in range(round(seconds * 20)):
+            self.t_s = began_s + 0.05 * (step + 1)
+            t_ns = START_NS + round(self.t_s * S)
+            place = self.path(self.t_s) * (1 + drift)
+            self.watch.take_pose(t_ns, self.map_id, self.camera_at(place), PLACED)
+            if heard:
+                self.watch.take_time(t_ns)
+            if step % 4 == 0 and not silent:
+                self.take_gps(t_ns - S // 5, off(self.t_s - began_s - 0.2), stands, sigma_m)
+            said += self.watch.warnings()
+        return said
+
+    def take_gps(self, t_ns: int, off_m: Array, stands: bool, sigma_m: float) -> None:
+        self.wander += -self.wander * 0.2 / 30 + self.rng.normal(0, 0.08, 3) * [1, 1, 1.5]
+        at = self.path(1e-9 * (t_ns - START_NS)) + self.wander + off_m
+        at = at + self.rng.normal(0, 0.05, 3)
+        self.frozen = (self.frozen if self.frozen is not None else at) if stands else None
+        sample = PositionSample(
+            t_ns, PositionSource.GPS, at if self.frozen is None else self.frozen, None, sigma_m
+        )
+        self.used.append((self.t_s, self.watch.may_use(sample)))
+
+    def camera_at(self, place: Array) -> Pose:
+        """`map_from_camera` of a body that is there, level."""
+        world_from_camera = Pose(np.eye(3), place) @ CAMERA_FROM_BODY.inverse()
+        inverse = WORLD_FROM_MAP.inverse()
+        return Pose(
+            inverse.rotation @ world_from_camera.rotation,
+            inverse.apply(world_from_camera.translation[None])[0],
+        )
+
+
+def faulty(path: Path, **how: object) -> tuple[Flown, list[Warned]]:
+    flown = Flown(path)
+    assert flown.fly(FAULT_S) == []
+    return flown, flown.fly(8.0, **how)  # type: ignore[arg-type]
+
+
+def after_s(warning: Warned) -> float:
+    return 1e-9 * (warning.t_ns - START_NS) - FAULT_S
+
+
+@pytest.mark.parametrize("path", [circle, hover, line])
+@pytest.mark.parametrize("seed", range(2))
+def test_no_word_about_satellites_that_wander(path: Path, seed: int) -> None:
+    flown = Flown(path, seed)
+    assert flown.fly(60.0) == []
+    assert all(used for _, used in flown.used)
+
+
+def test_no_word_about_vision_that_drifts() -> None:
+    """By its scale, one percent, which is stated."""
+    assert Flown(circle).fly(60.0, drift=0.01) == []
+
+
+@pytest.mark.parametrize("path", [circle, hover, line])
+def test_a_pull_of_a_metre_per_second_is_said_within_three_seconds(path: Path) -> None:
+    _, said = faulty(path, off=lambda t: np.array([0.6, 0.8, 0.0]) * max(t, 0.0))
+    assert [each.what for each in said] == [Doubt.PULL.value]
+    assert after_s(said[0]) < 3.0
+
+
+@pytest.mark.parametrize("path", [circle, hover, line])
+def test_a_jump_is_said_at_once_and_never_used(path: Path) -> None:
+    flown, said = faulty(path, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    assert [each.what for each in said] == [Doubt.JUMP.value]
+    assert after_s(said[0]) < 0.6
+    assert not any(used for t_s, used in flown.used if t_s > FAULT_S + 0.2)
+
+
+def test_a_single_outlier_is_left_out_without_a_word() -> None:
+    flown, said = faulty(circle, off=lambda t: np.array([30.0, 0, 0]) * (1.9 < t < 2.1))
+    assert said == []
+    assert sum(not used for _, used in flown.used) == 1
+
+
+def test_a_receiver_that_stands_is_said() -> None:
+    _, said = faulty(circle, stands=True)
+    assert [each.what for each in said] == [Doubt.STANDS.value]
+    assert after_s(said[0]) < 3.0
+
+
+def test_standing_over_one_spot_is_no_fault() -> None:
+    assert faulty(hover, stands=True)[1] == []
+
+
+def test_height_is_watched() -> None:
+    _, said = faulty(circle, off=lambda t: np.array([0.0, 0.0, -2.0]) * max(t, 0.0))
+    assert [each.what for each in said] == [Doubt.HEIGHT.value]
+
+
+def test_a_track_that_is_turned_is_said() -> None:
+    """By the heading of the map, or of a receiver, from where the vehicle sets off."""
+    turn = rotation_from_vector(np.array([0.0, 0.0, np.radians(30.0)]))
+    start = departure(FAULT_S)
+    _, said = faulty(departure, off=lambda t: (turn - np.eye(3)) @ (departure(FAULT_S + t) - start))
+    assert [each.what for each in said] == [Doubt.TURNED.value]
+
+
+def test_a_receiver_that_falls_silent_is_said_and_one_of_a_silent_link_is_not() -> None:
+    _, said = faulty(circle, silent=True)
+    assert [each.what for each in said] == [Doubt.GONE.value]
+    assert after_s(said[0]) < 1e-9 * GONE_NS + 0.3
+    flown, quiet = faulty(circle, silent=True, heard=False)
+    assert quiet == [] and flown.fly(10.0) == []
+
+
+def test_a_receiver_that_is_heard_seldom_is_not_gone() -> None:
+    flown = Flown(circle)
+    for _ in range(30):
+        assert flown.fly(1.8, silent=True) + flown.fly(0.2) == []
+
+
+def test_positions_that_state_no_accuracy_are_not_used() -> None:
+    flown, said = faulty(circle, sigma_m=2 * POOR_M)
+    assert [each.what for each in said] == [Doubt.POOR.value]
+    assert not flown.used[-1][1]
+
+
+def test_they_are_used_again_where_they_are_as_before() -> None:
+    flown, _ = faulty(circle, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    assert flown.fly(20.0, off=lambda _: np.array([30.0, -40.0, 0.0])) == []
+    back = flown.fly(20.0)
+    assert [each.what for each in back] == [USED_AGAIN]
+    assert back[0].good and flown.used[-1][1]
+    assert flown.fly(30.0) == []
+
+
+def test_a_pull_that_stops_elsewhere_stays_doubted() -> None:
+    flown, _ = faulty(circle, off=lambda t: np.array([1.0, 0, 0]) * max(t, 0.0))
+    assert flown.fly(30.0, off=lambda _: np.array([25.0, 0.0, 0.0])) == []
+    assert not flown.used[-1][1]
+
+
+def test_where_the_map_of_before_is_gone_they_are_used_again_after_a_while() -> None:
+    flown, _ = faulty(circle, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    flown.map_id = 7
+    said = flown.fly(40.0, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    assert [each.what for each in said] == [USED_AGAIN]
+
+
+def test_while_they_are_doubted_the_autopilots_own_estimate_is_not_used() -> None:
+    """It follows its receiver; without one it goes on by other sensors."""
+    pulled, _ = faulty(circle, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    silent, _ = faulty(circle, silent=True)
+    for flown, used in ((pulled, False), (silent, True)):
+        t_ns = START_NS + round(flown.t_s * S)
+        own = PositionSample(t_ns, PositionSource.LOCAL, circle(flown.t_s))
+        assert flown.watch.may_use(own) is used
+
+
+def test_each_verdict_has_words_for_the_pilot() -> None:
+    for what in [each.value for each in Doubt] + [USED_AGAIN]:
+        assert what in OF_WARNING
+        assert doubts(Warned(0, what)) is (what != USED_AGAIN)
+    assert doubts(Warned(0, "the camera has gone")) is None
