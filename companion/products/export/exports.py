@@ -135,13 +135,13 @@ PRODUCTS: Mapping[str, Product] = {
         "mesh, glTF",
         {"mesh.glb": lambda e: mesh_gltf(e.mesh)},
         Axes.GLTF,
-        lambda e: _about_mesh(e.mesh),
+        lambda e: _about_mesh(e.mesh, e.run),
     ),
     "mesh": Product(
         "mesh, PLY",
         {"mesh.ply": lambda e: mesh_ply(e.mesh)},
         Axes.LOCAL,
-        lambda e: _about_mesh(e.mesh),
+        lambda e: _about_mesh(e.mesh, e.run),
     ),
     "colmap": Product(
         "pictures, poses and cloud for COLMAP",
@@ -243,10 +243,11 @@ def _write_folder(folder: Path, files: Iterator[tuple[str, bytes]]) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _about_mesh(mesh: Mesh) -> list[str]:
+def _about_mesh(mesh: Mesh, run: FinishedRun) -> list[str]:
+    unit = "m" if run.metric else "map units"
     return [
-        f"Surface: {len(mesh.faces)} triangles in cells of {mesh.cell:g} m, within the mean of the "
-        "nearest points of the cloud; edges are rounded by about a cell. It ends where points do."
+        f"Surface: {len(mesh.faces)} triangles in cells of {mesh.cell:g} {unit}, at the mean of "
+        "the nearest points of the cloud; edges are rounded by about a cell. It ends where they do."
     ]
 
 

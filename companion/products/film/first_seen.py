@@ -12,7 +12,7 @@ from companion.products.cloud import Cloud
 from companion.products.flight_result import WorldPose
 
 MAX_POSES = 240
-LARGEST_COSINE = 0.05
+LEAST_COSINE = 0.05
 """A surface is seen where its normal leans towards the camera by this much at least."""
 REACH = 2.0
 """Points farther away than so many times the usual depth do not count as seen yet."""
@@ -40,7 +40,7 @@ def first_seen_ns(cloud: Cloud, poses: Sequence[WorldPose], camera: Camera) -> A
         inside = np.asarray(ahead & within)
         towards = pose.world_from_camera.translation - points[left]
         towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
-        facing = np.asarray((towards * normals[left]).sum(1) > LARGEST_COSINE)
+        facing = np.asarray((towards * normals[left]).sum(1) > LEAST_COSINE)
         inside = np.asarray(inside & (facing | faceless[left]))
         if inside.any():
             inside &= seen[:, 2] < REACH * np.median(seen[inside, 2])

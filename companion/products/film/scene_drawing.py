@@ -67,9 +67,11 @@ def draw_points(
         some[row[of_side], column[of_side]] = of_side + 1
         rank = np.maximum(rank, cv2.dilate(some, np.ones((int(side), int(side)), np.uint8)))
     known = rank > 0
-    point = order[rank.astype(np.int64) - 1] if len(order) else np.zeros(rank.shape, np.int64)
-    picture = np.where(known[..., None], rgb[point], background) if len(rgb) else background
-    nearest = np.where(known, depth[point], np.inf) if len(rgb) else np.full(rank.shape, np.inf)
+    if not known.any():
+        return background
+    point = order[rank.astype(np.int64) - 1]
+    picture = np.where(known[..., None], rgb[point], background)
+    nearest = np.where(known, depth[point], np.inf)
     return _shaded(picture, background, nearest.astype(np.float32))
 
 
