@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from companion.errors import InputError
+from companion.geometry.transforms import Array
 from companion.messages import Bytes
 from companion.products.export.flight_pictures import camera_of
 from companion.products.film.first_seen import first_seen_ns
@@ -26,8 +27,8 @@ from companion.products.run_folder import FinishedRun
 TURN_RAD = np.radians(50.0)
 """The view turns by so much from beginning to end."""
 DOWN_RAD = np.radians(38.0)
-DISTANCE = 0.88
-"""Of the view, in diagonals of cloud and path."""
+IN_VIEW = 0.99
+"""Share of points and path that lie in the picture, and not under the inset, all the time."""
 ACROSS = 0.4
 """The middle lies left of the picture's, at this share of the width, to make room for the inset."""
 INSET_SHARE = 0.34
@@ -81,8 +82,10 @@ class _Scene:
         self._extent = float(np.linalg.norm(high - low))
         self._middle = (low + high) / 2
         self._heading = slant_heading_rad(cloud, [places])
+        some = self._points[:: max(1, len(cloud) // N_SPACING)]
+        self._distance = self._fitting_distance(some, places)
         tree = cKDTree(self._points)
-        distance, _ = tree.query(self._points[:: max(1, len(cloud) // N_SPACING)], k=2)
+        distance, _ = tree.query(some, k=2)
         self._spacing = float(np.median(distance[:, 1]))
         self._segments = path_segments(run.poses)
         self._t_ns = np.array([pose.t_ns for pose in run.poses])
@@ -92,9 +95,7 @@ class _Scene:
     def frame(self, t_ns: float, share: float, picture: Bytes | None) -> Bytes:
         """The frame of a time of the flight; `share` of the film is over."""
         size = self._size
-        heading = self._heading + TURN_RAD * (share - 0.5)
-        across = 0.5 if picture is None else ACROSS
-        view = Viewpoint(self._middle, DISTANCE * self._extent, heading, DOWN_RAD, across)
+        view = self._view(share, self._distance)
         seen = self._seen_ns <= t_ns
         out = draw_points(
             view, self._points[seen], self._run.cloud.rgb[seen], self._spacing, size.width,
@@ -107,6 +108,29 @@ class _Scene:
             self._inset(out, picture)
         self._words(out, at, int(seen.sum()))
         return out
+
+    def _view(self, share: float, distance: float) -> Viewpoint:
+        heading = self._heading + TURN_RAD * (share - 0.5)
+        return Viewpoint(self._middle, distance, heading, DOWN_RAD, ACROSS)
+
+    def _fitting_distance(self, *parts: Array) -> float:
+        """The nearest distance from which each of the parts (N, 3) is in the picture."""
+        width, height = self._size.width, self._size.height
+        margin = MARGIN_SHARE * width
+        left, bottom = (1 - INSET_SHARE) * width - 2 * margin, 0.75 * INSET_SHARE * width + margin
+        for distance in self._extent * np.geomspace(0.5, 3, 30):
+            shares = []
+            for part in parts:
+                for share in np.linspace(0, 1, 5):
+                    pixels, _ = self._view(share, distance).pixels(part, width, height)
+                    inside = ((pixels > margin) & (pixels < [width - margin, height - margin])).all(
+                        1
+                    )
+                    inside &= (pixels[:, 0] < left) | (pixels[:, 1] > bottom)
+                    shares.append(inside.mean())
+            if min(shares) >= IN_VIEW:
+                break
+        return float(distance)
 
     def _inset(self, out: Bytes, picture: Bytes) -> None:
         margin = round(MARGIN_SHARE * self._size.width)

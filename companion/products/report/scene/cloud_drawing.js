@@ -20,7 +20,7 @@ vec3 ramp(float t) {
 void main() {
   vec3 world = at * metres_per_step;
   gl_Position = clip_from_world * vec4(world, 1.0);
-  gl_PointSize = clamp(size_px / gl_Position.w, 1.0, most_px);
+  gl_PointSize = clamp(size_px / gl_Position.w, 2.0, most_px);
   float t = clamp((heights.y - world.z) / (heights.y - heights.x), 0.0, 1.0);
   shown = by_height ? ramp(t) : colour;
 }`;

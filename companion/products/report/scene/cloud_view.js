@@ -22,7 +22,8 @@ class CloudView {
     this.heights = [low[2], high[2]];
     const size = Math.max(Math.hypot(high[0] - low[0], high[1] - low[1], high[2] - low[2]), 1e-3);
     const middle = low.map((v, i) => (v + high[i]) / 2);
-    this.camera = new OrbitCamera(middle, 0.95 * size, ...facts.view);
+    const narrow = Math.max(1, (1.6 * this.canvas.clientHeight) / this.canvas.clientWidth);
+    this.camera = new OrbitCamera(middle, 0.95 * size * narrow, ...facts.view);
     this.path = this.drawing.lines(facts.paths.flatMap((path) => this.segments(path)));
     this.keyframes = this.drawing.lines(
       facts.keyframes.flatMap((each) => this.frustum(each, 0.012 * size)),
@@ -85,7 +86,7 @@ class CloudView {
     if (this.shown.path) add(this.path, PATH, 2.4);
     if (this.ruler) add(this.ruler, RULER, 2);
     this.drawing.draw(
-      this.matrix, n, 1.9 * spacing * focal(h), this.heights, this.shown.heights, lines,
+      this.matrix, n, 2.0 * spacing * focal(h), this.heights, this.shown.heights, lines,
     );
     this.label(width, height);
     if (moving) this.redraw();
@@ -299,10 +300,11 @@ class CloudView {
   const text = (id) => document.getElementById(id).textContent;
   try {
     const data = Uint8Array.from(atob(text("scene-points").trim()), (c) => c.charCodeAt(0));
-    place.view = new CloudView(place, JSON.parse(text("scene-facts")), data);
     place.hidden = false;
+    place.view = new CloudView(place, JSON.parse(text("scene-facts")), data);
     document.getElementById("scene-without").hidden = true;
   } catch (error) {
+    place.hidden = true;
     document.getElementById("scene-without").textContent =
       `The cloud cannot be turned in this browser (${error.message}); the pictures below show it.`;
   }
