@@ -45,7 +45,7 @@ MAX_AGE_NS = 200_000_000
 """Age of the image that the pose is from, since its exposure; beyond it nothing is known: at 5 m/s
 all distances are a metre off."""
 UNKNOWN_AFTER_NS = 3_000_000_000
-"""That nothing is known is said for so long after the last that was: then nothing is sent."""
+"""Unknown distances are sent for so long after the last known ones: then nothing is."""
 
 
 class VehicleReports:

@@ -89,7 +89,7 @@ class ReadSiteMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteHead:
-    """What a file says of the map as a whole."""
+    """Head of a file: its account of the map as a whole."""
 
     revision: int
     parts: tuple[SitePart, ...]

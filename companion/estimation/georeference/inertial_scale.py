@@ -52,7 +52,7 @@ class InertialScale:
         self._least_nodes = LEAST_NODES if start is None else LEAST_NODES_STARTED
         self._scale = FIRST_SCALE
         self._noise = 2
-        """Which of NOISES is the likeliest."""
+        """Index of the likeliest of NOISES."""
         self._n_compared = 0
         """Frames at the last comparison of noises."""
 

@@ -73,7 +73,7 @@ class SiteUse:
         return self._world_from_site
 
     def warnings(self, t_ns: int) -> list[Warned]:
-        """What is to be said since the last call."""
+        """Warnings since the last call."""
         if self._other_camera:
             self._say(t_ns, OTHER_CAMERA, self._other_camera)
             self._other_camera = ""

@@ -1,4 +1,4 @@
-"""When each point of a cloud came into view."""
+"""Times at which the points of a cloud came into view."""
 
 from __future__ import annotations
 
