@@ -15,16 +15,8 @@ from companion.geometry.transforms import Pose
 from companion.messages import DepthMap, MapUpdate, PointChunk, Track, TrackState
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.camera_messages import (
-    INFORMATION,
-    STREAM,
-    STREAM_STATUS,
-    CameraStream,
-    camera_commands,
-    camera_information,
-    stream_information,
-    stream_status,
-)
+from drivers.mavlink.camera_component import CameraComponent
+from drivers.mavlink.camera_messages import CameraStream
 from drivers.mavlink.command_server import Command
 from drivers.mavlink.computer_status import computer_status
 from drivers.mavlink.message_requests import (
@@ -36,6 +28,7 @@ from drivers.mavlink.message_requests import (
     MessageRequests,
 )
 from drivers.mavlink.obstacle_distance import obstacle_distance
+from drivers.mavlink.wire.wire import run_together
 from drivers.system.own_addresses import own_addresses
 from drivers.video.rtsp_server import PATH
 
@@ -57,6 +50,9 @@ class VehicleReports:
         self._link, self._clock, self._watch = link, clock, watch
         self._config, self._obstacles = config, config.feedback.obstacle_distance
         self._camera: Camera | None = None
+        self._camera_component: CameraComponent | None = None
+        if config.video.listen:
+            self._camera_component = CameraComponent(link, clock, self._stream)
         self.computer_hz = COMPUTER_HZ
         """Rate of the computer's status, at most 5 Hz; 0: none."""
         self._camera_from_body = Pose.identity()
@@ -87,6 +83,10 @@ class VehicleReports:
 
     async def run(self) -> None:
         """Send until cancelled."""
+        camera = self._camera_component
+        await run_together(self._report(), *([camera.run()] if camera is not None else []))
+
+    async def _report(self) -> None:
         loop = asyncio.get_running_loop()
         credit = 0.0
         while True:
@@ -126,25 +126,12 @@ class VehicleReports:
             }
 
         began_ns = self._clock.now_ns()
-
-        def boot_ms() -> int:
-            return (self._clock.now_ns() - began_ns) // 1_000_000
-
-        of_camera: dict[int, Callable[[], object]] = {}
-        if self._config.video.listen:
-            of_camera = {
-                INFORMATION: lambda: camera_information(self._stream(), boot_ms()),
-                STREAM: lambda: stream_information(self._stream()),
-                STREAM_STATUS: lambda: stream_status(self._stream()),
-            }
-        asked = MessageRequests(
-            {
-                HEARTBEAT: self._link.heartbeat, COMPUTER_STATUS: self.computer_status,
-                **of_camera,
-            },
-            rates_hz, {COMPUTER_STATUS: set_computer_rate}, boot_ms,
-        )  # fmt: skip
-        return {**asked.commands, **(camera_commands(of_camera) if of_camera else {})}
+        return MessageRequests(
+            {HEARTBEAT: self._link.heartbeat, COMPUTER_STATUS: self.computer_status},
+            rates_hz,
+            {COMPUTER_STATUS: set_computer_rate},
+            lambda: (self._clock.now_ns() - began_ns) // 1_000_000,
+        ).commands
 
     def _stream(self) -> CameraStream:
         """The video stream as it is."""

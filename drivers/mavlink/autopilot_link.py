@@ -88,6 +88,8 @@ class AutopilotLink:
         self.other_companion = OtherCompanion()
         self.on_request: Take | None = None
         """Handler of all messages, for requests to our component."""
+        self.on_camera_request: Take | None = None
+        """The same for requests to the component that is our camera."""
         self._takers: defaultdict[int, list[Take]] = defaultdict(list)
         self._heard_ns = 0
         self._armed: bool | None = None
@@ -227,8 +229,9 @@ class AutopilotLink:
     def _take(self, message: Any, receive_ns: int) -> None:
         system, component = message.get_srcSystem(), message.get_srcComponent()
         kind = message.get_msgId()
-        if self.on_request is not None:
-            self.on_request(message, receive_ns)
+        for take in (self.on_request, self.on_camera_request):
+            if take is not None:
+                take(message, receive_ns)
         if kind == mavlink.MAVLINK_MSG_ID_HEARTBEAT and is_autopilot(message):
             if not self._is_ours(system, receive_ns):
                 return

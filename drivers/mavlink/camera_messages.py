@@ -1,4 +1,4 @@
-"""Our component as a camera with one video stream: https://mavlink.io/en/services/camera.html."""
+"""A camera with one video stream, as MAVLink tells it: https://mavlink.io/en/services/camera.html."""
 
 from __future__ import annotations
 

@@ -19,6 +19,8 @@ class MavlinkPort(Protocol):
     """Endpoint, for people."""
     identity: tuple[int, int]
     """System and component of sent messages; may be set at any time."""
+    second_component: int
+    """Another component of ours on the same system; 0 for none."""
 
     @property
     def connected(self) -> bool:
@@ -46,5 +48,5 @@ class MavlinkPort(Protocol):
     async def run(self, on_message: OnMessage) -> None:
         """Receive until cancelled, reconnecting as needed."""
 
-    def send(self, message: Any) -> None:
+    def send(self, message: Any, as_second: bool = False) -> None:
         """Send an unpacked pymavlink message; dropped and counted where impossible."""

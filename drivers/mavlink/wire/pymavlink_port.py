@@ -106,9 +106,20 @@ class PymavlinkPort:
         finally:
             self._on_message = _ignore
 
-    def send(self, message: Any) -> None:
+    @property
+    def second_component(self) -> int:
+        """See `MavlinkPort`."""
+        return self.router.second_component
+
+    @second_component.setter
+    def second_component(self, component: int) -> None:
+        self.router.second_component = component
+
+    def send(self, message: Any, as_second: bool = False) -> None:
         """Pack a message as ours, signed if there is a key, and send it."""
         writer, identity = self._writer, self.identity
+        if as_second:
+            identity = (identity[0], self.second_component)
         writer.srcSystem, writer.srcComponent = identity
         writer.seq = self._seq_out.get(identity, 0)
         if self._signing is not None:

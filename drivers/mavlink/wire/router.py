@@ -108,6 +108,8 @@ class Router:
     ) -> None:
         self._link = link
         self._identity = identity
+        self.second_component = 0
+        """Another component of ours on the same system; 0 for none."""
         self._deliver = deliver
         self._accepts = accepts
         self._queue_bytes = config.queue_kb * 1000
@@ -183,11 +185,12 @@ class Router:
         target = packet.target
         if target is not None:
             system, component = self._identity()
+            own = (component, self.second_component or component)
             # the autopilot is on the wire: what calls itself that here is not to be believed
-            meant = target[0] in (0, system) and target[1] in (0, component)
+            meant = target[0] in (0, system) and target[1] in (0, *own)
             if meant and packet.component != AUTOPILOT:
                 self._deliver(packet, monotonic_ns)
-                if target == (system, component):
+                if target[0] == system and target[1] in own:
                     return
         if not client.inbox:
             self._turns.append(client)
@@ -197,7 +200,8 @@ class Router:
 
     def _goes_in_circles(self, client: RouterClient, packet: Packet, monotonic_ns: int) -> bool:
         source = packet.system, packet.component
-        if source == self._identity():
+        system, component = self._identity()
+        if source[0] == system and source[1] in (component, self.second_component or component):
             return True
         if packet.component == AUTOPILOT:
             heard_ns = self._autopilots.get(packet.system)

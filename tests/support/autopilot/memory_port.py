@@ -18,6 +18,8 @@ class MemoryPort:
     def __init__(self) -> None:
         self.name = "memory"
         self.identity = (0, 0)
+        self.second_component = 0
+        self.sent_as_second: list[Any] = []
         self.connected, self.trouble = True, ""
         self.capacity_bytes_per_s: float | None = None
         self.n_received = self.n_sent = self.n_dropped = self.n_bad = 0
@@ -35,9 +37,9 @@ class MemoryPort:
     def set_tap(self, tap: Tap | None) -> None:
         """There are no bytes to be told of."""
 
-    def send(self, message: Any) -> None:
+    def send(self, message: Any, as_second: bool = False) -> None:
         message.pack(self._codec)  # fails where a field is out of its range
-        self.sent.append(message)
+        (self.sent_as_second if as_second else self.sent).append(message)
         self.n_sent += 1
 
     def hear(self, message: Any, t_ns: int, system: int = 1, component: int = 1) -> None:

@@ -184,7 +184,7 @@ async def test_what_is_on_the_disk_is_never_behind_what_was_sent(tmp_path: Path)
             assert json.loads(path.read_text())["reset_counter"] == message.reset_counter
         send(message)
 
-    vehicle.port.send = checked  # type: ignore[method-assign]
+    vehicle.port.send = checked  # type: ignore[method-assign, assignment]
     assert vehicle.run(3) and vehicle.run(3, resets=1) and vehicle.run(3, resets=2)
     assert vehicle.poses[-1].reset_counter == 2
 

@@ -1,0 +1,87 @@
+"""Our camera as a component of its own, which ground stations find and ask by themselves.
+
+QGroundControl and Mission Planner take for cameras the components from MAV_COMP_ID_CAMERA on, and
+no others. The protocol: https://mavlink.io/en/services/camera.html.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.timing.clock import FlightClock
+from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.camera_messages import (
+    INFORMATION,
+    STREAM,
+    STREAM_STATUS,
+    CameraStream,
+    camera_commands,
+    camera_information,
+    stream_information,
+    stream_status,
+)
+from drivers.mavlink.command_server import CommandServer
+from drivers.mavlink.ground_requests import COMMANDS
+from drivers.mavlink.message_requests import HEARTBEAT, MessageRequests
+from drivers.mavlink.request_limit import RequestLimit
+
+CAMERA: int = mavlink.MAV_COMP_ID_CAMERA
+HEARTBEAT_S = 1.0
+
+
+class CameraComponent:
+    """Answers for the camera, and says that it is there; to be used in the event loop."""
+
+    def __init__(
+        self, link: AutopilotLink, clock: FlightClock, stream: Callable[[], CameraStream]
+    ) -> None:
+        self._port = link.port
+        self._port.second_component = CAMERA
+        self._limit = RequestLimit()
+        began_ns = clock.now_ns()
+
+        def boot_ms() -> int:
+            return (clock.now_ns() - began_ns) // 1_000_000
+
+        made = {
+            INFORMATION: lambda: camera_information(stream(), boot_ms()),
+            STREAM: lambda: stream_information(stream()),
+            STREAM_STATUS: lambda: stream_status(stream()),
+        }
+        asked = MessageRequests(
+            {HEARTBEAT: camera_heartbeat, **made}, lambda: {HEARTBEAT: 1.0 / HEARTBEAT_S}, {},
+            boot_ms,
+        )  # fmt: skip
+        self._commands = CommandServer({**asked.commands, **camera_commands(made)})
+        link.on_camera_request = self._take
+
+    async def run(self) -> None:
+        """Say that it is there, until cancelled."""
+        while True:
+            if self._port.connected:
+                self._port.send(camera_heartbeat(), as_second=True)
+            await asyncio.sleep(HEARTBEAT_S)
+
+    def _take(self, message: Any, now_ns: int) -> None:
+        if message.get_msgId() not in COMMANDS:
+            return
+        system = self._port.identity[0]
+        target = message.target_system, message.target_component
+        if target[0] not in (0, system) or target[1] not in (0, CAMERA):
+            return
+        asker = message.get_srcSystem(), message.get_srcComponent()
+        if not self._limit.allows(asker, now_ns):
+            return
+        for answer in self._commands.take(message, target != (system, CAMERA), now_ns):
+            self._port.send(answer, as_second=True)
+
+
+def camera_heartbeat() -> Any:
+    """HEARTBEAT of the camera."""
+    return mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+    )
