@@ -376,6 +376,8 @@ class LocalisationStage:
         if self._resumption is not None:
             yield from self._check_resumption(self._resumption, frame.t_ns)
         if self._site is not None:
+            if added:
+                self._compare_with_site(frame.t_ns)
             yield from self._site.warnings(frame.t_ns)
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
@@ -426,6 +428,15 @@ class LocalisationStage:
         """Clear motion state after another map became active."""
         self._motion.reset()
         self._attitude.reset()
+
+    def _compare_with_site(self, t_ns: int) -> None:
+        """Compare the place of the last keyframe but one with what the autopilot measured then."""
+        placed, keyframes = self._georeferences.of(self._tracker.map), self._tracker.map.keyframes
+        if self._site is None or not self._site.located or placed is None or len(keyframes) < 2:
+            return
+        keyframe = keyframes[sorted(keyframes)[-2]]
+        place_m = placed.world_from_map.apply(keyframe.centre)
+        self._site.compare(t_ns, place_m, self._georeferencer.place_at(keyframe.t_ns))
 
     def _map_update(self) -> MapUpdate:
         with self._times("georeference"):

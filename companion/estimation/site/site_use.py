@@ -20,6 +20,7 @@ MAX_FOCAL_OFF = 0.01
 """Relative difference of focal lengths of the same camera, calibrated twice."""
 LOCATED = "located in the map of an earlier flight"
 CONTRADICTED = "the map of an earlier flight is not used"
+DOUBTED = "the map of an earlier flight is contradicted, and still flown on"
 OTHER_CAMERA = "the map of an earlier flight was made with another camera"
 
 
@@ -110,6 +111,18 @@ class SiteUse:
                 )
                 return False
         return True
+
+    def compare(self, t_ns: int, place_m: Array, measured_m: Array | None) -> None:
+        """Say it where satellites contradict the map after the flight was located in it.
+
+        `place_m` (3,) is the place of the camera by the map, `measured_m` (3,) the autopilot's,
+        None where unknown. The flight goes on in the map: which of them is wrong is not known.
+        """
+        if measured_m is None or not self._has_both:
+            return
+        off_m = float(np.linalg.norm(place_m - measured_m))
+        if off_m > MAX_OFF_M:
+            self._say(t_ns, DOUBTED, f"its place is {off_m:.0f} m from that by the autopilot")
 
     def locate(self, t_ns: int, n_matches: int) -> None:
         """Note that the flight was found in the map."""

@@ -10,6 +10,7 @@ import pytest
 from companion.estimation.site.site_of_flight import site_of_flight
 from companion.estimation.site.site_use import (
     CONTRADICTED,
+    DOUBTED,
     LOCATED,
     OTHER_CAMERA,
     SiteUse,
@@ -128,6 +129,15 @@ def test_in_the_air_a_map_has_a_place_once_the_origin_is_known(
     assert use.georeference.has_origin
     assert use.allowed(found, None, moved.apply(there))
     assert moved.translation[0] == pytest.approx(-11.1, abs=0.1)
+
+
+def test_satellites_that_contradict_later_are_said(site: SiteMap) -> None:
+    use = SiteUse(site, CAMERA, ORIGIN)
+    for off_m in (0.0, 19.0, 21.0, 30.0):
+        use.compare(5, np.zeros(3), np.array([off_m, 0.0, 0.0]))
+    use.compare(5, np.zeros(3), None)
+    (warning,) = use.warnings(5)
+    assert warning.what == DOUBTED and "21 m" in warning.detail
 
 
 def test_another_camera_is_said(site: SiteMap) -> None:
