@@ -30,11 +30,11 @@ from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.resumption import Resumption, Verdict
 from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
-from companion.estimation.site.site_of_flight import site_of_flight
+from companion.estimation.site.site_in_flight import SiteInFlight
 from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
-from companion.geometry.transforms import Array, Pose, Similarity
+from companion.geometry.transforms import Array, Pose
 from companion.messages import (
     Frame,
     FrameOverdue,
@@ -119,11 +119,7 @@ class LocalisationStage:
         self._tracker.atlas.loop_allowed = self._loop_allowed
         self._georeferences.reckoned_at = self._odometry.reckoning.path.at
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
-        self._site = site
-        if site is not None:
-            self._tracker.use_site(site.slam_map)
-            self._tracker.atlas.on_merge = self._merged
-            self._georeferences.hold(site.slam_map, site.georeference)
+        self._site = SiteInFlight(site, self._tracker, self._georeferencer, self._georeferences)
 
     @property
     def state(self) -> TrackState:
@@ -156,17 +152,10 @@ class LocalisationStage:
         if isinstance(message, FrameOverdue):
             return self._without_frame(message)
         if isinstance(message, GeoOrigin):
-            self._take_origin(message)
+            self._site.take_origin(message)
         elif isinstance(message, Telemetry):
             self._samples.append(message)
         return []
-
-    def _take_origin(self, origin: GeoOrigin) -> None:
-        """Place the map of an earlier flight about the origin of local NED."""
-        with self._tracker.map_lock.reading():
-            moved = None if self._site is None else self._site.set_origin(origin)
-            if moved is not None:
-                self._georeferences.move_held(moved)
 
     def _take_samples(self) -> None:
         for sample in self._samples:
@@ -250,10 +239,7 @@ class LocalisationStage:
 
         `flight` is its name, `origin` that of local NED.
         """
-        segments = ((s, self._georeferences.of(s)) for s in self._segments())
-        metric = [(segment, placed) for segment, placed in segments if placed is not None]
-        used = None if self._site is None else self._site.site
-        return site_of_flight(metric, self._camera, flight, origin, used)
+        return self._site.site_map(self._segments(), self._camera, flight, origin)
 
     def _segments(self) -> list[SlamMap]:
         return [s for s in self._tracker.segments if s.keyframes]
@@ -375,10 +361,7 @@ class LocalisationStage:
             yield update
         if self._resumption is not None:
             yield from self._check_resumption(self._resumption, frame.t_ns)
-        if self._site is not None:
-            if added:
-                self._compare_with_site(frame.t_ns)
-            yield from self._site.warnings(frame.t_ns)
+        yield from self._site.frame(frame.t_ns, added)
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
         yield from self._satellites.warnings()
@@ -428,15 +411,6 @@ class LocalisationStage:
         """Clear motion state after another map became active."""
         self._motion.reset()
         self._attitude.reset()
-
-    def _compare_with_site(self, t_ns: int) -> None:
-        """Compare the place of the last keyframe but one with what the autopilot measured then."""
-        placed, keyframes = self._georeferences.of(self._tracker.map), self._tracker.map.keyframes
-        if self._site is None or not self._site.located or placed is None or len(keyframes) < 2:
-            return
-        keyframe = keyframes[sorted(keyframes)[-2]]
-        place_m = placed.world_from_map.apply(keyframe.centre)
-        self._site.compare(t_ns, place_m, self._georeferencer.place_at(keyframe.t_ns))
 
     def _map_update(self) -> MapUpdate:
         with self._times("georeference"):
@@ -529,15 +503,8 @@ class LocalisationStage:
                 if keyframe.ned_from_camera is not None:
                     keyframe.ned_from_camera = keyframe.ned_from_camera @ rotation.T
 
-    def _merged(self, here: SlamMap, there: SlamMap, here_from_there: Similarity) -> None:
-        self._georeferences.merged(here, there, here_from_there)
-        if self._site is not None and there is self._site.slam_map:
-            self._site.locate(self._t_ns, len(there.keyframes))
-
     def _loop_allowed(self, keyframe: Keyframe, other: Keyframe, found: LoopClosure) -> bool:
-        if self._site is not None and found.there is self._site.slam_map:
-            return self._site.allowed(
-                found, self._georeferences.of(self._tracker.map),
-                self._georeferencer.place_at(keyframe.t_ns),
-            )  # fmt: skip
+        by_site = self._site.allowed(found)
+        if by_site is not None:
+            return by_site
         return self._georeferences.loop_allowed(self._tracker.map, keyframe, other, found)

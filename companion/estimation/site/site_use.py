@@ -39,14 +39,14 @@ class SiteUse:
         self.located = False
         self._origin, self._is_live = origin, is_live
         self._world_from_site = world_from_site(site.georeference.origin, origin)
-        self._warnings: list[Warned] = []
+        self._to_say: list[tuple[str, str]] = []
         self._said: set[str] = set()
         theirs = site.parts[-1].camera
-        self._other_camera = ""
         if abs(np.log(theirs.focal_px / camera.focal_px)) > MAX_FOCAL_OFF:
-            self._other_camera = (
+            self._say(
+                OTHER_CAMERA,
                 f"its focal length was {theirs.focal_px:.0f} pixels, and is {camera.focal_px:.0f}; "
-                "directions are compared, not pixels"
+                "directions are compared, not pixels",
             )
 
     @property
@@ -75,10 +75,8 @@ class SiteUse:
 
     def warnings(self, t_ns: int) -> list[Warned]:
         """Warnings since the last call."""
-        if self._other_camera:
-            self._say(t_ns, OTHER_CAMERA, self._other_camera)
-            self._other_camera = ""
-        out, self._warnings = self._warnings, []
+        out = [Warned(t_ns, what, detail, good=what == LOCATED) for what, detail in self._to_say]
+        self._to_say.clear()
         return out
 
     def allowed(
@@ -89,14 +87,13 @@ class SiteUse:
         `placed` is the georeference of its map by measurements of this flight, `measured_m` (3,)
         the place of the camera by satellites, NED metres, None where unknown.
         """
-        t_ns = found.keyframe.t_ns
         if placed is not None:
             units = self._world_from_site.scale / found.here_from_there.scale
             off = abs(float(np.log(placed.world_from_map.scale / units)))
             sigma = float(np.hypot(placed.sigma_scale, self.site.georeference.sigma_scale))
             if off > max(MIN_SCALE_OFF, SIGMAS_OFF * sigma):
                 self._say(
-                    t_ns, CONTRADICTED, f"its scale is off by {100 * (np.exp(off) - 1):.0f} % from "
+                    CONTRADICTED, f"its scale is off by {100 * (np.exp(off) - 1):.0f} % from "
                     f"that by {placed.method}",
                 )  # fmt: skip
                 return False
@@ -106,13 +103,11 @@ class SiteUse:
             there = found.relocalised.camera_from_map.inverse().translation
             off_m = float(np.linalg.norm(self._world_from_site.apply(there) - measured_m))
             if off_m > MAX_OFF_M:
-                self._say(
-                    t_ns, CONTRADICTED, f"its place is {off_m:.0f} m from that by the autopilot"
-                )
+                self._say(CONTRADICTED, f"its place is {off_m:.0f} m from that by the autopilot")
                 return False
         return True
 
-    def compare(self, t_ns: int, place_m: Array, measured_m: Array | None) -> None:
+    def compare(self, place_m: Array, measured_m: Array | None) -> None:
         """Say it where satellites contradict the map after the flight was located in it.
 
         `place_m` (3,) is the place of the camera by the map, `measured_m` (3,) the autopilot's,
@@ -122,18 +117,18 @@ class SiteUse:
             return
         off_m = float(np.linalg.norm(place_m - measured_m))
         if off_m > MAX_OFF_M:
-            self._say(t_ns, DOUBTED, f"its place is {off_m:.0f} m from that by the autopilot")
+            self._say(DOUBTED, f"its place is {off_m:.0f} m from that by the autopilot")
 
-    def locate(self, t_ns: int, n_matches: int) -> None:
+    def locate(self) -> None:
         """Note that the flight was found in the map."""
         self.located = True
         parts = ", ".join(part.flight for part in self.site.parts)
-        self._warnings.append(Warned(t_ns, LOCATED, f"{parts}: {n_matches} points", good=True))
+        self._say(LOCATED, f"{parts}: {len(self.site.keyframes)} keyframes")
 
-    def _say(self, t_ns: int, what: str, detail: str) -> None:
+    def _say(self, what: str, detail: str) -> None:
         if what not in self._said:
             self._said.add(what)
-            self._warnings.append(Warned(t_ns, what, detail))
+            self._to_say.append((what, detail))
 
 
 def world_from_site(site: GeoOrigin | None, world: GeoOrigin | None) -> Similarity:

@@ -134,8 +134,8 @@ def test_in_the_air_a_map_has_a_place_once_the_origin_is_known(
 def test_satellites_that_contradict_later_are_said(site: SiteMap) -> None:
     use = SiteUse(site, CAMERA, ORIGIN)
     for off_m in (0.0, 19.0, 21.0, 30.0):
-        use.compare(5, np.zeros(3), np.array([off_m, 0.0, 0.0]))
-    use.compare(5, np.zeros(3), None)
+        use.compare(np.zeros(3), np.array([off_m, 0.0, 0.0]))
+    use.compare(np.zeros(3), None)
     (warning,) = use.warnings(5)
     assert warning.what == DOUBTED and "21 m" in warning.detail
 
@@ -150,6 +150,6 @@ def test_another_camera_is_said(site: SiteMap) -> None:
 
 def test_being_located_is_good_news(site: SiteMap) -> None:
     use = SiteUse(site, CAMERA, ORIGIN)
-    use.locate(9, 120)
+    use.locate()
     (warning,) = use.warnings(9)
     assert warning.what == LOCATED and warning.good and use.located

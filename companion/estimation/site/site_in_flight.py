@@ -1,0 +1,82 @@
+"""The map of an earlier flight, as localisation uses it: found, taken over, compared, left."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from companion.estimation.georeference.georeferencer import Georeferencer
+from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
+from companion.estimation.site.site_of_flight import site_of_flight
+from companion.estimation.site.site_use import SiteUse
+from companion.geometry.camera import Camera
+from companion.geometry.geodesy import GeoOrigin
+from companion.geometry.transforms import Similarity
+from companion.messages import Warned
+from companion.slam.loop.loop_closure import LoopClosure
+from companion.slam.map.site_map import SiteMap
+from companion.slam.map.sparse_map import SlamMap
+from companion.slam.tracking.tracker import Tracker
+
+
+class SiteInFlight:
+    """A site map between tracker and georeferences; before the first frame, with the map lock."""
+
+    def __init__(
+        self, use: SiteUse | None, tracker: Tracker, georeferencer: Georeferencer,
+        georeferences: SegmentGeoreferences,
+    ) -> None:  # fmt: skip
+        self._use, self._tracker = use, tracker
+        self._georeferencer, self._georeferences = georeferencer, georeferences
+        if use is not None:
+            tracker.use_site(use.slam_map)
+            tracker.atlas.on_merge = self._merged
+            georeferences.hold(use.slam_map, use.georeference)
+
+    def take_origin(self, origin: GeoOrigin) -> None:
+        """Place the map about the origin of local NED."""
+        if self._use is None:
+            return
+        with self._tracker.map_lock.reading():
+            moved = self._use.set_origin(origin)
+            if moved is not None:
+                self._georeferences.move_held(moved)
+
+    def allowed(self, found: LoopClosure) -> bool | None:
+        """True if measurements do not contradict the map; None of a loop that is not with it."""
+        if self._use is None or found.there is not self._use.slam_map:
+            return None
+        return self._use.allowed(
+            found, self._georeferences.of(self._tracker.map),
+            self._georeferencer.place_at(found.keyframe.t_ns),
+        )  # fmt: skip
+
+    def frame(self, t_ns: int, added: bool) -> Iterator[Warned]:
+        """Warnings after a frame; `added` where it brought a keyframe."""
+        if self._use is None:
+            return
+        if added and self._use.located:
+            self._compare(self._use)
+        yield from self._use.warnings(t_ns)
+
+    def site_map(
+        self, segments: Sequence[SlamMap], camera: Camera, flight: str, origin: GeoOrigin | None
+    ) -> SiteMap | None:
+        """The site map that the flight leaves; see `site_of_flight`."""
+        placed = ((segment, self._georeferences.of(segment)) for segment in segments)
+        metric = [(segment, found) for segment, found in placed if found is not None]
+        used = None if self._use is None else self._use.site
+        return site_of_flight(metric, camera, flight, origin, used)
+
+    def _compare(self, use: SiteUse) -> None:
+        """Compare the place of the last keyframe but one with what the autopilot measured then."""
+        placed, keyframes = self._georeferences.of(self._tracker.map), self._tracker.map.keyframes
+        if placed is None or len(keyframes) < 2:
+            return
+        keyframe = keyframes[sorted(keyframes)[-2]]
+        place_m = placed.world_from_map.apply(keyframe.centre)
+        use.compare(place_m, self._georeferencer.place_at(keyframe.t_ns))
+
+    def _merged(self, here: SlamMap, there: SlamMap, here_from_there: Similarity) -> None:
+        self._georeferences.merged(here, there, here_from_there)
+        if self._use is not None and there is self._use.slam_map:
+            self._use.locate()
