@@ -36,14 +36,22 @@ def site_of_flight(
     revision = 1 if before is None else before.revision + 1
     if times:
         parts = (*parts, SitePart(flight, min(times), camera, revision))
-    if origin is None and before is not None:
-        origin = before.georeference.origin
     georeference = SiteGeoreference(
-        origin if placed.has_origin else None,
+        _origin(origin, placed, before),
         _sigma_m(times) if before is None else before.georeference.sigma_m,
         placed.sigma_yaw_rad, placed.sigma_scale, placed.method,
     )  # fmt: skip
     return site_map_of(segment, placed.world_from_map, parts, part_of_id, georeference, revision)
+
+
+def _origin(
+    of_flight: GeoOrigin | None, placed: Georeference, before: SiteMap | None
+) -> GeoOrigin | None:
+    """Origin of the world that a map lies in; where it was merged, that is as the earlier one."""
+    if before is None:
+        return of_flight if placed.has_origin else None
+    of_map = before.georeference.origin
+    return of_map and (of_flight or of_map)
 
 
 def _sigma_m(times_ns: list[int]) -> float:

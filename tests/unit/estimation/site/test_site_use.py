@@ -67,7 +67,7 @@ def test_a_flight_without_origin_has_that_of_the_map(slam_map: SlamMap, site: Si
     use = SiteUse(site, CAMERA, None)
     assert use.georeference.has_origin
     slam_map.held = frozenset()
-    merged = replace(use.georeference, world_from_map=Similarity.identity())
+    merged = replace(use.georeference, has_origin=False)  # as in the air, without an origin
     here = use.slam_map
     again = site_of_flight([(here, merged)], CAMERA, "evening", None, site)
     assert again is not None and again.georeference.origin == ORIGIN
