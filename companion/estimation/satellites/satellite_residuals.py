@@ -29,6 +29,9 @@ more."""
 RATE_M_S = (0.1, 0.25)
 """By which the errors of a receiver wander: with satellites that come and go by 0.1 m/s in the
 open; twice that, and vertically twice that again."""
+OF_STATED, OF_STATED_HZ = 0.2, 0.08
+"""The same as shares of the accuracy that a receiver states, where that gives more: one that is
+worse wanders more."""
 PATH = 0.01
 """Drift of vision, as a share of the way."""
 LAG_S = 0.12
@@ -82,6 +85,8 @@ class SatelliteResiduals:
         self._pairs: deque[_Pair] = deque()
         self._map_id: int | None = None
         self._placed: Georeference | None = None
+        self._stated_m = (0.0, 0.0)
+        """Accuracy that the last position stated, horizontal and vertical."""
         self.path_m = 0.0
         """Length of vision's way since the first pose, metres."""
 
@@ -115,6 +120,7 @@ class SatelliteResiduals:
         if at is None:
             return False
         speed = sample.velocity_ned_m_s
+        self._stated_m = sample.sigma_horizontal_m or 0.0, sample.sigma_vertical_m or 0.0
         self._pairs.append(
             _Pair(
                 1e-9 * sample.t_ns, sample.position_ned_m,
@@ -147,7 +153,7 @@ class SatelliteResiduals:
         if len(self._pairs) < 4 or self._placed is None:
             return []
         times, residual, world, gps, speeds, own_speeds = self._arrays()
-        white = self._white(residual)
+        white, rates = self._white(residual), self._rates
         now = times >= times[-1] - NOW_S
         out = []
         for window_s in WINDOWS_S:
@@ -168,9 +174,9 @@ class SatelliteResiduals:
                 PATH * way_m, placed.sigma_scale * level_m, placed.sigma_yaw_rad * level_m,
                 LAG_S * faster,
             ])  # fmt: skip
-            horizontal = np.linalg.norm([white[0] * shared, RATE_M_S[0] * span_s, *of_vision])
+            horizontal = np.linalg.norm([white[0] * shared, rates[0] * span_s, *of_vision])
             vertical = np.linalg.norm([
-                white[1] * shared, RATE_M_S[1] * span_s, PATH * way_m, TILT_RAD * way_m,
+                white[1] * shared, rates[1] * span_s, PATH * way_m, TILT_RAD * way_m,
                 placed.sigma_scale * abs(flown[2]), LAG_S * faster,
             ])  # fmt: skip
             speed = speeds[inside].mean(0) - own_speeds[inside].mean(0)[:2]
@@ -211,14 +217,21 @@ class SatelliteResiduals:
         world = to_world.apply(places)
         return t_s, gps - world, world, gps, speeds, to_world.scale * own @ to_world.rotation.T
 
+    @property
+    def _rates(self) -> tuple[float, float]:
+        """Wander of the errors, m/s, horizontal and vertical."""
+        level, up = (OF_STATED_HZ * stated_m for stated_m in self._stated_m)
+        return max(RATE_M_S[0], level), max(RATE_M_S[1], up)
+
     def _white(self, residual: Array) -> tuple[float, float]:
-        """Noise of single positions, horizontal and vertical, by their differences in a row."""
+        """Noise of single positions, horizontal and vertical: stated, or shown in a row."""
+        level, up = (OF_STATED * stated_m for stated_m in self._stated_m)
         steps = np.abs(np.diff(residual, axis=0))
-        if len(steps) < 8:
-            return WHITE_M
-        # 1.48 medians are a standard deviation, which a difference has sqrt(2) times
-        level = 1.05 * float(np.median(steps[:, :2]))
-        return max(WHITE_M[0], level), max(WHITE_M[1], 1.05 * float(np.median(steps[:, 2])))
+        if len(steps) >= 8:
+            # 1.48 medians are a standard deviation, which a difference has sqrt(2) times
+            level = max(level, 1.05 * float(np.median(steps[:, :2])))
+            up = max(up, 1.05 * float(np.median(steps[:, 2])))
+        return max(WHITE_M[0], level), max(WHITE_M[1], up)
 
     def _vision_at(self, t_s: float) -> tuple[Array, Array] | None:
         """Place and speed of the body in the map; None where vision is not known."""

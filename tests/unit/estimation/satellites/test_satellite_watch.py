@@ -120,6 +120,16 @@ def test_no_word_about_satellites_that_wander(path: Path, seed: int) -> None:
     assert all(used for _, used in flown.used)
 
 
+def test_a_receiver_that_states_less_may_wander_more() -> None:
+    """By a metre in two seconds, there and back, where it states 6 m."""
+
+    def wander(t_s: float) -> Array:
+        return np.array([1.5 * np.sin(0.35 * t_s), 1.5 * np.cos(0.5 * t_s), 0.0])
+
+    assert Flown(circle).fly(40.0, wander, sigma_m=6.0) == []
+    assert Flown(circle).fly(40.0, wander, sigma_m=1.0) != []
+
+
 def test_no_word_about_vision_that_drifts() -> None:
     """By its scale, one percent, which is stated."""
     assert Flown(circle).fly(60.0, drift=0.01) == []
