@@ -131,10 +131,9 @@ def _add(
     rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
     top, bottom = max(rows[0] - 1, 0), min(rows[-1] + 2, known.shape[0])
     left, right = max(columns[0] - 1, 0), min(columns[-1] + 2, known.shape[1])
-    ned, there = _finer(coarse[top:bottom, left:right], finer)
-    v0, u0 = round(top * finer), round(left * finer)
-    there = there[: sums.shape[0] - v0, : sums.shape[1] - u0]
-    ned = ned[: there.shape[0], : there.shape[1]]
+    fine_rows = np.arange(int(top * finer), min(int(bottom * finer), sums.shape[0]))
+    fine_columns = np.arange(int(left * finer), min(int(right * finer), sums.shape[1]))
+    ned, there = _finer(coarse, fine_rows, fine_columns, finer)
     pixels, depth = _seen(ned.astype(np.float64), pose, camera)
     rays = ned - pose.translation.astype(np.float32)
     cosine = rays[..., 2] / np.maximum(np.linalg.norm(rays, axis=-1), 1e-6)
@@ -149,7 +148,7 @@ def _add(
     sampled = cv2.remap(
         picture.rgb, at[..., 0].astype(np.float32), at[..., 1].astype(np.float32), cv2.INTER_LINEAR
     )
-    into = (slice(v0, v0 + there.shape[0]), slice(u0, u0 + there.shape[1]))
+    into = np.s_[fine_rows[0] : fine_rows[-1] + 1, fine_columns[0] : fine_columns[-1] + 1]
     weights[into] += weight.astype(np.float32)
     sums[into] += weight[..., None].astype(np.float32) * sampled
     return 1
@@ -177,13 +176,17 @@ def _depth_buffer(pixels: Array, depth: Array, camera: Camera) -> Floats:
     return np.asarray(cv2.erode(out.astype(np.float32), np.ones((3, 3))), np.float32)
 
 
-def _finer(ned: Floats, finer: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """Places (H, W, 3) on the finer grid, and True where the surface is known."""
+def _finer(
+    ned: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64], finer: float
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Places (H, W, 3) of cells of the finer grid, and True where the surface is known."""
+    # the middle of a fine cell, counted in coarse cells from the middle of the first
+    at = np.meshgrid((columns + 0.5) / finer - 0.5, (rows + 0.5) / finer - 0.5)
+    u, v = (each.astype(np.float32) for each in at)
     known = np.isfinite(ned[..., 0])
-    size = round(ned.shape[1] * finer), round(ned.shape[0] * finer)
     # the mean of the known neighbours, weighted as by bilinear interpolation
-    share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    filled = cv2.resize(np.where(known[..., None], ned, 0), size, interpolation=cv2.INTER_LINEAR)
-    there = np.asarray(share) > 0.5
+    how = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+    share = np.asarray(cv2.remap(known.astype(np.float32), u, v, how[0], borderMode=how[1]))
+    filled = cv2.remap(np.where(known[..., None], ned, 0), u, v, how[0], borderMode=how[1])
     out = np.asarray(filled) / np.maximum(share, 1e-6)[..., None]
-    return np.asarray(out, np.float32), np.asarray(there)
+    return np.asarray(out, np.float32), np.asarray(share > 0.5)

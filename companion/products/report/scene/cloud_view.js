@@ -96,7 +96,7 @@ class CloudView {
   adapt(now, moving) {
     const took_ms = now - this.drawn_ms;
     this.drawn_ms = moving ? now : NaN;
-    if (took_ms > SLOW_MS) this.budget *= Math.max(0.6, SLOW_MS / took_ms);
+    if (took_ms > SLOW_MS) this.budget *= Math.max(0.3, SLOW_MS / took_ms);
     if (took_ms < FAST_MS) this.budget *= 1.15;
     this.budget = Math.round(Math.min(Math.max(this.budget, LEAST_POINTS), this.facts.n));
   }
