@@ -52,3 +52,29 @@ def test_emulated_tests_say_what_is_wrong_with_an_option(tmp_path: Path) -> None
     )  # fmt: skip
     assert done.returncode == 2
     assert done.stderr == f"test_aarch64.sh: --bind {tmp_path}/missing: there is nothing\n"
+
+
+def test_container_is_given_what_it_copies() -> None:
+    """Each COPY of the build names something that is there and not left out."""
+    text = (ROOT / "packaging/Containerfile").read_text("utf-8")
+    wanted = [
+        path
+        for line in re.findall(r"^COPY (?!--from)(.+) \S+$", text, re.M)
+        for path in line.split()
+    ]
+    kept = {
+        line[1:] for line in (ROOT / ".containerignore").read_text("utf-8").splitlines()
+        if line.startswith("!")
+    }  # fmt: skip
+    assert len(wanted) > 5
+    for path in wanted:
+        assert (ROOT / path).exists(), path
+        assert any(path == each or path.startswith(f"{each}/") for each in kept), path
+
+
+def test_wheel_has_the_sample_flight() -> None:
+    settings = (ROOT / "pyproject.toml").read_text("utf-8")
+    for source, place in re.findall(r'^"(sample/[^"]+)" = "(companion/[^"]+)"$', settings, re.M):
+        assert (ROOT / source).is_file()
+        assert place == f"companion/{source}"
+    assert settings.count('= "companion/sample/survey/') == 4
