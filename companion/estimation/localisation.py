@@ -107,7 +107,9 @@ class LocalisationStage:
         )
         self._imu = JudgedAcceleration(self._acceleration, self._withdraw_accelerations)
         self._flow = FlowMeter(camera)
-        self._satellites = SatelliteWatch(self.camera_from_body)
+        self._satellites = SatelliteWatch(
+            self.camera_from_body, camera.body_from_camera is not None and not camera.assumed
+        )
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
         self._t_ns = 0
         self._samples: list[Telemetry] = []

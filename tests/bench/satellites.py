@@ -90,10 +90,10 @@ TRIED = (
 
 
 def watched(
-    seen: list[Seen], samples: Samples, camera_from_body: Pose
+    seen: list[Seen], samples: Samples, camera_from_body: Pose, calibrated: bool = True
 ) -> tuple[list[Warned], float]:
     """What is said, and the largest change as a share of the limit."""
-    watch = SatelliteWatch(camera_from_body)
+    watch = SatelliteWatch(camera_from_body, calibrated)
     said: list[Warned] = []
     nearest = 0.0
     poses = iter(seen)
@@ -134,10 +134,12 @@ def main() -> None:
         if not placed:
             print(f"| {path.name} | no metric map |")
             continue
+        camera = flight.camera
+        calibrated = camera.body_from_camera is not None and not camera.assumed
         span = Span(placed[0], placed[-1])
         for fault in TRIED:
             said, nearest = watched(
-                stage.seen, fault.telemetry(samples, span), stage.camera_from_body
+                stage.seen, fault.telemetry(samples, span), stage.camera_from_body, calibrated
             )
             words = "; ".join(
                 f"{1e-9 * (each.t_ns - span.fault_ns):.1f} s {each.what} ({each.detail})"

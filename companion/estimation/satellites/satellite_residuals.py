@@ -35,8 +35,11 @@ worse wanders more."""
 PATH = 0.01
 """Drift of vision, as a share of the way."""
 LAG_S = 0.12
-"""By which stamps of receivers and of an autopilot's link are off: counts where speed changes. A
-doubt takes 3.8 times as much, 0.45 s."""
+"""By which stamps of receivers and of an autopilot's link are off, before they have shown it:
+counts where speed changes."""
+LAG_WITHOUT_S, LAG_TAU_S, LAG_ERROR_M = 3.0, 5.0, 0.5
+"""It is fitted to what is older than the first, so that no fault is taken for it; errors of
+positions hold on for the second, and are of the third at least."""
 SIGMA_SPEED_M_S = 0.2
 N_STAND, STANDS_M, MOVES_M = 3, 0.03, 0.2
 """So many positions are the same, to a step of their last digit, while vision moves so far."""
@@ -87,6 +90,8 @@ class SatelliteResiduals:
         self._placed: Georeference | None = None
         self._stated_m = (0.0, 0.0)
         """Accuracy that the last position stated, horizontal and vertical."""
+        self.placed_since_s: float | None = None
+        """Time at which the map was first placed; None while it is not."""
         self.path_m = 0.0
         """Length of vision's way since the first pose, metres."""
 
@@ -101,6 +106,8 @@ class SatelliteResiduals:
             self.clear()
         self._map_id, self._placed = map_id, placed
         scale = placed.world_from_map.scale
+        if self.placed_since_s is None:
+            self.placed_since_s = 1e-9 * t_ns
         t_s, place = 1e-9 * t_ns, map_from_camera.apply(self._camera_from_body.translation / scale)
         if self._poses:
             self.path_m += scale * float(np.linalg.norm(place - self._poses[-1][1]))
@@ -112,7 +119,7 @@ class SatelliteResiduals:
         """Begin anew."""
         self._poses.clear()
         self._pairs.clear()
-        self._map_id = self._placed = None
+        self._map_id = self._placed = self.placed_since_s = None
 
     def take_position(self, sample: PositionSample) -> bool:
         """Pair a position with vision; False where vision is not known at its time."""
@@ -153,6 +160,8 @@ class SatelliteResiduals:
         if len(self._pairs) < 4 or self._placed is None:
             return []
         times, residual, world, gps, speeds, own_speeds = self._arrays()
+        lag_s, sigma_lag_s = _lag_of(times, residual, own_speeds)
+        residual = residual - lag_s * own_speeds
         white, rates = self._white(residual), self._rates
         now = times >= times[-1] - NOW_S
         out = []
@@ -172,12 +181,12 @@ class SatelliteResiduals:
             placed = self._placed
             of_vision = np.array([
                 PATH * way_m, placed.sigma_scale * level_m, placed.sigma_yaw_rad * level_m,
-                LAG_S * faster,
+                sigma_lag_s * faster,
             ])  # fmt: skip
             horizontal = np.linalg.norm([white[0] * shared, rates[0] * span_s, *of_vision])
             vertical = np.linalg.norm([
                 white[1] * shared, rates[1] * span_s, PATH * way_m, TILT_RAD * way_m,
-                placed.sigma_scale * abs(flown[2]), LAG_S * faster,
+                placed.sigma_scale * abs(flown[2]), sigma_lag_s * faster,
             ])  # fmt: skip
             speed = speeds[inside].mean(0) - own_speeds[inside].mean(0)[:2]
             sigma_speed = np.linalg.norm([SIGMA_SPEED_M_S, *(of_vision[1:] / span_s)])
@@ -249,3 +258,23 @@ class SatelliteResiduals:
             share = (t_s - tb) / (t1 - tb)
             return pb + share * (p1 - pb), speed
         return p1 + (t_s - t1) * speed, speed
+
+
+def _lag_of(times: Array, residual: Array, own_speeds: Array) -> tuple[float, float]:
+    """Time by which positions are ahead of their stamps, and its standard deviation, seconds.
+
+    By the residual that goes with the speed: maximum a posteriori, with `LAG_S` before.
+    """
+    old = times < times[-1] - LAG_WITHOUT_S
+    information = 1.0 / LAG_S**2
+    if np.count_nonzero(old) < 2:
+        return 0.0, LAG_S
+    speed, error = (each[old, :2] - each[old, :2].mean(0) for each in (own_speeds, residual))
+    spread = float((speed**2).sum())
+    if spread == 0.0:
+        return 0.0, LAG_S
+    spacing_s = float(times[old][-1] - times[old][0]) / (np.count_nonzero(old) - 1)
+    off_m = max(LAG_ERROR_M, float(np.sqrt((error**2).mean())))
+    shown = spread / off_m**2 * min(1.0, spacing_s / LAG_TAU_S)
+    lag_s = float((speed * error).sum()) / spread
+    return lag_s * shown / (shown + information), float((shown + information) ** -0.5)

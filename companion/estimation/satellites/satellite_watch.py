@@ -60,6 +60,11 @@ FREE_S = 30.0
 this long, if they go where vision goes."""
 
 
+SETTLED_S = 10.0
+"""Time for which a map has been placed before it is held against anything: its first scale is by a
+few positions, and moves by more than is stated."""
+
+
 class Doubt(Enum):
     """Reasons to doubt satellites: what a `Warned` says."""
 
@@ -76,9 +81,14 @@ USED_AGAIN = "satellite positions agree with vision again and are used"
 
 
 class SatelliteWatch:
-    """Takes poses of vision and positions of satellites, in order of time."""
+    """Takes poses of vision and positions of satellites, in order of time.
 
-    def __init__(self, camera_from_body: Pose) -> None:
+    Without `calibrated` vision is held against nothing: a lens or a mount that was guessed bends
+    its path. Satellites that fall silent are said all the same.
+    """
+
+    def __init__(self, camera_from_body: Pose, calibrated: bool = True) -> None:
+        self._calibrated = calibrated
         self._residuals = SatelliteResiduals(camera_from_body)
         self._doubt: Doubt | None = None
         self._map_id: int | None = None
@@ -140,9 +150,12 @@ class SatelliteWatch:
         if self._doubt is not None:
             self._look_for_end(sample.t_ns)
             return not self.doubted
-        if self._jumped(sample.t_ns):
-            return False
-        self._compare(sample.t_ns)
+        since_s = self._residuals.placed_since_s
+        settled = since_s is not None and 1e-9 * sample.t_ns - since_s >= SETTLED_S
+        if settled and self._calibrated:
+            if self._jumped(sample.t_ns):
+                return False
+            self._compare(sample.t_ns)
         return not self.doubted
 
     def _jumped(self, t_ns: int) -> bool:

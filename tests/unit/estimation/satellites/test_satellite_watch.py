@@ -10,6 +10,7 @@ import pytest
 from companion.estimation.satellites.satellite_watch import (
     GONE_NS,
     POOR_M,
+    SETTLED_S,
     USED_AGAIN,
     Doubt,
     SatelliteWatch,
@@ -130,6 +131,16 @@ def test_a_receiver_that_states_less_may_wander_more() -> None:
     assert Flown(circle).fly(40.0, wander, sigma_m=1.0) != []
 
 
+def test_no_word_about_stamps_that_are_late() -> None:
+    """By 0.3 s, which at turns in no time is five metres."""
+    flown = Flown(line)
+    assert flown.fly(60.0, lambda t: line(t - 0.3) - line(t)) == []
+    # what it has shown does not count for a fault: the next pull is said as soon
+    t_s = flown.t_s
+    said = flown.fly(6.0, lambda t: line(t_s + t - 0.3) - line(t_s + t) + [max(t, 0.0), 0, 0])
+    assert [each.what for each in said] == [Doubt.PULL.value]
+
+
 def test_no_word_about_vision_that_drifts() -> None:
     """By its scale, one percent, which is stated."""
     assert Flown(circle).fly(60.0, drift=0.01) == []
@@ -148,6 +159,16 @@ def test_a_jump_is_said_at_once_and_never_used(path: Path) -> None:
     assert [each.what for each in said] == [Doubt.JUMP.value]
     assert after_s(said[0]) < 0.6
     assert not any(used for t_s, used in flown.used if t_s > FAULT_S + 0.2)
+
+
+def test_nothing_is_held_against_a_map_that_is_young_or_of_a_lens_that_was_guessed() -> None:
+    young = Flown(circle)
+    assert young.fly(SETTLED_S - 0.5, lambda t: np.array([1.0, 0, 0]) * max(t, 0.0)) == []
+    guessed = Flown(circle)
+    guessed.watch = SatelliteWatch(CAMERA_FROM_BODY, calibrated=False)
+    assert guessed.fly(30.0, lambda t: np.array([1.0, 0, 0]) * max(t, 0.0)) == []
+    said = guessed.fly(5.0, silent=True)
+    assert [each.what for each in said] == [Doubt.GONE.value]
 
 
 def test_a_single_outlier_is_left_out_without_a_word() -> None:
