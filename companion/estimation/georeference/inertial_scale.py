@@ -10,14 +10,15 @@ from __future__ import annotations
 import numpy as np
 
 from companion.estimation.georeference.inertial_alignment import Fit, InertialAlignment, nodes_of
+from companion.estimation.georeference.steady_places import steadied
 from companion.estimation.georeference.tracked_places import Places
 from companion.estimation.georeference.trajectory_alignment import Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.inertial_motion import InertialStart
 from companion.geometry.transforms import Array
 
-NOISES = tuple(1e-4 * 2.0**n for n in range(5))
-"""White noise of a frame's place, units: 0.05 to 0.8 pixels of 500 at the typical distance."""
+NOISES = tuple(0.5e-4 * 2.0**n for n in range(6))
+"""White noise of a frame's place, units: 0.025 to 0.8 pixels of 500 at the typical distance."""
 FIRST_SCALE = 30.0
 """Metres per unit that the first weights are for. The unit is the typical distance of what the
 first two keyframes see."""
@@ -51,7 +52,7 @@ class InertialScale:
         self._lever_camera_m, self._start, self._most_nodes = lever_camera_m, start, most_nodes
         self._least_nodes = LEAST_NODES if start is None else LEAST_NODES_STARTED
         self._scale = FIRST_SCALE
-        self._noise = 2
+        self._noise = 3
         """Index of the likeliest of NOISES."""
         self._n_compared = 0
         """Frames at the last comparison of noises."""
@@ -62,11 +63,12 @@ class InertialScale:
         return self._most_nodes * SPACING_NS
 
     def update(
-        self, places: Places, integral: AccelerationIntegral, delay_ns: int = 0
-    ) -> Scale | None:
+        self, places: Places, integral: AccelerationIntegral, body_from_camera: Array,
+        delay_ns: int = 0,
+    ) -> Scale | None:  # fmt: skip
         """Scale by frames as the map has them now; None while it is unknown.
 
-        Autopilot stamps are late by `delay_ns`.
+        `body_from_camera` (3, 3) is the mount; autopilot stamps are late by `delay_ns`.
         """
         sums, known = integral.at(places.t_ns + delay_ns)
         if self._start is not None:
@@ -76,6 +78,7 @@ class InertialScale:
         if len(nodes) < self._least_nodes:
             return None
         places, sums = places.of(slice(nodes[0], None)), sums[nodes[0] :]
+        places = steadied(places, *integral.turns.at(places.t_ns + delay_ns), body_from_camera)
         start = self._start
         if start is not None and start.t_ns != places.t_ns[0]:
             start = None
@@ -129,9 +132,9 @@ def level_of(places: Places) -> Array:
 
 
 def settled(
-    places: Places, integral: AccelerationIntegral, lever_camera_m: Array, delay_ns: int = 0,
-    start: InertialStart | None = None,
+    places: Places, integral: AccelerationIntegral, lever_camera_m: Array,
+    body_from_camera: Array, delay_ns: int = 0, start: InertialStart | None = None,
 ) -> Scale | None:  # fmt: skip
     """Scale by the frames of a finished map; None while it is unknown."""
     estimate = InertialScale(lever_camera_m, start, MOST_NODES_FINAL)
-    return estimate.update(places, integral, delay_ns)
+    return estimate.update(places, integral, body_from_camera, delay_ns)

@@ -179,7 +179,8 @@ class SegmentGeoreferences:
         first = next(iter(segment.keyframes.values()))
         begun = self._begun_by_navigation(segment, first)
         start = None if begun is None else begun[0].start
-        lever_m, delay_ns = mount.rotation.T @ mount.translation, self._attitude.correction[1]
+        lever_m = mount.rotation.T @ mount.translation
+        turned, delay_ns = self._attitude.correction
         estimate = self._inertial.get(key)
         if estimate is None:
             estimate = self._inertial[key] = InertialScale(lever_m, start)
@@ -187,12 +188,10 @@ class SegmentGeoreferences:
         whole = final and self._acceleration.believed
         until_ns = newest[-1] + 1 if whole else newest[-min(SETTLED_AFTER, len(newest))]
         since_ns = 0 if whole else until_ns - estimate.window_ns
-        places = self._places.of(
-            table, segment.unit_of, self._attitude.correction[0], since_ns, until_ns
-        )
+        places = self._places.of(table, segment.unit_of, turned, since_ns, until_ns)
         if whole:
-            return settled(places, self._acceleration, lever_m, delay_ns, start)
-        found = estimate.update(places, self._acceleration, delay_ns)
+            return settled(places, self._acceleration, lever_m, turned, delay_ns, start)
+        found = estimate.update(places, self._acceleration, turned, delay_ns)
         return found if self._acceleration.believed else None
 
     def take(self, track: Track, ned_from_body: Array | None) -> None:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.estimation.inertial.turn_integral import TurnIntegral
 from companion.estimation.sample_series import SampleSeries
 from companion.geometry.transforms import Array, rotation_from_quaternion
 from companion.telemetry import AttitudeSample, ImuSample
@@ -46,6 +47,8 @@ class AccelerationIntegral:
     def __init__(self) -> None:
         self.believed = True
         """False while nobody knows yet whether the samples are right."""
+        self.turns = TurnIntegral()
+        """Of the same samples, without the attitude."""
         self._waiting: deque[ImuSample] = deque(maxlen=1000)
         self._attitudes: tuple[AttitudeSample, ...] = ()
         self._series = SampleSeries()
@@ -62,6 +65,7 @@ class AccelerationIntegral:
         """Add a sample; samples of a kind come in order of time."""
         if isinstance(sample, ImuSample):
             self._see_noise(sample)
+            self.turns.take(sample)
             self._waiting.append(sample)
         elif not self._attitudes or sample.t_ns > self._attitudes[-1].t_ns:
             self._attitudes = (*self._attitudes[-1:], sample)
@@ -74,6 +78,7 @@ class AccelerationIntegral:
     def withdraw(self, since_ns: int) -> None:
         """Drop integrals from a time on: the samples were wrong. There is a gap."""
         self._series.drop_since(since_ns)
+        self.turns.withdraw(since_ns)
         self._waiting.clear()
         self._last = None
 

@@ -57,13 +57,13 @@ class Flight:
         )  # fmt: skip
 
     def scale(self) -> Scale | None:
-        return settled(self.places, self.integral, LEVER_M)
+        return settled(self.places, self.integral, LEVER_M, np.eye(3))
 
     def live(self, start: InertialStart | None = None) -> list[Scale | None]:
         """The scale at each half second."""
         estimate, n = InertialScale(LEVER_M, start), len(self.places.t_ns)
         return [
-            estimate.update(self.places.of(slice(end)), self.integral)
+            estimate.update(self.places.of(slice(end)), self.integral, np.eye(3))
             for end in range(10, n + 1, 10)
         ]
 
@@ -130,7 +130,7 @@ def test_a_map_that_is_corrected_in_flight_keeps_its_scale() -> None:
             flight.places = before._replace(
                 rotations=turn @ before.rotations, places=before.places @ turn.T + by
             )
-        found = estimate.update(flight.places.of(slice(end)), flight.integral)
+        found = estimate.update(flight.places.of(slice(end)), flight.integral, np.eye(3))
         if found is not None and found.sigma < 0.1:
             assert abs(np.log(found.scale / METRES_PER_UNIT)) < 3.5 * found.sigma
     assert found is not None and found.sigma < 0.03
@@ -140,7 +140,7 @@ def test_frames_that_are_missing_are_left_out() -> None:
     """Tracking was lost for some seconds, of one map."""
     flight = Flight(weaving, 5)
     kept = np.flatnonzero((flight.places.t_ns < 8e9) | (flight.places.t_ns > 12e9))
-    found = settled(flight.places.of(kept), flight.integral, LEVER_M)
+    found = settled(flight.places.of(kept), flight.integral, LEVER_M, np.eye(3))
     assert found is not None
     assert found.sigma < 0.03
     assert abs(np.log(found.scale / METRES_PER_UNIT)) < 3.0 * found.sigma
@@ -152,7 +152,7 @@ def test_a_gap_in_the_accelerations_is_not_integrated_across() -> None:
     for sample in MeasuredMotion(weaving, np.random.default_rng(6), SECONDS + 1.0).samples():
         if isinstance(sample, AttitudeSample) or not 9.0 < sample.t_ns * 1e-9 < 9.5:
             gap.take(sample)
-    found = settled(flight.places, gap, LEVER_M)
+    found = settled(flight.places, gap, LEVER_M, np.eye(3))
     assert found is not None
     assert found.sigma < 0.03
     assert abs(np.log(found.scale / METRES_PER_UNIT)) < 3.0 * found.sigma
