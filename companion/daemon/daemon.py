@@ -333,11 +333,13 @@ class Daemon:
         if self._sender is not None:
             self._sender.take(odometry)
         if self._global_sender is not None:
+            self._global_sender.of_flight(self._flights.current)
             self._global_sender.take(odometry)
 
     def _on_georeferenced(self, told: Georeferenced) -> None:
         self._watch.take_georeference(told)
         if self._global_sender is not None:
+            self._global_sender.of_flight(self._flights.current)
             self._global_sender.take_georeference(told)
 
     def _on_flow(self, flow: OpticalFlow) -> None:

@@ -36,6 +36,7 @@ class GlobalSender:
     ) -> None:
         self._config, self._link, self._clock = config, link, clock
         self._poses, self._gate = PoseGate(config, use=use), GlobalGate(config, use)
+        self._flight: object = None
         self._rate = RateMeter()
         self._n_sent, self._sent_ns, self._sigma_m = 0, 0, 0.0
         self._why_not = ""
@@ -58,6 +59,13 @@ class GlobalSender:
     def take_georeference(self, told: Georeferenced) -> None:
         """Take the newest place of the map."""
         self._gate.take_georeference(told.georeference)
+
+    def of_flight(self, flight: object) -> None:
+        """What comes is of this flight: another localisation knows nothing of the one before."""
+        if flight is not self._flight:
+            self._flight = flight
+            self._poses.restart()
+            self._gate.restart()
 
     def doubt_satellites(self, doubted: bool) -> None:
         """Satellites are doubted, or are not any more."""

@@ -75,6 +75,11 @@ class GlobalGate:
         """Change the source that is given out."""
         self._config = config
 
+    def restart(self) -> None:
+        """Another localisation, whose map has no place yet, and which doubts nothing."""
+        self._placed = self._placed_at_m = None
+        self.doubted = False
+
     def take_position(self, sample: PositionSample) -> None:
         """Take a position of the autopilot; those of satellites count."""
         if sample.source is PositionSource.GPS and is_believed(sample, self._use):

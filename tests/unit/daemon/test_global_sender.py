@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import MEASUREMENTS, FeedbackConfig
 from companion.daemon.pose.global_sender import UNHEARD, GlobalSender
+from companion.estimation.gate.global_gate import NOT_PLACED
 from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry.transforms import Pose, Similarity
 from companion.messages import Georeference, Georeferenced, Odometry, TrackState
@@ -140,6 +141,18 @@ def test_nothing_beside_satellites_or_to_a_silent_autopilot() -> None:
     vehicle.link.alive = False  # as its watch finds after three seconds
     assert vehicle.run(1.0) == []
     assert vehicle.sender.health().why_not == UNHEARD
+
+
+def test_another_localisation_begins_without_a_place() -> None:
+    """Its vehicle may stand where its own world begins, before any map is placed."""
+    vehicle = Vehicle("sensor")
+    vehicle.sender.doubt_satellites(True)
+    assert vehicle.run(3.0, satellites=True) != []
+    vehicle.sender.of_flight("another")
+    vehicle.run(0.2)
+    assert vehicle.run(3.0, satellites=True) == []
+    assert vehicle.run(8.0) == []
+    assert vehicle.sender.health().why_not == NOT_PLACED
 
 
 def test_switched_off_it_is_silent() -> None:

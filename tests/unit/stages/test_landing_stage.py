@@ -8,11 +8,15 @@ import numpy as np
 
 from companion.app.landing_sent import LANDING_SENT, LandingSent
 from companion.config import CameraConfig, Config, LandingConfig, RecorderConfig, TelemetryConfig
+from companion.estimation.landing.marker_detector import MarkerDetector
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, quaternion_from_rotation
 from companion.messages import Frame, LandingTarget, Message
 from companion.runtime.in_order import InOrder
+from companion.runtime.parcel import Parcel
+from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stage_start import start_alone
 from companion.runtime.stages import stage_named
 from companion.telemetry import AttitudeSample
 from drivers.recording.flights_folder import RECORDING
@@ -21,6 +25,7 @@ from drivers.recording.recorded_flight import open_recording
 from drivers.recording.recorder import Recorder
 from drivers.recording.recording_topics import LANDING
 from tests.support.flights.marker_ground import MarkerGround, looking_at_marker
+from tests.support.processes.stage_heard import SOON_S, Heard
 
 CONFIG = Config(
     landing=LandingConfig("aruco_5x5_100", 3, 0.4), recorder=RecorderConfig(codec="raw")
@@ -97,3 +102,23 @@ def test_a_recording_holds_it_and_its_images_give_it_again(tmp_path: Path) -> No
         flight.recording.close()
     assert len(recorded) == 10
     assert [decision_bytes(each) for each in replayed(again, tmp_path / "2")] == recorded
+
+
+def test_in_a_process_of_its_own_it_finds_the_same() -> None:
+    """As in flight: frames come through shared memory, which cannot be written to."""
+    heard, ended = Heard(), Heard()
+    process = StageProcess(stage_named("landing"), start_alone, heard.parcel, ended.note)
+    frames = [each for each in descent() if isinstance(each, Frame)][:3]
+    try:
+        process.begin(Setup(CONFIG, CAMERA))
+        for n, frame in enumerate(frames):
+            process.offer(Parcel.of(frame))
+            heard.until(lambda n=n: len(heard.all) > n)  # type: ignore[misc]
+        process.ask_to_finish(Finish(hurry=False))
+        assert process.wait(SOON_S)
+    finally:
+        process.kill()
+    detector = MarkerDetector(CONFIG.landing, CAMERA)
+    wanted = [decision_bytes(detector.step(frame)) for frame in frames]
+    assert [decision_bytes(each) for each in heard.all] == wanted
+    assert ended.all == [""]
