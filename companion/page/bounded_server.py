@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any
@@ -98,6 +99,7 @@ class BoundedServer(uvicorn.Server):
 
 def bounded_server(application: Any) -> BoundedServer:
     """Server of an ASGI application; `serve(sockets=[…])` runs it."""
+    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)  # a line for each piece of rubbish
     return BoundedServer(
         uvicorn.Config(
             application, http=BoundedConnection, ws="none", lifespan="off", loop="asyncio",
