@@ -17,9 +17,10 @@ from ruamel.yaml.error import YAMLError
 
 from companion.config import CameraConfig, TelemetryConfig
 from companion.errors import FlightError
+from companion.estimation.attitude.attitude_by_imu import attitudes_by_imu
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose
-from companion.telemetry import ImuSample
+from companion.telemetry import AttitudeSample, ImuSample
 from drivers.datasets.flight_folder import camera_of
 from drivers.flight import Flight, TruePose
 from drivers.images.calibration_file import MODELS, body_from_camera_of
@@ -114,13 +115,23 @@ def _list(path: Path, said: Mapping[str, Any], key: str, n: int) -> list[float]:
 
 
 def _imu(mav: Path) -> LogContent:
+    """Rates and accelerations, and the attitudes that follow: the format has no others."""
     listing = mav / "imu0" / "data.csv"
     collected = TelemetryCollector("imu0")
-    if listing.is_file():
-        for t, *words in read_rows(listing, 7):
-            values = np.array(numbers_of(listing, words[:6]))
-            sample = ImuSample(0, values[:3], values[3:])
-            collected.add(ns_of_whole(listing, t), 0, sample)
+    if not listing.is_file():
+        return LogContent(collected, unchanged)
+    rows = read_rows(listing, 7)
+    t_ns = np.array([ns_of_whole(listing, t) for t, *_ in rows], np.int64)
+    values = np.array([numbers_of(listing, words[:6]) for _, *words in rows]).reshape(-1, 6)
+    order = np.argsort(t_ns, kind="stable")
+    t_ns, values = t_ns[order], values[order]
+    finite = np.isfinite(values).all(1)
+    for t, each in zip(t_ns.tolist(), values, strict=True):
+        collected.add(t, 0, ImuSample(0, each[:3], each[3:]))
+    if finite.any():
+        found = attitudes_by_imu(t_ns[finite], values[finite, :3], values[finite, 3:])
+        for t, attitude, rates in zip(t_ns[finite].tolist(), *found, strict=True):
+            collected.add(t, 0, AttitudeSample(0, attitude, rates))
     return LogContent(collected, unchanged)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,7 @@ def ideal(flown: Piece, tmp_path_factory: pytest.TempPathFactory) -> list[list[s
 
 def test_euroc(grey: list[list[str]], flown: Piece, tmp_path: Path) -> None:
     write_euroc(tmp_path / "flight", flown)
+    shutil.rmtree(tmp_path / "flight" / "mav0" / "imu0")  # its numbers are made up
     assert len(grey) >= 30
     assert path_of(replay_here(tmp_path / "flight", tmp_path / "out", *FAST)) == grey
 

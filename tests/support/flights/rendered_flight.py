@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
+from companion.app.poses_sent import PosesSent
 from companion.config import Config
+from companion.config_file import load_config
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Pose, quaternion_from_rotation, rotation_from_vector
+from companion.geometry.transforms import (
+    Pose,
+    quaternion_from_rotation,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 from companion.messages import Bytes, Frame, KeyframeAdded, Odometry, Track, Warned
 from companion.products.flight_result import FlightResult
 from companion.products.trajectory_error import Path, PathErrors, path_errors
 from companion.runtime.in_order import in_order_of_time
 from companion.telemetry import (
     AttitudeSample,
+    ImuSample,
     PositionSample,
     PositionSource,
     RangeSample,
     Telemetry,
 )
+from tests.support.flights.noisy_telemetry import with_noise
 from tests.support.flights.scene import texture
 
 CAMERA_DOWN = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
@@ -33,24 +42,36 @@ ATTITUDE_HZ, POSITION_HZ = 50.0, 10.0
 SKEW = rotation_from_vector(np.radians([0.3, -0.4, 0.5]))
 """By how much the autopilot's attitude is off."""
 METRES_PER_TEXEL = 0.05
+IMU_S, IMU_STEP_S = 0.01, 1e-3
+"""Interval of an IMU, and the step of the differences that it is drawn from."""
+GRAVITY_NED = np.array([0.0, 0.0, 9.80665])
+N_EXPOSED = 6
+"""Pictures in one exposure."""
 
 PathOf = Callable[[float], Pose]
 """`ned_from_body` by seconds since the start."""
 
 
 class Terrain:
-    """Flat ground, and flat roofs over it unless it is to be `plane`; z is down."""
+    """Flat ground, and flat roofs over it unless it is to be `plane`; z is down.
 
-    def __init__(self, seed: int, plane: bool = False) -> None:
+    All of it is larger by `scale`, detail too.
+    """
+
+    def __init__(
+        self, seed: int, plane: bool = False,
+        pattern: Callable[[np.random.Generator], Bytes] = texture, scale: float = 1.0,
+    ) -> None:  # fmt: skip
+        self._metres_per_texel = METRES_PER_TEXEL * scale
         rng = np.random.default_rng(seed)
         everywhere = (-np.inf, -np.inf, np.inf, np.inf)
-        self._levels = [(0.0, everywhere, texture(rng))]
+        self._levels = [(0.0, everywhere, pattern(rng))]
         for k in range(0 if plane else 40):
-            north, east = rng.uniform(-30, 30, 2)
-            size = rng.uniform(2, 6)
-            height = -rng.uniform(0.5, 3.5)
+            north, east = scale * rng.uniform(-30, 30, 2)
+            size = scale * rng.uniform(2, 6)
+            height = -scale * rng.uniform(0.5, 3.5)
             place = (north, east, north + size, east + size)
-            self._levels.append((height, place, self._levels[k % 5][2] if k > 4 else texture(rng)))
+            self._levels.append((height, place, self._levels[k % 5][2] if k > 4 else pattern(rng)))
         self._levels[1:] = sorted(self._levels[1:], key=lambda level: -level[0])
         self._rays: dict[int, Bytes] = {}
 
@@ -69,7 +90,7 @@ class Terrain:
                     continue
                 size = len(pattern)
                 column, row = (
-                    np.where(hit, np.mod(v / METRES_PER_TEXEL, size), -1.0).astype(np.float32)
+                    np.where(hit, np.mod(v / self._metres_per_texel, size), -1.0).astype(np.float32)
                     for v in (e, n)
                 )
                 drawn = cv2.remap(
@@ -99,6 +120,7 @@ class Flown:
     keyframes_s: list[float] = field(default_factory=list)
     """When keyframes came, seconds since the start."""
     warnings: list[str] = field(default_factory=list)
+    sent: PosesSent = field(default_factory=lambda: PosesSent(Config()))
     truth: Path | None = None
 
     @property
@@ -130,32 +152,53 @@ class Flown:
 
 def fly(
     camera: Camera, ned_from_body: PathOf, terrain: Terrain, seconds: float, rate_hz: float,
-    *, told: bool = True, dropout_s: tuple[float, float] = (0.0, 0.0),
+    *, told: bool = True, dropout_s: tuple[float, float] = (0.0, 0.0), exposure_s: float = 0.0,
+    imu_seed: int | None = None, settings: Sequence[str] = (),
 ) -> Flown:  # fmt: skip
     """Fly, in lockstep; without `told` there is no telemetry, and the mount is not known.
 
-    From the first to the second time of `dropout_s` the picture is white.
+    From the first to the second time of `dropout_s` the picture is white. Frames are stamped in the
+    middle of an exposure, in which what moves blurs. With `imu_seed` there is a noisy IMU, too.
     """
+    mount = camera.body_from_camera or CAMERA_DOWN
     if not told:
         camera = replace(camera, body_from_camera=None)
-    flown = Flown(LocalisationStage(Config(), camera, lambda _: nullcontext()))
+    config = load_config(None, list(settings))
+    flown = Flown(
+        LocalisationStage(config, camera, lambda _: nullcontext()), sent=PosesSent(config)
+    )
     n = round(seconds * rate_hz)
-    poses = [(_ns(k / rate_hz), ned_from_body(k / rate_hz) @ CAMERA_DOWN) for k in range(n)]
+    poses = [(_ns(k / rate_hz), ned_from_body(k / rate_hz) @ mount) for k in range(n)]
+    within_s = exposure_s * (np.arange(N_EXPOSED) / N_EXPOSED - 0.5 + 0.5 / N_EXPOSED)
+
+    def picture(k: int) -> Bytes:
+        if not exposure_s:
+            return terrain.picture(camera, poses[k][1])
+        drawn = [
+            terrain.picture(camera, ned_from_body(k / rate_hz + s) @ mount).astype(np.uint16)
+            for s in within_s
+        ]
+        return np.asarray(sum(drawn) // N_EXPOSED, np.uint8)
+
     flown.truth = Path(
         np.array([t for t, _ in poses], np.float64), np.stack([p.translation for _, p in poses]),
         np.stack([p.rotation for _, p in poses]),
     )  # fmt: skip
 
     def pictures() -> Iterator[Frame]:
-        for seq, (t_ns, pose) in enumerate(poses):
+        for seq, (t_ns, _) in enumerate(poses):
             dropped_out = _ns(dropout_s[0]) <= t_ns < _ns(dropout_s[1])
-            grey = terrain.picture(camera, pose)
+            grey = picture(seq)
             grey = np.full_like(grey, 252) if dropped_out else grey
             yield Frame(seq, t_ns, grey, np.repeat(grey[..., None], 3, 2))
 
     samples = list(_telemetry(ned_from_body, seconds)) if told else []
+    if imu_seed is not None:
+        still = inertial_samples(ned_from_body, seconds)
+        samples = sorted([*samples, *with_noise(still, imu_seed)], key=lambda s: s.t_ns)
     for message in in_order_of_time(samples, pictures()):
         flown.result.take(message)
+        flown.sent.take(message)
         if isinstance(message, Frame):
             flown.frames_ns.append(message.t_ns)
         for out in flown.stage.step(message):
@@ -167,6 +210,7 @@ def fly(
 
 def _note(flown: Flown, message: object) -> None:
     flown.result.take(message)  # type: ignore[arg-type]
+    flown.sent.take(message)  # type: ignore[arg-type]
     if isinstance(message, Track):
         flown.tracks.append(message)
     elif isinstance(message, Odometry):
@@ -198,3 +242,15 @@ def _telemetry(ned_from_body: PathOf, seconds: float) -> Iterator[Telemetry]:
         )
         samples.append(RangeSample(_ns(after_s), float(-here.translation[2])))
     yield from sorted(samples, key=lambda s: s.t_ns)
+
+
+def inertial_samples(ned_from_body: PathOf, seconds: float) -> Iterator[ImuSample]:
+    """What an IMU without errors measures."""
+    for after_s in np.arange(-1.0, seconds + 0.5, IMU_S):
+        before, here, later = (ned_from_body(after_s + s) for s in (-IMU_STEP_S, 0.0, IMU_STEP_S))
+        gained = later.translation + before.translation - 2.0 * here.translation
+        turn = vector_from_rotation(before.rotation.T @ later.rotation)
+        yield ImuSample(
+            _ns(after_s), turn / (2.0 * IMU_STEP_S),
+            here.rotation.T @ (gained / IMU_STEP_S**2 - GRAVITY_NED),
+        )  # fmt: skip

@@ -21,6 +21,31 @@ def texture(rng: np.random.Generator, size: int = 1024) -> Bytes:
     return np.asarray(out * 255, np.uint8)
 
 
+def leaves(rng: np.random.Generator, size: int = 1024) -> Bytes:
+    """Leaves that fell over each other, of all sizes: sharp edges, as those of real ground.
+
+    The dead leaves model (Lee, Mumford, Huang, 2001), of polygons; it wraps around.
+    """
+    out = np.full((size, size), 128, np.uint8)
+    n = size * size // 40
+    radii = 2.5 * rng.uniform(0.0025, 1.0, n) ** -0.5  # as many of each size as fit
+    for radius in np.sort(radii)[::-1]:
+        angles = np.sort(rng.uniform(0, 2 * np.pi, 5))
+        outline = radius * np.stack([np.cos(angles), np.sin(angles)], 1)
+        centre, grey = rng.uniform(0, size, 2), int(np.clip(rng.normal(128, 45), 10, 245))
+        near = {(0, 0), *((int(s), int(t)) for s in _over(centre[0], radius, size)
+                          for t in _over(centre[1], radius, size))}  # fmt: skip
+        for shift in near:
+            corners = (16 * (centre + outline + np.array(shift))).astype(np.int32)
+            cv2.fillPoly(out, [corners], (grey,), cv2.LINE_AA, 4)
+    return out
+
+
+def _over(at: float, radius: float, size: int) -> tuple[int, ...]:
+    """Shifts by which what reaches over an edge comes in at the other."""
+    return (0, *((size,) if at < radius else ()), *((-size,) if at > size - radius else ()))
+
+
 class PlaneWorld:
     """Planes z = const in NED (down positive), each a rectangle; the highest is seen first."""
 

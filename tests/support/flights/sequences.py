@@ -6,6 +6,7 @@ Written by the formats' published descriptions, with none of the readers' code.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
@@ -18,7 +19,7 @@ from companion.config import CameraConfig
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose, quaternion_from_rotation
 from companion.messages import Frame
-from companion.telemetry import Telemetry
+from companion.telemetry import ImuSample, Telemetry
 from drivers.open_flight import open_flight
 from tests.support.reference.scoring import read_tum
 
@@ -86,8 +87,11 @@ def write_flight_folder(folder: Path, flown: Piece, grey: bool = False) -> None:
     (folder / "camera.json").write_text(json.dumps(said))
 
 
-def write_euroc(folder: Path, flown: Piece) -> None:
-    """ASL layout: cam0, imu0 and the true states, which are the body's."""
+def write_euroc(folder: Path, flown: Piece, measured: Sequence[ImuSample] = ()) -> None:
+    """ASL layout: cam0, imu0 and the true states, which are the body's.
+
+    Without an IMU that `measured` anything there are made-up numbers.
+    """
     mav = folder / "mav0"
     (mav / "cam0" / "data").mkdir(parents=True)
     (mav / "imu0").mkdir()
@@ -110,7 +114,10 @@ def write_euroc(folder: Path, flown: Piece) -> None:
         f"distortion_coefficients: [{', '.join(map(repr, c.coefficients[:4]))}]\n"
     )
     imu = ["#timestamp [ns],w_RS_S_x [rad s^-1],w y,w z,a_RS_S_x [m s^-2],a y,a z"]
-    for k in range(200):
+    for each in measured:
+        numbers = ",".join(f"{v:.9f}" for v in (*each.gyro_rad_s, *each.accel_m_s2))
+        imu.append(f"{each.t_ns},{numbers}")
+    for k in range(0 if measured else 200):
         t_ns = flown.frames[0].t_ns + k * 5_000_000
         imu.append(f"{t_ns},{0.01 * k},-0.2,0.3,9.25,0.5,-3.125")
     (mav / "imu0" / "data.csv").write_text("\n".join(imu) + "\n")
