@@ -28,6 +28,7 @@ from companion.products.site_map_file import (
 from companion.products.trajectory_file import trajectory_tum
 from companion.slam.map.site_map import SiteMap
 from companion.slam.mapping.site_merge import merge_sites
+from companion.slam.mapping.site_prune import prune_site
 
 BYTES_PER_MB = 1e6
 
@@ -96,6 +97,15 @@ def save(path: Path, out: Path) -> ReadSiteMap:
     read = read_site_map(map_path(path))
     write_site_map(out, read.site)
     return read
+
+
+def prune(path: Path, out: Path, spacing_deg: float) -> str:
+    """Write a map without redundant keyframes; a line about what is left."""
+    site = read_site_map(map_path(path)).site
+    pruned = prune_site(site, spacing_deg)
+    write_site_map(out, pruned)
+    size_mb = out.stat().st_size / BYTES_PER_MB
+    return f"{len(pruned.keyframes)} of {len(site.keyframes)} keyframes left, {size_mb:.1f} MB"
 
 
 def merge(paths: Sequence[Path], out: Path) -> list[str]:

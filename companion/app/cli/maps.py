@@ -7,13 +7,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from companion.app.cli.options import Command, json_option, made_folder
+from companion.app.cli.options import Command, amount, json_option, made_folder
 from companion.app.stopping import StopSignals
 from companion.errors import InputError
 
 
 def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
-    """Show, verify, export, merge or save; 1 where a map is damaged."""
+    """Show, verify, export, merge, prune or save; 1 where a map is damaged."""
     from companion.app import map_command as maps
 
     if arguments.what == "show":
@@ -30,6 +30,9 @@ def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
         if len(arguments.maps) < 2:
             raise InputError("merge wants two maps or more")
         print("\n".join(maps.merge(arguments.maps, arguments.out)))
+        print(arguments.out)
+    elif arguments.what == "prune":
+        print(maps.prune(arguments.map, arguments.out, arguments.within))
         print(arguments.out)
     else:
         for each in maps.save(arguments.map, arguments.out).damaged:
@@ -66,5 +69,13 @@ def add_parsers(commands: Any) -> None:
     )
     merged.add_argument("maps", type=Path, nargs="+", metavar="MAP")
     merged.add_argument("--out", type=Path, required=True, metavar="FILE")
+    pruned = whats.add_parser(
+        "prune", parents=[given], help="leave out keyframes that others make redundant"
+    )
+    pruned.add_argument(
+        "--within", type=amount, default=3.0, metavar="DEG",
+        help="of another keyframe, as an angle seen from its points (default: 3)",
+    )  # fmt: skip
+    pruned.add_argument("--out", type=Path, required=True, metavar="FILE")
     saved = whats.add_parser("save", parents=[given], help="keep the map of a run elsewhere")
     saved.add_argument("--out", type=Path, required=True, metavar="FILE")

@@ -80,6 +80,23 @@ def test_maps_of_two_sites_are_not_merged(sites: tuple[SiteMap, SiteMap]) -> Non
     assert merge_sites(sites[0], elsewhere, IN_ITSELF) is None
 
 
+def test_pruning_leaves_out_redundant_keyframes_only(tmp_path: Path) -> None:
+    ground = Ground(np.random.default_rng(8))
+    near = [flown(np.array([0.02 * n, 0.0])) for n in range(16)]
+    far = [flown(np.array([3.0 + 2.0 * n, 0.0])) for n in range(6)]
+    site = kept(ground, near + far, "hover", 0.0, 1.0)
+    write_site_map(tmp_path / "all.map", site)
+    out = tmp_path / "few.map"
+    assert main(["map", "prune", str(tmp_path / "all.map"), "--out", str(out)]) == 0
+    pruned = read_site_map(out).site
+    assert pruned.revision == 2 and 0 < len(site.keyframes) - len(pruned.keyframes)
+    left = places(pruned)
+    for place in places(site)[16:]:
+        assert np.linalg.norm(left - place, axis=1).min() < 1e-6
+    times = {k.t_ns for k in site.keyframes}
+    assert {k.t_ns for k in pruned.keyframes} < times
+
+
 def test_the_command_merges_files(
     sites: tuple[SiteMap, SiteMap], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
