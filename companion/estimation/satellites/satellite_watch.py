@@ -57,9 +57,7 @@ WANDER_S = 60.0
 """For so long errors of a receiver wander away; they are bounded."""
 FREE_S = 30.0
 """Without the map of before nobody knows where satellites should be: then they are used again after
-this long, if they go where vision goes."""
-
-
+this long, if they go where vision goes, or if there is none: a map needs them for its place."""
 SETTLED_S = 10.0
 """Time for which a map has been placed before it is held against anything: its first scale is by a
 few positions, and moves by more than is stated."""
@@ -96,6 +94,8 @@ class SatelliteWatch:
         self._anchor: Array | None = None
         """Residual (3,) before the doubt began; None where that map is gone."""
         self._anchor_path_m = self._doubt_s = self._agrees_since_s = 0.0
+        self._was_judged = True
+        """True if the newest position was held against vision."""
         self._newest_ns = self._heard_ns = 0
         self._intervals_ns: deque[int] = deque(maxlen=N_KNOWN)
         self._warnings: list[Warned] = []
@@ -145,18 +145,19 @@ class SatelliteWatch:
                 anchor = self._residuals.offset_m(3.0)
                 self._begin(sample.t_ns, Doubt.POOR, anchor, f"{stated_m:.0f} m are stated")
             return not self.doubted
-        if not self._residuals.take_position(sample):
-            return not self.doubted
+        judged = self._residuals.take_position(sample) and self._settled(sample.t_ns)
         if self._doubt is not None:
-            self._look_for_end(sample.t_ns)
-            return not self.doubted
-        since_s = self._residuals.placed_since_s
-        settled = since_s is not None and 1e-9 * sample.t_ns - since_s >= SETTLED_S
-        if settled and self._calibrated:
+            self._look_for_end(sample.t_ns, judged)
+        elif judged:
             if self._jumped(sample.t_ns):
                 return False
             self._compare(sample.t_ns)
         return not self.doubted
+
+    def _settled(self, t_ns: int) -> bool:
+        """True if satellites can be held against the map."""
+        since_s = self._residuals.placed_since_s
+        return self._calibrated and since_s is not None and 1e-9 * t_ns - since_s >= SETTLED_S
 
     def _jumped(self, t_ns: int) -> bool:
         """True if the newest position is elsewhere than those of the second before."""
@@ -190,30 +191,44 @@ class SatelliteWatch:
             self._begin(t_ns, doubt, [change.base_m, *longer][-1], detail)
 
     def _begin(self, t_ns: int, doubt: Doubt, anchor: Array | None, detail: str) -> None:
-        self._doubt, self._anchor = doubt, anchor
+        self._doubt, self._anchor = doubt, anchor if self._settled(t_ns) else None
         self._anchor_path_m, self._doubt_s = self._residuals.path_m, 1e-9 * t_ns
         self._agrees_since_s = 0.0
         self._n_jumped = self._n_moved = 0
         self._warnings.append(Warned(t_ns, doubt.value, detail))
 
-    def _look_for_end(self, t_ns: int) -> None:
-        """End a doubt once satellites are where they should be, for long enough."""
-        t_s, offset = 1e-9 * t_ns, self._residuals.offset_m(1.0)
+    def _agrees(self, t_ns: int) -> bool:
+        """True if satellites go where vision goes, and are where they were before the doubt."""
+        offset = self._residuals.offset_m(1.0)
         recent = [c for c in self._residuals.changes() if c.window_s <= AGAIN_S]
-        agrees = offset is not None and not any(map(_doubt_of, recent))
-        if agrees and offset is not None and self._anchor is not None:
-            off_m = float(np.hypot(*(offset - self._anchor)[:2]))
-            since_m, since_s = self._residuals.path_m - self._anchor_path_m, t_s - self._doubt_s
-            sigma_m = np.linalg.norm(
-                [WHITE_M[0], 2 * PATH * since_m, RATE_M_S[0] * min(since_s, WANDER_S) / 4]
-            )
-            agrees = off_m < max(AGAIN_M, AGAIN_SIGMAS * float(sigma_m))
-        if not agrees:
+        if offset is None or any(map(_doubt_of, recent)):
+            return False
+        if self._anchor is None:
+            return True
+        off_m = float(np.hypot(*(offset - self._anchor)[:2]))
+        since_m = self._residuals.path_m - self._anchor_path_m
+        wandered_s = min(1e-9 * t_ns - self._doubt_s, WANDER_S)
+        sigma_m = float(
+            np.linalg.norm([WHITE_M[0], 2 * PATH * since_m, RATE_M_S[0] * wandered_s / 4])
+        )
+        return off_m < max(AGAIN_M, AGAIN_SIGMAS * sigma_m)
+
+    def _look_for_end(self, t_ns: int, judged: bool) -> None:
+        """End a doubt once nothing has contradicted satellites for long enough.
+
+        Those that were only gone, or poor, and that nothing is known of, are used at once.
+        """
+        t_s = 1e-9 * t_ns
+        if judged is not self._was_judged:  # counted anew by another measure
+            self._was_judged, self._agrees_since_s = judged, 0.0
+        if judged and not self._agrees(t_ns):
             self._agrees_since_s = 0.0
-        elif not self._agrees_since_s:
-            self._agrees_since_s = t_s
-        wait_s = AGAIN_S if self._anchor is not None else FREE_S
-        if self._agrees_since_s and t_s - self._agrees_since_s >= wait_s:
+            return
+        self._agrees_since_s = self._agrees_since_s or t_s
+        wait_s = AGAIN_S if judged and self._anchor is not None else FREE_S
+        if self._anchor is None and self._doubt in (Doubt.GONE, Doubt.POOR):
+            wait_s = 0.0
+        if t_s - self._agrees_since_s >= wait_s:
             self._doubt = None
             self._residuals.keep_since(self._agrees_since_s)
             self._warnings.append(

@@ -61,6 +61,7 @@ class Flown:
         self.wander = np.zeros(3)
         self.t_s = 0.0
         self.map_id = 0
+        self.tracked = True
         self.used: list[tuple[float, bool]] = []
         self.frozen: Array | None = None
 
@@ -75,7 +76,8 @@ class Flown:
             self.t_s = began_s + 0.05 * (step + 1)
             t_ns = START_NS + round(self.t_s * S)
             place = self.path(self.t_s) * (1 + drift)
-            self.watch.take_pose(t_ns, self.map_id, self.camera_at(place), PLACED)
+            if self.tracked:
+                self.watch.take_pose(t_ns, self.map_id, self.camera_at(place), PLACED)
             if heard:
                 self.watch.take_time(t_ns)
             if step % 4 == 0 and not silent:
@@ -238,7 +240,27 @@ def test_a_pull_that_stops_elsewhere_stays_doubted() -> None:
 def test_where_the_map_of_before_is_gone_they_are_used_again_after_a_while() -> None:
     flown, _ = faulty(circle, off=lambda _: np.array([30.0, -40.0, 0.0]))
     flown.map_id = 7
-    said = flown.fly(40.0, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    said = flown.fly(45.0, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    assert [each.what for each in said] == [USED_AGAIN]
+
+
+def test_a_receiver_that_comes_back_where_nothing_is_known_of_it_is_used_at_once() -> None:
+    """A map that has no scale yet needs it."""
+    blind, guessed = Flown(circle), Flown(circle)
+    blind.tracked = False
+    guessed.watch = SatelliteWatch(CAMERA_FROM_BODY, calibrated=False)
+    for flown in (blind, guessed):
+        assert flown.fly(20.0) == []
+        said = flown.fly(5.0, silent=True) + flown.fly(1.0)
+        assert [each.what for each in said] == [Doubt.GONE.value, USED_AGAIN]
+        assert flown.used[-1][1]
+
+
+def test_where_vision_is_gone_for_long_they_are_used_again() -> None:
+    flown, _ = faulty(circle, off=lambda _: np.array([30.0, -40.0, 0.0]))
+    flown.tracked = False
+    assert flown.fly(25.0, off=lambda _: np.array([30.0, -40.0, 0.0])) == []
+    said = flown.fly(10.0, off=lambda _: np.array([30.0, -40.0, 0.0]))
     assert [each.what for each in said] == [USED_AGAIN]
 
 
