@@ -144,6 +144,7 @@ class SatelliteWatch:
             if self._doubt is None and self._n_seen >= N_KNOWN:
                 anchor = self._residuals.offset_m(3.0)
                 self._begin(sample.t_ns, Doubt.POOR, anchor, f"{stated_m:.0f} m are stated")
+            self._agrees_since_s = 0.0
             return not self.doubted
         judged = self._residuals.take_position(sample) and self._settled(sample.t_ns)
         if self._doubt is not None:
@@ -216,7 +217,7 @@ class SatelliteWatch:
     def _look_for_end(self, t_ns: int, judged: bool) -> None:
         """End a doubt once nothing has contradicted satellites for long enough.
 
-        Those that were only gone, or poor, and that nothing is known of, are used at once.
+        Those that were only gone, and that nothing is known of, are used at once.
         """
         t_s = 1e-9 * t_ns
         if judged is not self._was_judged:  # counted anew by another measure
@@ -227,7 +228,7 @@ class SatelliteWatch:
         self._agrees_since_s = self._agrees_since_s or t_s
         wait_s = AGAIN_S if judged and self._anchor is not None else FREE_S
         if self._anchor is None and self._doubt in (Doubt.GONE, Doubt.POOR):
-            wait_s = 0.0
+            wait_s = 0.0 if self._doubt is Doubt.GONE else AGAIN_S
         if t_s - self._agrees_since_s >= wait_s:
             self._doubt = None
             self._residuals.keep_since(self._agrees_since_s)

@@ -222,6 +222,17 @@ def test_positions_that_state_no_accuracy_are_not_used() -> None:
     assert not flown.used[-1][1]
 
 
+def test_an_accuracy_about_the_limit_is_said_once() -> None:
+    flown = Flown(circle)
+    flown.tracked = False
+    assert flown.fly(5.0) == []
+    said: list[Warned] = []
+    for _ in range(10):
+        said += flown.fly(0.4, sigma_m=1.2 * POOR_M) + flown.fly(1.0, sigma_m=0.8 * POOR_M)
+    assert [each.what for each in said] == [Doubt.POOR.value]
+    assert [each.what for each in flown.fly(6.0)] == [USED_AGAIN]
+
+
 def test_they_are_used_again_where_they_are_as_before() -> None:
     flown, _ = faulty(circle, off=lambda _: np.array([30.0, -40.0, 0.0]))
     assert flown.fly(20.0, off=lambda _: np.array([30.0, -40.0, 0.0])) == []
