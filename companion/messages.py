@@ -77,8 +77,9 @@ class Track:
     backfilled: bool = False
     sigma_position: float = float("inf")
     sigma_rotation_rad: float = float("inf")
-    rates_camera_rad_s: Array | None = None
-    """Angular rate (3,) in camera axes by which the rolling shutter of the image was undone."""
+    shutter_motion: Array | None = None
+    """Motion (3, 3) by which the rolling shutter of the image was undone, as of
+    `companion.geometry.rolling_shutter.shutter_motion`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

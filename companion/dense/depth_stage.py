@@ -94,8 +94,8 @@ class DepthStage:
             buffered = self._frames.get(message.seq)
             if buffered is not None:
                 if self._undistortion.rolls and buffered.track is None:
-                    rates = message.rates_camera_rad_s
-                    buffered.grey = self._undistortion.image(buffered.grey, rates)
+                    motion = message.shutter_motion
+                    buffered.grey = self._undistortion.image(buffered.grey, motion)
                 buffered.track = message
         elif isinstance(message, KeyframeAdded):
             self._waiting.append(message)
@@ -122,7 +122,7 @@ class DepthStage:
         return out
 
     def _buffer(self, frame: Frame) -> None:
-        # of a rolling shutter once its track says how fast the camera turned
+        # of a rolling shutter once its track says how the camera moved
         rolls = self._undistortion.rolls
         grey = frame.grey if rolls else self._undistortion.image(frame.grey)
         self._frames[frame.seq] = _BufferedFrame(grey, frame.rgb)
@@ -150,8 +150,8 @@ class DepthStage:
         if len(chosen) < 3 or not self._scheduled():
             return []
         self._last_reference = keyframe.keyframe_id
-        rates = None if buffered.track is None else buffered.track.rates_camera_rad_s
-        rgb = self._undistortion.image(buffered.rgb, rates)
+        motion = None if buffered.track is None else buffered.track.shutter_motion
+        rgb = self._undistortion.image(buffered.rgb, motion)
 
         def depth(engine: DepthEngine) -> DepthMap:
             engine.begin(buffered.grey, near, far)

@@ -42,14 +42,14 @@ class Undistortion:
         """True if the camera has a rolling shutter, which is undone by `image`."""
         return self._unrolling is not None
 
-    def image(self, image: Bytes, rates_rad_s: Array | None = None) -> Bytes:
+    def image(self, image: Bytes, motion: Array | None = None) -> Bytes:
         """The undistorted image, (H, W) or (H, W, 3).
 
-        That of a rolling shutter is of the time of its middle row, where `rates_rad_s` (3,), by
-        which its camera turns in its own axes, is known.
+        That of a rolling shutter is of the time of its middle row, where the `motion` (3, 3) of its
+        camera is known, see `shutter_motion`.
         """
-        if self._unrolling is not None and rates_rad_s is not None:
-            return self._unrolling.image(image, rates_rad_s)
+        if self._unrolling is not None and motion is not None:
+            return self._unrolling.image(image, motion)
         return np.asarray(cv2.remap(image, *self._fixed, cv2.INTER_LINEAR), np.uint8)
 
     def grey(self, rgb: Bytes) -> Bytes:

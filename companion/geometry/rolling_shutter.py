@@ -1,9 +1,11 @@
-"""Rolling shutter: the rotation of the camera while its rows are read out, undone in the image.
+"""Rolling shutter: the motion of the camera while its rows are read out, undone in the image.
 
 Row v of an image of H rows is exposed (v - (H - 1) / 2) / (H - 1) of the readout after the middle
-row, whose time the stamp is. By then the camera has turned by its angular rate times that time, so
-that a ray of the middle row's camera is seen elsewhere; by how much does not depend on depth. The
-shift is smooth over the image: it is computed on a coarse grid and interpolated between.
+row, whose time the stamp is. By then the camera has turned by its angular rate times that time, and
+moved by its velocity times that time, so that a ray of the middle row's camera is seen elsewhere:
+by the rotation alike at all depths, by the way according to depth, for which a plane through the
+scene is enough. The shift is smooth over the image: it is computed on a coarse grid and
+interpolated between.
 """
 
 from __future__ import annotations
@@ -44,18 +46,37 @@ class RowTimes:
         out: Array = (np.asarray(rows, np.float64) - self._middle) * self._s_per_row
         return out
 
-    def seen_at(self, normalised: Array, rates_rad_s: Array) -> Array:
+    def seen_at(self, normalised: Array, motion: Array) -> Array:
         """Distorted pixels (N, 2) at which rays (N, 2) of the middle row's camera are seen.
 
-        The camera turns by `rates_rad_s` (3,) in its own axes. nan where a ray is not seen.
+        `motion` (3, 3) is that of the camera, see `shutter_motion`. nan where a ray is not seen.
         """
+        rates_rad_s, velocity, plane = motion
         rays = np.column_stack([normalised, np.ones(len(normalised))])
+        # in the sky a plane would lie behind the camera
+        moved = -np.maximum(rays @ plane, 0.0)[:, None] * velocity
         pixels = self._camera.project(rays)
         for _ in range(ROUNDS):
-            # the world turns the other way
             t_s = self.of_rows(pixels[:, 1])
-            pixels = self._camera.project(_turned(rays, -rates_rad_s, t_s))
+            # the world turns the other way
+            turned = _turned(rays + t_s[:, None] * moved, -rates_rad_s, t_s)
+            pixels = self._camera.project(turned)
         return pixels
+
+
+def shutter_motion(
+    rates_rad_s: Array, velocity: Array | None = None, plane: Array | None = None
+) -> Array:
+    """Motion (3, 3) of a camera while it is read out, in its axes.
+
+    Its rows are the angular rate (3,) in rad/s, the velocity (3,), and a plane that is about the
+    scene: the depth of a ray (x, y, 1) is one over its product with the plane (3,), in the unit of
+    length of the velocity. Without both the camera only turns.
+    """
+    none = np.zeros(3)
+    if velocity is None or plane is None:
+        return np.stack([rates_rad_s, none, none])
+    return np.stack([rates_rad_s, velocity, plane])
 
 
 def nodes(width: int, height: int) -> Array:
@@ -78,16 +99,16 @@ class Unrolling:
         height, width = self._shape = camera.height, camera.width
         self._rows = RowTimes(camera, readout_s)
         self._rays = camera.normalise(nodes(width, height)) if node_rays is None else node_rays
-        self._still = self._rows.seen_at(self._rays, np.zeros(3))
+        self._still = self._rows.seen_at(self._rays, np.zeros((3, 3)))
         if maps is None:
             u, v = np.meshgrid(np.arange(width), np.arange(height))
             maps = u.astype(np.float32), v.astype(np.float32)
         self._maps = maps
         self._is_distorted_alike = node_rays is None
 
-    def image(self, image: Bytes, rates_rad_s: Array) -> Bytes:
-        """The image (H, W) or (H, W, 3) of a camera that turns by `rates_rad_s` (3,)."""
-        shift = np.nan_to_num(self._rows.seen_at(self._rays, rates_rad_s) - self._still)
+    def image(self, image: Bytes, motion: Array) -> Bytes:
+        """The image (H, W) or (H, W, 3) of a camera with a `motion`, see `shutter_motion`."""
+        shift = np.nan_to_num(self._rows.seen_at(self._rays, motion) - self._still)
         if self._is_distorted_alike and np.abs(shift).max(initial=0.0) < LEAST_SHIFT_PX:
             return image
         columns, lines = (

@@ -30,8 +30,8 @@ from companion.topics.pose_rows import known_pose_of, pose_of, pose_rows
 
 STATES = list(TrackState)
 MOST_FRAMES, MOST_TRACKS, MOST_KEYFRAMES = 256, 4096, 64
-MOST_RATE_RAD_S = 100.0
-"""Gyroscopes end at a third of it."""
+MOST_MOTION = 1e4
+"""Of a camera's angular rate in rad/s, its velocity, and one over the distance of a scene."""
 
 
 NO_COLOUR = np.zeros((0, 0, 3), np.uint8)
@@ -205,10 +205,10 @@ def _tracks(tracks: Sequence[Track]) -> dict[str, np.ndarray]:
         "track_map_from_camera": pose_rows([t.map_from_camera for t in tracks]),
         "track_keyframe_from_camera": pose_rows([t.keyframe_from_camera for t in tracks]),
     }
-    rates = [t.rates_camera_rad_s for t in tracks]
-    if any(rate is not None for rate in rates):  # of a rolling shutter only
-        unknown = np.full(3, np.nan)
-        arrays["track_rates"] = np.stack([unknown if r is None else r for r in rates])
+    motions = [t.shutter_motion for t in tracks]
+    if any(motion is not None for motion in motions):  # of a rolling shutter only
+        unknown = np.full((3, 3), np.nan)
+        arrays["track_shutter"] = np.stack([unknown if m is None else m for m in motions])
     return arrays
 
 
@@ -225,9 +225,9 @@ def _tracks_of(envelope: Envelope) -> list[Track]:
         envelope.array(name, "<f8", n, 7, finite=False)
         for name in ("track_map_from_camera", "track_keyframe_from_camera")
     )
-    rates = np.full((n, 3), np.nan)
-    if "track_rates" in envelope.arrays:
-        rates = envelope.array("track_rates", "<f8", n, 3, finite=False)
+    motions = np.full((n, 3, 3), np.nan)
+    if "track_shutter" in envelope.arrays:
+        motions = envelope.array("track_shutter", "<f8", n, 3, 3, finite=False)
     out = []
     for k in range(n):
         track = Track(
@@ -235,7 +235,7 @@ def _tracks_of(envelope: Envelope) -> list[Track]:
             int(keyframes[k]) if keyframes[k] >= 0 else None, pose_of(relative[k]),
             int(found[k, 0]), int(found[k, 1]), None, bool(backfilled[k]),
             float(sigmas[k, 0]), float(sigmas[k, 1]),
-            rates[k] if np.abs(rates[k]).max() < MOST_RATE_RAD_S else None,
+            motions[k] if np.abs(motions[k]).max() < MOST_MOTION else None,
         )  # fmt: skip
         out.append(track)
     return out

@@ -12,8 +12,9 @@ import numpy as np
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.motion_filter import MotionFilter
 from companion.estimation.shutter.readout_estimation import ReadoutEstimate, ReadoutEstimator
+from companion.estimation.shutter.scene_plane import scene_plane
 from companion.geometry.camera import Camera
-from companion.geometry.rolling_shutter import Unrolling
+from companion.geometry.rolling_shutter import Unrolling, shutter_motion
 from companion.geometry.transforms import Array
 from companion.messages import Frame, Track, Warned
 from companion.slam.features.view import View
@@ -36,10 +37,11 @@ OTHER_READOUT = "the rolling shutter looks slower or faster than camera.readout_
 
 
 class ShutterOfFrames:
-    """Undoes the rotation of the camera while a frame is read out.
+    """Undoes the motion of the camera while a frame is read out.
 
-    By the autopilot's attitude, or where that is not the camera's by the rotation between the last
-    two images, which is said once; while neither is known a frame stays as it is. Without a readout
+    Its rotation by the autopilot's attitude, or where that is not the camera's by that between the
+    last two images, which is said once; while neither is known a frame stays as it is. Its way
+    before a plane through the points of the last frame, where that was tracked. Without a readout
     frames stay as they are, and only the shutter is watched.
     """
 
@@ -52,11 +54,15 @@ class ShutterOfFrames:
         self._estimator = ReadoutEstimator(camera.height)
         self._map: SlamMap | None = None
         self._rates: Array | None = None
+        self._motion: Array | None = None
+        self._last: Array | None = None
+        """Points (N, 3) of the map that the last frame saw."""
         self._warnings: list[Warned] = []
         self._said_by_images = self._said_readout = False
 
     def begin(self, frame: Frame, attitude: CameraAttitude, motion: MotionFilter) -> Frame:
         """The frame as a global shutter would have taken it."""
+        self._motion = None
         rates = attitude.rates_at(frame.t_ns, self._half_span_ns)
         by_images = rates is None
         if by_images:
@@ -67,19 +73,30 @@ class ShutterOfFrames:
         if by_images and not self._said_by_images:
             self._said_by_images = True
             self._warnings.append(Warned(frame.t_ns, BY_IMAGES, BY_IMAGES_WHY))
-        return replace(frame, grey=self._unrolling.image(frame.grey, self._rates))
+        self._motion = shutter_motion(self._rates, *self._way(frame.t_ns, attitude, motion))
+        return replace(frame, grey=self._unrolling.image(frame.grey, self._motion))
+
+    def _way(
+        self, t_ns: int, attitude: CameraAttitude, motion: MotionFilter
+    ) -> tuple[Array | None, Array | None]:
+        """Velocity of the camera and the plane before it, as for `shutter_motion`."""
+        pose, velocity = motion.predict(t_ns, attitude.at(t_ns)), motion.velocity
+        if pose is None or velocity is None or self._last is None:
+            return None, None
+        return pose.rotation.T @ velocity[0], scene_plane(pose.inverse().apply(self._last))
 
     def of(self, track: Track) -> Track:
-        """The track of this frame, with the rate by which its image was corrected."""
-        if self._unrolling is None or self._rates is None:
-            return track
-        return replace(track, rates_camera_rad_s=self._rates)
+        """The track of this frame, with the motion by which its image was corrected."""
+        return track if self._motion is None else replace(track, shutter_motion=self._motion)
 
     def end(self, view: View | None, slam_map: SlamMap) -> list[Warned]:
         """Compare what was seen in this frame, if it was tracked; warnings since the last call."""
         if slam_map is not self._map:
             self._map = slam_map
             self._estimator.reset()
+        self._last = None
+        if view is not None and self._unrolling is not None:
+            self._last = slam_map.positions[view.point_ids[view.point_ids >= 0]]
         if view is not None and self._rates is not None and not self._said_readout:
             self._estimator.take(view, slam_map.positions, self._rates)
             self._judge(view.t_ns)

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from companion.geometry.camera import Camera
+from companion.geometry.rolling_shutter import shutter_motion
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from companion.messages import Frame, KeyframeAdded, MapUpdate, Message, Track, TrackState
 from tests.support.flights.rolling_scene import rolled
@@ -51,7 +52,9 @@ def told(
             poses[keyframe] = at(k)
         relative = poses[keyframe].inverse() @ at(k)
         track = Track(k, k, TrackState.TRACKING, at(k), keyframe, relative)
-        yield k, track if rates_of is None else replace(track, rates_camera_rad_s=rates_of(k))
+        if rates_of is not None:
+            track = replace(track, shutter_motion=shutter_motion(rates_of(k)))
+        yield k, track
         if k % KEYFRAME_EVERY == 0:
             v, u = np.nonzero(depth)
             some = slice(None, None, 97)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.geometry.camera import Camera, Distortion
-from companion.geometry.rolling_shutter import RowTimes, Unrolling
+from companion.geometry.rolling_shutter import RowTimes, Unrolling, shutter_motion
 from companion.geometry.transforms import Array, Pose, rotation_from_vector
 from tests.support.flights.rolling_scene import rolled
 from tests.support.flights.scene import DOWN_LOOKING, PlaneWorld
@@ -35,7 +35,7 @@ def seen_by_search(camera: Camera, ray: Array) -> Array:
 def test_rays_are_seen_where_their_own_row_is_exposed(camera: Camera) -> None:
     pixels = np.array([[20.0, 15.0], [300.0, 20.0], [160.0, 120.0], [30.0, 225.0], [290.0, 220.0]])
     rays = camera.normalise(pixels)
-    seen = RowTimes(camera, READOUT_S).seen_at(rays, RATES)
+    seen = RowTimes(camera, READOUT_S).seen_at(rays, shutter_motion(RATES))
     expected = np.stack([seen_by_search(camera, ray) for ray in rays])
     np.testing.assert_allclose(seen, expected, atol=0.01)
     assert np.abs(seen - pixels).max() > 5.0, "ignored it is an error of many pixels"
@@ -51,7 +51,7 @@ def test_an_image_becomes_that_of_a_global_shutter(camera: Camera) -> None:
 
     still = world.render(camera, at)[0].astype(float)
     image = rolled(world, camera, pose_at, READOUT_S)
-    undone = Unrolling(camera, READOUT_S).image(image, RATES)
+    undone = Unrolling(camera, READOUT_S).image(image, shutter_motion(RATES))
     inside = np.s_[20:-20, 20:-20]  # what the rolling shutter did not see lies at the rim
     before = np.abs(image - still)[inside].mean()
     after = np.abs(undone - still)[inside].mean()
@@ -59,20 +59,41 @@ def test_an_image_becomes_that_of_a_global_shutter(camera: Camera) -> None:
     assert after < 0.15 * before
 
 
+def test_the_way_is_undone_before_a_plane() -> None:
+    world = PlaneWorld(np.random.default_rng(3))
+    place = np.array([0.0, 0.0, -12.0])
+    at = Pose(DOWN_LOOKING @ rotation_from_vector(np.array([0.3, 0.1, 0.0])), place)
+    velocity = np.array([9.0, -6.0, 3.0])  # of the camera, in its axes
+
+    def pose_at(t_s: float) -> Pose:
+        turned = at.rotation @ rotation_from_vector(RATES * t_s)
+        return Pose(turned, at.translation + at.rotation @ velocity * t_s)
+
+    still = world.render(RADTAN, at)[0].astype(float)
+    image = rolled(world, RADTAN, pose_at, READOUT_S)
+    down = at.rotation.T @ [0.0, 0.0, 1.0]
+    unrolling = Unrolling(RADTAN, READOUT_S)
+    errors = []
+    for motion in (shutter_motion(RATES), shutter_motion(RATES, velocity, down / 12.0)):
+        undone = unrolling.image(image, motion)
+        errors.append(np.abs(undone - still)[25:-25, 25:-25].mean())
+    assert errors[1] < 0.6 * errors[0], "of houses it is only about right"
+
+
 def test_an_image_is_left_alone_while_the_camera_hardly_turns() -> None:
     image = np.random.default_rng(1).integers(0, 256, (240, 320), np.uint8)
     unrolling = Unrolling(RADTAN, READOUT_S)
-    assert unrolling.image(image, np.full(3, 0.01)) is image
-    assert unrolling.image(image, np.full(3, 0.5)) is not image
+    assert unrolling.image(image, shutter_motion(np.full(3, 0.01))) is image
+    assert unrolling.image(image, shutter_motion(np.full(3, 0.5))) is not image
 
 
 def test_rates_that_no_camera_has_do_no_harm() -> None:
     image = np.full((240, 320), 7, np.uint8)
     for rates in (np.full(3, 100.0), np.array([0.0, 1e5, 0.0])):
-        assert Unrolling(RADTAN, READOUT_S).image(image, rates).shape == image.shape
+        assert Unrolling(RADTAN, READOUT_S).image(image, shutter_motion(rates)).shape == image.shape
 
 
 def test_odd_sizes() -> None:
     camera = replace(RADTAN, width=333, height=227, readout_ms=25.0)
     image = np.zeros((227, 333, 3), np.uint8)
-    assert Unrolling(camera, READOUT_S).image(image, RATES).shape == image.shape
+    assert Unrolling(camera, READOUT_S).image(image, shutter_motion(RATES)).shape == image.shape

@@ -134,15 +134,15 @@ def test_bundles_are_as_they_were() -> None:
             assert np.abs(image.grey.astype(int) - true_frame.grey).mean() < 3
 
 
-def test_angular_rates_of_a_rolling_shutter_come_along_and_impossible_ones_do_not() -> None:
+def test_motions_of_a_rolling_shutter_come_along_and_impossible_ones_do_not() -> None:
     (sent, *_) = topic_flight.bundles(20)
-    rates = [None, np.array([0.1, -2.0, 0.3]), np.array([0.0, 1e200, 0.0])]
-    tracks = [replace(sent.tracks[0], rates_camera_rad_s=rate) for rate in rates]
+    motions = [None, np.arange(9.0).reshape(3, 3), np.full((3, 3), 1e200)]
+    tracks = [replace(sent.tracks[0], shutter_motion=motion) for motion in motions]
     back = bundle_of(unpack(replace(sent, tracks=tracks).pack())).tracks
-    assert back[0].rates_camera_rad_s is None and back[2].rates_camera_rad_s is None
-    assert back[1].rates_camera_rad_s is not None
-    assert back[1].rates_camera_rad_s.tolist() == [0.1, -2.0, 0.3]
-    assert "track_rates" not in unpack(sent.pack()).arrays
+    assert back[0].shutter_motion is None and back[2].shutter_motion is None
+    assert back[1].shutter_motion is not None
+    assert back[1].shutter_motion.ravel().tolist() == list(range(9))
+    assert "track_shutter" not in unpack(sent.pack()).arrays
 
 
 def test_a_map_is_rebuilt_from_its_changes() -> None:

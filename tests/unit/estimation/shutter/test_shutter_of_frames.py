@@ -69,9 +69,9 @@ def test_by_attitude_also_where_later_ones_have_not_come() -> None:
     for until_s in (1.0, 0.001):
         shutter = ShutterOfFrames(CAMERA)
         found = shutter.begin(frame, attitude(until_s), MotionFilter())
-        rates = shutter.of(track()).rates_camera_rad_s
-        assert rates is not None
-        np.testing.assert_allclose(rates, RATES_CAMERA, atol=2e-3)
+        motion = shutter.of(track()).shutter_motion
+        assert motion is not None
+        np.testing.assert_allclose(motion[0], RATES_CAMERA, atol=2e-3)
         assert difference(found.grey, still) < 0.25 * before
         assert not shutter.end(None, SlamMap(1.2, 8))
 
@@ -82,14 +82,14 @@ def test_without_attitude_by_images_which_is_said_once() -> None:
     shutter, motion, slam_map = ShutterOfFrames(CAMERA), MotionFilter(), SlamMap(1.2, 8)
     nothing = CameraAttitude(None)
     assert shutter.begin(frame, nothing, motion) is frame, "nothing is known yet"
-    assert shutter.of(track()).rates_camera_rad_s is None
+    assert shutter.of(track()).shutter_motion is None
     for t_s in (-0.1, -0.05):
         pose = Pose(body_at(t_s) @ BODY_FROM_CAMERA.rotation, np.zeros(3))
         motion.correct(T_NS + round(t_s * 1e9), pose, None)
     found = shutter.begin(frame, nothing, motion)
-    rates = shutter.of(track()).rates_camera_rad_s
-    assert rates is not None
-    np.testing.assert_allclose(rates, RATES_CAMERA, atol=1e-6)
+    used = shutter.of(track()).shutter_motion
+    assert used is not None
+    np.testing.assert_allclose(used[0], RATES_CAMERA, atol=1e-6)
     assert difference(found.grey, still) < 0.25 * difference(seen, still)
     assert [w.what for w in shutter.end(None, slam_map)] == [BY_IMAGES]
     shutter.begin(frame, nothing, motion)
@@ -100,4 +100,4 @@ def test_of_a_shutter_that_is_not_known_frames_stay_as_they_are() -> None:
     frame = Frame(0, T_NS, image()[0], np.zeros((0, 0, 3), np.uint8))
     shutter = ShutterOfFrames(replace(CAMERA, readout_ms=None))
     assert shutter.begin(frame, attitude(1.0), MotionFilter()) is frame
-    assert shutter.of(track()).rates_camera_rad_s is None
+    assert shutter.of(track()).shutter_motion is None
