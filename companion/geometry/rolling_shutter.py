@@ -96,6 +96,7 @@ class Unrolling:
         self, camera: Camera, readout_s: float, node_rays: Array | None = None,
         maps: tuple[Floats, Floats] | None = None,
     ) -> None:  # fmt: skip
+        self._camera = camera
         height, width = self._shape = camera.height, camera.width
         self._rows = RowTimes(camera, readout_s)
         self._rays = camera.normalise(nodes(width, height)) if node_rays is None else node_rays
@@ -118,6 +119,14 @@ class Unrolling:
             image, columns, lines, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
         )
         return np.asarray(unrolled, np.uint8)
+
+    def seen(self, pixels: NDArray[Any], motion: Array) -> Floats:
+        """Pixels (N, 2) of the image that was read out, of those of one distorted alike.
+
+        Unchanged where a pixel has no ray.
+        """
+        found = self._rows.seen_at(self._camera.normalise(pixels), motion)
+        return np.asarray(np.where(np.isfinite(found), found, pixels), np.float32)
 
     def _fine(self, shift: Array) -> tuple[Floats, Floats]:
         """Shift of columns and of rows (H, W) from that at the nodes (N, 2)."""

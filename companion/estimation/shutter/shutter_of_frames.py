@@ -86,8 +86,16 @@ class ShutterOfFrames:
         return pose.rotation.T @ velocity[0], scene_plane(pose.inverse().apply(self._last))
 
     def of(self, track: Track) -> Track:
-        """The track of this frame, with the motion by which its image was corrected."""
-        return track if self._motion is None else replace(track, shutter_motion=self._motion)
+        """The track of this frame, with the motion by which its image was corrected.
+
+        Its keypoints lie where the image that was read out shows them.
+        """
+        if self._motion is None or self._unrolling is None:
+            return track
+        keypoints = track.keypoints_px
+        if keypoints is not None:
+            keypoints = self._unrolling.seen(keypoints, self._motion)
+        return replace(track, shutter_motion=self._motion, keypoints_px=keypoints)
 
     def end(self, view: View | None, slam_map: SlamMap) -> list[Warned]:
         """Compare what was seen in this frame, if it was tracked; warnings since the last call."""

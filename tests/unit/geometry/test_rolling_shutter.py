@@ -39,6 +39,8 @@ def test_rays_are_seen_where_their_own_row_is_exposed(camera: Camera) -> None:
     expected = np.stack([seen_by_search(camera, ray) for ray in rays])
     np.testing.assert_allclose(seen, expected, atol=0.01)
     assert np.abs(seen - pixels).max() > 5.0, "ignored it is an error of many pixels"
+    unrolling = Unrolling(camera, READOUT_S)
+    np.testing.assert_allclose(unrolling.seen(pixels, shutter_motion(RATES)), seen, atol=1e-4)
 
 
 @CAMERAS

@@ -59,7 +59,8 @@ def difference(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def track() -> Track:
-    return Track(0, T_NS, TrackState.TRACKING)
+    found = np.array([[160.0, 20.0]], np.float32)
+    return Track(0, T_NS, TrackState.TRACKING, keypoints_px=found)
 
 
 def test_by_attitude_also_where_later_ones_have_not_come() -> None:
@@ -69,8 +70,10 @@ def test_by_attitude_also_where_later_ones_have_not_come() -> None:
     for until_s in (1.0, 0.001):
         shutter = ShutterOfFrames(CAMERA)
         found = shutter.begin(frame, attitude(until_s), MotionFilter())
-        motion = shutter.of(track()).shutter_motion
-        assert motion is not None
+        given = shutter.of(track())
+        motion = given.shutter_motion
+        assert motion is not None and given.keypoints_px is not None
+        assert abs(given.keypoints_px[0, 0] - 160.0) > 2.0, "where it was read out, as it is shown"
         np.testing.assert_allclose(motion[0], RATES_CAMERA, atol=2e-3)
         assert difference(found.grey, still) < 0.25 * before
         assert not shutter.end(None, SlamMap(1.2, 8))
