@@ -25,7 +25,7 @@ from companion.estimation.georeference.trajectory_alignment import (
 )
 from companion.estimation.georeference.velocity_verdict import VelocityVerdict
 from companion.estimation.sample_series import SampleSeries
-from companion.geometry.transforms import Array, Pose, Similarity
+from companion.geometry.transforms import Array, Pose, Similarity, rotation_from_vector
 from companion.messages import Georeference, Warned
 from companion.telemetry import PositionSample, PositionSource, Telemetry
 
@@ -33,6 +33,7 @@ MAX_VELOCITY_AGE_NS = 400_000_000
 """A velocity is extrapolated for at most so long."""
 MAX_SIGMA_ROTATION_RAD = np.radians(8.0)
 MAX_SAMPLES = 400
+DOWN = np.array([0.0, 0.0, 1.0])
 MAX_SIGMA_SCALE_NEW_MAP = 0.5
 """Largest relative scale error at which a new map is placed."""
 
@@ -194,6 +195,9 @@ class Georeferencer:
                     return found
         if level is None:
             return None
+        if inertial is not None and inertial.down_map is not None:
+            # the autopilot's own level is off by half a degree for minutes
+            level = turned_to(level @ inertial.down_map, DOWN) @ level
         known = self._scales(samples, level, inertial)
         return self._from_scale(samples, level, reduce(reconciled, known) if known else None)
 
@@ -291,6 +295,14 @@ class Georeferencer:
         return Georeference(
             similarity, sigma, float(SIGMA_YAW_RAD), method, n, 0.0, has_origin=False
         )
+
+
+def turned_to(first: Array, second: Array) -> Array:
+    """The smallest rotation (3, 3) that takes one unit vector (3,) to another near it."""
+    axis = np.cross(first, second)
+    sine = float(np.linalg.norm(axis))
+    angle_rad = float(np.arctan2(sine, first @ second))
+    return rotation_from_vector(axis * (angle_rad / max(sine, 1e-12)))
 
 
 def place_new_map(

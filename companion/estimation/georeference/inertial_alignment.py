@@ -84,14 +84,16 @@ class _Seen(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A scale, its relative standard deviation, and how well all fits.
+    """A scale, its relative standard deviation, the map's vertical, and how well all fits.
 
-    `log_likelihood` is that of the scale it was weighted for, up to a constant; `squared` the
-    squared normalised residual per degree of freedom, 1 where the model is true.
+    `down_map` (3,) is a unit vector; `log_likelihood` is that of the scale it was weighted for, up
+    to a constant; `squared` the squared normalised residual per degree of freedom, 1 where the
+    model is true.
     """
 
     scale: float
     sigma: float
+    down_map: Array
     log_likelihood: float
     squared: float
 
@@ -123,7 +125,7 @@ class InertialAlignment:
         node_of = np.searchsorted(0.5 * (t_s[nodes[1:]] + t_s[nodes[:-1]]), t_s)
         first = np.searchsorted(node_of, np.arange(len(nodes)))
         turns = np.add.reduceat(rotations @ places.ned_from_camera.transpose(0, 2, 1), first)
-        self.n_nodes, self._density_m_s2 = len(nodes), density_m_s2
+        self.n_nodes, self._density_m_s2, self._level = len(nodes), density_m_s2, level
         # between nodes; across a gap nothing is known
         steps = _moves(t_s, sums, nodes[:-1], nodes[1:], _nearest_rotations(turns[1:] + turns[:-1]))
         known = np.abs(np.diff(sums[nodes, 8, 0])) < NO_GAP
@@ -179,9 +181,12 @@ class InertialAlignment:
             return None
         # noise of the map on the regressors, and that of these on themselves
         sigma = float(np.sqrt(signal + 2.0 * max(by_noise, 0.0))) / signal
+        best = signal / -float(left[0, 1])
+        state = (solved @ np.array([best, 1.0])).reshape(self.n_nodes, N_STATE)
+        down = GRAVITY_NED_M_S2 + np.r_[state[:, TILT].mean(0), 0.0]
         return Fit(
-            signal / -float(left[0, 1]), sigma, -0.5 * (squared + found.log_determinant),
-            squared / (3.0 * seen.n),
+            best, sigma, self._level.T @ (down / np.linalg.norm(down)),
+            -0.5 * (squared + found.log_determinant), squared / (3.0 * seen.n),
         )  # fmt: skip
 
     def _equations(self, scale: float, sigma_map: float) -> _Equations:

@@ -96,7 +96,7 @@ class InertialScale:
         if found is None:
             return None
         sigma = float(np.hypot(np.sqrt(max(found.squared, 1.0)) * found.sigma, SIGMA_SENSITIVITY))
-        return Scale(self._scale, sigma, "accelerometers", aligned.n_nodes)
+        return Scale(self._scale, sigma, "accelerometers", aligned.n_nodes, found.down_map)
 
     def _weighted(self, aligned: InertialAlignment) -> Fit | None:
         """Fit with weights for the scale that is found."""

@@ -36,12 +36,16 @@ DISAGREE = 3.0
 
 
 class Scale(NamedTuple):
-    """Metres per map unit, relative standard deviation, method, and number of measurements."""
+    """Metres per map unit, relative standard deviation, method, and number of measurements.
+
+    `down_map` is the vertical (3,) of the map, where it was found with the scale.
+    """
 
     scale: float
     sigma: float
     method: str
     n: int
+    down_map: Array | None = None
 
 
 def reconciled(first: Scale, second: Scale) -> Scale:

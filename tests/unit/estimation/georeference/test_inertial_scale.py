@@ -42,7 +42,7 @@ class Flight:
         rng = np.random.default_rng(seed)
         self.integral = AccelerationIntegral()
         motion = MeasuredMotion(path, rng, seconds + 1.0, axes)
-        self.bias_m_s2 = motion.bias_m_s2
+        self.bias_m_s2, self.tilt = motion.bias_m_s2, motion.tilt
         for sample in motion.samples():
             self.integral.take(sample)
         t_s = np.arange(0.5, seconds, 0.05)
@@ -169,3 +169,23 @@ def test_what_is_stated_is_what_it_is_off_by() -> None:
     print(f"normalised squared error {np.mean(np.square(off)):.2f}, mean {np.mean(off):.2f}")
     assert 0.3 < np.mean(np.square(off)) < 2.0
     assert abs(np.mean(off)) < 0.7
+
+
+def test_the_vertical_is_better_than_the_autopilots() -> None:
+    """A body that turns tells a tilt of its attitude from a bias of its accelerometers."""
+    own, found = [], []
+    for seed in range(6):
+        flight = Flight(weaving, seed)
+        scale = flight.scale()
+        assert scale is not None and scale.down_map is not None
+        down = np.array([0.0, 0.0, 1.0])
+        own.append(_angle_rad(flight.tilt.T @ down, down))
+        found.append(_angle_rad(scale.down_map, MAP_FROM_NED @ down))
+    print(
+        f"off by {np.degrees(found).round(2)} degrees, the autopilot by {np.degrees(own).round(2)}"
+    )
+    assert np.sqrt(np.mean(np.square(found))) < 0.4 * np.sqrt(np.mean(np.square(own)))
+
+
+def _angle_rad(first: Array, second: Array) -> float:
+    return float(np.arccos(np.clip(first @ second, -1.0, 1.0)))
