@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from companion.estimation.georeference.tracked_places import Places
-from companion.geometry.transforms import Array
+from companion.geometry.transforms import Array, skew
 
 MAX_STEP_S = 0.5
 """Between two frames, for gyroscopes to say how one is turned against the other."""
@@ -43,8 +43,13 @@ def steadied(
     errors = np.einsum("nij,nj->ni", rotations[1:], _vectors(by_gyro.transpose(0, 2, 1) @ seen))
     if np.count_nonzero(known) < LEAST_FRAMES:
         return places
-    turns = np.einsum("nij,nj->ni", rotations, rates @ mount)
-    errors = _undelayed(errors, np.diff(turns, axis=0), rotations[1:] @ mount.T, dt_s, known)
+    changes = np.diff(np.einsum("nij,nj->ni", rotations, rates @ mount), axis=0)
+    # by a delay of the stamps, a bias, and a mount that is a little off
+    columns = np.concatenate([
+        changes[..., None], rotations[1:] @ mount.T * dt_s[:, None, None],
+        rotations[1:] @ skew(_vectors(by_gyro)),
+    ], axis=2)  # fmt: skip
+    errors = _without(errors, columns, known)
     noise = _noise(places.places, rotations, errors, known)
     if noise is None:
         return places
@@ -61,17 +66,15 @@ def steadied(
     return places._replace(places=places.places - moved)
 
 
-def _undelayed(
-    errors: Array, changes: Array, map_from_body: Array, dt_s: Array, known: NDArray[np.bool_]
-) -> Array:
-    """Errors without what a bias, and a delay of the stamps, make of changes of the rate.
+def _without(errors: Array, columns: Array, known: NDArray[np.bool_]) -> Array:
+    """Errors (N, 3) without what follows columns (N, 3, M).
 
     Nothing where they are not known, or far beyond others.
     """
-    columns = np.concatenate([changes[..., None], map_from_body * dt_s[:, None, None]], axis=2)
+    left, n = errors, columns.shape[2]
     for _ in range(2):
         found, *_ = np.linalg.lstsq(
-            columns[known].reshape(-1, 4), errors[known].ravel(), rcond=None
+            columns[known].reshape(-1, n), errors[known].ravel(), rcond=None
         )
         left = errors - columns @ found
         size = np.linalg.norm(left, axis=1)

@@ -46,10 +46,13 @@ def _scatter(places: Places, true: Array) -> float:
     return float(np.diff(places.places - true, axis=0).std() / np.sqrt(2.0))
 
 
-def test_places_are_steadier_by_gyroscopes() -> None:
+@pytest.mark.parametrize("off_rad", [0.0, 0.02])
+def test_places_are_steadier_by_gyroscopes(off_rad: float) -> None:
+    """With a mount that is a degree off, too."""
     rng = np.random.default_rng(0)
     places, true = _flown(rng)
-    found = steadied(places, *_gyroscopes(rng).at(places.t_ns), MOUNT)
+    mount = MOUNT @ rotation_from_vector(np.array([off_rad, 0.0, -off_rad]))
+    found = steadied(places, *_gyroscopes(rng).at(places.t_ns), mount)
     print(f"{_scatter(places, true) * 1e3:.1f} mm, then {_scatter(found, true) * 1e3:.1f} mm")
     assert _scatter(found, true) < 0.5 * _scatter(places, true)
     assert np.abs(np.mean(found.places - places.places, axis=0)).max() < 1e-3
