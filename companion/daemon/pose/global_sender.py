@@ -61,7 +61,7 @@ class GlobalSender:
         self._gate.take_georeference(told.georeference)
 
     def of_flight(self, flight: object) -> None:
-        """What comes is of this flight: another localisation knows nothing of the one before."""
+        """Begin anew with another flight: its localisation knows nothing of the one before."""
         if flight is not self._flight:
             self._flight = flight
             self._poses.restart()
