@@ -37,6 +37,8 @@ OBSTACLES_HZ, COMPUTER_HZ = 10.0, 1.0
 MAX_AGE_NS = 200_000_000
 """Age of the image that the pose is from, since its exposure; beyond it nothing is known: at 5 m/s
 all distances are a metre off."""
+MOST_WAITING = 4
+"""Depth maps and chunks between two rounds; of more the newest count. One takes a megabyte."""
 UNKNOWN_AFTER_NS = 3_000_000_000
 """Unknown distances are sent for so long after the last known ones: then nothing is."""
 
@@ -60,12 +62,12 @@ class VehicleReports:
 
     def restart(self, camera: Camera | None) -> None:
         """Begin another flight with another map."""
-        self._cloud = RecentCloud()
         self._track: Track | None = None
         self._map: MapUpdate | None = None
         self._camera = camera or self._camera
-        self._waiting: deque[DepthMap] = deque(maxlen=2)
-        """Depth maps that the next round takes up: it has a thread for it."""
+        waiting: deque[DepthMap | PointChunk] = deque(maxlen=MOST_WAITING)
+        self._seen = RecentCloud(), waiting
+        """The cloud, which is the thread's of a round alone, and what the next round adds to it."""
         self._known_ns = 0
         if camera is not None and camera.body_from_camera is not None:
             self._camera_from_body = camera.body_from_camera.inverse()
@@ -76,10 +78,8 @@ class VehicleReports:
             self._track = message
         elif isinstance(message, MapUpdate):
             self._map = message
-        elif isinstance(message, DepthMap):
-            self._waiting.append(message)
         elif self._obstacles:
-            self._cloud.add(message)
+            self._seen[1].append(message)
 
     async def run(self) -> None:
         """Send until cancelled."""
@@ -152,26 +152,33 @@ class VehicleReports:
     def _obstacle_distance(self) -> object | None:
         """OBSTACLE_DISTANCE now; None where nothing was known for long."""
         now_ns = self._clock.now_ns()
-        while self._waiting:
-            self._cloud.add_map(self._waiting.popleft())
-        found = self._obstacles_now(now_ns)
+        track, update = self._track, self._map
+        cloud, waiting = self._seen
+        while waiting:
+            message = waiting.popleft()
+            if isinstance(message, DepthMap):
+                cloud.add_map(message)
+            else:
+                cloud.add(message)
+        found = self._obstacles_now(now_ns, track, update, cloud)
         if found is not None:
             self._known_ns = now_ns
         elif now_ns - self._known_ns > UNKNOWN_AFTER_NS:
             return None
-        message: object = obstacle_distance(unknown(now_ns) if found is None else found)
-        return message
+        told: object = obstacle_distance(unknown(now_ns) if found is None else found)
+        return told
 
-    def _obstacles_now(self, now_ns: int) -> Obstacles | None:
+    def _obstacles_now(
+        self, now_ns: int, track: Track | None, update: MapUpdate | None, cloud: RecentCloud
+    ) -> Obstacles | None:
         """Obstacles from the map's own pose; None while that is unknown or old."""
-        track, update = self._track, self._map
         if (
             track is None or track.state is not TrackState.TRACKING
             or track.map_from_camera is None or now_ns - track.t_ns > MAX_AGE_NS
             or update is None or update.georeference is None
         ):  # fmt: skip
             return None
-        seen = self._cloud.in_world(now_ns, update)
+        seen = cloud.in_world(now_ns, update)
         if seen is None:
             return None
         world_from_map = update.georeference.world_from_map

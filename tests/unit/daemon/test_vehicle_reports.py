@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import sys
+import threading
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,15 @@ from companion.daemon.vehicle_reports import MAX_AGE_NS, UNKNOWN_AFTER_NS, Vehic
 from companion.dense.obstacles import FREE_S, STAYS_S
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity
-from companion.messages import DepthMap, Georeference, MapUpdate, PixelState, Track, TrackState
+from companion.messages import (
+    DepthMap,
+    Georeference,
+    MapUpdate,
+    PixelState,
+    PointChunk,
+    Track,
+    TrackState,
+)
 from tests.support.autopilot.memory_link import SetClock, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
 
@@ -177,3 +187,36 @@ def test_it_goes_out_ten_times_a_second() -> None:
         return len(approach.port.of("OBSTACLE_DISTANCE"))
 
     assert asyncio.run(asyncio.wait_for(fly(), 5.0)) >= 3
+
+
+def test_chunks_and_flights_come_while_a_round_is_made() -> None:
+    """Its thread would end with an error, and the daemon with it."""
+    approach, errors, over = Approach(), [], threading.Event()
+    approach.fly(3.0)
+    switch_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+
+    def rounds() -> None:
+        try:
+            while not over.is_set():
+                approach.now()
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=rounds)
+    thread.start()
+    ones = np.ones((500, 3), np.float32)
+    try:
+        for n in range(3000):
+            rgb = np.zeros(ones.shape, np.uint8)
+            one = ones[:, 0]
+            approach.reports.take(
+                PointChunk(n % 20, approach.clock.t_ns, ones, rgb, one, ones, one)
+            )
+            if n % 300 == 299:
+                approach.reports.restart(CAMERA)
+    finally:
+        over.set()
+        thread.join()
+        sys.setswitchinterval(switch_s)
+    assert errors == []
