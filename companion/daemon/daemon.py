@@ -137,8 +137,9 @@ class Daemon:
                 )
             if config.gps.switch_source:
                 self._source_switch = SourceSwitch(
-                    config.gps, self._link, clock, self._sends_poses, self._on_warned
-                )
+                    config.gps, self._link, clock, self._sends_poses,
+                    lambda: self._flights.current, self._on_warned,
+                )  # fmt: skip
             date = AutopilotDate(self._link)
         dates = FlightDates(
             clock, lambda: date.ahead_ns if date is not None else None, clock_is_set
@@ -271,11 +272,10 @@ class Daemon:
             text = of_warning(warning.what, warning.detail, warning.good)
             if text is not None:
                 self._soon(self._tell_pilot, text)
-        self._soon(self._take_doubt, warning)
         self._soon(self._flights.take, warning)
 
     def _take_doubt(self, warning: Warned) -> None:
-        """Take a change of the verdict on satellites; in the event loop."""
+        """Take a change of the current flight's verdict on satellites; in the event loop."""
         doubted = doubts(warning)
         if doubted is None:
             return
@@ -312,13 +312,19 @@ class Daemon:
 
             return lambda message: self._soon(later, message)
 
+        take_doubt = current(self._take_doubt)
+
+        def warned(warning: Warned) -> None:
+            self._on_warned(warning)
+            take_doubt(warning)
+
         reports = self._reports if self._settings.config.feedback.obstacle_distance else None
         return Listener(
             odometry=current(self._on_odometry),
             flow=current(self._on_flow),
             landing=current(self._on_landing),
             georeferenced=current(self._on_georeferenced),
-            warned=self._on_warned,
+            warned=warned,
             localisation_died=lambda: self._soon(self._starts.localisation_died, flight),
             unusable=lambda why: self._soon(self._starts.stage_unusable, why),
             snapshot=current(self._on_snapshot),

@@ -1,7 +1,8 @@
 """Switches the sources of ArduPilot's EKF while satellites are doubted, where that is allowed.
 
-It is done while poses are sent only: else the EKF would be left with nothing. Runs in the event
-loop.
+It is done while poses are sent only: else the EKF would be left with nothing. A doubt outlives its
+flight in the air, where what begins anew knows nothing of it, and ends on the ground. Runs in the
+event loop.
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ NOT_SWITCHED = "the EKF's sources could not be switched"
 
 
 class SourceSwitch:
-    """Changes the EKF source set by the verdict on satellites; `sending` is True with poses."""
+    """Changes the EKF source set by the verdict on satellites.
+
+    `sending` is True with poses, `flight` gives the current flight, None without one.
+    """
 
     def __init__(
         self,
@@ -32,18 +36,22 @@ class SourceSwitch:
         link: AutopilotLink,
         clock: FlightClock,
         sending: Callable[[], bool],
+        flight: Callable[[], object],
         warn: Callable[[Warned], None],
     ) -> None:
         self._config, self._link, self._clock = config, link, clock
-        self._sending, self._warn = sending, warn
+        self._sending, self._flight, self._warn = sending, flight, warn
         self._doubted = False
-        self._switched = False
-        """True while the EKF is on the set without satellites, by our command."""
+        self._doubted_in: object = None
+        """Flight that has the doubt."""
+        self._switched: bool | None = False
+        """True while the EKF is on the set without satellites, by our command; None while a command
+        is unanswered, which may have been obeyed."""
         self._not_before_ns = 0
 
     def doubt_satellites(self, doubted: bool) -> None:
         """Satellites are doubted, or are not any more."""
-        self._doubted = doubted
+        self._doubted, self._doubted_in = doubted, self._flight() if doubted else None
 
     async def run(self) -> None:
         """Switch when due; until cancelled."""
@@ -54,6 +62,8 @@ class SourceSwitch:
     async def step(self) -> None:
         """Switch if due."""
         now_ns, vehicle = self._clock.now_ns(), self._link.vehicle
+        if self._doubted and vehicle is not None and not vehicle.armed:
+            self._doubted = self._flight() is self._doubted_in
         if self._doubted == self._switched or now_ns < self._not_before_ns:
             return
         if vehicle is None or vehicle.firmware != "ardupilot" or not self._link.alive:
@@ -68,6 +78,8 @@ class SourceSwitch:
             what = TO_VISION if to_vision else TO_SATELLITES
             self._warn(Warned(self._clock.now_ns(), what, f"set {number}", good=not to_vision))
             return
+        if result < 0:
+            self._switched = None
         self._not_before_ns = self._clock.now_ns() + AGAIN_NS
         detail = f"set {number}: MAV_RESULT {result}" if result >= 0 else f"set {number}: no answer"
         self._warn(Warned(self._clock.now_ns(), NOT_SWITCHED, detail))

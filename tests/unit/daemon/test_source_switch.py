@@ -32,14 +32,19 @@ class Vehicle:
         self.warned: list[Warned] = []
         self.sending, self.result = True, mavlink.MAV_RESULT_ACCEPTED
         self.switch = SourceSwitch(
-            GpsConfig(True, 3, 1), self.link, self.clock, lambda: self.sending, self.warned.append
-        )
-        self.autopilot = autopilot
+            GpsConfig(True, 3, 1), self.link, self.clock, lambda: self.sending,
+            lambda: self.flight, self.warned.append,
+        )  # fmt: skip
+        self.autopilot, self.flight = autopilot, object()
 
     async def begin(self) -> None:
         await listen(self.link)
+        self.hear(armed=True)
+
+    def hear(self, armed: bool) -> None:
+        mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
         self.port.hear(
-            mavlink.MAVLink_heartbeat_message(2, self.autopilot, 0, 0, 4, 3), self.clock.t_ns
+            mavlink.MAVLink_heartbeat_message(2, self.autopilot, mode, 0, 4, 3), self.clock.t_ns
         )
 
     async def step(self) -> None:
@@ -129,5 +134,59 @@ def test_nothing_for_another_firmware_or_a_silent_one(silent: bool) -> None:
         vehicle.switch.doubt_satellites(True)
         await vehicle.step()
         assert vehicle.sets == []
+
+    asyncio.run(fly())
+
+
+def test_a_doubt_outlives_its_flight_in_the_air_only() -> None:
+    """Another flight's verdict begins anew: nobody would ever take the doubt back."""
+
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+        vehicle.switch.doubt_satellites(True)
+        await vehicle.step()
+        vehicle.flight = object()  # localisation has died in the air
+        await vehicle.step()
+        assert vehicle.sets == [3]
+        vehicle.hear(armed=False)
+        await vehicle.step()
+        assert vehicle.sets == [3, 1]
+
+    asyncio.run(fly())
+
+
+def test_on_the_ground_a_doubt_of_the_flight_that_goes_on_stays() -> None:
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+        vehicle.hear(armed=False)
+        vehicle.switch.doubt_satellites(True)
+        for _ in range(3):
+            await vehicle.step()
+        assert vehicle.sets == [3]
+
+    asyncio.run(fly())
+
+
+def test_a_command_without_answer_may_have_been_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Satellites that agree again before it was answered are to be flown on."""
+
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+
+        async def unanswered(number: int) -> int:
+            return -1
+
+        with monkeypatch.context() as patch:
+            patch.setattr(vehicle.link, "set_source_set", unanswered)
+            vehicle.switch.doubt_satellites(True)
+            await vehicle.step()
+        vehicle.switch.doubt_satellites(False)
+        vehicle.clock.t_ns += AGAIN_NS
+        await vehicle.step()
+        await vehicle.step()
+        assert vehicle.sets == [1]
 
     asyncio.run(fly())
