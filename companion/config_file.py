@@ -39,7 +39,11 @@ CONSTANTS: Mapping[str, Any] = {
 }  # fmt: skip
 """Keys of version 0.1.0 that are no more, with the value that counts instead."""
 
-_PASSWORD = re.compile(r"(://[^:/@\s]*):[^@/\s]+@")
+_PASSWORD = re.compile(r"(://[^:/@\s]*):[^/\s]+@")
+_PASSWORD_GIVEN = re.compile(
+    r"""\b(user-pw|proxy-pw|password|passwd|pwd|pass)=("[^"]*"|'[^']*'|[^\s&"'!]+)""", re.IGNORECASE
+)
+"""In a pipeline of GStreamer, and in the query of a URL."""
 
 
 @cache
@@ -180,8 +184,8 @@ def shown(config: Config) -> dict[str, Any]:
 
 
 def without_passwords(text: str) -> str:
-    """A text, with the passwords of URLs in it made unreadable."""
-    return _PASSWORD.sub(r"\1:***@", text)
+    """A text, with the passwords of URLs and pipelines in it made unreadable."""
+    return _PASSWORD_GIVEN.sub(r"\1=***", _PASSWORD.sub(r"\1:***@", text))
 
 
 def command_shown(argv: Sequence[str]) -> str:

@@ -89,7 +89,8 @@ class Access:
 
     def is_token(self, session: Session, token: str) -> bool:
         """True of the token of this session, which has a name."""
-        return bool(session.name) and hmac.compare_digest(self.token(session), token)
+        own = self.token(session).encode()
+        return bool(session.name) and hmac.compare_digest(own, token.encode())
 
     @property
     def _signer(self) -> URLSafeSerializer:

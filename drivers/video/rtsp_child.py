@@ -18,6 +18,8 @@ import threading
 LENGTH = struct.Struct("<I")
 MOST_WAITING = 400_000
 """Bytes that wait for the packer; beyond, pictures are left out."""
+MOST_SESSIONS = 8
+"""Viewers at once; more are refused: each has buffers and sockets of its own."""
 LAUNCH = (
     "( appsrc name=companion_source is-live=true do-timestamp=true format=time max-bytes=2000000"
     " caps=video/x-h264,stream-format=byte-stream,alignment=au"
@@ -67,6 +69,7 @@ def main() -> None:
     server = GstRtspServer.RTSPServer()
     server.set_address(host)
     server.set_service(port)
+    server.get_session_pool().set_max_sessions(MOST_SESSIONS)
     server.get_mount_points().add_factory(path, factory)
     loop = GLib.MainLoop()
     if server.attach(None) == 0:

@@ -35,6 +35,8 @@ class RtspServer:
         self.problem = ""
         """Reason why nobody can watch; "" where one can."""
         self._left = bytearray()
+        self._feeding = threading.Lock()
+        """Held while pictures are written, which never waits: no server ends, or begins, then."""
         self._over = threading.Event()
         self._child: subprocess.Popen[bytes] | None = None
         self._thread = threading.Thread(target=self._run, name="rtsp", daemon=True)
@@ -42,16 +44,17 @@ class RtspServer:
 
     def send(self, picture: bytes) -> bool:
         """Send a picture (H.264, annex B); False where it was left out, as nothing is taken."""
-        child = self._child
-        if child is None or child.stdin is None:
-            return False
-        if self._left:
+        with self._feeding:
+            child = self._child
+            if child is None or child.stdin is None:
+                return False
+            if self._left:
+                self._write(child.stdin.fileno())
+            if self._left:
+                return False
+            self._left += len(picture).to_bytes(4, "little") + picture
             self._write(child.stdin.fileno())
-        if self._left:
-            return False
-        self._left += len(picture).to_bytes(4, "little") + picture
-        self._write(child.stdin.fileno())
-        return True
+            return True
 
     def close(self) -> None:
         """End it."""
@@ -89,14 +92,16 @@ class RtspServer:
             os.set_blocking(child.stdin.fileno(), False)
             with contextlib.suppress(OSError):  # it may have less
                 fcntl.fcntl(child.stdin.fileno(), F_SETPIPE_SZ, PIPE_BYTES)
-            self._left.clear()
-            self._child = child
+            with self._feeding:
+                self._left.clear()
+                self._child = child
             if self._over.is_set():
                 return
             for line in child.stdout:
                 self._hear(line)
         finally:
-            self._child = None
+            with self._feeding:
+                self._child = None
             child.kill()
             child.wait()
             child.stdin.close()

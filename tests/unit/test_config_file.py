@@ -275,6 +275,18 @@ def test_passwords_are_not_shown() -> None:
     )
 
 
+@pytest.mark.parametrize("text", [
+    "rtsp://eye:s3@cret@10.0.0.2/main",
+    "rtspsrc location=rtsp://10.0.0.2/ user-id=eye user-pw=s3cret ! rtph264depay",
+    'rtspsrc user-pw="s3 cret" ! decodebin',
+    "http://10.0.0.2/live?user=eye&password=s3cret&channel=1",
+])  # fmt: skip
+def test_nor_are_those_of_pipelines_and_queries(text: str) -> None:
+    seen = without_passwords(text)
+    assert "cret" not in seen and "***" in seen
+    assert "10.0.0.2" in seen or "10.0.0.2" not in text
+
+
 def test_a_command_is_shown_without_where_the_program_lies() -> None:
     argv = ["/home/pilot/.venv/bin/companion", "replay", "a flight", "--set", "x=rtsp://a:b@c/"]
     assert command_shown(argv) == "companion replay 'a flight' --set x=rtsp://a:***@c/"

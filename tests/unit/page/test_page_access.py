@@ -163,3 +163,9 @@ def test_names_of_other_sites_that_lead_here_are_refused(served: ServedPage) -> 
         assert served.ask("GET", "/", peer=HERE, headers={"host": host}).status == 421
     for host in ("127.0.0.1:9880", "[::1]:9880", "localhost"):
         assert served.ask("GET", "/", peer=HERE, headers={"host": host}).status == 200
+
+
+def test_a_token_of_other_letters_is_a_wrong_one(served: ServedPage) -> None:
+    headers = served.paired(served.codes.change)
+    answer = served.ask("POST", "/restart", peer=ELSEWHERE, headers=headers, form={"token": "ä"})
+    assert answer.status == 403
