@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.motion_filter import MotionFilter
-from companion.estimation.shutter.readout_estimation import ReadoutEstimate, ReadoutEstimator
+from companion.estimation.shutter.readout_estimation import ReadoutEstimator
 from companion.estimation.shutter.scene_plane import scene_plane
 from companion.geometry.camera import Camera
 from companion.geometry.rolling_shutter import Unrolling, shutter_motion
@@ -110,11 +110,6 @@ class ShutterOfFrames:
             self._judge(view.t_ns)
         said, self._warnings = self._warnings, []
         return said
-
-    @property
-    def estimate(self) -> ReadoutEstimate | None:
-        """The readout beyond the one that is stated; None while unknown."""
-        return self._estimator.estimate
 
     def _judge(self, t_ns: int) -> None:
         found = self._estimator.estimate
