@@ -39,6 +39,8 @@ CONSTANTS: Mapping[str, Any] = {
 }  # fmt: skip
 """Keys of version 0.1.0 that are no more, with the value that counts instead."""
 
+HIDDEN = "***"
+"""Text in place of a password."""
 _PASSWORD = re.compile(r"(://[^:/@\s]*):[^/\s]+@")
 _PASSWORD_GIVEN = re.compile(
     r"""\b(user-pw|proxy-pw|password|passwd|pwd|pass)=("[^"]*"|'[^']*'|[^\s&"'!]+)""", re.IGNORECASE
@@ -185,7 +187,7 @@ def shown(config: Config) -> dict[str, Any]:
 
 def without_passwords(text: str) -> str:
     """A text, with the passwords of URLs and pipelines in it made unreadable."""
-    return _PASSWORD_GIVEN.sub(r"\1=***", _PASSWORD.sub(r"\1:***@", text))
+    return _PASSWORD_GIVEN.sub(rf"\1={HIDDEN}", _PASSWORD.sub(rf"\1:{HIDDEN}@", text))
 
 
 def command_shown(argv: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from starlette.routing import Route
 
 from companion.page.remedies import OF_REASON, OTHER, remedy
 from companion.page.setup_steps import source
-from companion.page.site import Site
+from companion.page.site import Site, is_number
 
 RECENT_S = 600.0
 """Age of warnings that are shown here; Health in the journal has all."""
@@ -55,7 +55,7 @@ class NowViews:
     async def _picture(self, request: Request) -> Response:
         await self._site.watch.status()  # which tells where the exporter is
         after = request.query_params.get("after", "")
-        found = self._site.scene.picture_after(int(after) if after.isdecimal() else -1)
+        found = self._site.scene.picture_after(int(after) if is_number(after) else -1)
         if found is None:
             return Response(status_code=204)
         return Response(found, media_type="application/json")

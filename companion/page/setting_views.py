@@ -11,12 +11,19 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from companion.config import Config
-from companion.config_file import dump, listed_words_of, value_of_key, without_passwords, words_of
+from companion.config_file import (
+    HIDDEN,
+    dump,
+    listed_words_of,
+    value_of_key,
+    without_passwords,
+    words_of,
+)
 from companion.daemon.control.reload import needs_restart
 from companion.errors import CompanionError, ConfigError
 from companion.page.setting_texts import PURPOSES, Setting, settings
 from companion.page.settings_file import Change, SettingsFile, shown_value, value_of_text
-from companion.page.site import Form, Site
+from companion.page.site import Form, Site, is_number
 
 SHOWN_CHANGES = 20
 
@@ -82,6 +89,9 @@ class SettingViews:
         for name, text in form.items():
             if name not in now or text == shown_value(now[name]):
                 continue
+            if HIDDEN in text:
+                wrong[name] = "its password is not shown here: type it again"
+                continue
             try:
                 value = value_of_text(name, text)
             except ConfigError as error:
@@ -103,7 +113,7 @@ class SettingViews:
         number = form.get("number", "")
         try:
             changes = await asyncio.to_thread(
-                self._file.undo, int(number) if number.isdecimal() else -1
+                self._file.undo, int(number) if is_number(number) else -1
             )
         except CompanionError as error:
             return await self._site.refused(request, str(error), 409)

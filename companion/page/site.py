@@ -26,6 +26,8 @@ NOT_KNOWN = "companion does not answer, so that nobody knows whether the motors 
 LOOKS_ON = "This device may look on only. Pair it with the code to change things."
 MOST_SAID = 64
 """Messages that wait for the view that shows them."""
+MOST_DIGITS = 18
+"""Of a number in a request: Python refuses to read thousands of them."""
 OWN_SITE = ("same-origin", "none")
 """Values of Sec-Fetch-Site for forms of this page."""
 
@@ -117,6 +119,11 @@ async def read_form(request: Request) -> Form | None:
         return dict(parse_qsl(body.decode(), keep_blank_values=True, max_num_fields=400))
     except (ClientDisconnect, ValueError):
         return None
+
+
+def is_number(text: str) -> bool:
+    """True of a whole number of a request that is not longer than any of ours."""
+    return text.isdecimal() and len(text) <= MOST_DIGITS
 
 
 def is_same_origin(request: Request) -> bool:

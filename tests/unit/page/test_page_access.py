@@ -169,3 +169,13 @@ def test_a_token_of_other_letters_is_a_wrong_one(served: ServedPage) -> None:
     headers = served.paired(served.codes.change)
     answer = served.ask("POST", "/restart", peer=ELSEWHERE, headers=headers, form={"token": "ä"})
     assert answer.status == 403
+
+
+def test_a_number_of_thousands_of_digits_is_none(served: ServedPage) -> None:
+    long = "9" * 5000
+    answer = served.ask("GET", f"/now/picture?after={long}", headers={"host": "localhost"})
+    assert answer.status == 204
+    headers, token = served.changer()
+    asked = {"token": token, "number": long}
+    answer = served.ask("POST", "/settings/undo", peer=ELSEWHERE, headers=headers, form=asked)
+    assert answer.status == 409

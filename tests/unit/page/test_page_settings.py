@@ -149,3 +149,10 @@ def test_files_written_otherwise_are_changed_or_refused_whole(tmp_path: Path, te
 def test_forms_say_values_as_they_read_them() -> None:
     for name, value in dump(Config()).items():
         assert value_of_text(name, shown_value(value)) == value, name
+
+
+def test_a_password_that_is_not_shown_is_not_kept_as_stars(served: ServedPage) -> None:
+    before = served.config.read_text()
+    answer = save(served, camera__url="rtsp://eye:***@10.0.0.3/live")
+    assert answer.status == 422 and "type it again" in answer.text
+    assert served.config.read_text() == before
