@@ -96,8 +96,9 @@ OF_WARNING: Mapping[str, str] = {
     "no node elsewhere makes depth any more": "Look at the other machine, and the network to it.",
     "a node elsewhere makes the depth": NOTHING,
     "questions came over the network that cannot be read": "Another version is on the network.",
-    "the autopilot is not asked for its IMU": "Raise the baud: see what is said.",
-    "the autopilot's IMU is asked for less often": "Raise the baud: see what is said.",
+    "the autopilot is not asked for its IMU":
+        "No scale by it and no dead reckoning. If the link is too slow: raise its baud.",
+    "the autopilot's IMU is asked for less often": "The link is too slow: raise its baud.",
     "looks like a rolling shutter: set camera.readout_ms": "Set camera.readout_ms as is said.",
     "the rolling shutter looks slower or faster than camera.readout_ms":
         "Correct camera.readout_ms as is said.",
