@@ -18,7 +18,7 @@ from typing import Any
 
 from companion import __version__
 from companion.app.progress import Progress
-from companion.app.replay_command import RecordedInput, replay
+from companion.app.replay.replay_command import RecordedInput, replay
 from companion.app.thumbnail import thumbnail
 from companion.config import Config
 from companion.config_file import shown

@@ -19,6 +19,7 @@ from drivers.mavlink.camera_component import CameraComponent
 from drivers.mavlink.camera_messages import CameraStream
 from drivers.mavlink.command_server import Command
 from drivers.mavlink.computer_status import computer_status
+from drivers.mavlink.measurements.obstacle_distance import obstacle_distance
 from drivers.mavlink.message_requests import (
     COMPUTER_STATUS,
     HEARTBEAT,
@@ -27,7 +28,6 @@ from drivers.mavlink.message_requests import (
     VISION_POSITION,
     MessageRequests,
 )
-from drivers.mavlink.obstacle_distance import obstacle_distance
 from drivers.mavlink.wire.wire import run_together
 from drivers.system.own_addresses import own_addresses
 from drivers.video.rtsp_server import PATH

@@ -20,7 +20,7 @@ from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose
 from companion.messages import FrameTracked, Odometry, TrackState
 from companion.telemetry import Telemetry
-from drivers.mavlink.pose_messages import FRAMES, pose_messages
+from drivers.mavlink.measurements.pose_messages import FRAMES, pose_messages
 from drivers.mavlink.vehicle import Firmware
 from drivers.mavlink.wire.packet_stream import MavlinkStream
 from drivers.recording.recorded_content import is_sample_topic, sample_of

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.app.poses_sent import PosesSent
+from companion.app.replay.poses_sent import PosesSent
 from companion.config_file import load_config
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.transforms import Array, rotation_from_quaternion

@@ -28,7 +28,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from companion.app.poses_sent import PosesSent
+from companion.app.replay.poses_sent import PosesSent
 from companion.config_file import load_config
 from companion.estimation.gate.pose_gate import PoseToSend
 from companion.estimation.inertial.inertial_motion import PLACE

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.app.bench.injected_faults import FAULTS, NO_FAULT, Span
-from companion.app.poses_sent import PosesSent
+from companion.app.replay.poses_sent import PosesSent
 from companion.config import Config
 from companion.config_file import load_config
 from companion.estimation.localisation import LocalisationStage

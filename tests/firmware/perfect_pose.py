@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.estimation.gate.pose_gate import PoseToSend
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Pose, rotation_from_quaternion
-from drivers.mavlink.pose_messages import odometry_message
+from drivers.mavlink.measurements.pose_messages import odometry_message
 from drivers.mavlink.vehicle import Firmware
 from tests.firmware.ground import COMPANION, Ground
 

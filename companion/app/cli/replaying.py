@@ -59,17 +59,17 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
                 "--as-flown replays a whole flight, in the order in which it came: leave out "
                 "--paced, --start and --stop"
             )
-        from companion.app.as_flown import replay_as_flown
+        from companion.app.replay.as_flown import replay_as_flown
 
         made_folder(arguments.out)
         replay_as_flown(arguments.flight, arguments.out, config, progress, print)
         signals.take()
         return 0
-    from companion.app.replay_command import RecordedInput, replay
+    from companion.app.replay.replay_command import RecordedInput, replay
     from companion.telemetry import belief_in_words
 
     if arguments.paced:
-        from companion.app.paced_replay import replay_paced as replay
+        from companion.app.replay.paced_replay import replay_paced as replay
     given = RecordedInput(arguments.flight, config, arguments.start, arguments.stop)
     for remark in given.log.remarks:
         print(f"telemetry: {remark}")

@@ -18,7 +18,10 @@ from companion.messages import OpticalFlow
 from companion.telemetry import AttitudeSample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.flow_messages import optical_flow_message, optical_flow_rad_message
+from drivers.mavlink.measurements.flow_messages import (
+    optical_flow_message,
+    optical_flow_rad_message,
+)
 
 MAX_AGE_NS = 300_000_000
 """Older flow is not sent."""

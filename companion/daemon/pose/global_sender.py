@@ -17,7 +17,7 @@ from companion.pilot_messages import GLOBAL_OFF, GLOBAL_ON
 from companion.telemetry import AttitudeSample, PositionSample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.global_messages import RATES_HZ, global_message
+from drivers.mavlink.measurements.global_messages import RATES_HZ, global_message
 
 LOST_NS = 3_000_000_000
 """The pilot is told after this long without a position."""

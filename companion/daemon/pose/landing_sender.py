@@ -18,7 +18,7 @@ from companion.pilot_messages import MARKER_LOST, MARKER_SEEN
 from companion.telemetry import AttitudeSample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.landing_messages import LocalPosition, landing_target_message
+from drivers.mavlink.measurements.landing_messages import LocalPosition, landing_target_message
 
 LOST_NS = 1_000_000_000
 """The pilot is told after this long without a position: single frames miss it now and then."""

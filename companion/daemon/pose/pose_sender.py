@@ -29,7 +29,7 @@ from companion.telemetry import AttitudeSample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_height import AutopilotHeight
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.pose_messages import pose_messages
+from drivers.mavlink.measurements.pose_messages import pose_messages
 
 TICK_S, IDLE_TICK_S = 0.002, 0.05
 """Between two polls of the gate."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from companion.app.poses_sent import PosesSent
+from companion.app.replay.poses_sent import PosesSent
 from companion.config import Config
 from companion.config_file import load_config
 from companion.estimation.localisation import LocalisationStage

@@ -23,7 +23,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
 )
 from companion.messages import Georeference, MapUpdate, PointChunk
-from drivers.mavlink.obstacle_distance import obstacle_distance
+from drivers.mavlink.measurements.obstacle_distance import obstacle_distance
 
 PLACE = np.array([103.0, -57.0, -12.0])
 FREE = 2001

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.app.landing_sent import LANDING_SENT, LandingSent
+from companion.app.replay.landing_sent import LANDING_SENT, LandingSent
 from companion.config import CameraConfig, Config, LandingConfig, RecorderConfig, TelemetryConfig
 from companion.estimation.landing.marker_detector import MarkerDetector
 from companion.geometry.camera import Camera

@@ -9,7 +9,10 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.messages import OpticalFlow
-from drivers.mavlink.flow_messages import optical_flow_message, optical_flow_rad_message
+from drivers.mavlink.measurements.flow_messages import (
+    optical_flow_message,
+    optical_flow_rad_message,
+)
 
 VELOCITY_BODY_M_S, RANGE_M = np.array([3.0, -1.2, 0.4]), 6.0
 RATES_RAD_S = np.array([0.21, -0.34, 0.55])

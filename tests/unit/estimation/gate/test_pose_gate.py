@@ -15,7 +15,7 @@ from companion.estimation.gate.pose_gate import PoseGate, PoseToSend, Sending
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import Odometry, TrackState
 from companion.telemetry import AttitudeSample
-from drivers.mavlink.pose_messages import euler_of, odometry_message, vision_messages
+from drivers.mavlink.measurements.pose_messages import euler_of, odometry_message, vision_messages
 
 MS = 1_000_000
 LATENCY_NS = 40 * MS

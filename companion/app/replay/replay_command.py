@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
-from companion.app.landing_sent import LandingSent
-from companion.app.poses_sent import PosesSent
 from companion.app.progress import Progress
+from companion.app.replay.landing_sent import LandingSent
+from companion.app.replay.poses_sent import PosesSent
 from companion.config import Config
 from companion.config_file import command_shown, shown
 from companion.errors import FlightError, StageError

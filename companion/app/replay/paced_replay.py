@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from companion.app.progress import Progress
-from companion.app.replay_command import RecordedInput, Watched
+from companion.app.replay.replay_command import RecordedInput, Watched
 from companion.config import Config
 from companion.daemon.flights.flight_facts import facts_of
 from companion.daemon.flights.live_flight import Listener, LiveFlight

@@ -1,0 +1,1 @@
+"""Replays of recorded flights: in order, paced, or as flown."""
