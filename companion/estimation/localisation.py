@@ -12,8 +12,9 @@ import numpy as np
 
 from companion.config import Config
 from companion.estimation.attitude.camera_attitude import AttitudeCheck, CameraAttitude
+from companion.estimation.attitude.keyframe_attitudes import clear_since, correct_mount
 from companion.estimation.camera_motion import CameraMotion
-from companion.estimation.checkpoint import MAX_BYTES, Checkpoint
+from companion.estimation.checkpoint import Checkpoint
 from companion.estimation.georeference.georeferencer import Georeferencer
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
@@ -25,9 +26,9 @@ from companion.estimation.inertial.inertial_navigation import (
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
 from companion.estimation.lift_off.optical_flow import FlowMeter
 from companion.estimation.lift_off.standing import Standing
+from companion.estimation.map_resumption import MAP_RESUMED, MapResumption
 from companion.estimation.odometry.odometry_frame import MapView
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
-from companion.estimation.resumption import Resumption, Verdict
 from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_in_flight import SiteInFlight
@@ -48,7 +49,6 @@ from companion.messages import (
     Warned,
 )
 from companion.slam.loop.loop_closure import LoopClosure
-from companion.slam.map.map_part import map_of, part_around
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
@@ -68,8 +68,6 @@ TELEMETRY_KEPT_NS = 600_000_000_000
 """Older telemetry is only needed at the times of keyframes."""
 PRUNE_PERIOD_NS = 60_000_000_000
 NO_CLIMB = "at lift-off it sees another motion than the accelerometers measure; check mount.*"
-MAP_RESUMED = "map resumed after restart"
-MAP_NOT_RECOGNISED = "old map not recognised: new map"
 
 
 class LocalisationStage:
@@ -108,7 +106,7 @@ class LocalisationStage:
         self._imu = JudgedAcceleration(self._acceleration, self._withdraw_accelerations)
         self._flow = FlowMeter(camera)
         self._satellites = SatelliteWatch(
-            self.camera_from_body, camera.body_from_camera is not None and not camera.assumed
+            camera.camera_from_body, camera.body_from_camera is not None and not camera.assumed
         )
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
         self._t_ns = 0
@@ -116,8 +114,10 @@ class LocalisationStage:
         """Telemetry since the last frame: taken with the next, while nothing is mapped."""
         self._n_samples = 0
         self._pruned_ns: int | None = None
-        self._resumption: Resumption | None = None
-        """While a stored map is being verified."""
+        self._resumption = MapResumption(
+            camera, config.features, self._tracker, self._attitude, self._motion,
+            self._georeferences, self._odometry,
+        )  # fmt: skip
         self._tracker.atlas.loop_allowed = self._loop_allowed
         self._georeferences.reckoned_at = self._odometry.reckoning.path.at
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
@@ -137,12 +137,6 @@ class LocalisationStage:
     def n_loops(self) -> int:
         """Number of loops closed and maps merged."""
         return self._tracker.atlas.n_loops
-
-    @property
-    def camera_from_body(self) -> Pose:
-        """Inverse mount; the identity where unknown."""
-        mount = self._camera.body_from_camera
-        return mount.inverse() if mount is not None else Pose.identity()
 
     def step(self, message: Message | GeoOrigin) -> Iterable[Message]:
         """Process one message; messages come in order of time.
@@ -191,25 +185,8 @@ class LocalisationStage:
         A copy. None while a stored map is being verified, and with a scale while attitude, needed
         for verification, is missing.
         """
-        last, segment = self._motion.last, self._tracker.map
-        if self._resumption is not None or last is None or last.map_from_camera is None:
-            return None
-        if last.t_ns != self._t_ns or self.state is not TrackState.TRACKING:
-            return None
-        attitude, georeference = self._attitude.at(last.t_ns), self._georeferences.of(segment)
-        mounted = self._camera.body_from_camera is not None
-        if georeference is not None and mounted and attitude is None:
-            return None
-        with self._times("checkpoint"), self._tracker.map_lock.reading():
-            place = last.map_from_camera.translation
-            (nearest,) = segment.nearest(place, 1, set())
-            part = part_around(segment, segment.keyframes[nearest], MAX_BYTES)
-        mount, delay_ns = self._attitude.correction
-        return Checkpoint(
-            last.t_ns, part, self._tracker.next_keyframe_id,
-            None if attitude is None else attitude @ last.map_from_camera.rotation.T, georeference,
-            self._odometry.state if georeference is not None else None, mount, delay_ns,
-        )  # fmt: skip
+        with self._times("checkpoint"):
+            return self._resumption.keep(self._t_ns)
 
     def resume(self, kept: Checkpoint, t_ns: int, absent_ns: int) -> None:
         """Start with a stored map, to be verified; before the first frame, at `t_ns`.
@@ -217,13 +194,7 @@ class LocalisationStage:
         Its scale and georeference are used once several frames agree. Its last frame was
         `absent_ns` ago.
         """
-        shift_ns = t_ns - absent_ns - kept.t_ns  # clocks of two processes may differ
-        features = self._config.features
-        segment = map_of(kept.part, features.scale_factor, features.n_levels, shift_ns)
-        self._resumption = Resumption(kept, t_ns, absent_ns)
-        attitude = {k.keyframe_id: k.ned_from_camera for k in kept.part.keyframes}
-        self._attitude.resume(kept.body_from_camera, kept.delay_ns, attitude)
-        self._tracker.resume(segment, kept.next_keyframe_id, self._resumption.until_ns)
+        self._resumption.begin(kept, t_ns, absent_ns)
 
     def finish(self, adjust: bool = True) -> list[Message]:
         """The map at the end of a flight, with or without a final global adjustment."""
@@ -361,8 +332,11 @@ class LocalisationStage:
             update = self._map_update()
         if update is not None:
             yield update
-        if self._resumption is not None:
-            yield from self._check_resumption(self._resumption, frame.t_ns)
+        resumed = self._resumption.frame(frame.t_ns)
+        if resumed is not None:
+            yield resumed
+            if resumed.what == MAP_RESUMED:
+                yield self._map_update()
         yield from self._site.frame(frame.t_ns, added)
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
@@ -380,34 +354,6 @@ class LocalisationStage:
         when_ns: Array = np.array(sorted(living.values()))
         self._georeferencer.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
         self._acceleration.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
-
-    def _check_resumption(self, resumption: Resumption, t_ns: int) -> Iterator[MapUpdate | Warned]:
-        """Verify the stored map; resume or drop it."""
-        last = self._motion.last
-        if last is not None and last.t_ns != t_ns:
-            last = None
-        kept, segment = resumption.kept, self._tracker.map
-        in_use = segment.first_keyframe_id == kept.part.first_keyframe_id
-        verdict = Verdict.REFUSED
-        if in_use:
-            attitude = self._attitude.at(t_ns)
-            verdict = resumption.check(t_ns, last, attitude, self.camera_from_body)
-        if verdict is Verdict.TRYING:
-            return
-        self._resumption = None
-        if verdict is Verdict.REFUSED:
-            self._tracker.drop_map(kept.part.first_keyframe_id)
-            if in_use:
-                self._reset_motion()
-            yield Warned(t_ns, MAP_NOT_RECOGNISED, resumption.why_not)
-            return
-        if kept.georeference is not None:
-            self._georeferences.resume(segment, kept.georeference)
-            if kept.odometry is not None:
-                self._odometry.resume(segment.first_keyframe_id, kept.georeference, kept.odometry)
-        away_s = resumption.absent_ns * 1e-9
-        yield Warned(t_ns, MAP_RESUMED, f"its last frame was {away_s:.1f} s before the first", True)
-        yield self._map_update()
 
     def _reset_motion(self) -> None:
         """Clear motion state after another map became active."""
@@ -474,11 +420,12 @@ class LocalisationStage:
 
     def _apply_check(self, checked: AttitudeCheck, segment: SlamMap) -> list[Warned]:
         if checked.now_from_before is not None:
-            self._correct_attitudes(checked.now_from_before)
+            correct_mount(self._tracker.segments, checked.now_from_before)
         if checked.before_from_now_ned is not None:
             self._motion.filter.correct_attitude(checked.before_from_now_ned)
         if checked.invalid_since_ns is not None:
-            self._invalidate_attitudes(checked.invalid_since_ns)
+            self._motion.filter.discard_alignment()
+            clear_since(self._tracker.segments, checked.invalid_since_ns)
         if checked.reinitialise:
             self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)
             self._reset_motion()
@@ -489,21 +436,6 @@ class LocalisationStage:
         """Forget what accelerations since a time gave: they were wrong."""
         self._odometry.forget_reckoned()
         self._georeferences.withdraw_accelerations(since_ns)
-
-    def _invalidate_attitudes(self, since_ns: int) -> None:
-        """Clear attitudes of keyframes since a time, which were not those of the camera."""
-        self._motion.filter.discard_alignment()
-        for segment in self._tracker.segments:
-            for keyframe in segment.keyframes.values():
-                if keyframe.t_ns >= since_ns:
-                    keyframe.ned_from_camera = None
-
-    def _correct_attitudes(self, rotation: Array) -> None:
-        """Rotate attitudes of keyframes by a correction of the mount."""
-        for segment in self._tracker.segments:
-            for keyframe in segment.keyframes.values():
-                if keyframe.ned_from_camera is not None:
-                    keyframe.ned_from_camera = keyframe.ned_from_camera @ rotation.T
 
     def _loop_allowed(self, keyframe: Keyframe, other: Keyframe, found: LoopClosure) -> bool:
         by_site = self._site.allowed(found)

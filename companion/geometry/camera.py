@@ -66,6 +66,12 @@ class Camera:
         """Mean focal length in pixels."""
         return 0.5 * (self.fx + self.fy)
 
+    @property
+    def camera_from_body(self) -> Pose:
+        """Inverse mount; the identity where unknown."""
+        mount = self.body_from_camera
+        return mount.inverse() if mount is not None else Pose.identity()
+
     def matrix(self) -> Array:
         """The (3, 3) intrinsic matrix."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])

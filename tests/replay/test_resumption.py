@@ -17,7 +17,8 @@ import pytest
 
 from companion.config import Config
 from companion.estimation.checkpoint import MAX_BYTES, Checkpoint, decode, encode, read_arrays
-from companion.estimation.localisation import MAP_NOT_RECOGNISED, MAP_RESUMED, LocalisationStage
+from companion.estimation.localisation import LocalisationStage
+from companion.estimation.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
 from companion.estimation.resumption import TIMEOUT_NS
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (

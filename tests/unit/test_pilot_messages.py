@@ -14,7 +14,7 @@ from companion.daemon.control import armed_settings
 from companion.daemon.control.flight_parameters import PARAMETERS
 from companion.daemon.flights import live_flight, recording_recovery, viewing
 from companion.daemon.pose import pose_sender
-from companion.estimation import localisation
+from companion.estimation import map_resumption
 from companion.estimation.gate import pose_gate
 from companion.estimation.inertial import imu_verdict
 from companion.estimation.shutter import shutter_of_frames
@@ -128,7 +128,7 @@ def test_every_warning_has_its_words() -> None:
     whats = {
         *phrases(camera_feed), *phrases(disk_writer), *phrases(live_samples),
         link_watch.DAMAGED, link_watch.REFUSED, link_watch.FLOODS, link_watch.SLOW,
-        localisation.MAP_RESUMED, localisation.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
+        map_resumption.MAP_RESUMED, map_resumption.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
         link_watch.NO_MAVLINK, live_flight.RESTARTED, live_flight.LOCALISATION_DIED,
         live_flight.NOT_FINISHED,
         imu_verdict.NOT_USED, imu_verdict.USED_AGAIN,
@@ -138,7 +138,7 @@ def test_every_warning_has_its_words() -> None:
         recording_recovery.NOT_WRITABLE, ground_requests.TOO_MANY,
         topics_work.MALFORMED, topics_work.TAKEN,
         topics_work.NOT_TAKEN, flight_result.GIVEN_UP, armed_settings.NOT_KEPT,
-        localisation.MAP_RESUMED, localisation.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
+        map_resumption.MAP_RESUMED, map_resumption.MAP_NOT_RECOGNISED, localisation_work.NOT_KEPT,
     }  # fmt: skip
     for module in (
         "drivers/mavlink/autopilot_link.py",

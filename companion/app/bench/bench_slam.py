@@ -19,7 +19,7 @@ from companion.app.progress import Progress
 from companion.config import Config
 from companion.errors import FlightError
 from companion.estimation.localisation import LocalisationStage
-from companion.geometry.transforms import Array, rotation_from_quaternion
+from companion.geometry.transforms import Array, Pose, rotation_from_quaternion
 from companion.messages import Frame, Odometry, Track, TrackState
 from companion.products.flight_result import FlightResult
 from companion.products.surroundings import peak_memory_mb
@@ -130,12 +130,14 @@ def _run(
         listener.result.take(out)
     progress.finish()
     cost = _Cost(np.array(frame_ms), times.summary().get("mapping", {}).get("p50_ms", 0.0))
-    return _row(path.name, truth, fault, span, above_m, frame_t_ns, listener, cost, stage)
+    mount = flight.camera.camera_from_body.inverse()
+    return _row(path.name, truth, fault, span, above_m, frame_t_ns, listener, cost, stage, mount)
 
 
 def _row(
     name: str, truth: Path, fault: Fault, span: Span, above_m: float | None,
     frame_t_ns: list[int], listener: _Listener, cost: _Cost, stage: LocalisationStage,
+    mount: Pose,
 ) -> BenchRow:  # fmt: skip
     poses = listener.result.poses()
     estimate = _path_of(
@@ -153,8 +155,8 @@ def _row(
     return BenchRow(
         name, fault.name, len(frame_t_ns), round(float(known.mean()), 4) if len(due) else 0.0,
         path_errors(estimate, truth), live_errors.ate_sim3_m if live_errors else None,
-        _worst_step(listener.odometry, truth, stage), _nees(listener.odometry, truth, stage),
-        _nees_yaw(listener.odometry, truth, stage),
+        _worst_step(listener.odometry, truth, mount), _nees(listener.odometry, truth, mount),
+        _nees_yaw(listener.odometry, truth, mount),
         max((o.reset_counter for o in listener.odometry), default=0),
         _longest_gap_s(due, known),
         sum(o.state is TrackState.DEAD_RECKONING for o in listener.odometry),
@@ -200,7 +202,7 @@ def _longest_gap_s(due_ns: Array, known: NDArray[np.bool_]) -> float:
     return round(longest, 3)
 
 
-def _nees(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
+def _nees(odometry: list[Odometry], truth: Path, body_from_camera: Pose) -> float | None:
     """NEES of the displacement over ten seconds, in the true attitude's frame at its start."""
     known = [o for o in odometry if o.world_from_body is not None]
     times = np.array([o.t_ns for o in known])
@@ -209,15 +211,14 @@ def _nees(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> fl
         j = int(np.searchsorted(times, start.t_ns + NEES_NS))
         if j >= len(known) or known[j].reset_counter != start.reset_counter:
             continue
-        error = _step_error(start, known[j], truth, stage)
+        error = _step_error(start, known[j], truth, body_from_camera)
         variance = known[j].sigma_position_m ** 2
         ratios.append(float((error**2).sum()) / (3.0 * variance))
     return round(float(np.mean(ratios)), 2) if ratios else None
 
 
-def _nees_yaw(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
+def _nees_yaw(odometry: list[Odometry], truth: Path, body_from_camera: Pose) -> float | None:
     """NEES of the heading of every pose against the truth."""
-    body_from_camera = stage.camera_from_body.inverse()
     ratios = []
     for o in odometry:
         if o.world_from_body is None:
@@ -228,10 +229,9 @@ def _nees_yaw(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -
     return round(float(np.mean(ratios)), 3) if ratios else None
 
 
-def _step_error(start: Odometry, end: Odometry, truth: Path, stage: LocalisationStage) -> Array:
+def _step_error(start: Odometry, end: Odometry, truth: Path, body_from_camera: Pose) -> Array:
     """Error (3,) of the camera's displacement, in its attitude at the start."""
     assert start.world_from_body is not None and end.world_from_body is not None
-    body_from_camera = stage.camera_from_body.inverse()
     a, b = start.world_from_body @ body_from_camera, end.world_from_body @ body_from_camera
     i, j = (int(np.abs(truth.t_ns - o.t_ns).argmin()) for o in (start, end))
     step = a.rotation.T @ (b.translation - a.translation)
@@ -239,7 +239,7 @@ def _step_error(start: Odometry, end: Odometry, truth: Path, stage: Localisation
     return np.asarray(step - true, np.float64)
 
 
-def _worst_step(odometry: list[Odometry], truth: Path, stage: LocalisationStage) -> float | None:
+def _worst_step(odometry: list[Odometry], truth: Path, body_from_camera: Pose) -> float | None:
     """Largest RPE between consecutive odometry poses without a reset between them, metres."""
     worst: float | None = None
     before: Odometry | None = None
@@ -250,6 +250,9 @@ def _worst_step(odometry: list[Odometry], truth: Path, stage: LocalisationStage)
             before is not None and now.reset_counter == before.reset_counter
             and now.t_ns - before.t_ns < STEP_NS
         ):  # fmt: skip
-            worst = max(worst or 0.0, float(np.linalg.norm(_step_error(before, now, truth, stage))))
+            worst = max(
+                worst or 0.0,
+                float(np.linalg.norm(_step_error(before, now, truth, body_from_camera))),
+            )
         before = now
     return worst

@@ -15,11 +15,8 @@ from companion.app.progress import Progress
 from companion.config import Config
 from companion.errors import FlightError, StageError
 from companion.estimation.gate.gate_journal import poses_as_sent
-from companion.estimation.localisation import (
-    MAP_NOT_RECOGNISED,
-    MAP_RESUMED,
-    LocalisationStage,
-)
+from companion.estimation.localisation import LocalisationStage
+from companion.estimation.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
 from companion.geometry.camera import Camera
 from companion.messages import Frame, FrameOverdue, Odometry
 from companion.products.atomic_file import write_atomically
