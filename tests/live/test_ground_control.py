@@ -58,6 +58,12 @@ def ground(flying: Flying) -> Iterator[GroundStation]:
         yield connected
 
 
+def snapshots(flying: Flying) -> list[Path]:
+    """Clouds that were written in flight, in order of their numbers."""
+    (flight,) = flying.daemon.flown()
+    return sorted(flight.glob("snapshot-*.ply"))
+
+
 def test_before_take_off(flying: Flying, ground: GroundStation) -> None:
     standby = mavlink.MAV_STATE_STANDBY
     ground.heard("HEARTBEAT", 10, lambda beat: beat.system_status == standby)
@@ -78,7 +84,9 @@ def test_before_take_off(flying: Flying, ground: GroundStation) -> None:
     flying.daemon.line("ground: feedback.min_quality = 20", 5)
     assert "min_quality = 20" in (flying.daemon.folder / "kept.toml").read_text()
     assert ground.set("FB_MIN_QUALITY", 1000.0) == 20.0
-    assert ground.command(SNAPSHOT) == [IN_PROGRESS, FAILED]  # there are no points yet
+    results = ground.command(SNAPSHOT)  # on a slow machine there may be points by now
+    assert results in ([IN_PROGRESS, FAILED], [IN_PROGRESS, ACCEPTED])
+    assert bool(snapshots(flying)) == (results[-1] == ACCEPTED)
 
 
 def test_what_ground_stations_ask_of_every_component(ground: GroundStation) -> None:
@@ -117,11 +125,10 @@ def test_the_cloud_is_written_now(flying: Flying, ground: GroundStation) -> None
         assert time.monotonic() < until_s
         time.sleep(1.0)
     assert results == [IN_PROGRESS, ACCEPTED]
-    (flight,) = flying.daemon.flown()
-    (path,) = flight.glob("snapshot-*.ply")
+    path = snapshots(flying)[-1]
     n_points = len(read_ply(path))
     assert n_points
-    assert f"{path.name}, {n_points} points" in flying.daemon.line("cloud written", 5).text
+    flying.daemon.line(f"cloud written: {path.name}, {n_points} points", 5)
 
 
 def test_viewers_have_a_budget(flying: Flying, ground: GroundStation) -> None:
