@@ -130,6 +130,9 @@ def measured(tree: Path, seconds: float) -> dict[str, float]:
         daemon = Daemon(folder, *settings, program=program)
         # names of version 0.1, which both read
         daemon._command = [each.replace("expert.", "") for each in daemon._command]
+        if not (tree / "companion" / "page").is_dir():  # a version without a page
+            at = daemon._command.index("page.listen=")
+            del daemon._command[at - 1 : at + 1]
         with contextlib.redirect_stdout(sys.stderr), daemon, autopilot:
             daemon.until(lambda health: health["tracker"] == "tracking", UP_S)
             time.sleep(SETTLE_S)
