@@ -139,7 +139,7 @@ def main() -> None:
         span = Span(placed[0], placed[-1])
         for fault in TRIED:
             said, nearest = watched(
-                stage.seen, fault.telemetry(samples, span), stage.camera_from_body, calibrated
+                stage.seen, fault.telemetry(samples, span), camera.camera_from_body, calibrated
             )
             words = "; ".join(
                 f"{1e-9 * (each.t_ns - span.fault_ns):.1f} s {each.what} ({each.detail})"
