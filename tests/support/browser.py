@@ -20,6 +20,8 @@ FLAGS = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
 """So that it asks nothing of the network by itself."""
+WAIT_MS = 60_000
+"""Longest wait for what a page is to show: half a minute has not been enough on a busy machine."""
 
 
 class Browser:
@@ -46,7 +48,7 @@ class Browser:
             )  # fmt: skip
             entering.callback(context.close)
             self.page = context.pages[0]
-            self.page.set_default_timeout(20_000)
+            self.page.set_default_timeout(WAIT_MS)
             self.page.on("console", self._said)
             self.page.on("request", lambda request: self.asked.add(urlsplit(request.url).netloc))
             self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
