@@ -45,8 +45,9 @@ class SourceSwitch:
         self._doubted_in: object = None
         """Flight that has the doubt."""
         self._switched: bool | None = False
-        """True while the EKF is on the set without satellites, by our command; None while a command
-        is unanswered, which may have been obeyed."""
+        """True while the EKF is on the set without satellites, by our command; None where that is
+        not known: a command without an answer may have been obeyed, a reboot forgets it."""
+        self._n_reboots = link.clock_filter.n_reboots
         self._not_before_ns = 0
 
     def doubt_satellites(self, doubted: bool) -> None:
@@ -64,6 +65,9 @@ class SourceSwitch:
         now_ns, vehicle = self._clock.now_ns(), self._link.vehicle
         if self._doubted and vehicle is not None and not vehicle.armed:
             self._doubted = self._flight() is self._doubted_in
+        if self._n_reboots != self._link.clock_filter.n_reboots:
+            self._n_reboots = self._link.clock_filter.n_reboots
+            self._switched = None if self._switched else self._switched
         if self._doubted == self._switched or now_ns < self._not_before_ns:
             return
         if vehicle is None or vehicle.firmware != "ardupilot" or not self._link.alive:

@@ -169,6 +169,35 @@ def test_on_the_ground_a_doubt_of_the_flight_that_goes_on_stays() -> None:
     asyncio.run(fly())
 
 
+@pytest.mark.parametrize("doubted", [True, False])
+def test_an_autopilot_that_reboots_while_switched_is_told_its_set_again(doubted: bool) -> None:
+    """It has come up with its first set."""
+
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+        vehicle.switch.doubt_satellites(True)
+        await vehicle.step()
+        vehicle.link.clock_filter.n_reboots += 1
+        vehicle.switch.doubt_satellites(doubted)
+        await vehicle.step()
+        await vehicle.step()
+        assert vehicle.sets == [3, 3 if doubted else 1]
+
+    asyncio.run(fly())
+
+
+def test_an_autopilot_that_reboots_on_its_own_set_is_left_alone() -> None:
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+        vehicle.link.clock_filter.n_reboots += 1
+        await vehicle.step()
+        assert vehicle.sets == []
+
+    asyncio.run(fly())
+
+
 def test_a_command_without_answer_may_have_been_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Satellites that agree again before it was answered are to be flown on."""
 
