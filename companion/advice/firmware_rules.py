@@ -6,13 +6,16 @@ That is the pose of the body, in metres, stamped at exposure, with covariances a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from companion.advice.wanted import ARDUPILOT, PX4, Between, Bits, Near, OneOf, Values, Wanted
-from companion.config import FeedbackConfig
+from companion.config import FeedbackConfig, GpsConfig, LandingConfig
 
 DELAY_TOLERANCE_MS = 15.0
 MAX_VISO_DELAY_MS = 250.0
+LEAST_LAG_S, MOST_LAG_S = 0.02, 0.25
+"""Range of PLND_LAG."""
+SOURCE_SETS = 1, 2, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +25,13 @@ class Context:
     feedback: FeedbackConfig
     mode: str
     latency_ms: float | None
+    gps: GpsConfig = field(default_factory=GpsConfig)
+    landing: LandingConfig = field(default_factory=LandingConfig)
+
+    @property
+    def vision_set(self) -> int:
+        """Source set of ArduPilot's EKF that takes our pose."""
+        return self.gps.vision_set if self.gps.switch_source else 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +57,9 @@ def _quality(context: Context, values: Values) -> Wanted:
     return Between(0, context.feedback.min_quality)
 
 
-def _velocity(context: Context, values: Values) -> Wanted:
-    return OneOf((6, 0))
-
-
 def _needs_compass(context: Context, values: Values) -> Wanted | None:
-    return OneOf((1,)) if values.get("EK3_SRC1_YAW") == 1 else None
+    compass = values.get(f"EK3_SRC{context.vision_set}_YAW") == 1
+    return OneOf((1,)) if compass else None
 
 
 def _viso_delay(context: Context, values: Values) -> Wanted | None:
@@ -66,9 +73,49 @@ def _proximity(context: Context, values: Values) -> Wanted | None:
     return OneOf((2,)) if context.feedback.obstacle_distance else None
 
 
+def _from_pose(number: int, wanted: Wanted) -> Callable[[Context, Values], Wanted | None]:
+    """The condition where the source set of that number takes our pose."""
+    return lambda context, values: wanted if context.vision_set == number else None
+
+
+def _position(number: int) -> Callable[[Context, Values], Wanted | None]:
+    """Our position, or that of satellites in the set that the EKF is switched back to."""
+
+    def wanted(context: Context, values: Values) -> Wanted | None:
+        if context.vision_set == number:
+            return OneOf((6,))
+        back = context.gps.switch_source and context.gps.satellites_set == number
+        return OneOf((3,)) if back else None
+
+    return wanted
+
+
+def _landing(wanted: Wanted) -> Callable[[Context, Values], Wanted | None]:
+    """The condition where a marker is looked for."""
+    return lambda context, values: wanted if context.landing.marker != "off" else None
+
+
+def _landing_lag(context: Context, values: Values) -> Wanted | None:
+    if context.landing.marker == "off" or context.latency_ms is None:
+        return None
+    lag_s = min(max(1e-3 * context.latency_ms, LEAST_LAG_S), MOST_LAG_S)
+    return Near(round(lag_s, 3), 1e-3 * DELAY_TOLERANCE_MS)
+
+
 def _for_flow(message: str, wanted: Wanted) -> Callable[[Context, Values], Wanted | None]:
     """The condition where that message of optical flow is sent."""
     return lambda context, values: wanted if context.feedback.flow == message else None
+
+
+def _for_place(wanted: Wanted) -> Callable[[Context, Values], Wanted | None]:
+    """The condition where the place on earth is sent as one more sensor."""
+    return lambda context, values: wanted if context.feedback.global_position == "sensor" else None
+
+
+def _place_delay(context: Context, values: Values) -> Wanted | None:
+    if context.feedback.global_position != "sensor" or context.latency_ms is None:
+        return None
+    return Near(round(context.latency_ms), DELAY_TOLERANCE_MS)
 
 
 def fused(context: Context, values: Values) -> Wanted:
@@ -97,6 +144,28 @@ OUR_BODY = (
 
 FLOW_IN_BODY = "our flow is about the body's axes, whatever way the camera looks"
 
+
+def _source_set(number: int) -> tuple[Rule, ...]:
+    """Rules of one of the source sets of ArduPilot's EKF."""
+    name = f"EK3_SRC{number}_"
+    return (
+        Rule(name + "POSXY", _position(number), "6 takes the horizontal position from our pose, 3 "
+             "from satellites, which gps.switch_source goes back to",
+             lacking="ArduPilot before 4.1; it cannot be told to use vision beside a GPS"
+             if number == 1 else ""),
+        Rule(name + "VELXY", _from_pose(number, OneOf((6, 0))), "6 takes the velocity that we "
+             "send; 3 waits for a GPS"),
+        Rule(name + "POSZ", _from_pose(number, OneOf((1, 6))), "1 is the barometer, 6 our height; "
+             "3 waits for a GPS"),
+        Rule(name + "VELZ", _from_pose(number, OneOf((6, 0))), "6 takes the vertical velocity that "
+             "we send; 3 waits for a GPS"),
+        Rule(name + "YAW", _from_pose(number, OneOf((1, 6))), "1 is the compass, which is best, "
+             "since our heading comes from the autopilot's own; 6 is ours"),
+    )  # fmt: skip
+
+
+OUR_TARGET = "the marker that we send is told from the body, whatever way the camera looks"
+
 ARDUPILOT_RULES = (
     Rule(
         "VISO_TYPE", _always(OneOf((1,))), "1 (MAVLink) takes our pose as it is; 0 takes none, 2 "
@@ -109,15 +178,7 @@ ARDUPILOT_RULES = (
     Rule("EK3_ENABLE", _always(OneOf((1,))), "only EKF3 takes a position from vision", reboot=True,
          lacking="only EKF3 takes a position from vision, and this firmware has none"),
     Rule("AHRS_EKF_TYPE", _always(OneOf((3,))), "the vehicle flies on what this EKF says"),
-    Rule("EK3_SRC1_POSXY", _always(OneOf((6,))), "6 takes the horizontal position from our pose",
-         lacking="ArduPilot before 4.1; it cannot be told to use vision beside a GPS"),
-    Rule("EK3_SRC1_VELXY", _velocity, "6 takes the velocity that we send; 3 waits for a GPS"),
-    Rule("EK3_SRC1_POSZ", _always(OneOf((1, 6))), "1 is the barometer, 6 our height; 3 waits for "
-         "a GPS"),
-    Rule("EK3_SRC1_VELZ", _velocity, "6 takes the vertical velocity that we send; 3 waits for a "
-         "GPS"),
-    Rule("EK3_SRC1_YAW", _always(OneOf((1, 6))), "1 is the compass, which is best, since our "
-         "heading comes from the autopilot's own; 6 is ours"),
+    *(rule for number in SOURCE_SETS for rule in _source_set(number)),
     Rule("COMPASS_ENABLE", _needs_compass, "EK3_SRC1_YAW takes the heading from the compass"),
     Rule("VISO_ORIENT", _always(OneOf((0,))), OUR_BODY),
     Rule("VISO_SCALE", _always(Near(1.0, 1e-3)), "our pose is in metres"),
@@ -130,6 +191,16 @@ ARDUPILOT_RULES = (
          "counts from arrival"),
     Rule("PRX1_TYPE", _proximity, "2 takes OBSTACLE_DISTANCE, which feedback.obstacle_distance "
          "sends", reboot=True),
+    Rule("PLND_ENABLED", _landing(OneOf((1,))), "1 lands on the marker that we send",
+         reboot=True),
+    Rule("PLND_TYPE", _landing(OneOf((1,))), "1 (MAVLink) takes LANDING_TARGET", reboot=True),
+    Rule("PLND_ORIENT", _landing(OneOf((25,))), OUR_TARGET, reboot=True),
+    Rule("PLND_YAW_ALIGN", _landing(OneOf((0,))), OUR_TARGET),
+    Rule("PLND_CAM_POS_X", _landing(Near(0.0, 0.005)), OUR_TARGET),
+    Rule("PLND_CAM_POS_Y", _landing(Near(0.0, 0.005)), OUR_TARGET),
+    Rule("PLND_CAM_POS_Z", _landing(Near(0.0, 0.005)), OUR_TARGET),
+    Rule("PLND_LAG", _landing_lag, "the time from exposure to sending, as measured: the vehicle's "
+         "own motion since then is taken off by it", reboot=True),
     Rule("FLOW_TYPE", _for_flow("optical_flow", OneOf((5,))), "5 (MAVLink) takes OPTICAL_FLOW, "
          "which feedback.flow sends", reboot=True),
     Rule("FLOW_ORIENT_YAW", _for_flow("optical_flow", OneOf((0,))), FLOW_IN_BODY),
@@ -162,6 +233,12 @@ PX4_RULES = (
     Rule("EKF2_OF_CTRL", _for_flow("optical_flow_rad", OneOf((1,))), "1 fuses OPTICAL_FLOW_RAD, "
          "which feedback.flow sends"),
     Rule("SENS_FLOW_ROT", _for_flow("optical_flow_rad", OneOf((0,))), FLOW_IN_BODY),
+    Rule("EKF2_AGP0_ID", _for_place(OneOf((10,))), "the id of the places on earth that "
+         "feedback.global_position sends; a sensor of another id has its own slot"),
+    Rule("EKF2_AGP0_CTRL", _for_place(Bits(0b01, "0 (horizontal position)")), "without it "
+         "the place on earth that we send is not fused"),
+    Rule("EKF2_AGP0_DELAY", _place_delay, "the time from exposure to sending, as measured; PX4 "
+         "stamps a place on earth when it comes", reboot=True),
     Rule("COM_ARM_WO_GPS", _always(OneOf((1, 2))), "0 refuses to arm without a GPS fix"),
 )  # fmt: skip
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from companion.advice.firmware_rules import COMPARED, EITHER_OF, RULES, Context, Rule, fused
 from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
-from companion.config import FeedbackConfig
+from companion.config import FeedbackConfig, GpsConfig, LandingConfig
+
+NO_SWITCH, NO_MARKER = GpsConfig(), LandingConfig()
 
 
 def names_to_read(firmware: str) -> list[str]:
@@ -18,12 +20,14 @@ def advise(
     feedback: FeedbackConfig,
     mode: str,
     latency_ms: float | None = None,
+    gps: GpsConfig = NO_SWITCH,
+    landing: LandingConfig = NO_MARKER,
 ) -> list[Finding]:
     """Findings on the parameters of an autopilot for `mode`, in the order of the rules.
 
     `values` holds those of `names_to_read` that the autopilot has.
     """
-    context = Context(feedback, mode, latency_ms)
+    context = Context(feedback, mode, latency_ms, gps, landing)
     findings = []
     for rule in RULES[firmware]:
         value = values.get(rule.name)

@@ -131,7 +131,9 @@ async def _examine(
             loop = (LOOP_RATE,) if firmware == ARDUPILOT else ()
             read = await parameters.read([*names_to_read(firmware), *ports, *loop])
             values = {name: each.value for name, each in read.items()}
-            findings = advise(firmware, values, feedback, mode, latency_ms)
+            findings = advise(
+                firmware, values, feedback, mode, latency_ms, config.gps, config.landing
+            )
             if baud:
                 findings += check_line(firmware, values, config.link, feedback, mode, baud)
             findings += check_loop_rate(values, config.link)

@@ -8,7 +8,7 @@ from companion.advice.firmware_rules import RULES
 from companion.advice.line_rate import check_line, line_parameters
 from companion.advice.pose_parameters import advise, names_to_read
 from companion.advice.wanted import FIRMWARES, Finding
-from companion.config import FeedbackConfig, LinkConfig
+from companion.config import FeedbackConfig, GpsConfig, LandingConfig, LinkConfig
 from tests.support.autopilot import fake_parameters
 
 NEW = {
@@ -150,6 +150,41 @@ def test_flow_needs_its_parameters_where_it_is_sent() -> None:
     found = blocking("px4", amiss, feedback=FeedbackConfig(flow="optical_flow_rad"))
     assert {name: found[name].set_to for name in amiss} == {"EKF2_OF_CTRL": 1, "SENS_FLOW_ROT": 0}
     assert blocking("px4", amiss, feedback=flow) == {}
+
+
+def test_a_set_of_its_own_takes_the_pose_where_sources_are_switched() -> None:
+    values = {**NEW["ardupilot"], **{f"EK3_SRC{n}_{each}": 0.0 for n in (1, 2)
+              for each in ("POSXY", "VELXY", "VELZ", "POSZ", "YAW")}}  # fmt: skip
+    values |= {"VISO_TYPE": 1, "EK3_SRC1_YAW": 1}
+    gps = GpsConfig(switch_source=True)
+    found = advise("ardupilot", values, FEEDBACK, "odometry", 60.0, gps)
+    told = {each.name: each.set_to for each in found if each.name.startswith("EK3_SRC")}
+    assert told == {"EK3_SRC1_POSXY": 3, "EK3_SRC2_POSXY": 6, "EK3_SRC2_POSZ": 1, "EK3_SRC2_YAW": 1}
+
+
+def test_landing_needs_its_parameters_where_a_marker_is_set() -> None:
+    values = {**NEW["ardupilot"], **ARDUPILOT_READY, "PLND_ENABLED": 0, "PLND_TYPE": 0,
+              "PLND_ORIENT": 0, "PLND_CAM_POS_X": 0.1, "PLND_LAG": 0.02}  # fmt: skip
+    assert all(
+        "PLND" not in each.name for each in advise("ardupilot", values, FEEDBACK, "odometry")
+    )
+    marker = LandingConfig(marker="apriltag_36h11", size_m=0.5)
+    found = advise("ardupilot", values, FEEDBACK, "odometry", 74.0, GpsConfig(), marker)
+    told = {each.name: each.set_to for each in found if each.name.startswith("PLND")}
+    assert told == {
+        "PLND_ENABLED": 1, "PLND_TYPE": 1, "PLND_ORIENT": 25, "PLND_CAM_POS_X": 0,
+        "PLND_LAG": 0.074,
+    }  # fmt: skip
+
+
+def test_a_place_on_earth_needs_a_slot_of_its_id() -> None:
+    amiss = {"EKF2_AGP0_ID": 0.0, "EKF2_AGP0_CTRL": 2.0, "EKF2_AGP0_DELAY": 0.0}
+    sending = FeedbackConfig(global_position="sensor")
+    found = blocking("px4", amiss, latency_ms=70, feedback=sending)
+    assert {name: found[name].set_to for name in amiss} == {
+        "EKF2_AGP0_ID": 10, "EKF2_AGP0_CTRL": 3, "EKF2_AGP0_DELAY": 70,
+    }  # fmt: skip
+    assert blocking("px4", amiss, latency_ms=70) == {}
 
 
 def test_slow_line_is_reported_by_port() -> None:
