@@ -1,4 +1,4 @@
-"""companion compare: effect of a change of program, settings or machine on a flight."""
+"""companion compare: differences between two runs of a flight, or between two maps of a site."""
 
 from __future__ import annotations
 

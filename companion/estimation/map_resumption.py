@@ -12,6 +12,7 @@ from companion.estimation.resumption import Resumption, Verdict
 from companion.geometry.camera import Camera
 from companion.messages import TrackState, Warned
 from companion.slam.map.map_part import map_of, part_around
+from companion.slam.map.site_map import of_this_flight
 from companion.slam.tracking.tracker import Tracker
 
 MAP_RESUMED = "map resumed after restart"
@@ -64,11 +65,14 @@ class MapResumption:
         """Start with a stored map, to be verified; before the first frame, at `t_ns`.
 
         Its scale and georeference are used once several frames agree. Its last frame was
-        `absent_ns` ago.
+        `absent_ns` ago. Where there is a map of an earlier flight, the stored one is looked for in
+        that again, of which it holds a small part at most.
         """
         shift_ns = t_ns - absent_ns - kept.t_ns  # clocks of two processes may differ
         features = self._features
-        segment = map_of(kept.part, features.scale_factor, features.n_levels, shift_ns)
+        part = (of_this_flight(kept.part) if self._tracker.atlas.site else None) or kept.part
+        segment = map_of(part, features.scale_factor, features.n_levels, shift_ns)
+        segment.alive[: segment.n_points] &= segment.n_observers[: segment.n_points] > 0
         self._trying = Resumption(kept, t_ns, absent_ns)
         attitude = {k.keyframe_id: k.ned_from_camera for k in kept.part.keyframes}
         self._attitude.resume(kept.body_from_camera, kept.delay_ns, attitude)

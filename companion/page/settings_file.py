@@ -115,8 +115,8 @@ class SettingsFile:
             for c in [*earlier, *new][-MOST_CHANGES:]
         ]
         try:
-            write_atomically(self._changes, json.dumps(kept).encode())
-            self._changes.chmod(0o600)  # a URL may hold a password
+            # a URL may hold a password
+            write_atomically(self._changes, json.dumps(kept).encode(), mode=0o600)
         except OSError as error:
             raise ConfigError(
                 f"set, but the list of changes cannot be kept: {error.strerror}"

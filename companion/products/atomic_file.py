@@ -9,17 +9,19 @@ from pathlib import Path
 
 
 def write_atomically(
-    path: Path, data: bytes | Iterable[bytes], durable: bool = False, like: Path | None = None
-) -> None:
+    path: Path, data: bytes | Iterable[bytes], durable: bool = False, like: Path | None = None,
+    mode: int = 0o666,
+) -> None:  # fmt: skip
     """Put `data`, whole or in parts, at `path`, replacing the old file in one step.
 
     Raises OSError. A failed write leaves the old file as it was, and no partial file. With
     `durable` it waits until the data is on disk, and so survives a loss of power. Owner and mode
-    are those of `like`, if any.
+    are those of `like`, if any; else it is created with `mode`, less the umask.
     """
     part = path.with_name(f".{path.name}.part")
     try:
-        with part.open("wb") as file:
+        part.unlink(missing_ok=True)  # one left by a crash has the mode that it was created with
+        with open(part, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             if like is not None:
                 theirs = like.stat()
                 os.fchown(file.fileno(), theirs.st_uid, theirs.st_gid)

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import sqlite3
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, nullcontext
 from pathlib import Path
 from shutil import copy
 
 import numpy as np
 import pytest
 
+from companion.config import Config
+from companion.estimation.localisation import LocalisationStage
+from companion.estimation.map_resumption import MAP_RESUMED
+from companion.estimation.site.site_use import LOCATED, SiteUse
+from companion.messages import Frame, Message, Warned
 from companion.products.site_map_file import SITE_MAP, read_site_map
+from companion.runtime.in_order import in_order_of_time
+from companion.telemetry import AttitudeSample
+from drivers.open_flight import open_flight
 from tests.support.processes.program import Run, replay_here
 from tests.support.reference.scoring import read_tum
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
+CONFIG = Config()
 BARE = ["--set", "depth.enabled=false"]
 
 
@@ -48,3 +58,35 @@ def test_a_map_from_a_newer_version_ends_a_replay(first: Run, tmp_path: Path) ->
         file.execute("PRAGMA user_version = 99")
     done = replay_here(SAMPLE, tmp_path / "out", "--map", str(newer), *BARE)
     assert done.status == 2 and "version 99" in done.stderr
+
+
+def test_a_flight_taken_up_after_a_restart_is_located_in_it_again(first: Run) -> None:
+    site = read_site_map(first.out / SITE_MAP).site
+    flight = open_flight(SAMPLE, CONFIG.camera, CONFIG.telemetry)
+    samples = [s for s in flight.telemetry().samples if isinstance(s, AttitudeSample)]
+
+    def flown(begin_s: float, end_s: float) -> Iterator[Message]:
+        begin_ns, end_ns = (flight.start_ns + round(s * 1e9) for s in (begin_s, end_s))
+        own = [s for s in samples if begin_ns - 1e9 < s.t_ns < end_ns]
+        return in_order_of_time(own, flight.frames(begin_ns, end_ns))
+
+    def stage() -> LocalisationStage:
+        use = SiteUse(site, flight.camera, None)
+        return LocalisationStage(CONFIG, flight.camera, lambda _: nullcontext(), site=use)
+
+    before = stage()
+    said = [o.what for m in flown(5, 8) for o in before.step(m) if isinstance(o, Warned)]
+    assert LOCATED in said
+    kept = before.checkpoint()
+    assert kept is not None
+    after, again = stage(), list[str]()
+    for message in flown(7, 11):
+        if isinstance(message, Frame) and not again:
+            after.resume(kept, message.t_ns, 1_000_000_000)
+            again.append("resumed")
+        again += [o.what for o in after.step(message) if isinstance(o, Warned)]
+    assert MAP_RESUMED in again and LOCATED in again
+    left = after.site_map("after", None)
+    assert left is not None
+    assert len(left.parts) == len(site.parts) + 1 and len(left.keyframes) > len(site.keyframes)
+    assert min(k.t_ns for k in left.keyframes) > 0

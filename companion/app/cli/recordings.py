@@ -84,10 +84,12 @@ def _repair(paths: Sequence[Path], gently: bool, progress: Progress) -> int:
 
 
 def _compare(arguments: argparse.Namespace, signals: StopSignals) -> int:
-    """Compare two runs; 1 where a limit is not kept."""
+    """Compare two runs, 1 where a limit is not kept; or two maps."""
+    made_folder(arguments.out)
+    if arguments.maps:
+        return _compare_maps(arguments)
     from companion.app.compare_command import beyond, compare, in_words
 
-    made_folder(arguments.out)
     found = compare(arguments.run_a, arguments.run_b, arguments.out)
     print(in_words(found))
     if arguments.out is not None:
@@ -96,6 +98,18 @@ def _compare(arguments: argparse.Namespace, signals: StopSignals) -> int:
     for line in too_far:
         print(f"companion: {line}", file=sys.stderr)
     return 1 if too_far else 0
+
+
+def _compare_maps(arguments: argparse.Namespace) -> int:
+    from companion.app.compare_maps import PAGE, changes_in_words, compare_maps
+
+    if arguments.max_apart is not None or arguments.max_cloud is not None:
+        raise InputError("--max-apart and --max-cloud are of two runs, not of --maps")
+    found = compare_maps(arguments.run_a, arguments.run_b, arguments.out)
+    print(changes_in_words(found))
+    if arguments.out is not None:
+        print(f"report: {arguments.out / PAGE}")
+    return 0
 
 
 def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -126,12 +140,16 @@ def add_parsers(commands: Any) -> None:
     """Add them to the subparsers of the program."""
     _add_flights(commands)
     compare = commands.add_parser(
-        "compare", help="what differs between two runs of a flight",
+        "compare", help="what differs between two runs of a flight, or two maps of a site",
         description="Compare the --out folders of two replays of one flight: poses, cloud, times. "
-        "Exit status 1 where a limit is given and not kept.",
+        "Exit status 1 where a limit is given and not kept. With --maps: what is gone, new or "
+        "moved at a site between two flights.",
     )  # fmt: skip
-    compare.add_argument("run_a", type=Path, metavar="RUN_A")
-    compare.add_argument("run_b", type=Path, metavar="RUN_B")
+    compare.add_argument("run_a", type=Path, metavar="A")
+    compare.add_argument("run_b", type=Path, metavar="B")
+    compare.add_argument(
+        "--maps", action="store_true", help="A and B are site maps of two flights over one site"
+    )
     compare.add_argument("--out", type=Path, metavar="DIR", help="write a report with plots there")
     compare.add_argument(
         "--max-apart", type=amount, metavar="M", help="poses at most so far apart, RMS"

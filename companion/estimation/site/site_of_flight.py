@@ -12,6 +12,7 @@ from companion.geometry.geodesy import GeoOrigin
 from companion.messages import Georeference
 from companion.slam.map.site_map import SiteGeoreference, SiteMap, SitePart, site_map_of
 from companion.slam.map.sparse_map import SlamMap
+from companion.slam.mapping.site_fading import faded
 
 
 def site_of_flight(
@@ -21,7 +22,8 @@ def site_of_flight(
     """The site map of the largest of some maps; None of none.
 
     `flight` is its name, `origin` that of its local NED. Keyframes of an earlier site map that it
-    was merged with, `used`, stay those of their flights.
+    was merged with, `used`, stay those of their flights; points of it that this one looks through
+    are left out.
     """
     if not segments:
         return None
@@ -41,7 +43,8 @@ def site_of_flight(
         _sigma_m(times) if before is None else before.georeference.sigma_m,
         placed.sigma_yaw_rad, placed.sigma_scale, placed.method,
     )  # fmt: skip
-    return site_map_of(segment, placed.world_from_map, parts, part_of_id, georeference, revision)
+    site = site_map_of(segment, placed.world_from_map, parts, part_of_id, georeference, revision)
+    return site if before is None else faded(site)
 
 
 def _origin(

@@ -67,7 +67,7 @@ def _path(found: Comparison) -> Markup | None:
     rotation.set_ylabel("turned [deg], grey")
     rotation.set_ylim(bottom=0)
     rotation.grid(False)
-    return _svg(figure)
+    return figure_svg(figure)
 
 
 def _cloud(found: Comparison) -> Markup | None:
@@ -84,7 +84,7 @@ def _cloud(found: Comparison) -> Markup | None:
     axes.set_ylabel("share of points")
     axes.set_xlim(left=0)
     axes.legend(loc="lower right")
-    return _svg(figure)
+    return figure_svg(figure)
 
 
 def _shares(values: Array) -> tuple[Array, Array]:
@@ -92,7 +92,8 @@ def _shares(values: Array) -> tuple[Array, Array]:
     return np.quantile(values, shares), shares
 
 
-def _svg(figure: Figure) -> Markup:
+def figure_svg(figure: Figure) -> Markup:
+    """A figure as SVG within a page."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()

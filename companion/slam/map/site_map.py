@@ -26,6 +26,8 @@ BORN_EARLIER = -1000
 """Keyframe at which a saved point counts as created: one long before any of now."""
 NO_KEYFRAME = -1
 BESIDE_PX = 100.0
+MIN_KEYFRAMES_ALONE = 3
+"""Keyframes of a flight's own in which a camera can be found: neighbours confirm it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +89,7 @@ def site_map_of(
     keyframes = tuple(
         replace(
             k, keyframe_id=n, camera_from_map=_pose_in_world(k.camera_from_map, world_from_map),
-            t_ns=k.t_ns + EARLIER_NS if k.keyframe_id in part_of_id else k.t_ns,
+            t_ns=k.t_ns + EARLIER_NS if _is_earlier(k) else k.t_ns,
         )
         for n, k in enumerate(part.keyframes)
     )  # fmt: skip
@@ -134,6 +136,19 @@ def slam_map_of(site: SiteMap, camera: Camera) -> SlamMap:
     counted = slam_map.n_observers[: slam_map.n_points]
     slam_map.alive[: slam_map.n_points] = counted >= 2  # of a map that was read in part
     return slam_map
+
+
+def of_this_flight(part: MapPart) -> MapPart | None:
+    """The part of a map without keyframes of an earlier flight; None where too little is left.
+
+    What but one keyframe of this flight observes stays: it will be seen again.
+    """
+    own = tuple(k for k in part.keyframes if not _is_earlier(k))
+    return replace(part, keyframes=own) if len(own) >= MIN_KEYFRAMES_ALONE else None
+
+
+def _is_earlier(keyframe: Keyframe) -> bool:
+    return keyframe.t_ns < -EARLIER_NS // 2
 
 
 def pixels_of(camera: Camera, normalised: Array) -> Floats:

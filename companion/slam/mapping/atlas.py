@@ -97,9 +97,12 @@ class Atlas:
     def resume(self, kept: SlamMap) -> None:
         """Activate a stored map and index its keyframes; no other may have been initialised.
 
-        It may hold keyframes of an earlier flight already, which is therefore not looked for.
+        It is looked for in the map of an earlier flight unless ids of both could be confused, as
+        where it holds keyframes of that flight already.
         """
-        self.segments, self.site = [kept], None
+        if self.site is not None and not self.site.keyframes.keys().isdisjoint(kept.keyframes):
+            self.site = None
+        self.segments = [kept]
         for keyframe in kept.keyframes.values():
             self.index_keyframe(keyframe)
 

@@ -33,7 +33,7 @@ from companion.telemetry import (
     Telemetry,
 )
 from tests.support.flights.noisy_telemetry import with_noise
-from tests.support.flights.scene import texture
+from tests.support.flights.scene import leaves, texture
 
 CAMERA_DOWN = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
 """`body_from_camera` of a camera that looks straight down, the top of its picture forward."""
@@ -74,6 +74,12 @@ class Terrain:
             self._levels.append((height, place, self._levels[k % 5][2] if k > 4 else pattern(rng)))
         self._levels[1:] = sorted(self._levels[1:], key=lambda level: -level[0])
         self._rays: dict[int, Bytes] = {}
+
+    def add_roof(self, height_m: float, at: tuple[float, float], size_m: float, look: int) -> None:
+        """Put a square roof with its corner at (north, east) there; `look` is a seed."""
+        place = (*at, at[0] + size_m, at[1] + size_m)
+        self._levels.append((-height_m, place, leaves(np.random.default_rng(look), 256)))
+        self._levels[1:] = sorted(self._levels[1:], key=lambda level: -level[0])
 
     def picture(self, camera: Camera, ned_from_camera: Pose) -> Bytes:
         """What the camera sees (H, W); mid grey where a pixel has no ray or meets nothing."""
