@@ -41,7 +41,6 @@ from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.estimation.satellites.satellite_watch import doubts
 from companion.geometry.geodesy import GeoOrigin
-from companion.health import LatencyMeter
 from companion.messages import (
     NO_PICTURE,
     Frame,
@@ -51,6 +50,7 @@ from companion.messages import (
     OpticalFlow,
     Warned,
 )
+from companion.meters import LatencyMeter
 from companion.pilot_messages import PilotText, of_warning
 from companion.products.flight_result import RunFacts
 from companion.runtime.stage_protocol import ResultsWritten, Snapshot

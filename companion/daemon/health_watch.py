@@ -26,13 +26,12 @@ from companion.health import (
     FlowHealth,
     Health,
     LandingHealth,
-    LatencyMeter,
     StageHealth,
-    StageMeter,
-    StatusLines,
 )
 from companion.messages import Georeferenced, Odometry, TrackState, Warned
+from companion.meters import LatencyMeter, StageMeter
 from companion.runtime.governor import Governor, LoadSample
+from companion.status_lines import StatusLines, line_of
 from companion.timing.clock import FlightClock, monotonic_s
 from drivers.camera.camera_feed import CameraFeed
 from drivers.mavlink.autopilot_link import AutopilotLink
@@ -248,7 +247,11 @@ class HealthWatch:
         """Status document of `companion status`."""
         flight = self._flights.current
         believed = self._believed if flight is None else flight.believed
-        return {"version": __version__, "believed": list(believed), **self.health().to_json()}
+        health = self.health()
+        return {
+            "version": __version__, "believed": list(believed), **health.to_json(),
+            "line": line_of(health),
+        }  # fmt: skip
 
     def health(self) -> Health:
         """Health now."""

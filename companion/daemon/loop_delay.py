@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from companion.health import LatencyMeter
+from companion.meters import LatencyMeter
 from companion.timing.clock import FlightClock
 
 TICK_S = 0.05

@@ -11,8 +11,9 @@ import numpy as np
 
 from companion.config import CameraConfig
 from companion.errors import CompanionError, ConfigError
-from companion.health import SourceHealth, SourceMeter, SourceState
+from companion.health import SourceHealth, SourceState
 from companion.messages import Frame, Warned
+from companion.meters import SourceMeter
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_source import CameraSource, EndOfPictures, Picture
 from drivers.system.fault_trace import FaultTraces

@@ -18,8 +18,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.advice.imu_room import imu_room
 from companion.config import LinkConfig
 from companion.geometry.geodesy import GeoOrigin
-from companion.health import RateMeter, SourceHealth, SourceMeter
+from companion.health import SourceHealth
 from companion.messages import Warned
+from companion.meters import RateMeter, SourceMeter
 from companion.pilot_messages import PilotText
 from companion.telemetry import ArmedSample, LandedSample, Telemetry
 from companion.timing.clock import FlightClock

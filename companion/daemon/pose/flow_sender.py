@@ -13,8 +13,9 @@ import numpy as np
 from companion.config import FeedbackConfig
 from companion.estimation.lift_off.optical_flow import NO_ATTITUDE
 from companion.geometry.transforms import Array
-from companion.health import FlowHealth, LatencyMeter, RateMeter
+from companion.health import FlowHealth
 from companion.messages import OpticalFlow
+from companion.meters import LatencyMeter, RateMeter
 from companion.telemetry import AttitudeSample
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink

@@ -11,8 +11,9 @@ from collections.abc import Collection
 from companion.config import FeedbackConfig, Measurement
 from companion.estimation.gate.global_gate import GlobalGate
 from companion.estimation.gate.pose_gate import PoseGate
-from companion.health import FeedbackHealth, RateMeter
+from companion.health import FeedbackHealth
 from companion.messages import Georeferenced, Odometry
+from companion.meters import RateMeter
 from companion.pilot_messages import GLOBAL_OFF, GLOBAL_ON
 from companion.telemetry import AttitudeSample, PositionSample
 from companion.timing.clock import FlightClock

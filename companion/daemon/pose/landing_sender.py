@@ -12,8 +12,9 @@ import numpy as np
 
 from companion.config import LandingConfig, Measurement
 from companion.estimation.landing.landing_gate import LandingGate
-from companion.health import LandingHealth, LatencyMeter, RateMeter
+from companion.health import LandingHealth
 from companion.messages import LandingTarget
+from companion.meters import LatencyMeter, RateMeter
 from companion.pilot_messages import MARKER_LOST, MARKER_SEEN
 from companion.telemetry import AttitudeSample
 from companion.timing.clock import FlightClock

@@ -16,8 +16,9 @@ from companion.estimation.gate.gate_journal import JournaledGate
 from companion.estimation.gate.pose_gate import PoseToSend, Sending
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
-from companion.health import FeedbackHealth, LatencyMeter, RateMeter
+from companion.health import FeedbackHealth
 from companion.messages import Odometry, Warned
+from companion.meters import LatencyMeter, RateMeter
 from companion.pilot_messages import (
     DEAD_RECKONING,
     POSITION_ON,

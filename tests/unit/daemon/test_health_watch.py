@@ -12,8 +12,10 @@ import pytest
 
 from companion.config import Config
 from companion.daemon.health_watch import PATIENCE_NS, HealthWatch
-from companion.health import LatencyMeter, SourceHealth
+from companion.health import SourceHealth
 from companion.messages import Odometry, TrackState
+from companion.meters import LatencyMeter
+from companion.status_lines import line_of
 from companion.timing.clock import FlightClock
 from drivers.system.journal import Journal
 
@@ -58,7 +60,7 @@ def test_latencies_are_sorted_once_for_a_health(
     assert health.pose_latency_p95_ms == localisation.latency_p95_ms
     assert localisation.latency_p95_ms is not None and localisation.latency_p95_ms >= 20.0
     asked.clear()
-    assert watch.line_due(health) == health.line()
+    assert watch.line_due(health) == line_of(health)
     assert not asked, "the health that there is will do"
 
 
