@@ -47,7 +47,7 @@ reference: opencl
 	mkdir -p sample/reference
 	cp out/reference/trajectory.tum out/reference/cloud.ply out/reference/report.json sample/reference
 
-# config/companion.toml and docs/settings.md, after a change to companion/config.py.
+# config/companion.toml and docs/settings.md, after a change to companion/config.
 settings: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.support.settings_text
 

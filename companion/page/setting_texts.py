@@ -1,4 +1,4 @@
-"""Texts, bounds and units of settings, read from companion/config.py."""
+"""Texts, bounds and units of settings, read from companion/config."""
 
 from __future__ import annotations
 

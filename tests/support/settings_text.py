@@ -1,4 +1,4 @@
-"""config/companion.toml and docs/settings.md, made of companion/config.py by `make settings`."""
+"""config/companion.toml and docs/settings.md, made of companion/config by `make settings`."""
 
 from __future__ import annotations
 
