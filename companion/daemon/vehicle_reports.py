@@ -7,9 +7,19 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 
+import numpy as np
+
 from companion.config import Config, FeedbackConfig
 from companion.daemon.health_watch import HealthWatch
-from companion.dense.obstacles import Obstacles, RecentCloud, obstacles_around, unknown
+from companion.dense.fresh_sight import points_found, sectors_seen
+from companion.dense.obstacles import (
+    N_SECTORS,
+    Obstacles,
+    RecentCloud,
+    known_in,
+    obstacles_around,
+    unknown,
+)
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from companion.messages import DepthMap, MapUpdate, PointChunk, Track, TrackState
@@ -35,8 +45,10 @@ from drivers.video.rtsp_server import PATH
 EVERY_NETWORK = ("0.0.0.0", "::", "")
 OBSTACLES_HZ, COMPUTER_HZ = 10.0, 1.0
 MAX_AGE_NS = 200_000_000
-"""Age of the image that the pose is from, since its exposure; beyond it nothing is known: at 5 m/s
-all distances are a metre off."""
+"""Age of the image that the pose is from, and of that in which a sector was seen, since exposure;
+beyond it nothing is known: at 5 m/s all distances are a metre off."""
+MOST_TRACKS = 16
+"""Frames within that age, and more at 60 a second: every other is then enough."""
 MOST_WAITING = 4
 """Depth maps and chunks between two rounds; of more the newest count. One takes a megabyte."""
 UNKNOWN_AFTER_NS = 3_000_000_000
@@ -63,6 +75,8 @@ class VehicleReports:
     def restart(self, camera: Camera | None) -> None:
         """Begin another flight with another map."""
         self._track: Track | None = None
+        self._tracks: deque[Track] = deque(maxlen=MOST_TRACKS)
+        """The newest that found map points."""
         self._map: MapUpdate | None = None
         self._camera = camera or self._camera
         waiting: deque[DepthMap | PointChunk] = deque(maxlen=MOST_WAITING)
@@ -76,6 +90,8 @@ class VehicleReports:
         """Take a track, a map update, a depth map or points."""
         if isinstance(message, Track):
             self._track = message
+            if self._obstacles and message.keypoints_px is not None and not message.backfilled:
+                self._tracks.append(message)
         elif isinstance(message, MapUpdate):
             self._map = message
         elif self._obstacles:
@@ -160,7 +176,7 @@ class VehicleReports:
                 cloud.add_map(message)
             else:
                 cloud.add(message)
-        found = self._obstacles_now(now_ns, track, update, cloud)
+        found = self._obstacles_now(now_ns, track, list(self._tracks), update, cloud)
         if found is not None:
             self._known_ns = now_ns
         elif now_ns - self._known_ns > UNKNOWN_AFTER_NS:
@@ -169,13 +185,17 @@ class VehicleReports:
         return told
 
     def _obstacles_now(
-        self, now_ns: int, track: Track | None, update: MapUpdate | None, cloud: RecentCloud
-    ) -> Obstacles | None:
-        """Obstacles from the map's own pose; None while that is unknown or old."""
+        self, now_ns: int, track: Track | None, tracks: list[Track], update: MapUpdate | None,
+        cloud: RecentCloud,
+    ) -> Obstacles | None:  # fmt: skip
+        """Obstacles from the map's own pose; None while that is unknown or old.
+
+        Known are sectors alone in which one of the newest frames has found points of the map.
+        """
         if (
             track is None or track.state is not TrackState.TRACKING
             or track.map_from_camera is None or now_ns - track.t_ns > MAX_AGE_NS
-            or update is None or update.georeference is None
+            or update is None or update.georeference is None or self._camera is None
         ):  # fmt: skip
             return None
         seen = cloud.in_world(now_ns, update)
@@ -185,4 +205,19 @@ class VehicleReports:
         world_from_body = (
             world_from_map.apply_to_pose(track.map_from_camera) @ self._camera_from_body
         )
-        return obstacles_around(track.t_ns, world_from_body, *seen)
+        points, eyes, ages = seen
+        is_seen = np.zeros(N_SECTORS, bool)
+        for each in tracks:
+            pose = each.map_from_camera
+            if pose is None or each.keypoints_px is None or now_ns - each.t_ns > MAX_AGE_NS:
+                continue
+            camera_in_world = world_from_map.apply_to_pose(pose)
+            is_seen |= sectors_seen(
+                each.keypoints_px, camera_in_world, world_from_body, self._camera
+            )
+            if each is track:
+                found = points_found(update.points_map, each.keypoints_px, pose, self._camera)
+                points = np.concatenate([points, world_from_map.apply(found)])
+                eyes = np.concatenate([eyes, np.tile(camera_in_world.translation, (len(found), 1))])
+                ages = np.r_[ages, np.full(len(found), np.inf)]  # of no free space do they tell
+        return known_in(obstacles_around(track.t_ns, world_from_body, points, eyes, ages), is_seen)

@@ -4,7 +4,7 @@ Sectors are horizontal, around the vehicle, the first centred on straight ahead,
 view. Unseen space is unknown, not free: a sector is free only where lines of sight pass through it,
 at the height of the vehicle, to something farther away, and only where that was seen just now.
 Obstacles stay for longer: they stand where they were seen. So a vehicle that hovers, of which depth
-knows nothing new, sees what is free turn to unknown.
+knows nothing new, sees what is free turn to unknown. What no recent frame confirms is unknown too.
 
 Static textured obstacles are detected; moving or untextured ones are not.
 """
@@ -12,7 +12,7 @@ Static textured obstacles are detected; moving or untextured ones are not.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,12 @@ class Obstacles:
     max_cm: int
 
 
+def known_in(found: Obstacles, sectors: NDArray[np.bool_]) -> Obstacles:
+    """The same with all but some sectors (72,) unknown."""
+    kept = np.where(sectors, found.distances_cm, UNKNOWN_CM).astype(np.uint16)
+    return replace(found, distances_cm=kept)
+
+
 def unknown(t_ns: int) -> Obstacles:
     """Nothing is known."""
     nothing = np.full(N_SECTORS, UNKNOWN_CM, np.uint16)
@@ -68,7 +74,7 @@ def obstacles_around(
     points, eyes = points_world_m[finite] - position, seen_from_world_m[finite] - position
     is_new = ages_s[finite] <= FREE_S
     distance_m = np.hypot(points[:, 0], points[:, 1])
-    sector = _sector(points, world_from_body)
+    sector = sector_of(points, world_from_body)
 
     max_cm = round(MAX_M * 100)
     min_cm = round(MIN_M * 100)
@@ -91,7 +97,7 @@ def obstacles_around(
     return Obstacles(t_ns, distances_cm, min_cm, max_cm)
 
 
-def _sector(points: Array, world_from_body: Pose) -> NDArray[np.int64]:
+def sector_of(points: Array, world_from_body: Pose) -> NDArray[np.int64]:
     """Sector of each point (N, 3), relative to the vehicle, in world axes."""
     forward = world_from_body.rotation[:, 0]
     bearing_rad = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(forward[1], forward[0])

@@ -49,6 +49,16 @@ def read_run(folder: Path) -> FinishedRun:
     )  # fmt: skip
 
 
+def read_path(folder: Path) -> tuple[list[WorldPose], GeoOrigin | None]:
+    """Camera poses of a run, and the origin of their local NED, None where not on the globe.
+
+    InputError where it is no run, or incomplete.
+    """
+    report = _report(folder / "report.json")
+    origin = _origin(folder / "report.json", report) if report.get("unit") == "m" else None
+    return _poses(folder / "trajectory.tum"), origin
+
+
 def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()

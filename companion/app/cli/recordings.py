@@ -25,7 +25,7 @@ from companion.errors import InputError
 
 
 def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
-    """List, show, trim, export, verify, repair or prune."""
+    """List, show, trim, export, verify, repair or prune; or make a mission of one."""
     from companion.app import flights_command as flights
     from companion.service.flights_meant import flights_meant, installed_services
 
@@ -48,6 +48,12 @@ def _flights(arguments: argparse.Namespace, signals: StopSignals) -> int:
         path = flights.found_recording(arguments.flight, folder)
         progress = signals.between_frames(progress_on(sys.stderr, ""))
         print(flights.export_flight(path, arguments.out, progress))
+    elif what == "mission":
+        from companion.app.flights_mission import mission
+
+        print(mission(
+            arguments.flight, folder, arguments.out, arguments.within, arguments.back
+        ))  # fmt: skip
     elif what == "verify":
         text, well = flights.verify_flights(
             flights.recordings_meant(arguments.flights_named, folder), megabytes
@@ -197,7 +203,19 @@ def _add_flights(commands: Any) -> None:
         "and flight.tlog, or telemetry.csv where no bytes of a link were recorded.",
     )  # fmt: skip
     export.add_argument("--out", type=Path, required=True, metavar="DIR")
-    for parser in (show, trim, export):
+    mission = does.add_parser(
+        "mission", parents=[place], help="its path, or the way back, as a mission",
+        description="Write the path of a flight as waypoints for a ground station: FILE.plan for "
+        "QGroundControl, FILE.waypoints for Mission Planner and MAVProxy. Heights are above sea "
+        "level. Check it before it is flown: nothing of it looks for obstacles.",
+    )  # fmt: skip
+    mission.add_argument("--out", type=Path, required=True, metavar="FILE")
+    mission.add_argument(
+        "--within", type=amount, default=0.5, metavar="M",
+        help="leave out places this near to the line between others (default: 0.5)",
+    )  # fmt: skip
+    mission.add_argument("--back", action="store_true", help="from the end to the beginning")
+    for parser in (show, trim, export, mission):
         parser.add_argument("flight", metavar="FLIGHT", help="name, folder or file")
     verify = does.add_parser(
         "verify", parents=[place], help="check all checksums",

@@ -78,7 +78,9 @@ class Terrain:
     def add_roof(self, height_m: float, at: tuple[float, float], size_m: float, look: int) -> None:
         """Put a square roof with its corner at (north, east) there; `look` is a seed."""
         place = (*at, at[0] + size_m, at[1] + size_m)
-        self._levels.append((-height_m, place, leaves(np.random.default_rng(look), 256)))
+        corner = np.rint(np.array(at) / self._metres_per_texel).astype(int)
+        pattern = np.roll(leaves(np.random.default_rng(look), 256), corner, (0, 1))
+        self._levels.append((-height_m, place, pattern))
         self._levels[1:] = sorted(self._levels[1:], key=lambda level: -level[0])
 
     def picture(self, camera: Camera, ned_from_camera: Pose) -> Bytes:
@@ -198,7 +200,7 @@ def fly(
             grey = np.full_like(grey, 252) if dropped_out else grey
             yield Frame(seq, t_ns, grey, np.repeat(grey[..., None], 3, 2))
 
-    samples = list(_telemetry(ned_from_body, seconds)) if told else []
+    samples = list(telemetry_of(ned_from_body, seconds)) if told else []
     if imu_seed is not None:
         still = inertial_samples(ned_from_body, seconds)
         samples = sorted([*samples, *with_noise(still, imu_seed)], key=lambda s: s.t_ns)
@@ -231,7 +233,7 @@ def _ns(after_s: float) -> int:
     return START_NS + round(after_s * 1e9)
 
 
-def _telemetry(ned_from_body: PathOf, seconds: float) -> Iterator[Telemetry]:
+def telemetry_of(ned_from_body: PathOf, seconds: float) -> Iterator[Telemetry]:
     """Attitude a little off, positions that wander by decimetres, velocity, and a rangefinder."""
     samples: list[Telemetry] = []
     rng = np.random.default_rng(5)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import (
     DepthMap,
+    Floats,
     Georeference,
     MapUpdate,
     PixelState,
@@ -66,6 +68,9 @@ class Approach:
         self.keyframes: dict[int, Pose] = {}
         self.late: list[tuple[int, DepthMap]] = []
         self.position = np.zeros(3)
+        across, down = np.meshgrid(np.linspace(2, 157, 40), np.linspace(20, 100, 8))
+        self.keypoints_px: Floats | None = np.c_[across.ravel(), down.ravel()].astype(np.float32)
+        """Of the map points found in each frame: all over the image, at first."""
 
     @property
     def map_from_camera(self) -> Pose:
@@ -80,8 +85,11 @@ class Approach:
             since = round((now_ns - self.began_ns) / (S / 20))
             if tracked:
                 self.reports.take(
-                    Track(since, now_ns - S // 20, TrackState.TRACKING, self.map_from_camera)
-                )
+                    Track(
+                        since, now_ns - S // 20, TrackState.TRACKING, self.map_from_camera,
+                        keypoints_px=self.keypoints_px,
+                    )
+                )  # fmt: skip
             if speed_m_s and tracked and since % 10 == 0:
                 self.add_keyframe(since // 10, now_ns)
             while self.late and self.late[0][0] <= now_ns:
@@ -150,6 +158,34 @@ def test_hovering_turns_free_to_unknown_and_then_all() -> None:
     assert approach.fly(FREE_S + 0.1, 0.0)[0] == UNKNOWN
     assert 0 < approach.now()[3] < 2000
     assert set(approach.fly(STAYS_S, 0.0)) == {UNKNOWN}
+
+
+def test_a_sector_that_no_newest_frame_sees_is_unknown() -> None:
+    """Though its obstacle stands where it was, and depth has told of it a second ago."""
+    approach = Approach()
+    assert FREE > approach.fly(3.0)[3]
+    everywhere = approach.keypoints_px
+    assert everywhere is not None
+    approach.keypoints_px = everywhere[everywhere[:, 0] < CAMERA.cx]
+    found = approach.fly(1e-9 * MAX_AGE_NS + 0.1)
+    assert found[3] == UNKNOWN and found[69] != UNKNOWN
+    approach.keypoints_px = None  # followed by its pattern, and none of its points found
+    assert set(approach.fly(1e-9 * MAX_AGE_NS + 0.1)) == {UNKNOWN}
+
+
+def test_points_of_the_map_in_the_newest_frame_are_obstacles() -> None:
+    """As of something that no depth map shows yet."""
+    approach = Approach(wall_m=60.0, pole=(0, 90, 0.1))
+    approach.fly(1.5)
+    assert approach.keypoints_px is not None
+    post = np.c_[np.full(9, 8.0), np.full(9, -0.2), np.linspace(-0.5, 0.5, 9)]
+    seen = CAMERA.project(FORWARD.inverse().apply(post - approach.position))
+    approach.keypoints_px = np.concatenate([approach.keypoints_px, seen.astype(np.float32)])
+    update = approach.reports._map
+    assert update is not None
+    approach.reports.take(replace(update, points_map=post / METRES_PER_UNIT))
+    found = approach.fly(0.05, speed_m_s=0.0)
+    assert min(found[0], found[71]) == pytest.approx(100 * (8.0 - approach.position[0]), abs=30)
 
 
 def test_an_old_image_makes_everything_unknown_and_then_silent() -> None:

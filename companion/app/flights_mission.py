@@ -1,0 +1,54 @@
+"""companion flights mission: the path that a flight took, or the way back, as a mission."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from companion.errors import FlightError, InputError
+from companion.products.atomic_file import write_atomically
+from companion.products.mission_file import mission_plan, mission_waypoints, thinned
+from companion.products.run_folder import read_path
+
+WRITERS = {".plan": mission_plan, ".waypoints": mission_waypoints}
+MAX_ITEMS = 700
+"""ArduPilot keeps at least so many with its usual storage."""
+LONG_GAP_M = 10.0
+"""A straight line over a gap of the path that is worth a word."""
+
+
+def mission(given: str, folder: Path, out: Path, within_m: float, back: bool) -> str:
+    """Write the path of a flight, or the way back from its end; a line about it.
+
+    `given` is the folder of a run or the name of a flight in `folder`. InputError where its path
+    has no place on the globe, or where autopilots could not keep so many waypoints.
+    """
+    write = WRITERS.get(out.suffix)
+    if write is None:
+        raise InputError(f"{out}: wanted is a name that ends in {' or '.join(WRITERS)}")
+    run = next((p for p in (Path(given), folder / given) if p.is_dir()), None)
+    if run is None:
+        raise FlightError(f"{given}: no folder of a run, and no flight of this name in {folder}")
+    poses, origin = read_path(run)
+    if origin is None:
+        raise InputError(f"{run}: no place on the globe is known of it, so it makes no mission")
+    if len(poses) < 2:
+        raise InputError(f"{run}: it has no path")
+    path_m = np.stack([pose.world_from_camera.translation for pose in poses])
+    steps_m = np.linalg.norm(np.diff(path_m, axis=0), axis=1)
+    places = thinned(path_m[::-1] if back else path_m, within_m)
+    if len(places) > MAX_ITEMS:
+        raise InputError(
+            f"{run}: {len(places)} waypoints, and autopilots keep {MAX_ITEMS}: give a greater "
+            f"--within than {within_m:g}"
+        )
+    write_atomically(out, write(places, origin))
+    gap = f"; a straight line of {steps_m.max():.0f} m where it had no pose" * bool(
+        steps_m.max() > LONG_GAP_M
+    )
+    return (
+        f"{out}: {len(places)} waypoints, {steps_m.sum():.0f} m{', back from its end' * back}, "
+        f"within {within_m:g} m of the path; heights above sea level, {-path_m[:, 2].max():.1f} to "
+        f"{-path_m[:, 2].min():.1f} m above its origin{gap}"
+    )

@@ -1,0 +1,170 @@
+"""OBSTACLE_DISTANCE on approaches to a wall, a pole and a branch, by measured depth.
+
+    python -m tests.bench.obstacle_approach [--things wall,pole,branch] [--thin 0.3,0.1]
+
+Each is flown towards, weaving a little, down to 3 m, by the localisation and depth stages in
+lockstep and `VehicleReports` beside them, which is asked ten times a second, 60 ms after the
+exposure of the newest frame. The true distance of a sector in the middle of the view is that of
+what stands in the band of heights that is searched. Depth comes as soon as it can be computed at
+all: its time of computation is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+
+from companion.config_file import load_config
+from companion.daemon.vehicle_reports import VehicleReports
+from companion.dense.obstacles import ABOVE_M, BELOW_M, SECTOR_DEG, UNKNOWN_CM
+from companion.geometry.camera import Camera
+from companion.geometry.transforms import Pose, yaw_rotation
+from companion.messages import DepthMap, Frame, MapUpdate, Message, PointChunk, Track
+from companion.runtime.in_order import InOrder, in_order_of_time
+from companion.runtime.stage_protocol import Finish, Setup
+from companion.runtime.stages import stage_named
+from tests.support.autopilot.memory_link import SetClock, memory_link
+from tests.support.autopilot.memory_port import MemoryPort
+from tests.support.flights.approach_scene import ApproachScene, Rod, Sheet
+from tests.support.flights.rendered_flight import START_NS, telemetry_of
+
+PITCH = np.radians(8.0)
+FORWARD = Pose(
+    np.array([[0.0, -np.sin(PITCH), np.cos(PITCH)], [1, 0, 0], [0, np.cos(PITCH), np.sin(PITCH)]]),
+    np.zeros(3),
+)
+"""`body_from_camera` of a camera that looks ahead and a little down."""
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, body_from_camera=FORWARD)
+HEIGHT_M, SPEED_M_S, RATE_HZ = 3.0, 1.5, 15.0
+FIRST_M, LAST_M = 20.0, 3.0
+"""Distances at begin and end."""
+LATE_NS = 60_000_000
+IN_VIEW = range(-5, 6)
+"""Sectors: the view is 65 degrees wide."""
+NEAR_CM, FREE_CM = 800, 2001
+
+
+def scene(thing: str, thick_m: float) -> ApproachScene:
+    """Ground with a wall far behind, and a thing at north 0."""
+
+    def wall(north: float, look: int, half: float, high: float) -> Sheet:
+        return Sheet(
+            np.array([north, -half, -high]),
+            np.array([0, 2 * half, 0]),
+            np.array([0, 0, high]),
+            look,
+        )
+
+    things: list[Sheet | Rod] = [
+        Sheet(np.array([-60.0, -60, 0]), np.array([120.0, 0, 0]), np.array([0, 120.0, 0]), 1),
+        wall(34.0, 2, 40.0, 22.0),
+    ]
+    if thing == "wall":
+        things.append(wall(0.0, 3, 6.0, 7.0))
+    elif thing == "pole":
+        things.append(Rod(np.array([0, 0.4, 0.0]), np.array([0, 0.4, -7.0]), thick_m / 2, 4))
+    else:
+        ends = np.array([0, -2.5, -3.2]), np.array([0, 2.5, -2.9])
+        things.append(Rod(*ends, thick_m / 2, 5))
+        things.append(Rod(np.array([0, 2.5, 0.0]), np.array([0, 2.5, -7.0]), 0.2, 4))
+    return ApproachScene(things)
+
+
+def place(after_s: float) -> Pose:
+    """`ned_from_body`."""
+    north = -FIRST_M + SPEED_M_S * after_s
+    east, down = 0.6 * np.sin(0.8 * after_s), -HEIGHT_M + 0.25 * np.sin(0.5 * after_s)
+    return Pose(yaw_rotation(0.03 * np.sin(0.4 * after_s)), np.array([north, east, down]))
+
+
+class Approach:
+    """One approach, and what was told of it."""
+
+    def __init__(self, thing: str, thick_m: float) -> None:
+        self._scene = scene(thing, thick_m)
+        self._clock = SetClock()
+        self._clock.t_ns = START_NS
+        watch: Any = None
+        config = load_config(None, ["feedback.obstacle_distance=true"])
+        link = memory_link(MemoryPort(), self._clock, lambda _: None)
+        self._reports = VehicleReports(link, self._clock, watch, config)
+        self._reports.restart(CAMERA)
+        self._asked_ns = 0
+        self.errors: list[float] = []
+        """Relative to 5 % + 0.3 m, where a distance was told and true."""
+        self.counts = {"told": 0, "unknown": 0, "free though within 8 m": 0, "free": 0}
+        self.first_m = 0.0
+        """Distance at which the thing was first told in one of its sectors."""
+        stages = [stage_named("localisation"), stage_named("depth")]
+        run = InOrder(stages, Setup(config, CAMERA), self._watch, print)
+        seconds = (FIRST_M - LAST_M) / SPEED_M_S
+        frames = (self._frame(n) for n in range(round(seconds * RATE_HZ)))
+        for message in in_order_of_time(telemetry_of(place, seconds), frames):
+            run.feed(message)
+            if isinstance(message, Frame):
+                run.collect()
+                self._compare(message)
+        run.finish(lambda _: Finish(hurry=False))
+
+    def _frame(self, n: int) -> Frame:
+        grey = self._scene.picture(CAMERA, place(n / RATE_HZ) @ FORWARD)
+        t_ns = START_NS + round(n / RATE_HZ * 1e9)
+        return Frame(n, t_ns, grey, np.repeat(grey[..., None], 3, 2))
+
+    def _watch(self, message: Message) -> None:
+        if isinstance(message, Track | MapUpdate | DepthMap | PointChunk):
+            self._reports.take(message)
+
+    def _compare(self, frame: Frame) -> None:
+        if frame.t_ns - self._asked_ns < 100_000_000:
+            return
+        self._asked_ns = frame.t_ns
+        self._clock.t_ns = frame.t_ns + LATE_NS
+        message: Any = self._reports._obstacle_distance()
+        if message is None:
+            return
+        body = place((frame.t_ns - START_NS) * 1e-9)
+        yaw = np.arctan2(body.rotation[1, 0], body.rotation[0, 0])
+        within = np.radians(SECTOR_DEG * np.linspace(-0.5, 0.5, 25))
+        for sector in IN_VIEW:
+            bearings = yaw + np.radians(SECTOR_DEG * sector) + within
+            true_m = self._scene.nearest_m(body.translation, bearings, ABOVE_M, BELOW_M)
+            true_cm = 100 * float(true_m.min())
+            told_cm = message.distances[sector % 72]
+            if told_cm == UNKNOWN_CM:
+                self.counts["unknown"] += 1
+            elif told_cm == FREE_CM:
+                self.counts["free"] += 1
+                self.counts["free though within 8 m"] += true_cm < NEAR_CM
+            elif true_cm < FREE_CM:
+                self.counts["told"] += 1
+                off = abs(told_cm - true_cm) / (0.05 * true_cm + 30)
+                self.errors.append(off)
+                if off <= 1 and not self.first_m and true_cm < 100 * FIRST_M:
+                    self.first_m = true_cm / 100
+            else:
+                self.counts["told"] += 1
+                self.errors.append(np.inf)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--things", default="wall,pole,branch")
+    parser.add_argument("--thin", default="0.3", help="thickness of pole and branch, metres")
+    options = parser.parse_args()
+    for thing in options.things.split(","):
+        for thick in [1.0] if thing == "wall" else [float(t) for t in options.thin.split(",")]:
+            flown = Approach(thing, thick)
+            errors = np.array(flown.errors)
+            good = 100 * (errors <= 1).mean() if len(errors) else 0.0
+            print(
+                f"{thing} {thick:g} m thick: {good:.1f} % of {len(errors)} distances within "
+                f"5 % + 0.3 m, first at {flown.first_m:.1f} m; {flown.counts}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
