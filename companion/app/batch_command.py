@@ -13,10 +13,12 @@ import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from companion import __version__
+from companion.app.merged_maps import Pair, merge_flights, merge_pair
 from companion.app.progress import Progress
 from companion.app.replay.replay_command import RecordedInput, replay
 from companion.app.thumbnail import thumbnail
@@ -24,7 +26,7 @@ from companion.config import Config
 from companion.config_file import shown
 from companion.errors import CompanionError, InputError
 from companion.products.atomic_file import write_atomically
-from companion.products.report.batch_page import BatchResult, batch_page
+from companion.products.report.batch_page import BatchResult, MergedMap, batch_page
 
 DONE, INDEX, REPORT, THUMBNAIL = "batch.json", "index.html", "report.json", "thumbnail.jpg"
 MOST_FILES = 1000
@@ -33,10 +35,11 @@ MOST_FILES = 1000
 
 def batch(
     flights: Sequence[Path], out: Path, config: Config, *, scheduler: str | None,
-    n_workers: int | None, progress: Progress,
-) -> list[BatchResult]:  # fmt: skip
+    n_workers: int | None, progress: Progress, merge: bool = False,
+) -> tuple[list[BatchResult], list[MergedMap]]:  # fmt: skip
     """Replay all flights into folders of `out`, and write index.html there.
 
+    With `merge` their site maps become one, or several where they show no common place.
     `scheduler` is the address of a Dask cluster that sees the same files, else processes of this
     machine do it. InputError where Dask is not there.
     """
@@ -52,23 +55,28 @@ def batch(
             todo[name] = flight, mark
     names = [*_named(flights)]
 
+    maps: list[MergedMap] = []
+
     def write_index() -> list[BatchResult]:
         known = [results[name] for name in names if name in results]
         pictures = {each.name: _bytes(out / each.name / THUMBNAIL) for each in known}
-        write_atomically(out / INDEX, batch_page(known, pictures))
+        write_atomically(out / INDEX, batch_page(known, pictures, maps))
         return known
 
     progress.start(len(names))
     progress.update(len(results), "done", 0)
-    if todo:
-        with _cluster(scheduler, n_workers or len(todo)) as run:
+    if todo or merge:
+        with _cluster(scheduler, n_workers or max(len(todo), len(names) // 2, 1)) as client:
             write_index()
-            for result in run(out, todo, config):
+            for result in _replayed(client, out, todo, config):
                 results[result.name] = result
                 progress.update(len(results), "done", 0)
                 write_index()
+            if merge:
+                good = [name for name in names if not results[name].error]
+                maps = merge_flights(good, out.absolute(), partial(_merged_pairs, client))
     progress.finish()
-    return write_index()
+    return write_index(), maps
 
 
 def replay_one(name: str, flight: Path, out: Path, config: Config, mark: str) -> BatchResult:
@@ -93,28 +101,13 @@ def _cluster(scheduler: str | None, n_wanted: int) -> Iterator[Any]:
     except ImportError as error:
         raise InputError("companion batch needs Dask: pip install '.[batch]' in a clone") from error
     dask: Any = distributed  # whose calls carry no types
-
-    def run(out: Path, todo: dict[str, tuple[Path, str]], config: Config) -> Iterator[BatchResult]:
-        futures = {
-            client.submit(replay_one, name, flight.absolute(), out.absolute(), config, mark,
-                          pure=False): (name, flight)
-            for name, (flight, mark) in todo.items()
-        }  # fmt: skip
-        for future in dask.as_completed(futures):
-            name, flight = futures[future]
-            error = future.exception()
-            if error is not None:  # its process has died
-                yield BatchResult(name, flight, f"{type(error).__name__}: {error}", {})
-            else:
-                yield dataclasses.replace(future.result(), flight=flight)
-
     if scheduler is not None:
         try:
             client = dask.Client(scheduler, timeout="10s")
         except (OSError, ValueError, TimeoutError) as error:
             raise InputError(f"{scheduler}: there is no Dask scheduler: {error}") from error
         with client:
-            yield run
+            yield client
         return
     n_workers = min(n_wanted, len(os.sched_getaffinity(0)))
     with (
@@ -124,7 +117,40 @@ def _cluster(scheduler: str | None, n_wanted: int) -> Iterator[Any]:
         ) as cluster,
         dask.Client(cluster) as client,
     ):  # fmt: skip
-        yield run
+        yield client
+
+
+def _replayed(
+    client: Any, out: Path, todo: dict[str, tuple[Path, str]], config: Config
+) -> Iterator[BatchResult]:
+    """Results of all flights, as they come."""
+    from distributed import as_completed
+
+    completed: Any = as_completed
+    futures = {
+        client.submit(replay_one, name, flight.absolute(), out.absolute(), config, mark,
+                      pure=False): (name, flight)
+        for name, (flight, mark) in todo.items()
+    }  # fmt: skip
+    for future in completed(futures):
+        name, flight = futures[future]
+        error = future.exception()
+        if error is not None:  # its process has died
+            yield BatchResult(name, flight, f"{type(error).__name__}: {error}", {})
+        else:
+            yield dataclasses.replace(future.result(), flight=flight)
+
+
+def _merged_pairs(client: Any, pairs: Sequence[Pair]) -> Iterator[bool]:
+    """True for each pair of maps that is one now. InputError where a process has died."""
+    futures = [client.submit(merge_pair, *pair, pure=False) for pair in pairs]
+    for (first, other, _), future in zip(pairs, futures, strict=True):
+        error = future.exception()
+        if isinstance(error, CompanionError | OSError):
+            raise error
+        if error is not None:
+            raise InputError(f"{first} and {other} cannot be merged: {error}") from error
+        yield bool(future.result())
 
 
 def _named(flights: Sequence[Path]) -> dict[str, Path]:

@@ -3,9 +3,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from companion.geometry.transforms import Similarity
+from companion.products.site_map_file import SITE_MAP, read_site_map, write_site_map
+from companion.slam.map.site_map import SiteGeoreference, SitePart, site_map_of
 from tests.support.flights.recorded import record
+from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
 
 pytest.importorskip("distributed")
 FIRST, SECOND = "2026-01-01T00-00-00Z", "2026-01-02T00-00-00Z"
@@ -43,6 +48,19 @@ def test_an_archive_is_replayed_once_and_shown_on_one_page(tmp_path: Path) -> No
     again = [(out / name / "report.json").stat().st_mtime_ns for name in (FIRST, SECOND)]
     assert again[0] == stamps[0] and again[1] > stamps[1]
     assert json.loads((out / SECOND / "report.json").read_text())["frames"] == 10
+
+    ground = Ground(np.random.default_rng(5))
+    for n, name in enumerate((FIRST, SECOND)):
+        path = [flown(p, 2.6 * n) for p in np.linspace((-5, n), (5, -n), 9)]
+        made = mapped(ground, path, Similarity.identity())
+        part, placed = SitePart(name, 0, CAMERA, 1), SiteGeoreference(None, 1.0, 0.02, 0.01, "gps")
+        site = site_map_of(made, Similarity.identity(), (part,), {}, placed, 1)
+        write_site_map(out / name / SITE_MAP, site)
+    done = batch(*flights[:2], *settings, "--merge")
+    assert done.returncode == 0, done.stderr
+    assert "2 done before" in done.stdout and f"site.map: {FIRST}, {SECOND}" in done.stdout
+    assert len(read_site_map(out / SITE_MAP).site.keyframes) == 18
+    assert "of these also seen by others" in (out / "index.html").read_text()
 
 
 def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:

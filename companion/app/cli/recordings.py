@@ -123,10 +123,11 @@ def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.batch_command import INDEX, batch
 
     made_folder(arguments.out)
-    results = batch(
+    results, maps = batch(
         arguments.flights, arguments.out, load_config(arguments.config, arguments.set),
         scheduler=arguments.scheduler, n_workers=arguments.workers,
         progress=signals.between_frames(progress_on(sys.stderr, "", "flights")),
+        merge=arguments.merge,
     )  # fmt: skip
     failed = [result for result in results if result.error]
     for result in failed:
@@ -134,6 +135,8 @@ def _batch(arguments: argparse.Namespace, signals: StopSignals) -> int:
     before = sum(result.done_before for result in results)
     plural = "" if len(results) == 1 else "s"
     print(f"{len(results)} flight{plural}, {before} done before, {len(failed)} failed")
+    for each in maps:
+        print(f"{arguments.out / each.name}: {', '.join(part.flight for part in each.flights)}")
     print(f"index: {arguments.out / INDEX}")
     signals.take()
     return 1 if failed else 0
@@ -172,6 +175,10 @@ def add_parsers(commands: Any) -> None:
     )  # fmt: skip
     batch.add_argument("flights", type=Path, nargs="+", metavar="FLIGHT")
     batch.add_argument("--out", type=Path, required=True, metavar="DIR")
+    batch.add_argument(
+        "--merge", action="store_true",
+        help="make one site map of all, DIR/site.map, and more where they show no common place",
+    )  # fmt: skip
     batch.add_argument(
         "--workers", type=count, metavar="N", help="processes (default: one per core)"
     )

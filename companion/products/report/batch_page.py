@@ -23,12 +23,40 @@ class BatchResult:
     done_before: bool = False
 
 
-def batch_page(rows: Sequence[BatchResult], pictures: Mapping[str, bytes]) -> bytes:
-    """HTML with the pictures, JPEG by name, embedded; links to the reports."""
+@dataclass(frozen=True, slots=True)
+class MergedFlight:
+    """Share of one flight in a map: its keyframes, and the points that they observe.
+
+    Of these `n_shared` are observed by other flights too, from which it is `apart_m` away there:
+    one standard deviation, of one axis.
+    """
+
+    flight: str
+    n_keyframes: int
+    n_points: int
+    n_shared: int
+    apart_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class MergedMap:
+    """A site map of several flights, or of one that shows no place of the others."""
+
+    name: str
+    n_keyframes: int
+    n_points: int
+    flights: tuple[MergedFlight, ...]
+
+
+def batch_page(
+    rows: Sequence[BatchResult], pictures: Mapping[str, bytes], maps: Sequence[MergedMap] = ()
+) -> bytes:
+    """HTML with the pictures, JPEG by name, embedded; links to the reports; merged maps."""
     return rendered(
         "batch.html.j2",
         rows=[_shown(row, pictures.get(row.name, b"")) for row in rows],
         n_failed=sum(bool(row.error) for row in rows),
+        maps=maps,
     )
 
 

@@ -1,0 +1,53 @@
+"""Maps of many flights: as few as there are sites, whatever order they come in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from companion.app.merged_maps import Pair, merge_flights, merge_pair
+from companion.geometry.transforms import Array, Similarity
+from companion.products.report.batch_page import batch_page
+from companion.products.site_map_file import SITE_MAP, read_site_map, write_site_map
+from companion.slam.map.site_map import SiteGeoreference, SitePart, site_map_of
+from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
+
+
+def fly(out: Path, name: str, ground: Ground, begin: Array, end: Array) -> None:
+    made = mapped(ground, [flown(p) for p in np.linspace(begin, end, 9)], Similarity.identity())
+    placed = SiteGeoreference(None, 1.0, 0.02, 0.01, "gps")
+    part = SitePart(name, 0, CAMERA, 1)
+    (out / name).mkdir()
+    site = site_map_of(made, Similarity.identity(), (part,), {}, placed, 1)
+    write_site_map(out / name / SITE_MAP, site)
+
+
+def one_by_one(pairs: Sequence[Pair]) -> Iterator[bool]:
+    files = [path for pair in pairs for path in pair[:2]]
+    assert len(set(files)) == len(files)  # they may be merged at the same time
+    return (merge_pair(*pair) for pair in pairs)
+
+
+def test_flights_that_only_a_third_one_joins_and_one_over_another_site(tmp_path: Path) -> None:
+    ground = Ground(np.random.default_rng(5))
+    west, middle, east = (np.array([north, 0.0]) for north in (-20, 0, 20))
+    fly(tmp_path, "west", ground, west, west + [8, 0])
+    fly(tmp_path, "east", ground, east - [8, 0], east)
+    fly(tmp_path, "elsewhere", Ground(np.random.default_rng(6)), middle, middle + [8, 0])
+    fly(tmp_path, "across", ground, west + [5, 0.5], east - [5, 0.5])
+    (tmp_path / "lost").mkdir()
+    (tmp_path / "site-7.map").write_bytes(b"of a run before")
+    names = ["west", "east", "elsewhere", "across", "lost"]
+    maps = merge_flights(names, tmp_path, one_by_one)
+    flights = [sorted(each.flight for each in found.flights) for found in maps]
+    assert flights == [["across", "east", "west"], ["elsewhere"]]
+    assert [found.name for found in maps] == [SITE_MAP, "site-2.map"]
+    assert {p.name for p in tmp_path.iterdir() if p.is_file()} == {SITE_MAP, "site-2.map"}
+    assert not (tmp_path / ".merging").exists()
+    assert len(read_site_map(tmp_path / SITE_MAP).site.keyframes) == 27
+    for each in maps[0].flights:
+        assert each.n_shared > 50 and 0 < each.apart_m < 0.1
+    page = batch_page([], {}, maps).decode()
+    assert "site-2.map" in page and "No place in it is seen in the other maps" in page
