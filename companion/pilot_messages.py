@@ -68,6 +68,10 @@ IMU_NOT_USED = PilotMessage(NOTICE, "autopilot IMU data not used")
 IMU_USED = PilotMessage(INFO, "autopilot IMU data used again")
 VELOCITY_NOT_USED = PilotMessage(NOTICE, "autopilot velocity not used")
 VELOCITY_USED = PilotMessage(INFO, "autopilot velocity used again")
+LIMIT_FAST = PilotMessage(WARNING, "vision near limit: too low or fast")
+LIMIT_FAINT = PilotMessage(WARNING, "vision near limit: low contrast")
+LIMIT_FEW = PilotMessage(WARNING, "vision near limit: little structure")
+LIMIT_AWAY = PilotMessage(INFO, "vision away from its limits")
 
 # -- satellites -----------------------------------------------------------------
 
@@ -204,6 +208,10 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "the autopilot's IMU is used again": IMU_USED,
     "the autopilot's velocity contradicts its positions and is not used": VELOCITY_NOT_USED,
     "the autopilot's velocity agrees with its positions again": VELOCITY_USED,
+    "the ground passes too fast for the camera: tracking may fail": LIMIT_FAST,
+    "too little contrast: tracking may fail": LIMIT_FAINT,
+    "few points in view: tracking may fail": LIMIT_FEW,
+    "tracking is away from its limits again": LIMIT_AWAY,
     "satellite positions jump and are not used": GPS_JUMP,
     "satellite positions drift away from vision and are not used": GPS_PULL,
     "satellite height drifts away from vision and is not used": GPS_HEIGHT,

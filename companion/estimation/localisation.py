@@ -33,6 +33,7 @@ from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_in_flight import SiteInFlight
 from companion.estimation.site.site_use import SiteUse
+from companion.estimation.tracking_margin import TrackingMargin
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose
@@ -109,6 +110,7 @@ class LocalisationStage:
             camera.camera_from_body, camera.body_from_camera is not None and not camera.assumed
         )
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
+        self._margin = TrackingMargin(camera, config.features.n_features)
         self._t_ns = 0
         self._samples: list[Telemetry] = []
         """Telemetry since the last frame: taken with the next, while nothing is mapped."""
@@ -341,6 +343,12 @@ class LocalisationStage:
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
         yield from self._satellites.warnings()
+        if not stands:
+            tracker = self._tracker
+            yield from self._margin.take(
+                next(m for m in tracked if isinstance(m, Track) and m.seq == frame.seq),
+                tracker.view_of(frame.seq), tracker.map, tracker.n_features, tracker.feature_ratio,
+            )  # fmt: skip
         yield from self._check_attitude(frame.t_ns)
         self._prune(frame.t_ns)
 

@@ -36,6 +36,13 @@ OF_WARNING: Mapping[str, str] = {
     "the autopilot's velocity contradicts its positions and is not used":
         "Check compass, and mount and lens of a flow sensor.",
     "the autopilot's velocity agrees with its positions again": NOTHING,
+    "the ground passes too fast for the camera: tracking may fail":
+        "Climb or slow down; a higher camera.rate_hz helps.",
+    "too little contrast: tracking may fail":
+        "More light, a clean lens, other ground; be ready to fly by other means.",
+    "few points in view: tracking may fail":
+        "Back to ground with structure; be ready to fly by other means.",
+    "tracking is away from its limits again": NOTHING,
     "satellite positions jump and are not used": SPOOFED,
     "satellite positions drift away from vision and are not used": SPOOFED,
     "satellite height drifts away from vision and is not used": SPOOFED,

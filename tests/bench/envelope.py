@@ -58,18 +58,19 @@ SWEEPS: dict[str, tuple[str, str, Sequence[float]]] = {
 class Seen(Terrain):
     """Ground as a camera sees it under a condition."""
 
-    def __init__(self, condition: Condition) -> None:
+    def __init__(self, condition: Condition, seed: int = 3) -> None:
         def pattern(rng: np.random.Generator) -> Bytes:
             drawn = leaves(rng)
             blur = condition.blur_texels
             return np.asarray(cv2.GaussianBlur(drawn, (0, 0), blur)) if blur else drawn
 
-        super().__init__(3, pattern=pattern, scale=condition.height_m / HEIGHT_M)
+        super().__init__(seed, pattern=pattern, scale=condition.height_m / HEIGHT_M)
         self._condition, self._noise = condition, np.random.default_rng(8)
+        self.contrast = condition.contrast
 
     def picture(self, camera: Camera, ned_from_camera: Pose) -> Bytes:
         grey = super().picture(camera, ned_from_camera).astype(np.float32)
-        grey = 128.0 + self._condition.contrast * (grey - 128.0)
+        grey = 128.0 + self.contrast * (grey - 128.0)
         # six of these are one exposure
         grey += self._noise.normal(scale=6**0.5 * self._condition.noise_grey, size=grey.shape)
         return np.asarray(np.clip(np.rint(grey), 0, 255), np.uint8)
@@ -107,7 +108,7 @@ def row(value: float, unit: str, flown: Flown, way_m: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("sweeps", nargs="*", choices=[*SWEEPS, []], default=list(SWEEPS))
+    parser.add_argument("sweeps", nargs="*", default=list(SWEEPS))
     given = parser.parse_args()
     print("| | tracked | off, of the way | quality | sent | warned of | |")
     print("|---|---|---|---|---|---|---|", flush=True)

@@ -15,12 +15,14 @@ GRID = 4
 def quality_of(track: Track, size_px: Array) -> int:
     """1..100, from the number, image coverage and match ratio of inliers.
 
-    `size_px` (2,) is the width and height of the image.
+    Points that are new in this very frame say nothing of its pose and do not count. `size_px` (2,)
+    is the width and height of the image.
     """
     if track.keypoints_px is None or not len(track.keypoints_px):
         return 1
     cells = np.clip((track.keypoints_px / size_px * GRID).astype(int), 0, GRID - 1)
     spread = len(np.unique(cells @ [1, GRID])) / GRID**2
-    count = min(1.0, track.n_inliers / FULL_COUNT)
-    found = track.n_inliers / max(track.n_matches, 1)
+    n_inliers = min(track.n_inliers, track.n_matches)
+    count = min(1.0, n_inliers / FULL_COUNT)
+    found = n_inliers / max(track.n_matches, 1)
     return int(np.clip(round(100 * count * np.sqrt(spread) * np.sqrt(found)), 1, 100))

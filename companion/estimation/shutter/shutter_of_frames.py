@@ -26,6 +26,9 @@ that. In such a time a drone turns steadily."""
 NOTICED_S, MAX_SIGMA_RATIO = 0.004, 0.1
 """Readout beyond the one that is stated that is said, and the largest ratio of its standard
 deviation to it. At 100 degrees/s 4 ms are 0.2 degrees at the top and the bottom of the image."""
+SURE_SIGMAS = 3.0
+"""Of a readout that is smaller than what is said by so many standard deviations nothing will be:
+the watch, half a millisecond a frame, ends."""
 
 BY_IMAGES = "rolling shutter is undone by the rotation between images alone"
 BY_IMAGES_WHY = (
@@ -58,11 +61,15 @@ class ShutterOfFrames:
         self._last: Array | None = None
         """Points (N, 3) of the map that the last frame saw."""
         self._warnings: list[Warned] = []
-        self._said_by_images = self._said_readout = False
+        self._said_by_images = False
+        self.watches = True
+        """False once the readout is known: nothing that comes later would be said."""
 
     def begin(self, frame: Frame, attitude: CameraAttitude, motion: MotionFilter) -> Frame:
         """The frame as a global shutter would have taken it."""
         self._motion = None
+        if self._unrolling is None and not self.watches:
+            return frame
         rates = attitude.rates_at(frame.t_ns, self._half_span_ns)
         by_images = rates is None
         if by_images:
@@ -99,13 +106,13 @@ class ShutterOfFrames:
 
     def end(self, view: View | None, slam_map: SlamMap) -> list[Warned]:
         """Compare what was seen in this frame, if it was tracked; warnings since the last call."""
-        if slam_map is not self._map:
+        if slam_map is not self._map and self.watches:
             self._map = slam_map
             self._estimator.reset()
         self._last = None
         if view is not None and self._unrolling is not None:
             self._last = slam_map.positions[view.point_ids[view.point_ids >= 0]]
-        if view is not None and self._rates is not None and not self._said_readout:
+        if view is not None and self._rates is not None and self.watches:
             self._estimator.take(view, slam_map.positions, self._rates)
             self._judge(view.t_ns)
         said, self._warnings = self._warnings, []
@@ -113,11 +120,15 @@ class ShutterOfFrames:
 
     def _judge(self, t_ns: int) -> None:
         found = self._estimator.estimate
-        if found is None or abs(found.readout_s) < NOTICED_S:
+        if found is None:
             return
-        if found.sigma_s > MAX_SIGMA_RATIO * abs(found.readout_s):
+        if abs(found.readout_s) + SURE_SIGMAS * found.sigma_s < NOTICED_S:
+            self._end_watch()
             return
-        self._said_readout = True
+        beyond = abs(found.readout_s) >= NOTICED_S
+        if not beyond or found.sigma_s > MAX_SIGMA_RATIO * abs(found.readout_s):
+            return
+        self._end_watch()
         readout_ms, sigma_ms = self._readout_ms + 1e3 * found.readout_s, 1e3 * found.sigma_s
         if readout_ms < 0:
             detail = (
@@ -128,3 +139,8 @@ class ShutterOfFrames:
             detail = f"its rows seem to be exposed over {readout_ms:.0f} +- {sigma_ms:.0f} ms"
         what = OTHER_READOUT if self._unrolling is not None else ROLLING
         self._warnings.append(Warned(t_ns, what, detail))
+
+    def _end_watch(self) -> None:
+        """Stop comparing frames, and let go of the map and the frames that were kept for it."""
+        self.watches, self._map = False, None
+        self._estimator.reset()

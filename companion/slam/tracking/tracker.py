@@ -77,6 +77,8 @@ class Tracker:
         self._camera = camera
         self._times = times
         self._extractor = FeatureExtractor(config.features, camera)
+        self.n_features = 0
+        """Features seen in the last frame."""
         self._is_live = background
         self._next_keyframe_id = 0
         self.map_lock = MapLock(order)
@@ -121,6 +123,7 @@ class Tracker:
         """Process one frame, with the map lock held; frames come in order of time."""
         with self._times("features"):
             features = self._extractor.extract(frame.grey)
+        self.n_features = len(features)
         return self._track_frame(frame, features, prior) + self._worker.done()
 
     def resume(self, kept: SlamMap, next_keyframe_id: int, until_ns: int) -> None:

@@ -127,9 +127,15 @@ class Flown:
     odometry: list[Odometry] = field(default_factory=list)
     keyframes_s: list[float] = field(default_factory=list)
     """When keyframes came, seconds since the start."""
-    warnings: list[str] = field(default_factory=list)
+    warned: list[tuple[int, str]] = field(default_factory=list)
+    """Times and kinds of warnings."""
     sent: PosesSent = field(default_factory=lambda: PosesSent(Config()))
     truth: Path | None = None
+
+    @property
+    def warnings(self) -> list[str]:
+        """Kinds of warnings, in order of time."""
+        return [what for _, what in self.warned]
 
     @property
     def placed_share(self) -> float:
@@ -226,7 +232,7 @@ def _note(flown: Flown, message: object) -> None:
     elif isinstance(message, KeyframeAdded):
         flown.keyframes_s.append((message.t_ns - START_NS) * 1e-9)
     elif isinstance(message, Warned):
-        flown.warnings.append(message.what)
+        flown.warned.append((message.t_ns, message.what))
 
 
 def _ns(after_s: float) -> int:
