@@ -1,0 +1,65 @@
+"""ORB level by level against one extractor over all levels, and the lens in a compiled loop."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from companion.config import FeaturesConfig
+from companion.geometry.camera import Camera, Distortion
+from companion.messages import Bytes
+from companion.slam.compiled.spreading import spread
+from companion.slam.features.orb_features import CELL_PX, FeatureExtractor, normalise
+
+LENS = Camera(
+    640, 480, 500.0, 480.0, 310.0, 245.0, Distortion.RADTAN, (-0.3, 0.1, 2e-3, -1e-3, 0.02)
+)
+
+
+def textured(width: int, height: int) -> Bytes:
+    """Blots of all sizes, so that every level has corners."""
+    rng = np.random.default_rng(width)
+    total = np.zeros((height, width), np.float32)
+    for sigma in (1.0, 3.0, 9.0):
+        noise = rng.normal(size=(height, width)).astype(np.float32)
+        total += cv2.GaussianBlur(noise, (0, 0), sigma) * sigma
+    return np.clip(128 + 50 * total, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (333, 257)])
+@pytest.mark.parametrize("scale_factor", [1.2, 1.37])
+def test_levels_extract_what_one_extractor_does(size: tuple[int, int], scale_factor: float) -> None:
+    config = FeaturesConfig(n_features=300, n_levels=6, scale_factor=scale_factor)
+    grey, camera = textured(*size), Camera(*size, 500.0, 500.0, size[0] / 2, size[1] / 2)
+    found = FeatureExtractor(config, camera).extract(grey)
+    orb = cv2.ORB.create(nfeatures=4 * 300, scaleFactor=scale_factor, nlevels=6, fastThreshold=12)
+    keypoints = list(orb.detect(grey, None))
+    assert len(keypoints) > 1.25 * 300
+    pixels = np.array([k.pt for k in keypoints], np.float32)
+    response = np.array([k.response for k in keypoints], np.float32)
+    chosen = spread(pixels, response, CELL_PX, 300)
+    described, words = orb.compute(grey, [keypoints[i] for i in chosen.tolist()])
+    octaves = np.array([k.octave for k in described])
+    assert len(set(octaves.tolist())) > 3
+    half = (0.5 * (scale_factor**octaves - 1.0)).astype(np.float32)
+    np.testing.assert_array_equal(found.octaves, octaves)
+    np.testing.assert_array_equal(found.pixels, pixels[chosen] + half[:, None])
+    np.testing.assert_array_equal(found.descriptors, words)
+    np.testing.assert_array_equal(
+        found.angles_deg, np.array([k.angle for k in described], np.float32)
+    )
+
+
+def test_an_image_without_corners_has_no_features() -> None:
+    found = FeatureExtractor(FeaturesConfig(), LENS).extract(np.full((480, 640), 90, np.uint8))
+    assert len(found) == 0 and found.descriptors.shape == (0, 32)
+
+
+def test_pixels_are_undistorted_to_the_same_bytes() -> None:
+    pixels = np.random.default_rng(1).uniform(-4000, 4000, (4000, 2)).astype(np.float32)
+    pixels[:1000] = np.abs(pixels[:1000]) * [0.16, 0.12]
+    expected = LENS.normalise(pixels)
+    assert 100 < np.count_nonzero(np.isnan(expected[:, 0])) < 3000  # beyond where the model folds
+    assert normalise(LENS, pixels).tobytes() == expected.tobytes()
+    assert normalise(LENS, pixels[:0]).shape == (0, 2)
