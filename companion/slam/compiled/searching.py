@@ -64,6 +64,18 @@ def _in_cells(pixels: Floats, n_columns: int, n_rows: int) -> tuple[Ints, Ints]:
     return order, starts
 
 
+@compiled(integers, integer, integer)
+def find_both(ids: Ints, one: int, other: int) -> tuple[int, int, bool]:
+    """First index of an id, -1 if absent, its number, and whether another id is there, too."""
+    first, n, there = -1, 0, False
+    for i in range(len(ids)):
+        if ids[i] == one:
+            first = i if n == 0 else first
+            n += 1
+        there |= ids[i] == other
+    return first, n, there
+
+
 @compiled(
     pairs, integers, words, integers, numbers, single_pairs, words, integers,
     number, number, integer,

@@ -267,6 +267,13 @@ class SlamMap:
         self.observers[points, self.n_observers[points] % N_OBSERVERS_KEPT] = keyframe.keyframe_id
         np.add.at(self.n_observers, points, 1)
 
+    def move_observation(self, keyframe: Keyframe, feature: int, point: int) -> None:
+        """As `add_observations` of one feature that observes another point until now."""
+        self.n_observers[keyframe.point_ids[feature]] -= 1
+        keyframe.point_ids[feature] = point
+        self.observers[point, self.n_observers[point] % N_OBSERVERS_KEPT] = keyframe.keyframe_id
+        self.n_observers[point] += 1
+
     def remove_observations(self, keyframe: Keyframe, features: Ints) -> None:
         """Remove observations of a keyframe; points left with fewer than two are removed."""
         old = keyframe.point_ids[features]

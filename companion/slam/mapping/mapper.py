@@ -9,6 +9,7 @@ import numpy as np
 
 from companion.geometry.camera import Camera
 from companion.messages import Bytes
+from companion.slam.compiled.searching import find_both
 from companion.slam.features.matching import match_epipolar
 from companion.slam.features.orb_features import Bools, Ints
 from companion.slam.features.patches import image_levels
@@ -190,21 +191,23 @@ class Mapper:
         if a == b or not (slam_map.alive[a] and slam_map.alive[b]):
             return
         keep, drop = (a, b) if slam_map.n_observers[a] >= slam_map.n_observers[b] else (b, a)
-        for keyframe in self._observers(drop):
-            feature = np.flatnonzero(keyframe.point_ids == drop)
-            if np.any(keyframe.point_ids == keep):
-                keyframe.point_ids[feature] = -1
-            else:
-                slam_map.add_observations(keyframe, feature, np.full(len(feature), keep))
+        known = slam_map.observers[drop]
+        for key in sorted(set(known[known >= 0].tolist())):
+            keyframe = slam_map.keyframes.get(key)
+            if keyframe is None:
+                continue
+            feature, n_drop, has_keep = find_both(keyframe.point_ids, drop, keep)
+            if n_drop and has_keep:
+                keyframe.point_ids[keyframe.point_ids == drop] = -1
+            elif n_drop == 1:
+                slam_map.move_observation(keyframe, feature, keep)
+            elif n_drop:
+                features = np.flatnonzero(keyframe.point_ids == drop)
+                slam_map.add_observations(keyframe, features, np.full(n_drop, keep))
         slam_map.alive[drop] = False
         slam_map.n_observers[drop] = 0
         slam_map.n_visible[keep] += slam_map.n_visible[drop]
         slam_map.n_found[keep] += slam_map.n_found[drop]
-
-    def _observers(self, point: int) -> list[Keyframe]:
-        known = self._map.observers[point]
-        near = [self._map.keyframes.get(k) for k in np.unique(known[known >= 0]).tolist()]
-        return [k for k in near if k is not None and np.any(k.point_ids == point)]
 
     def fuse_held(self, keyframe: Keyframe) -> None:
         """Let a keyframe observe the points of an earlier flight that are to be seen from it."""

@@ -13,6 +13,7 @@ from companion.geometry.transforms import (
     rotation_from_vector,
     yaw_rotation,
 )
+from companion.slam.compiled.searching import find_both
 from companion.slam.features.matching import match_epipolar
 from companion.slam.features.orb_features import Features
 from companion.slam.map.local_map import Projector, Visible
@@ -164,3 +165,10 @@ def test_epipolar_matches_match_numpy(n: int) -> None:
     np.testing.assert_array_equal(found[1], wanted[1])
     assert n < 600 or len(found[0]) > 100
     assert len(match_epipolar(a, b, index_a[:1], index_b, b_from_a)[0]) == 0
+
+
+def test_two_ids_are_found_in_one_pass() -> None:
+    ids = np.array([4, -1, 7, 4, 9])
+    assert find_both(ids, 4, 9) == (0, 2, True)
+    assert find_both(ids, 7, 5) == (2, 1, False)
+    assert find_both(ids[:0], 7, 5) == (-1, 0, False)

@@ -95,3 +95,21 @@ def test_long_flight_is_adjusted_in_windows(
     assert error_px() > 2.0
     Mapper(CAMERA, slam_map, MapLock()).adjust_all(4)
     assert error_px() < 0.6
+
+
+def test_one_observation_moves_as_several_do(slam_map: SlamMap) -> None:
+    keyframe = slam_map.keyframes[4]
+    features, points = slam_map.observations_of(keyframe)
+    feature, dropped = int(features[0]), int(points[0])
+    kept = next(p for p in range(slam_map.n_points) if p not in points)
+    names = ("observers", "n_observers")
+    before = {name: getattr(slam_map, name).copy() for name in names}
+    slam_map.move_observation(keyframe, feature, kept)
+    moved = {name: getattr(slam_map, name).copy() for name in names}
+    assert keyframe.point_ids[feature] == kept
+    for name, values in before.items():
+        setattr(slam_map, name, values)
+    keyframe.point_ids[feature] = dropped
+    slam_map.add_observations(keyframe, np.array([feature]), np.array([kept]))
+    for name, values in moved.items():
+        np.testing.assert_array_equal(getattr(slam_map, name), values)
