@@ -109,43 +109,53 @@ def schur_complement(
     information, `gradient` (P, 3) of the points; `by_point` are the observations of variable
     cameras, ordered by point.
     """
-    reduction, rhs_part = np.zeros((6 * n_variable, 6 * n_variable)), np.zeros(6 * n_variable)
-    through = np.empty((6, 3))
+    blocks = np.zeros((n_variable, n_variable, 6, 6))
+    rhs_part, through = np.zeros((n_variable, 6)), np.empty((6, 3))
+    most, start = 0, 0
+    for i in range(len(by_point)):
+        if point[by_point[i]] != point[by_point[start]]:
+            start = i
+        most = max(most, i + 1 - start)
+    turned, cameras = np.empty((most, 3, 6)), np.empty(most, np.int64)
     start = 0
     for end in range(1, len(by_point) + 1):
         p = point[by_point[start]]
         if end < len(by_point) and point[by_point[end]] == p:
             continue
-        for one in by_point[start:end]:
-            row = 6 * camera[one]
+        n, of_point, right = end - start, inverse[p], gradient[p]
+        for i in range(n):
+            # turned over, so that the innermost loop goes along rows
+            one = by_point[start + i]
+            cameras[i] = camera[one]
+            for k in range(6):
+                for m in range(3):
+                    turned[i, m, k] = hcp[one, k, m]
+        for i in range(n):
+            own = turned[i]
             for k in range(6):
                 for m in range(3):
                     through[k, m] = (
-                        hcp[one, k, 0] * inverse[p, 0, m]
-                        + hcp[one, k, 1] * inverse[p, 1, m]
-                        + hcp[one, k, 2] * inverse[p, 2, m]
+                        own[0, k] * of_point[0, m]
+                        + own[1, k] * of_point[1, m]
+                        + own[2, k] * of_point[2, m]
                     )
-                rhs_part[row + k] += (
-                    through[k, 0] * gradient[p, 0]
-                    + through[k, 1] * gradient[p, 1]
-                    + through[k, 2] * gradient[p, 2]
+                rhs_part[cameras[i], k] += (
+                    through[k, 0] * right[0] + through[k, 1] * right[1] + through[k, 2] * right[2]
                 )
-            for other in by_point[start:end]:
-                column = 6 * camera[other]
-                if column < row:
+            for j in range(n):
+                if cameras[j] < cameras[i]:
                     continue
+                block, other = blocks[cameras[i], cameras[j]], turned[j]
                 for k in range(6):
+                    a, b, c = through[k, 0], through[k, 1], through[k, 2]
                     for m in range(6):
-                        reduction[row + k, column + m] += (
-                            through[k, 0] * hcp[other, m, 0]
-                            + through[k, 1] * hcp[other, m, 1]
-                            + through[k, 2] * hcp[other, m, 2]
-                        )
+                        block[k, m] += a * other[0, m] + b * other[1, m] + c * other[2, m]
         start = end
+    reduction = np.empty((6 * n_variable, 6 * n_variable))
     for i in range(6 * n_variable):
-        for k in range(i):
-            reduction[i, k] = reduction[k, i]
-    return reduction, rhs_part
+        for k in range(i + 1):
+            reduction[k, i] = reduction[i, k] = blocks[k // 6, i // 6, k % 6, i % 6]
+    return reduction, rhs_part.ravel()
 
 
 @compiled(matrices, pairs, matrices, integers, integers, integers, pairs)
