@@ -16,6 +16,7 @@ meet in a product. Quaternions are Hamilton, ordered w x y z, with w >= 0.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,6 +98,14 @@ class Similarity:
         return Similarity(1.0 / self.scale, r, -(r @ self.translation) / self.scale)
 
 
+_IDENTITY = np.eye(3)
+
+
+def _length(v: Array) -> float:
+    """Norm of one vector, as `np.linalg.norm` has it, without what that asks about its argument."""
+    return math.sqrt(v.dot(v))
+
+
 def skew(v: Array) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     v = np.asarray(v, np.float64)
@@ -120,21 +129,22 @@ def rotation_from_vector(rotvec: Array) -> Array:
     >>> np.round(rotation_from_vector(np.array([0, 0, np.pi / 2])) @ [1, 0, 0], 6)
     array([0., 1., 0.])
     """
-    v = np.asarray(rotvec, np.float64)
-    theta = float(np.linalg.norm(v))
-    k = skew(v)
+    v = np.ascontiguousarray(rotvec, np.float64)
+    theta = _length(v)
+    x, y, z = v.tolist()
+    k: Array = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     if theta < 1e-8:
-        r: Array = np.eye(3) + k + 0.5 * k @ k
+        r: Array = _IDENTITY + k + 0.5 * k @ k
         return r
-    r = np.eye(3) + np.sin(theta) / theta * k + (1 - np.cos(theta)) / theta**2 * (k @ k)
+    r = _IDENTITY + np.sin(theta) / theta * k + (1 - np.cos(theta)) / theta**2 * (k @ k)
     return r
 
 
 def vector_from_rotation(rotation: Array) -> Array:
     """Rotation vector (3,) in radians of a rotation (3, 3); the inverse of the above."""
-    w, x, y, z = quaternion_from_rotation(rotation)
-    v = np.array([x, y, z])
-    s = float(np.linalg.norm(v))
+    quaternion = quaternion_from_rotation(rotation)
+    w, v = quaternion[0], quaternion[1:].copy()
+    s = _length(v)
     if s < 1e-12:
         return 2.0 * v
     out: Array = v / s * 2.0 * np.arctan2(s, w)
@@ -160,8 +170,8 @@ def vectors_from_rotations(rotations: Array) -> Array:
 
 def rotation_from_quaternion(quaternion_wxyz: NDArray[Any]) -> Array:
     """Rotation (3, 3) of a quaternion w x y z; it is normalised first."""
-    q = np.asarray(quaternion_wxyz, np.float64)
-    w, x, y, z = q / np.linalg.norm(q)
+    q = np.ascontiguousarray(quaternion_wxyz, np.float64)
+    w, x, y, z = (q / _length(q)).tolist()
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -173,18 +183,18 @@ def rotation_from_quaternion(quaternion_wxyz: NDArray[Any]) -> Array:
 
 def quaternion_from_rotation(rotation: Array) -> Array:
     """Unit quaternion w x y z, w >= 0, of a rotation (3, 3) (Shepperd's method)."""
-    m = np.asarray(rotation, np.float64)
-    t = m[0, 0] + m[1, 1] + m[2, 2]
-    k = int(np.argmax([t, m[0, 0], m[1, 1], m[2, 2]]))
-    if k == 0:
-        q = np.array([1 + t, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    elif k == 1:
-        q = np.array([m[2, 1] - m[1, 2], 1 + 2 * m[0, 0] - t, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]])
-    elif k == 2:
-        q = np.array([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 + 2 * m[1, 1] - t, m[1, 2] + m[2, 1]])
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64).tolist()
+    t = a + e + i
+    largest = max(t, a, e, i)
+    if t == largest:
+        q = np.array([1 + t, h - f, c - g, d - b])
+    elif a == largest:
+        q = np.array([h - f, 1 + 2 * a - t, b + d, c + g])
+    elif e == largest:
+        q = np.array([c - g, b + d, 1 + 2 * e - t, f + h])
     else:
-        q = np.array([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 + 2 * m[2, 2] - t])
-    q = q / np.linalg.norm(q)
+        q = np.array([d - b, c + g, f + h, 1 + 2 * i - t])
+    q = q / _length(q)
     out: Array = -q if q[0] < 0 else q
     return out
 
