@@ -39,6 +39,7 @@ from companion.messages import Bytes
 from drivers.camera.live_calibration import body_from_camera
 from drivers.images.calibration_file import assumed_camera
 from tests.firmware.camera_faults import Faults, parse
+from tests.firmware.landmarks import landmarks_of
 from tests.firmware.looks import LOOKS
 from tests.firmware.picture_server import Due, PictureServer
 from tests.firmware.scene import Scene
@@ -71,7 +72,10 @@ class DrawnCamera:
             yaw_deg=arguments.yaw_deg, z_m=0.0,
         )  # fmt: skip
         self._body_from_camera = body_from_camera(mount)
-        self._scene = Scene(arguments.seed, arguments.look, self._camera, arguments.photos)
+        self._scene = Scene(
+            arguments.seed, arguments.look, self._camera, arguments.photos,
+            landmarks_of(arguments.landmarks),
+        )  # fmt: skip
         self._drawn_ms: dict[int, float] = {}
 
     def run(self) -> None:
@@ -191,6 +195,7 @@ def main() -> None:
     parser.add_argument("--above-m", type=float, default=0.0, help="lens above the vehicle's place")
     parser.add_argument("--look", choices=sorted(LOOKS), default="day")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--landmarks", default="", help="marker:NORTH:EAST,wall:NORTH")
     parser.add_argument("--photos", type=Path, help="folder of aerial photographs for the ground")
     parser.add_argument(
         "--origin", type=triple, help="LAT,LON,ALT of the scene's middle; else the first place told"

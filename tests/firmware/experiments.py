@@ -9,39 +9,43 @@ import numpy as np
 
 from tests.firmware import manoeuvres
 from tests.firmware.faults import FAULTS, suffer
+from tests.firmware.features import DEGREE_M, FEATURES, OWN_SOURCES, up_by_gps
 from tests.firmware.figures import Figures, strayed_m
+from tests.firmware.pilots import SET_EKF_SOURCE_SET
 from tests.firmware.trial import Conditions, Trial
 
 Flown = Callable[[Trial, Figures], None]
-HOLD_S, READY_S, PATIENT_S, GPS_S = 60.0, 30.0, 45.0, 60.0
+HOLD_S, READY_S, PATIENT_S = 60.0, 30.0, 45.0
 USUAL = "position on", "dead reckoning", "autopilot connected", "camera recovered"
 """Texts of a flight in which nothing is wrong."""
-SET_EKF_SOURCE_SET = 42007
-GLITCH_DEG = 50.0 / 111319.0
-SECOND_SOURCE = {
-    "VISO_TYPE": 1, "VISO_DELAY_MS": 62, "EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 3,
-    "EK3_SRC1_VELZ": 3, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6, "EK3_SRC2_VELZ": 6,
-    "EK3_SRC2_POSZ": 1, "EK3_SRC2_YAW": 1,
-}  # fmt: skip
-
-
-def _up(trial: Trial, figures: Figures) -> bool:
-    trial.start_daemon()
-    return manoeuvres.get_ready(trial, figures) and manoeuvres.take_off(trial, figures)
+GLITCH_DEG = 50.0 / DEGREE_M
 
 
 def take_off(trial: Trial, figures: Figures) -> None:
     """No GPS from power-on; up, hold, down."""
     stood = trial.ground.place_m
-    if _up(trial, figures):
+    if manoeuvres.up(trial, figures):
         manoeuvres.keep_place(trial, figures, "hold after take-off", 15.0)
         manoeuvres.land(trial, figures, stood)
+
+
+def square(trial: Trial, figures: Figures) -> None:
+    """No GPS from power-on; the first half of a tour: hold, square of 4 m, landing."""
+    stood = trial.ground.place_m
+    if not manoeuvres.up(trial, figures):
+        return
+    trial.mark(f"holds in {trial.pilot.holds_in}: {trial.pilot.set_mode(trial.pilot.holds_in)}")
+    time.sleep(manoeuvres.SETTLE_S)
+    manoeuvres.keep_place(trial, figures, "hold", 0.5 * HOLD_S)
+    manoeuvres.ready_to_go(trial)
+    manoeuvres.fly_square(trial, figures, 4.0, 0.15)
+    manoeuvres.land(trial, figures, stood)
 
 
 def tour(trial: Trial, figures: Figures) -> None:
     """No GPS from power-on; hold, squares, circle, climb, full turn, landing where it took off."""
     stood = trial.ground.place_m
-    if not _up(trial, figures):
+    if not manoeuvres.up(trial, figures):
         return
     trial.mark(f"holds in {trial.pilot.holds_in}: {trial.pilot.set_mode(trial.pilot.holds_in)}")
     time.sleep(manoeuvres.SETTLE_S)
@@ -60,7 +64,7 @@ def tour(trial: Trial, figures: Figures) -> None:
 
 def wander(trial: Trial, figures: Figures) -> None:
     """Five minutes about, and back over known ground."""
-    if not _up(trial, figures):
+    if not manoeuvres.up(trial, figures):
         return
     manoeuvres.ready_to_go(trial)
     start, true_start = trial.ground.believed_m, manoeuvres.mean_place(trial)
@@ -78,7 +82,7 @@ def wander(trial: Trial, figures: Figures) -> None:
 
 def faults(trial: Trial, figures: Figures) -> None:
     """Camera, cable and companion fail in the air, one after the other."""
-    if not _up(trial, figures):
+    if not manoeuvres.up(trial, figures):
         return
     trial.pilot.set_mode(trial.pilot.holds_in)
     time.sleep(manoeuvres.SETTLE_S)
@@ -95,7 +99,7 @@ def faults(trial: Trial, figures: Figures) -> None:
 def second_flight(trial: Trial, figures: Figures) -> None:
     """Two flights after one power-on; the autopilot restarts on the ground between a third."""
     stood = trial.ground.place_m
-    if not _up(trial, figures):
+    if not manoeuvres.up(trial, figures):
         return
     manoeuvres.land(trial, figures, stood)
     time.sleep(manoeuvres.SETTLE_S)
@@ -115,17 +119,8 @@ def second_flight(trial: Trial, figures: Figures) -> None:
 
 def gps_lost(trial: Trial, figures: Figures) -> None:
     """Up by GPS; over to our pose by source set; GPS goes, and comes back 50 m off."""
-    trial.start_daemon()
-    has_place = trial.ground.until(lambda: trial.ground.believed, 90.0)
-    mode = trial.pilot.modes_to_arm_in[-1]
-    figures.add_true("armed by GPS", has_place and _armed_in(trial, mode, GPS_S))
-    if not trial.ground.armed or not trial.pilot.take_off(manoeuvres.TAKE_OFF_M):
+    if not up_by_gps(trial, figures):
         return
-    manoeuvres.ready_to_go(trial)
-    start, yaw_rad = trial.ground.believed_m, manoeuvres.believed_yaw(trial)
-    for way in ((6, 0), (6, 6), (0, 6), (0, 0)):
-        trial.pilot.go_to(start + np.array([*way, 0.0]), yaw_rad, within_m=0.7)
-    time.sleep(manoeuvres.CORNER_S)  # it still brakes: what it moves is to be of the change alone
     sending = trial.until("poses", lambda: trial.sending, 20.0)
     figures.add_true("poses beside GPS", sending is not None, str(trial.feedback))
     if sending is None:
@@ -168,7 +163,7 @@ def wrong_set_up(trial: Trial, figures: Figures) -> None:
     trial.start_daemon()
     sending = trial.until("poses", lambda: trial.sending, PATIENT_S)
     figures.add("first pose after both are up", sending, "s", note=str(trial.feedback))
-    armed = sending is not None and _armed_in(trial, trial.pilot.modes_to_arm_in[-1])
+    armed = sending is not None and manoeuvres.armed_in(trial, trial.pilot.modes_to_arm_in[-1])
     if armed:
         trial.pilot.take_off(manoeuvres.TAKE_OFF_M)
         time.sleep(10.0)
@@ -189,21 +184,13 @@ def two_companions(trial: Trial, figures: Figures) -> None:
         figures.add_true("no pose beside another companion", began is None, str(trial.feedback))
         told = any("second companion" in text for _, text in trial.ground.texts)
         figures.add_true("the pilot is told", told)
-        figures.add_true("cannot be armed", not _armed_in(trial, trial.pilot.modes_to_arm_in[0]))
+        figures.add_true(
+            "cannot be armed", not manoeuvres.armed_in(trial, trial.pilot.modes_to_arm_in[0])
+        )
     trial.mark("the other has gone")
     stood = trial.ground.place_m
     if manoeuvres.get_ready(trial, figures) and manoeuvres.take_off(trial, figures):
         manoeuvres.land(trial, figures, stood)
-
-
-def _armed_in(trial: Trial, mode: str, patience_s: float = 15.0) -> bool:
-    """Arm in a mode with the sticks at rest; what the autopilot says to it is noted."""
-    began_s = time.time()
-    trial.pilot.hold_sticks(in_air=False)
-    armed = trial.pilot.set_mode(mode, patience_s) and trial.pilot.arm(patience_s)
-    texts = dict.fromkeys(trial.ground.texts_since(began_s)[-6:])
-    trial.mark(f"armed {armed}: {' / '.join(texts)}")
-    return armed
 
 
 COPTER_PARAMETERS = {
@@ -217,12 +204,14 @@ PX4_PARAMETERS = {
 """Values other than those that docs/autopilots.md asks for, tried one at a time."""
 EXPERIMENTS: dict[str, tuple[Flown, Conditions]] = {
     "take_off": (take_off, Conditions()),
+    "square": (square, Conditions()),
     "tour": (tour, Conditions()),
     "wander": (wander, Conditions()),
     "faults": (faults, Conditions()),
     "second_flight": (second_flight, Conditions()),
     "doctor": (doctor, Conditions(by_doctor=True)),
-    "gps_lost": (gps_lost, Conditions(has_gps=True, parameters=SECOND_SOURCE)),
+    "gps_lost": (gps_lost, Conditions(has_gps=True, parameters=OWN_SOURCES)),
+    **FEATURES,
     "mount_90": (wrong_set_up, Conditions(mount_roll_deg=90.0)),
     "upside_down": (wrong_set_up, Conditions(mount_roll_deg=180.0)),
     "lens_10": (wrong_set_up, Conditions(lens_scale=1.1)),

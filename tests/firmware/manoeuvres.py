@@ -23,6 +23,22 @@ TURN_S = 24.0
 MEAN_S = 1.0
 
 
+def up(trial: Trial, figures: Figures) -> bool:
+    """The daemon started, and 5 m up on its poses."""
+    trial.start_daemon()
+    return get_ready(trial, figures) and take_off(trial, figures)
+
+
+def armed_in(trial: Trial, mode: str, patience_s: float = 15.0) -> bool:
+    """Arm in a mode with the sticks at rest; what the autopilot says to it is noted."""
+    began_s = time.time()
+    trial.pilot.hold_sticks(in_air=False)
+    armed = trial.pilot.set_mode(mode, patience_s) and trial.pilot.arm(patience_s)
+    texts = dict.fromkeys(trial.ground.texts_since(began_s)[-6:])
+    trial.mark(f"armed {armed}: {' / '.join(texts)}")
+    return armed
+
+
 def get_ready(trial: Trial, figures: Figures) -> bool:
     """From power-on to a vehicle that has been armed where it stands, in each mode that matters."""
     began_s = time.time()

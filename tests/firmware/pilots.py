@@ -15,11 +15,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.transforms import Array
 from tests.firmware.ground import CENTRED, THROTTLE_LOW, Ground
-from tests.firmware.simulators import Simulator
+from tests.firmware.simulators import Px4, Simulator
 
 PLACE_AND_YAW, PLACE_SPEED_AND_YAW = 0b100111111000, 0b100111000000
 """What of SET_POSITION_TARGET_LOCAL_NED is not to be ignored."""
 FORCED = 21196
+SET_EKF_SOURCE_SET = 42007
 ACK_S = 2.0
 PX4_SPEED_M_S = 2.0
 """Told a place far away, PX4 tilts by 45 degrees, and the camera looks at the horizon: so the place
@@ -122,6 +123,10 @@ class Pilot:
                 self._ground.send(message)
                 time.sleep(0.1)
 
+    def lose_gps(self) -> None:
+        """Have the simulated receiver see nothing any more."""
+        raise NotImplementedError
+
     def _ask_for_mode(self, name: str) -> None:
         raise NotImplementedError
 
@@ -146,6 +151,10 @@ class CopterPilot(Pilot):
         super().__init__(ground, firmware)
         names = {number: name for name, number in COPTER_MODES.items()}
         ground.named = lambda mode: names.get(mode, str(mode))
+
+    def lose_gps(self) -> None:
+        """See `Pilot`."""
+        self.set_parameters({"SIM_GPS1_ENABLE": 0.0})
 
     def _ask_for_mode(self, name: str) -> None:
         custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
@@ -198,6 +207,11 @@ class Px4Pilot(Pilot):
         return self._ground.until(
             lambda: np.linalg.norm(self._ground.believed_m - place_m) < within_m, timeout_s
         )
+
+    def lose_gps(self) -> None:
+        """See `Pilot`."""
+        assert isinstance(self._firmware, Px4)
+        self._firmware.shell("param", "set", "SIM_GPS_USED", "0")
 
     @staticmethod
     def _named(mode: int) -> str:

@@ -22,6 +22,7 @@ from companion.geometry.transforms import Array, Pose
 from companion.messages import Bytes
 from tests.firmware.boxes import boxes_of, triangles_of
 from tests.firmware.ground_texture import grain_texture, ground_texture
+from tests.firmware.landmarks import Landmarks
 from tests.firmware.looks import LOOKS
 from tests.firmware.sensor import Sensor
 
@@ -61,7 +62,7 @@ void main() {
     grain_at = (metres - moved.yx) / sizes.z;
     north_east = place.xy;
     tinted = tint * light;
-    strong = mix(vec3(1.0), strength, is_ground);
+    strong = is_ground > 1.5 ? vec3(0.0) : mix(vec3(1.0), strength, is_ground);
 }
 """
 FRAGMENT = """
@@ -98,22 +99,29 @@ void main() {
 """
 
 
+NONE = Landmarks()
+
+
 class Scene:
     """See above. It is drawn by the thread that made it."""
 
-    def __init__(self, seed: int, look: str, camera: Camera, photos: Path | None = None) -> None:
+    def __init__(
+        self, seed: int, look: str, camera: Camera, photos: Path | None = None,
+        landmarks: Landmarks = NONE,
+    ) -> None:  # fmt: skip
         # one thread: a second would take the other core from what is tried
         os.environ.setdefault("LP_NUM_THREADS", "1")
         # by name: it is there in trials only
         moderngl: Any = importlib.import_module("moderngl")
         self._camera = camera
         self.look = LOOKS[look]
-        self.boxes = boxes_of(seed)
+        self.boxes = [*boxes_of(seed), *landmarks.walls()]
         self._sensor = Sensor(camera, self.look, seed)
         self._gl: Any = moderngl.create_context(standalone=True, backend="egl")
         defines = "#version 330\n" + "#define SHADOW\n" * self.look.shadow
         self._program = self._gl.program(VERTEX.strip(), defines + FRAGMENT)
-        vertices = np.concatenate([_plane(), triangles_of(self.boxes, seed)]).astype("f4")
+        shapes = _plane(), triangles_of(self.boxes, seed), landmarks.triangles()
+        vertices = np.concatenate(shapes).astype("f4")
         self._shape = self._gl.vertex_array(
             self._program,
             [(self._gl.buffer(vertices.tobytes()), "3f 2f 3f 1f",

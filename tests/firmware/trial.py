@@ -77,8 +77,12 @@ class Conditions:
     perfect: bool = False
     """The truth is sent, instead of the companion's poses."""
     look: str = "day"
+    landmarks: str = ""
+    """See `landmarks_of`."""
     has_gps: bool = False
     has_range: bool = True
+    has_depth: bool = False
+    pose_mode: str = "odometry"
     by_doctor: bool = False
     """Parameters of the pose are left as the firmware has them."""
     backend: str = "pymavlink"
@@ -205,9 +209,10 @@ class Trial:
             f"camera.calibration={self.folder / 'lens.toml'}",
             "mount.known=true", f"mount.pitch_deg={c.pitch_deg:g}",
             f"link.url=udpin:127.0.0.1:{self._companion_port}", f"expert.link.backend={c.backend}",
-            "feedback.mode=odometry", f"feedback.origin_latitude_deg={home.latitude_deg}",
+            f"feedback.mode={c.pose_mode}", f"feedback.origin_latitude_deg={home.latitude_deg}",
             f"feedback.origin_longitude_deg={home.longitude_deg}",
-            f"feedback.origin_altitude_m={home.altitude_m}", "depth.enabled=false",
+            f"feedback.origin_altitude_m={home.altitude_m}",
+            f"depth.enabled={str(c.has_depth).lower()}",
             f"expert.features.n_features={N_FEATURES}", *c.settings,
         ]  # fmt: skip
 
@@ -300,7 +305,7 @@ class Trial:
             "--rate-hz", CAMERA_HZ, "--latency-ms", LATENCY_MS, f"--pitch-deg={c.pitch_deg}",
             f"--roll-deg={c.mount_roll_deg}", "--lens-scale", c.lens_scale,
             "--above-m", LENS_M - self.firmware.stands_m,
-            "--look", c.look, "--seed", c.seed, f"--origin={origin}",
+            "--look", c.look, "--landmarks", c.landmarks, "--seed", c.seed, f"--origin={origin}",
             "--out", self.folder, *c.camera_words,
         )  # fmt: skip
 

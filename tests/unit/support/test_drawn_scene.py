@@ -19,6 +19,7 @@ from tests.firmware import scene
 from tests.firmware.boxes import BOX_MAX_M, FREE_M, boxes_of
 from tests.firmware.camera_faults import Faults, Order, parse
 from tests.firmware.ground_texture import grain_texture, ground_texture
+from tests.firmware.landmarks import BOARD_M, FAMILY, MARKER_ID, landmarks_of
 from tests.firmware.scene import GROUND_M, SUN_UP, Scene
 
 CAMERA = Camera(320, 240, 210.0, 205.0, 150.5, 126.5)
@@ -64,6 +65,20 @@ def test_boxes_leave_the_middle_and_the_sky_free() -> None:
             nearest = np.abs([box.north, box.east]) - [box.half_north, box.half_east]
             assert nearest.max() >= FREE_M
             assert box.height <= BOX_MAX_M
+
+
+def test_a_marker_lies_where_the_camera_projects_it(make: Make) -> None:
+    make("day")  # so that it is skipped where that cannot be
+    scene = Scene(3, "day", CAMERA, landmarks=landmarks_of("marker:1.5:1.0,wall:16"))
+    pose = seen_from(0.5, 0.5, 3.0, yaw_deg=20.0, pitch_deg=-75.0)
+    dictionary = cv2.aruco.getPredefinedDictionary(FAMILY)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(
+        grey(scene.draw(pose, 0.0))
+    )
+    assert np.ravel(numbers).tolist() == [MARKER_ID]
+    middle = CAMERA.project(pose.inverse().apply(np.array([1.5, 1.0, -BOARD_M])))
+    assert np.linalg.norm(corners[0][0].mean(axis=0) - middle) < 1.0
+    assert scene.boxes[-1].north - scene.boxes[-1].half_north == 16.0
 
 
 def test_a_box_is_where_the_camera_projects_it(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:

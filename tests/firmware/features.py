@@ -1,0 +1,203 @@
+"""Flights on what a firmware is given besides poses: marker, place on earth, doubt, obstacles."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from companion.geometry.transforms import Array
+from tests.firmware import manoeuvres
+from tests.firmware.figures import Figures, percentile, strayed_m
+from tests.firmware.landmarks import FAMILY_WORD, MARKER_ID, MARKER_M
+from tests.firmware.pilots import SET_EKF_SOURCE_SET, CopterPilot
+from tests.firmware.trial import Conditions, Trial
+
+GPS_S, PLACED_S = 90.0, 30.0
+DEGREE_M = 111319.0
+PULL_M_S, PULLED_S = 1.0, 12.0
+SAID_S, JUMP_M = 3.0, 0.3
+MARKER_AT = 1.5, 1.0
+MARKER_OFF_M = 0.15
+WALL_NORTH_M, CLEAR_M = 16.0, 1.5
+FORWARD = 0.25
+"""Of the pitch stick: 3 m/s by ArduCopter's LOIT_SPEED of 12.5 m/s."""
+WALL_S, STOPPED_M_S = 25.0, 0.1
+OWN_SOURCES = {
+    "VISO_TYPE": 1, "VISO_DELAY_MS": 62, "EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 3,
+    "EK3_SRC1_VELZ": 3, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6, "EK3_SRC2_VELZ": 6,
+    "EK3_SRC2_POSZ": 1, "EK3_SRC2_YAW": 1,
+}  # fmt: skip
+"""Satellites first, our pose as the second set."""
+
+
+def up_by_gps(trial: Trial, figures: Figures) -> bool:
+    """Arm and take off by satellites, then once round a square, which places the map."""
+    trial.start_daemon()
+    has_place = trial.ground.until(lambda: trial.ground.believed, GPS_S)
+    mode = trial.pilot.modes_to_arm_in[-1]
+    armed = has_place and manoeuvres.armed_in(trial, mode, GPS_S)
+    figures.add_true("armed by GPS", armed)
+    if not armed or not trial.pilot.take_off(manoeuvres.TAKE_OFF_M):
+        return False
+    manoeuvres.ready_to_go(trial)
+    start, yaw_rad = trial.ground.believed_m, manoeuvres.believed_yaw(trial)
+    for way in ((6, 0), (6, 6), (0, 6), (0, 0)):
+        trial.pilot.go_to(start + np.array([*way, 0.0]), yaw_rad, within_m=0.7)
+    time.sleep(manoeuvres.CORNER_S)  # it still brakes: what it moves is to be of the change alone
+    return True
+
+
+def landing_marker(trial: Trial, figures: Figures) -> None:
+    """Up beside a marker, and down by the mode that lands: onto the marker."""
+    stood = trial.ground.place_m
+    if not manoeuvres.up(trial, figures):
+        return
+    seen = trial.until("marker", lambda: _told(trial, "marker in sight"), 10.0)
+    figures.add_true("marker in sight", seen is not None)
+    down = trial.pilot.land(90.0)
+    off = (trial.ground.place_m - stood)[:2] - np.array(MARKER_AT)
+    trial.mark(f"landed {down}, off the marker by {off.round(2).tolist()}")
+    figures.add("landed away from the marker", float(np.linalg.norm(off)), "m", MARKER_OFF_M)
+    figures.add_true("disarmed by itself", down)
+
+
+def spoofed(trial: Trial, figures: Figures) -> None:
+    """Satellites are pulled away at 1 m/s: said, switched, held; rebooted on the ground after."""
+    if not up_by_gps(trial, figures):
+        return
+    sending = trial.until("poses beside GPS", lambda: trial.sending, 20.0)
+    figures.add_true("poses beside GPS", sending is not None, str(trial.feedback))
+    if sending is None:
+        trial.pilot.land()
+        return
+    time.sleep(PLACED_S - 20.0)  # satellites are compared once the map was metric for ten seconds
+    before, began_s = manoeuvres.mean_place(trial), time.time()
+    trial.mark("GPS is pulled away")
+    while (lasts_s := time.time() - began_s) < PULLED_S:
+        trial.pilot.set_parameters({"SIM_GPS1_GLTCH_X": PULL_M_S * lasts_s / DEGREE_M})
+    said_s = _when_told(trial, began_s, "GPS drifts", "GPS position jump")
+    switched_s = _when_told(trial, began_s, "EKF sources switched: no GPS")
+    figures.add("pull of 1 m/s: said after", said_s, "s", SAID_S)
+    figures.add("pull of 1 m/s: source set switched after", switched_s, "s", SAID_S + 1.0)
+    level_m, down_m = strayed_m(trial.ground.window(began_s, time.time()), before)
+    figures.add("pull of 1 m/s: moved, level", level_m.max(), "m", JUMP_M)
+    figures.add("pull of 1 m/s: moved, height", down_m.max(), "m", JUMP_M)
+    if switched_s is not None:
+        manoeuvres.keep_place(trial, figures, "hold on our pose", 10.0)
+        manoeuvres.fly_square(trial, figures, 4.0, 0.15)
+    trial.pilot.land()
+    trial.firmware.restart()
+    restarted_s = time.time()
+    trial.mark("autopilot restarted while its sources are switched")
+    again = trial.until("autopilot", lambda: _told(trial, "autopilot connected", restarted_s), 30.0)
+    trial.ground.ask_for_messages()
+    time.sleep(10.0)
+    figures.add("connected again after its restart", again, "s")
+    texts = [t for t in trial.ground.texts_since(restarted_s) if "EKF sources" in t]
+    figures.add_true("the source set is asked for anew", bool(texts), " / ".join(texts))
+
+
+def earth_position(trial: Trial, figures: Figures) -> None:
+    """Satellites go; the EKF is told where it is by our map. ArduPilot's reckons by flow beside."""
+    if not up_by_gps(trial, figures):
+        return
+    trial.mark(f"global: {trial.status.get('global_position')}")
+    before = manoeuvres.mean_place(trial)
+    trial.pilot.lose_gps()
+    if isinstance(trial.pilot, CopterPilot):
+        trial.ground.command(SET_EKF_SOURCE_SET, 2.0)
+    trial.mark("GPS goes")
+    began_s = time.time()
+    sent = trial.until("place on earth", lambda: _told(trial, "global position by"), 30.0)
+    figures.add("place on earth by vision after", sent, "s", 10.0)
+    time.sleep(30.0)
+    level_m, _ = strayed_m(trial.ground.window(began_s, time.time()), before)
+    figures.add("without satellites: moved, level", level_m.max(), "m", 3.0)
+    off_m = _believed_off(trial, began_s + 10.0)
+    figures.add("the EKF's place off, 95 %", percentile(off_m, 95), "m", 1.5)
+    trial.mark(f"{trial.ground.mode}, global: {trial.status.get('global_position')}")
+    trial.pilot.land()
+
+
+def wall(trial: Trial, figures: Figures) -> None:
+    """Towards a wall by the stick: the autopilot's own avoidance stops before it."""
+    if not manoeuvres.up(trial, figures):
+        return
+    trial.pilot.stream(None)
+    trial.mark(f"LOITER: {trial.pilot.set_mode('LOITER')}")
+    time.sleep(manoeuvres.SETTLE_S)
+    trial.mark("stick forward")
+    began_s = time.time()
+    trial.ground.sticks = lambda: (0.0, -FORWARD, 0.5, 0.0)
+    trial.until("at rest", lambda: _at_rest(trial, began_s + 6.0), WALL_S)
+    trial.pilot.hold_sticks(in_air=True)
+    path = trial.ground.window(began_s, time.time())
+    clear_m = WALL_NORTH_M - float(path[:, 0].max())
+    nearest = trial.ground.latest.get("COMPANION/OBSTACLE_DISTANCE")
+    seen_m = min(nearest.distances) / 100 if nearest else math.nan
+    trial.mark(
+        f"stopped {clear_m:.2f} m before the wall, which it is told to be {seen_m:.2f} m off"
+    )
+    figures.add("flown towards the wall", float(path[-1, 0] - path[0, 0]), "m")
+    figures.add("nearer to the wall than 1.5 m by", max(0.0, CLEAR_M - clear_m), "m", 0.0,
+                f"{clear_m:.2f} m clear")  # fmt: skip
+    trial.pilot.land()
+
+
+def _told(trial: Trial, text: str, since_s: float = 0.0) -> bool:
+    return any(text in said for said in trial.ground.texts_since(since_s))
+
+
+def _when_told(trial: Trial, since_s: float, *texts: str) -> float | None:
+    """Seconds from a time on until a pilot has read one of them."""
+    for when_s, said in trial.ground.texts:
+        if when_s >= since_s and any(each in said for each in texts):
+            return when_s - since_s
+    return None
+
+
+def _believed_off(trial: Trial, since_s: float) -> Array:
+    """Level distance (N,) of the autopilot's place from the true one."""
+    true = np.array([(each.t_s, *each.place_m[:2]) for each in trial.ground.true])
+    told = np.array([row[:3] for row in trial.ground.believed if row[0] >= since_s])
+    at = np.stack([np.interp(told[:, 0], true[:, 0], true[:, k]) for k in (1, 2)], axis=1)
+    off_m: Array = np.linalg.norm(told[:, 1:] - at, axis=1)
+    return off_m
+
+
+def _at_rest(trial: Trial, not_before_s: float) -> bool:
+    speed = float(np.linalg.norm(trial.ground.true[-1].velocity_m_s[:2]))
+    return time.time() > not_before_s and speed < STOPPED_M_S
+
+
+FEATURES: dict[str, tuple[Callable[[Trial, Figures], None], Conditions]] = {
+    "landing_marker": (landing_marker, Conditions(
+        pitch_deg=-80.0, landmarks="marker:{}:{}".format(*MARKER_AT),
+        parameters={"PLND_ENABLED": 1, "PLND_TYPE": 1, "PLND_LAG": 0.06},
+        settings=(f"landing.marker={FAMILY_WORD}", f"landing.id={MARKER_ID}",
+                  f"landing.size_m={MARKER_M}"),
+    )),
+    "spoofed": (spoofed, Conditions(
+        has_gps=True, parameters=OWN_SOURCES, settings=("gps.switch_source=true",),
+    )),
+    "earth_position": (earth_position, Conditions(
+        has_gps=True, pose_mode="off",
+        parameters={**OWN_SOURCES, "EK3_SRC2_POSXY": 0, "EK3_SRC2_VELXY": 5, "EK3_SRC2_VELZ": 0,
+                    "FLOW_TYPE": 5, "EK3_FLOW_DELAY": 60},
+        settings=("feedback.global_position=estimate", "feedback.flow=optical_flow"),
+    )),
+    "earth_position_px4": (earth_position, Conditions(
+        has_gps=True, pose_mode="off",
+        parameters={"EKF2_EV_CTRL": 0, "EKF2_AGP0_ID": 10, "EKF2_AGP0_CTRL": 1,
+                    "EKF2_AGP0_DELAY": 60},
+        settings=("feedback.global_position=sensor",),
+    )),
+    "wall": (wall, Conditions(
+        wind_m_s=0.0, pitch_deg=-20.0, landmarks=f"wall:{WALL_NORTH_M:g}", has_depth=True,
+        parameters={"PRX1_TYPE": 2, "AVOID_ENABLE": 7},
+        settings=("feedback.obstacle_distance=true", "depth.stride=4"),
+    )),
+}  # fmt: skip
