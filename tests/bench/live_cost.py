@@ -134,7 +134,7 @@ def measured(tree: Path, seconds: float) -> dict[str, float]:
             at = daemon._command.index("page.listen=")
             del daemon._command[at - 1 : at + 1]
         with contextlib.redirect_stdout(sys.stderr), daemon, autopilot:
-            daemon.until(lambda health: health["tracker"] == "tracking", UP_S)
+            daemon.until(lambda health: health["tracker"] == "tracking", timeout_s=UP_S)
             time.sleep(SETTLE_S)
             process = psutil.Process(daemon._running.pid)
             first, first_own = cpu_and_memory(process), own(pickled)

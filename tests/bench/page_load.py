@@ -136,7 +136,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, Paged(Path(folder), depth=given.dense) as paged:
         paged.until_served()
         paged.autopilot.arm()
-        paged.daemon.until(lambda health: health["feedback"]["sending"], FLY_S, "poses")
+        paged.daemon.until(lambda health: health["feedback"]["sending"], "poses", timeout_s=FLY_S)
         for number in range(given.rounds):
             for loaded in (False, True):
                 hz, p95_ms, pss_mb, page_mb = result = measured(paged, given.seconds, loaded)

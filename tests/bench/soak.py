@@ -184,7 +184,7 @@ def fly(arguments: argparse.Namespace) -> Soak:
                     time.sleep(max(0.05, 1.0 - (time.monotonic() - began_s) % 1.0))
                 autopilot.disarm()  # should the machine have been too busy before
                 with GroundStation(ground_port) as ground:  # else the flight would go on
-                    ground.command(NEW_MAP, timeout_s=60)
+                    ground.command(NEW_MAP)
                 lap += 1
         except KeyboardInterrupt:
             pass  # what was seen so far is told all the same

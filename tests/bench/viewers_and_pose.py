@@ -66,7 +66,7 @@ def measured(flight: Path | None, rounds: int) -> dict[str, np.ndarray]:
             contextlib.redirect_stdout(sys.stderr),
             Daemon(folder, *settings, program=UNGOVERNED) as daemon,
         ):
-            daemon.until(lambda health: health["tracker"] == "tracking", 60)
+            daemon.until(lambda health: health["tracker"] == "tracking", timeout_s=60)
             time.sleep(SETTLE_S)
             for n in range(rounds):
                 # there and back, since the map grows meanwhile

@@ -56,7 +56,7 @@ def flown(
         time.sleep(FLY_S)
         flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
         flying.autopilot.disarm()
-        flying.daemon.line("results so far", 60.0)
+        flying.daemon.line("results so far")
         (path,) = flying.daemon.flown()
         flying.daemon.stop()
     return path

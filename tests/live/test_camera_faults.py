@@ -25,10 +25,10 @@ def all_well_again(flying: Flying) -> Iterator[None]:
 
 
 def test_missing_at_the_start_and_coming_later(flying: Flying) -> None:
-    flying.daemon.line("the camera is not there", 20)
+    flying.daemon.line("the camera is not there")
     assert flying.until_source("camera", "missing")["n"] == 0
     flying.until_source("autopilot", "running")
-    assert flying.daemon.status()["tracker"] == "waiting for the camera"
+    flying.daemon.until(lambda health: health["tracker"] == "waiting for the camera", "it waits")
     flying.autopilot.arm()
     assert not flying.daemon.flown()
     plugged_ns = time.monotonic_ns()
@@ -71,14 +71,14 @@ def test_invalid_images_and_valid_again(
     began_ns = time.monotonic_ns()
     fault(flying, True)
     flying.assert_ceased(began_ns)
-    flying.daemon.line(named, 10, began_ns)
+    flying.daemon.line(named, after_ns=began_ns)
     seen = flying.until_source("camera", *states)
     assert "127.0.0.1" in seen["detail"], "which camera is to be told"
     fault(flying, False)
     right_ns = time.monotonic_ns()
     flying.until_source("camera", "running")
     flying.assert_soon(right_ns, time.monotonic_ns())
-    flying.daemon.line("the camera is back", 5, right_ns)
+    flying.daemon.line("the camera is back", after_ns=right_ns)
     flying.assert_resumed(right_ns)
     flying.assert_true_poses()
 
@@ -88,11 +88,11 @@ def test_covered_for_two_seconds(flying: Flying) -> None:
     covered_ns = time.monotonic_ns()
     flying.camera.covered = True
     flying.assert_ceased(covered_ns)
-    flying.daemon.until(lambda health: health["tracker"] == "lost", 10, "it is lost")
+    flying.daemon.until(lambda health: health["tracker"] == "lost", "it is lost")
     time.sleep(max(0.0, 2.0 - (time.monotonic_ns() - covered_ns) * 1e-9))
     flying.camera.covered = False
     seen_ns = time.monotonic_ns()
-    flying.daemon.until(lambda health: health["tracker"] == "tracking", 10, "it is found")
+    flying.daemon.until(lambda health: health["tracker"] == "tracking", "it is found")
     flying.assert_soon(seen_ns, time.monotonic_ns())
     flying.assert_resumed(seen_ns)
     flying.until_told("vision position on", seen_ns)

@@ -28,12 +28,12 @@ def test_poses_go_on_without_sight_for_two_seconds(flying: Flying, how: str) -> 
     n_resets = flying.daemon.status()["feedback"]["n_resets"]
     covered_ns = time.monotonic_ns()
     setattr(flying.camera, how, True)
-    flying.daemon.until(lambda health: health["feedback"]["bridging"], 10, "it bridges")
+    flying.daemon.until(lambda health: health["feedback"]["bridging"], "it bridges")
     flying.until_told(TOLD, covered_ns)
     time.sleep(max(0.0, 2.0 - (time.monotonic_ns() - covered_ns) * 1e-9))
     setattr(flying.camera, how, False)
     seen_ns = time.monotonic_ns()
-    flying.daemon.until(lambda health: health["tracker"] == "tracking", 10, "it is found")
+    flying.daemon.until(lambda health: health["tracker"] == "tracking", "it is found")
     flying.until_told("vision position on", seen_ns)
     flying.assert_went_on(covered_ns)
     assert flying.daemon.status()["feedback"]["n_resets"] == n_resets
@@ -44,11 +44,11 @@ def test_they_end_when_they_are_uncertain(flying: Flying) -> None:
     flying.until_sending()
     covered_ns = time.monotonic_ns()
     flying.camera.covered = True
-    flying.until_told("vision position lost", covered_ns, 60)
-    flying.daemon.until(lambda health: not health["feedback"]["sending"], 5, "no poses")
+    flying.until_told("vision position lost", covered_ns)
+    flying.daemon.until(lambda health: not health["feedback"]["sending"], "no poses")
     flying.camera.covered = False
     seen_ns = time.monotonic_ns()
-    flying.until_told("vision position on", seen_ns, 30)
+    flying.until_told("vision position on", seen_ns)
     flying.assert_true_poses()
     # of the place; what the scale is uncertain by over the last seconds comes on top: 0.1 m
     assert max(flying.poses.sigma_m) <= (1.0**2 + 0.15**2) ** 0.5

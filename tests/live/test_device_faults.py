@@ -34,9 +34,11 @@ def test_in_flight_the_next_device_takes_over_and_the_pose_goes_on(
         flying.until_stage("depth", lambda it: it["rate_hz"] > 0, LONG_S)
         failed_ns = time.monotonic_ns()
         now.touch()
-        flying.daemon.line("started again: depth: killed by SIGABRT", LONG_S, failed_ns)
+        flying.daemon.line(
+            "started again: depth: killed by SIGABRT", after_ns=failed_ns, timeout_s=LONG_S
+        )
         flying.until_stage("depth", lambda it: it["detail"].startswith(second.named), LONG_S)
-        flying.daemon.line(FAILED_OVER, LONG_S, failed_ns)
+        flying.daemon.line(FAILED_OVER, after_ns=failed_ns, timeout_s=LONG_S)
         flying.until_told(MAP_OTHER_DEVICE.text, failed_ns)
         health = flying.until_stage("depth", lambda it: it["alive"] and it["rate_hz"] > 0, LONG_S)
         assert health["n_restarted"] == 1

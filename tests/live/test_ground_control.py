@@ -28,7 +28,6 @@ UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
 REQUEST_MESSAGE, SET_INTERVAL = (
     mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
 )  # fmt: skip
-PORT, VIEWERS = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM)
 MAP_S = 120.0
 """A first piece of the dense map on a processor that others use too."""
 
@@ -39,22 +38,31 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def flying(folder: Path) -> Iterator[Flying]:
+def port() -> int:
+    return free_port(socket.SOCK_STREAM)
+
+
+@pytest.fixture(scope="module")
+def flying(folder: Path, port: int) -> Iterator[Flying]:
+    """In the dark at first, so that there is no map."""
     settings = (
-        f'router.clients=["tcpin:127.0.0.1:{PORT}"]', f"stream.listen=127.0.0.1:{VIEWERS}",
+        f'router.clients=["tcpin:127.0.0.1:{port}"]',
+        f"stream.listen=127.0.0.1:{free_port(socket.SOCK_STREAM)}",
         f"control.keep={folder}/kept.toml", "depth.enabled=true", "depth.stride=8",
         "feedback.min_quality=15", "expert.features.n_features=500",
     )  # fmt: skip
-    with Flying(folder, *settings, program=UNGOVERNED) as begun:
+    dark = Flying(folder, *settings, program=UNGOVERNED)
+    dark.camera.covered = True
+    with dark as begun:
         begun.until_source("camera", "running")
         begun.until_source("autopilot", "running")
         yield begun
 
 
 @pytest.fixture
-def ground(flying: Flying) -> Iterator[GroundStation]:
-    with GroundStation(PORT) as connected:
-        connected.heard("HEARTBEAT", 5)
+def ground(flying: Flying, port: int) -> Iterator[GroundStation]:
+    with GroundStation(port) as connected:
+        connected.heard("HEARTBEAT")
         yield connected
 
 
@@ -66,13 +74,13 @@ def snapshots(flying: Flying) -> list[Path]:
 
 def test_before_take_off(flying: Flying, ground: GroundStation) -> None:
     standby = mavlink.MAV_STATE_STANDBY
-    ground.heard("HEARTBEAT", 10, lambda beat: beat.system_status == standby)
+    ground.heard("HEARTBEAT", lambda beat: beat.system_status == standby)
     found = ground.parameters()
     assert list(found) == list(PARAMETERS)
     assert (found["FB_MODE"], found["FB_MIN_QUALITY"], found["MAP_STRIDE"]) == (1.0, 15.0, 8.0)
     assert ground.set("FB_MIN_QUALITY", 20.0) == 20.0
     health = flying.daemon.until(
-        lambda health: health["set_by_ground"] == {"feedback.min_quality": 20}, 5
+        lambda health: health["set_by_ground"] == {"feedback.min_quality": 20}, "set"
     )
     assert health["feedback"]["mode"] == "odometry"
     table = subprocess.run(
@@ -81,17 +89,20 @@ def test_before_take_off(flying: Flying, ground: GroundStation) -> None:
         capture_output=True, text=True, check=True, timeout=30,
     ).stdout  # fmt: skip
     assert "feedback.min_quality = 20 (by the ground)" in table
-    flying.daemon.line("ground: feedback.min_quality = 20", 5)
-    assert "min_quality = 20" in (flying.daemon.folder / "kept.toml").read_text()
+    flying.daemon.line("ground: feedback.min_quality = 20")
+    kept = flying.daemon.folder / "kept.toml"
+    flying.daemon.until(lambda _: kept.exists() and "min_quality = 20" in kept.read_text(), "kept")
     assert ground.set("FB_MIN_QUALITY", 1000.0) == 20.0
-    results = ground.command(SNAPSHOT)  # on a slow machine there may be points by now
-    assert results in ([IN_PROGRESS, FAILED], [IN_PROGRESS, ACCEPTED])
-    assert bool(snapshots(flying)) == (results[-1] == ACCEPTED)
+    flying.until_stage("results", lambda found: found["detail"] != "starting")
+    assert ground.command(SNAPSHOT) == [IN_PROGRESS, FAILED]
+    flying.daemon.line("no cloud was written: ")
+    assert not snapshots(flying)
+    flying.camera.heal()
 
 
 def test_what_ground_stations_ask_of_every_component(ground: GroundStation) -> None:
     assert ground.command(REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == [ACCEPTED]
-    version = ground.heard("AUTOPILOT_VERSION", 5)
+    version = ground.heard("AUTOPILOT_VERSION")
     assert version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     assert ground.command(mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION, 1.0) == [ACCEPTED]
     assert ground.command(REQUEST_MESSAGE, 259.0) == [UNSUPPORTED]  # of a camera
@@ -100,7 +111,7 @@ def test_what_ground_stations_ask_of_every_component(ground: GroundStation) -> N
     status = mavlink.MAVLINK_MSG_ID_ONBOARD_COMPUTER_STATUS
     assert ground.command(SET_INTERVAL, status, 200_000.0) == [ACCEPTED]
     assert ground.command(REQUEST_MESSAGE, 244.0, status) == [ACCEPTED]
-    assert ground.heard("MESSAGE_INTERVAL", 5).interval_us == 200_000
+    assert ground.heard("MESSAGE_INTERVAL").interval_us == 200_000
     assert ground.command(SET_INTERVAL, status, 1000.0) == [DENIED]
     assert ground.command(SET_INTERVAL, status, 0.0) == [ACCEPTED]
 
@@ -109,7 +120,7 @@ def test_mapping_is_left_and_taken_up(flying: Flying, ground: GroundStation) -> 
     flying.take_off()
     flying.until_stage("depth", lambda found: found["n"] > 0, MAP_S)
     assert ground.command(MAPPING, 0.0) == [ACCEPTED]
-    flying.until_stage("depth", lambda found: found["detail"] == "switched off", 5)
+    flying.until_stage("depth", lambda found: found["detail"] == "switched off")
     time.sleep(1.5)
     n_done = flying.until_stage("depth", lambda found: True)["n"]
     time.sleep(1.0)
@@ -128,14 +139,16 @@ def test_the_cloud_is_written_now(flying: Flying, ground: GroundStation) -> None
     path = snapshots(flying)[-1]
     n_points = len(read_ply(path))
     assert n_points
-    flying.daemon.line(f"cloud written: {path.name}, {n_points} points", 5)
+    flying.daemon.line(f"cloud written: {path.name}, {n_points} points")
 
 
 def test_viewers_have_a_budget(flying: Flying, ground: GroundStation) -> None:
     assert ground.command(BUDGET, 300.0) == [ACCEPTED]
-    flying.until_stage("viewers", lambda found: "budget 300 kbit/s" in found["detail"], 10)
+    flying.until_stage("viewers", lambda found: "budget 300 kbit/s" in found["detail"])
     assert ground.command(BUDGET, -5.0) == [DENIED]
-    assert flying.daemon.status()["set_by_ground"]["stream.budget_kbit_s"] == 300.0
+    flying.daemon.until(
+        lambda health: health["set_by_ground"].get("stream.budget_kbit_s") == 300.0, "told"
+    )
 
 
 def test_while_armed_the_pose_cannot_be_made_easier(flying: Flying, ground: GroundStation) -> None:
@@ -148,7 +161,7 @@ def test_while_armed_the_pose_cannot_be_made_easier(flying: Flying, ground: Grou
     flying.assert_went_on(began_ns)  # a stricter limit takes no pose away that keeps it
 
 
-def test_a_storm_of_requests_delays_no_pose(flying: Flying) -> None:
+def test_a_storm_of_requests_delays_no_pose(flying: Flying, port: int) -> None:
     """All kinds, for us, from one and from many; and what is no request at all."""
     flying.take_off()
     rng, codec, began_ns = random.Random(3), mavlink.MAVLink(None, 255, 190), time.monotonic_ns()
@@ -159,7 +172,7 @@ def test_a_storm_of_requests_delays_no_pose(flying: Flying) -> None:
         mavlink.MAVLink_command_long_message(*OURS, 512, 0, 148, 0, 0, 0, 0, 0, 0),
         mavlink.MAVLink_command_long_message(*OURS, 7777, 0, 1, 0, 0, 0, 0, 0, 0),
     ]
-    with GroundStation(PORT) as ground:
+    with GroundStation(port) as ground:
         ground._socket.setblocking(False)
         while time.monotonic_ns() - began_ns < 3e9:
             codec.srcSystem = rng.choice((255, 254, rng.randrange(2, 255)))
@@ -171,23 +184,26 @@ def test_a_storm_of_requests_delays_no_pose(flying: Flying) -> None:
                 pass
             time.sleep(0.005)
     flying.assert_went_on(began_ns)
-    flying.daemon.line("more is asked of the companion", 5, began_ns)
+    flying.daemon.line("more is asked of the companion", after_ns=began_ns)
 
 
 def test_a_new_map_raises_the_reset_counter(flying: Flying, ground: GroundStation) -> None:
     flying.autopilot.arm()
-    before = flying.daemon.until(lambda health: health["quality"] > 0, 60, "it finds its way")
+    before = flying.daemon.until(lambda health: health["quality"] > 0, "it finds its way")
     assert ground.command(NEW_MAP) == [DENIED]  # the autopilot may fly on these poses
     began_ns = time.monotonic_ns()
-    assert ground.command(NEW_MAP, 1.0, timeout_s=60) == [IN_PROGRESS, ACCEPTED]
-    after = flying.daemon.until(lambda health: health["flight"] not in ("", before["flight"]), 10)
-    assert after["feedback"]["n_resets"] == before["feedback"]["n_resets"] + 1
-    flying.daemon.line("ground: a new map begins", 0, began_ns)
-    flying.daemon.line("flight over", 90, began_ns)
+    assert ground.command(NEW_MAP, 1.0) == [IN_PROGRESS, ACCEPTED]
+    n_resets = before["feedback"]["n_resets"] + 1
+    flying.daemon.until(
+        lambda health: health["flight"] not in ("", before["flight"])
+        and health["feedback"]["n_resets"] == n_resets, "another flight, and that it was told",
+    )  # fmt: skip
+    flying.daemon.line("ground: a new map begins", after_ns=began_ns)
+    flying.daemon.line("flight over", after_ns=began_ns)
     assert json.loads((flying.daemon.flights / before["flight"] / "report.json").read_text())
     assert all((path / "flight.mcap").exists() for path in flying.daemon.flown())
     flying.until_sending(MAP_S)
-    assert flying.poses.resets[-1] >= after["feedback"]["n_resets"]
+    assert flying.poses.resets[-1] >= n_resets
 
 
 def test_the_pose_is_switched_off(flying: Flying, ground: GroundStation) -> None:
@@ -199,7 +215,7 @@ def test_the_pose_is_switched_off(flying: Flying, ground: GroundStation) -> None
     assert flying.daemon.status()["feedback"]["mode"] == "off"
     assert ground.set("FB_MODE", 1.0) == 0.0  # until it has landed
     flying.autopilot.disarm()
-    flying.daemon.line("disarmed", 10, began_ns)
+    flying.daemon.line("disarmed", after_ns=began_ns)
     assert ground.set("FB_MODE", 1.0) == 1.0
     assert not flying.daemon.said("Traceback")
     flying.assert_stops()

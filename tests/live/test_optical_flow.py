@@ -59,17 +59,18 @@ def test_the_autopilot_gets_the_flow(tmp_path: Path, kind: str) -> None:
     settings = ("feedback.mode=off", f"feedback.flow={kind.lower()}")
     with Flying(tmp_path, *settings) as flying:
         flying.autopilot.arm()
-        flying.autopilot.wait_for(kind, 60, 60, lambda got: got.message.quality > 0)
+        flying.autopilot.wait_for(kind, 60, 90, lambda got: got.message.quality > 0)
         health = flying.daemon.until(
-            lambda health: health["flow"]["sending"] and health["flow"]["rate_hz"] > 5, 10, "rate"
+            lambda health: health["flow"]["sending"] and health["flow"]["rate_hz"] > 5, "rate"
         )
         assert health["flow"]["message"] == kind.lower()
         found, when_ns = derotated(kind, flying.autopilot.of(kind))
         assert not flying.autopilot.of("ODOMETRY")
         flying.camera.covered = True
-        flying.daemon.until(lambda health: health["flow"]["why_not"] != "", 10, "it sees nothing")
-        covered_ns = time.monotonic_ns()
-        time.sleep(1.0)
+        flying.daemon.until(lambda health: health["flow"]["why_not"] != "", "it sees nothing")
+        # what was sent before may still be on its way
+        covered_ns = time.monotonic_ns() + 500_000_000
+        time.sleep(1.5)
         dark = [each for each in flying.autopilot.of(kind) if each.monotonic_ns > covered_ns]
         flying.assert_stops()
     late_ns = range(0, MOST_LATE_NS, STEP_NS)

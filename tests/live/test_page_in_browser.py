@@ -149,7 +149,7 @@ def test_a_setting_is_changed_refused_and_undone(page: Any, paged: Paged, browse
     press(page, "Save [feedback]")
     assert note(page) == "Changed: feedback.max_sigma_m is now 0.5."
     assert load_config(paged.config).feedback.max_sigma_m == 0.5
-    paged.daemon.line("configuration read again", 60)
+    paged.daemon.line("configuration read again")
     page.get_by_role("button", name="Undo the change of feedback.max_sigma_m").first.click()
     assert note(page) == "Changed: feedback.max_sigma_m is now the default."
 
@@ -189,10 +189,10 @@ def test_the_map_is_moved_by_its_buttons(page: Any, paged: Paged) -> None:
 
 def test_the_flight_is_kept_downloaded_and_deleted(page: Any, paged: Paged) -> None:
     paged.autopilot.disarm()
-    paged.daemon.line("results so far", 60)
+    paged.daemon.line("results so far")
     page.goto("about:blank")  # it would complain of a daemon that is away
     paged.start_again()  # which ends the flight
-    paged.daemon.until(lambda health: health["armed"] is False, 60, "disarmed")
+    paged.daemon.until(lambda health: health["armed"] is False, "disarmed")
     go(page, paged, "/flights")
     flight = page.locator(".flights a").filter(has=page.locator("polyline")).first
     flight.click()

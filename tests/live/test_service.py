@@ -8,7 +8,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
@@ -16,7 +16,7 @@ import pytest
 
 from companion.daemon.health_watch import PATIENCE_NS
 from companion.daemon.periodic_checks import NO_PROGRESS
-from tests.support.processes.daemon_process import Daemon
+from tests.support.processes.daemon_process import PATIENCE_S, Daemon
 
 PATTERN = ("camera.source=pattern", "daemon.flight=always", "recorder.enabled=false")
 
@@ -39,6 +39,13 @@ class ServiceManager:
         """When a notice came last."""
         return max((t_s for t_s, text in self.notices if text.startswith(start)), default=None)
 
+    def until(self, such: Callable[[], bool]) -> None:
+        """Wait until it has heard what it should."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not such():
+            assert time.monotonic() < until_s, self.notices
+            time.sleep(0.02)
+
     def close(self) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as last:
             last.sendto(b"", self._socket.getsockname())
@@ -56,14 +63,11 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service
 
 def test_it_is_ready_when_its_stages_are(tmp_path: Path, manager: ServiceManager) -> None:
     with Daemon(tmp_path, *PATTERN, "depth.enabled=false") as daemon:
-        until_s = time.monotonic() + 60
-        while manager.last_s("READY=1") is None:
-            assert time.monotonic() < until_s
-            time.sleep(0.02)
+        manager.until(lambda: manager.last_s("READY=1") is not None)
         stages = {stage["name"]: stage for stage in daemon.status()["stages"]}
         assert all(stage["detail"] != "starting" for stage in stages.values()), stages
         daemon.stop()
-        assert manager.last_s("STOPPING=1") is not None
+        manager.until(lambda: manager.last_s("STOPPING=1") is not None)
 
 
 def test_without_a_camera_it_is_not_ready(tmp_path: Path, manager: ServiceManager) -> None:
@@ -79,10 +83,10 @@ def test_a_pose_loop_that_hangs_for_good_is_left_to_the_watchdog(
 ) -> None:
     """Every localisation is stopped: the daemon starts others, then says no more that it lives."""
     with Daemon(tmp_path, *PATTERN, "depth.enabled=false") as daemon:
-        daemon.until(lambda health: health["tracker"] == "tracking", 60)
+        daemon.until(lambda health: health["tracker"] == "tracking")
         began_s, stopped = time.monotonic(), set[int]()
         while not daemon.said(NO_PROGRESS):
-            assert time.monotonic() < began_s + 60
+            assert time.monotonic() < began_s + PATIENCE_S
             with contextlib.suppress(AssertionError, psutil.Error, ProcessLookupError):
                 pid = daemon.stage("localisation")
                 if pid not in stopped:
@@ -98,8 +102,5 @@ def test_a_pose_loop_that_hangs_for_good_is_left_to_the_watchdog(
         for pid in stopped:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        daemon.until(lambda health: health["tracker"] == "tracking", 60)
-        until_s = time.monotonic() + 10
-        while (manager.last_s("WATCHDOG=1") or 0.0) <= last_s:  # poses again, and so it is alive
-            assert time.monotonic() < until_s
-            time.sleep(0.1)
+        daemon.until(lambda health: health["tracker"] == "tracking")
+        manager.until(lambda: (manager.last_s("WATCHDOG=1") or 0.0) > last_s)  # poses: it is alive

@@ -46,19 +46,22 @@ def test_what_is_killed_begins_again(
     flying: Flying, kind: str, number: signal.Signals, named: str
 ) -> None:
     flying.until_sending()
-    flying.until_stage(kind, lambda found: found["detail"] != "starting", 60)
+    flying.until_stage(kind, lambda found: found["detail"] != "starting")
     killed_ns = flying.daemon.signal_stage(kind, number)
     # what only gets the time that is left over needs some of it to end, too
-    named_ns = flying.daemon.line(f"started again: {kind}: {named}", 60, killed_ns).monotonic_ns
+    named_ns = flying.daemon.line(
+        f"started again: {kind}: {named}", after_ns=killed_ns
+    ).monotonic_ns
     flying.until_stage(kind, lambda found: found["alive"] and found["n_restarted"] == 1)
     flying.assert_soon(named_ns, time.monotonic_ns())
-    flying.until_stage(kind, lambda found: found["detail"] != "starting", 60)
+    flying.until_stage(kind, lambda found: found["detail"] != "starting")
     flying.until_told(" restarted", killed_ns)
     flying.assert_went_on(killed_ns)
     flying.assert_true_poses()
     if kind == "results":  # what begins anew writes beside what was written before
-        for part in (".", "part-2"):
-            assert (flying.daemon.flown()[-1] / part / "flight.rrd").exists()
+        folder = flying.daemon.flown()[-1]
+        files = [folder / part / "flight.rrd" for part in (".", "part-2")]
+        flying.daemon.until(lambda _: all(file.exists() for file in files), "both are there")
 
 
 def test_what_hangs_is_named_and_goes_on_when_it_can(flying: Flying) -> None:
@@ -70,12 +73,12 @@ def test_what_hangs_is_named_and_goes_on_when_it_can(flying: Flying) -> None:
         for kind in kinds:
             seen = flying.until_stage(kind, lambda found: not found["alive"], 3 * NO_SIGN_S)
             assert "no sign of it" in seen["detail"]
-        flying.daemon.line("results down (no sign of it", 5, min(stopped_ns))
+        flying.daemon.line("results down (no sign of it", after_ns=min(stopped_ns))
     finally:
         for kind in kinds:
             continued_ns = flying.daemon.signal_stage(kind, signal.SIGCONT)
     for kind in kinds:
-        flying.until_stage(kind, lambda found: found["alive"] and found["n_dropped"] > 0, 30)
+        flying.until_stage(kind, lambda found: found["alive"] and found["n_dropped"] > 0)
     flying.assert_went_on(min(stopped_ns))
     flying.assert_soon(continued_ns, time.monotonic_ns(), 10.0)
     flying.assert_true_poses()
@@ -90,19 +93,23 @@ def viewer_of(flying: Flying) -> psutil.Process | None:
     return max(found, key=lambda child: child.create_time(), default=None)
 
 
+def until_viewer(flying: Flying) -> psutil.Process:
+    """Wait until there is one."""
+    flying.daemon.until(lambda _: viewer_of(flying) is not None, "a viewer")
+    found = viewer_of(flying)
+    assert found is not None
+    return found
+
+
 def test_a_viewer_that_hangs_or_dies(flying: Flying) -> None:
     flying.until_sending()
     began_ns = time.monotonic_ns()
-    viewer = viewer_of(flying)
-    assert viewer is not None
+    viewer = until_viewer(flying)
     viewer.suspend()
     time.sleep(1.5)
     viewer.kill()
-    flying.daemon.line("the viewer has gone", 10, began_ns)
-    until_s = time.monotonic() + 30
-    while viewer_of(flying) is None:
-        assert time.monotonic() < until_s, "it is not opened again"
-        time.sleep(0.1)
+    flying.daemon.line("the viewer has gone", after_ns=began_ns)
+    until_viewer(flying)
     flying.assert_went_on(began_ns)
     flying.assert_true_poses()
 
@@ -121,16 +128,16 @@ def test_another_localisation_takes_over(
     folder, resets = flying.daemon.flown()[-1], flying.poses.resets[-1]
     lost_ns = flying.daemon.signal_stage("localisation", number)
     flying.assert_ceased(lost_ns)
-    named_ns = flying.daemon.line(named, 20, lost_ns).monotonic_ns
+    named_ns = flying.daemon.line(named, after_ns=lost_ns).monotonic_ns
     flying.assert_soon(lost_ns, named_ns, within_s)
-    flying.daemon.line("localisation has died", 10, lost_ns)
+    flying.daemon.line("localisation has died", after_ns=lost_ns)
     flying.until_stage("localisation", lambda found: found["detail"] != "starting")
     flying.assert_soon(named_ns, time.monotonic_ns())
     # nothing ties the new map to the old: the autopilot is told so
     flying.until_sending()
     assert flying.poses.resets[-1] > resets
-    flying.daemon.line("its results go to", 0, lost_ns)
-    flying.daemon.line(f"flight over: {folder}", 30, lost_ns)
+    flying.daemon.line("its results go to", after_ns=lost_ns)
+    flying.daemon.line(f"flight over: {folder}", after_ns=lost_ns)
     assert list(folder.rglob("report.json"))
     flying.assert_true_poses()
 
@@ -144,6 +151,6 @@ def test_it_still_ends_in_time_and_leaves_nothing_behind(flying: Flying) -> None
     if viewer is not None:
         viewer.suspend()
     flying.assert_stops()
-    psutil.wait_procs(children, timeout=10)
+    psutil.wait_procs(children, timeout=60)
     assert not [child for child in children if child.is_running()]
     assert not flying.daemon.said("Traceback")

@@ -48,15 +48,17 @@ def test_what_hangs_in_flight_is_ended_and_begins_again(tmp_path: Path) -> None:
     settings = "camera.source=pattern", "camera.rate_hz=10", "depth.enabled=false", "link.url="
     with Daemon(tmp_path, *settings, program=("-c", IMPATIENT)) as daemon:
         for kind in (*KINDS, "localisation"):
-            daemon.until(partial(is_up, kind=kind, n_restarted=0), UP_S)
+            daemon.until(partial(is_up, kind=kind, n_restarted=0), timeout_s=UP_S)
         stopped_ns = {kind: daemon.signal_stage(kind, signal.SIGSTOP) for kind in KINDS}
         n_poses = stage_of(daemon.status(), "localisation")["n"]
         for kind in KINDS:
-            ended = daemon.line(f"started again: {kind}: it hung for", UP_S, stopped_ns[kind])
+            ended = daemon.line(
+                f"started again: {kind}: it hung for", after_ns=stopped_ns[kind], timeout_s=UP_S
+            )
             assert ended.monotonic_ns - stopped_ns[kind] > (ANSWER_S - 2.0) * 1e9
         for kind in KINDS:
-            daemon.until(partial(is_up, kind=kind, n_restarted=1), UP_S)
-            daemon.until(partial(works, kind=kind), UP_S)
+            daemon.until(partial(is_up, kind=kind, n_restarted=1), timeout_s=UP_S)
+            daemon.until(partial(works, kind=kind), timeout_s=UP_S)
         assert stage_of(daemon.status(), "localisation")["n"] > n_poses, "poses went on"
         daemon.stop(60.0)
         assert not daemon.said("Traceback")

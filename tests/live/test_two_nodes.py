@@ -130,4 +130,4 @@ def test_the_ground_is_killed_and_restarted_and_its_map_grows_on(nodes: Nodes) -
     assert nodes.sent_bytes > 300_000  # by no other way
     assert drone.poll() is None
     drone.send_signal(signal.SIGTERM)
-    assert drone.wait(20) == 0
+    assert drone.wait(60) == 0

@@ -11,6 +11,8 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 OURS = (1, 197)
+PATIENCE_S = 60.0
+"""Of one who waits for an answer from a machine with much to do."""
 
 
 def asked(message: Any, system: int = 255, component: int = 190) -> Any:
@@ -29,7 +31,7 @@ class GroundStation:
     """
 
     def __init__(self, port: int) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", port), 5)
+        self._socket = socket.create_connection(("127.0.0.1", port), PATIENCE_S)
         self._codec = mavlink.MAVLink(None, 255, 190)
         self._codec.robust_parsing = True
         self._pending: list[Any] = []
@@ -48,44 +50,42 @@ class GroundStation:
         self._socket.sendall(message.pack(self._codec))
         self._codec.seq = (self._codec.seq + 1) % 256
 
-    def heard(
-        self, kind: str, timeout_s: float, such: Callable[[Any], bool] = lambda _: True
-    ) -> Any:
+    def heard(self, kind: str, such: Callable[[Any], bool] = lambda _: True) -> Any:
         """The next message of a kind of our component; AssertionError without one."""
-        until_s = time.monotonic() + timeout_s
+        until_s = time.monotonic() + PATIENCE_S
         while (left_s := until_s - time.monotonic()) > 0:
             for message in self._read(left_s):
                 source = message.get_srcSystem(), message.get_srcComponent()
                 if source == OURS and message.get_type() == kind and such(message):
                     return message
-        raise AssertionError(f"no {kind} in {timeout_s:g} s")
+        raise AssertionError(f"no {kind} in {PATIENCE_S:g} s")
 
-    def command(self, number: int, *values: float, timeout_s: float = 10.0) -> list[int]:
+    def command(self, number: int, *values: float) -> list[int]:
         """Give a COMMAND_LONG; the MAV_RESULTs that it is answered with, each but once in a row."""
         parameters = [*values, *[0.0] * (7 - len(values))]
         self.send(mavlink.MAVLink_command_long_message(*OURS, number, 0, *parameters))
         results: list[int] = []
         while not results or results[-1] == mavlink.MAV_RESULT_IN_PROGRESS:
-            answer = self.heard("COMMAND_ACK", timeout_s, lambda ack: ack.command == number)
+            answer = self.heard("COMMAND_ACK", lambda ack: ack.command == number)
             if results[-1:] != [answer.result]:
                 results.append(answer.result)
         return results
 
-    def parameters(self, timeout_s: float = 20.0) -> dict[str, float]:
+    def parameters(self) -> dict[str, float]:
         """All of them, by name."""
         self.send(mavlink.MAVLink_param_request_list_message(*OURS))
         found: dict[str, float] = {}
         n = 1
         while len(found) < n:
-            value = self.heard("PARAM_VALUE", timeout_s)
+            value = self.heard("PARAM_VALUE")
             found[value.param_id], n = value.param_value, value.param_count
         return found
 
-    def set(self, name: str, value: float, timeout_s: float = 10.0) -> float:
+    def set(self, name: str, value: float) -> float:
         """Set a parameter; what it is then said to be."""
         kind = mavlink.MAV_PARAM_TYPE_REAL32
         self.send(mavlink.MAVLink_param_set_message(*OURS, name.encode(), value, kind))
-        said = self.heard("PARAM_VALUE", timeout_s, lambda got: got.param_id == name)
+        said = self.heard("PARAM_VALUE", lambda got: got.param_id == name)
         return float(said.param_value)
 
     def _read(self, timeout_s: float) -> list[Any]:

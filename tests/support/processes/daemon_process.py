@@ -1,7 +1,7 @@
 """The daemon as a child process: watched, queried, signalled, and always ended.
 
     with Daemon(tmp_path, "camera.source=pattern") as daemon:
-        daemon.until(lambda health: health["tracker"] == "tracking", 20)
+        daemon.until(lambda health: health["tracker"] == "tracking")
 
 Its socket and its flights lie in the folder given. What it says on standard error is kept by line,
 each with the time it came, and printed at the end for whoever has to find out what went wrong.
@@ -29,6 +29,8 @@ from drivers.system.status_socket import ask_status
 from tests.support.processes.program import Run
 
 ASK_EVERY_S = 0.05
+PATIENCE_S = 90.0
+"""So long is waited for what a quiet machine does in seconds: how soon is asked elsewhere."""
 PROGRAM = ("-m", "companion")
 NO_GOVERNOR = """
 import sys
@@ -109,8 +111,9 @@ class Daemon:
         return ask_status(self.socket)
 
     def until(
-        self, such: Callable[[dict[str, Any]], Any], timeout_s: float, what: str = ""
-    ) -> dict[str, Any]:
+        self, such: Callable[[dict[str, Any]], Any], what: str = "", *,
+        timeout_s: float = PATIENCE_S,
+    ) -> dict[str, Any]:  # fmt: skip
         """Its status once that is as wanted; AssertionError if it does not become so in time."""
         until_s = time.monotonic() + timeout_s
         health: dict[str, Any] = {}
@@ -124,8 +127,8 @@ class Daemon:
         said = health.get("line", "it does not answer")
         raise AssertionError(f"not within {timeout_s:g} s: {what or 'as wanted'}; {said}")
 
-    def line(self, text: str, timeout_s: float = 0.0, after_ns: int = 0) -> Line:
-        """The first line with a text in it that came after a time; AssertionError without one."""
+    def line(self, text: str, *, after_ns: int = 0, timeout_s: float = PATIENCE_S) -> Line:
+        """Wait for the first line with a text in it that came after a time."""
         until_s = time.monotonic() + timeout_s
         with self._came:
             while True:
@@ -157,11 +160,15 @@ class Daemon:
         self._running.send_signal(number)
 
     def stop(self, timeout_s: float = 30.0) -> float:
-        """SIGTERM; how many seconds it took to end. AssertionError unless it ends well."""
+        """SIGTERM, and all that it says until it ends; how many seconds that took.
+
+        AssertionError unless it ends well.
+        """
         began_s = time.monotonic()
         self.send(signal.SIGTERM)
         status = self._running.wait(timeout_s)
         took_s = time.monotonic() - began_s
+        self._reader.join(PATIENCE_S)
         assert status == 0, status
         return took_s
 

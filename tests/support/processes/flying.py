@@ -28,13 +28,12 @@ from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import MadeUpFlight
 from tests.support.autopilot.received_poses import Array, Poses, poses_of
 from tests.support.cameras.http_camera import HttpCamera, world_from_body
-from tests.support.processes.daemon_process import PROGRAM, Daemon
+from tests.support.processes.daemon_process import PATIENCE_S, PROGRAM, Daemon
 from tests.support.processes.strain import Strain
 
 PathOf = Callable[[int], Pose]
 """`world_from_body` by CLOCK_MONOTONIC, ns."""
 RANGE, IMU = ("DISTANCE_SENSOR",), ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU")
-TAKE_OFF_S = 60.0
 STOP_S = 3.0
 MOST_AWAY_M, MOST_TURNED_DEG = 1.0, 5.0
 """What a pose may be wrong by: a tenth of the distance to the ground."""
@@ -119,31 +118,33 @@ class Flying:
         self.autopilot.arm()
         self.until_sending()
 
-    def until_sending(self, timeout_s: float = TAKE_OFF_S) -> None:
+    def until_sending(self, timeout_s: float = PATIENCE_S) -> None:
         """Wait until poses are sent, and have come for half a second."""
-        self.daemon.until(lambda health: health["feedback"]["sending"], timeout_s, "poses")
+        self.daemon.until(
+            lambda health: health["feedback"]["sending"], "poses", timeout_s=timeout_s
+        )
         now_ns = time.monotonic_ns()
-        self.autopilot.wait_for("ODOMETRY", 15, 20, lambda got: got.monotonic_ns >= now_ns)
+        self.autopilot.wait_for("ODOMETRY", 15, PATIENCE_S, lambda got: got.monotonic_ns >= now_ns)
 
-    def until_source(self, name: str, *states: str, timeout_s: float = 15.0) -> dict[str, Any]:
+    def until_source(self, name: str, *states: str) -> dict[str, Any]:
         """Wait until a source is in one of these states; its part of the status."""
         health = self.daemon.until(
-            lambda health: source(health, name)["state"] in states, timeout_s, f"{name} {states}"
+            lambda health: source(health, name)["state"] in states, f"{name} {states}"
         )
         return source(health, name)
 
-    def until_stage(self, name: str, such: Any, timeout_s: float = 20.0) -> dict[str, Any]:
+    def until_stage(self, name: str, such: Any, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
         """Wait until a stage is as wanted; its part of the status."""
         health = self.daemon.until(
             lambda health: stage(health, name) is not None and such(stage(health, name)),
-            timeout_s, f"{name} as wanted",
+            f"{name} as wanted", timeout_s=timeout_s,
         )  # fmt: skip
         return stage(health, name) or {}
 
-    def until_told(self, text: str, after_ns: int, timeout_s: float = 10.0) -> int:
+    def until_told(self, text: str, after_ns: int = 0) -> int:
         """Wait until the pilot has been told of something since a time; when that was."""
         (told,) = self.autopilot.wait_for(
-            "STATUSTEXT", 1, timeout_s,
+            "STATUSTEXT", 1, PATIENCE_S,
             lambda got: got.monotonic_ns >= after_ns and text in got.message.text,
         )  # fmt: skip
         return told.monotonic_ns
@@ -192,8 +193,8 @@ class Flying:
     def assert_ceased(self, from_ns: int, limit_s: float = CEASE_S) -> None:
         """After what happened at a time the poses cease, soon, and the pilot is told."""
         # which may have happened already, on a machine that has too much to do
-        self.daemon.until(lambda health: not health["feedback"]["sending"], 10, "no poses")
-        self.daemon.until(lambda _: not self._is_told_on(), 10, "the pilot is told")
+        self.daemon.until(lambda health: not health["feedback"]["sending"], "no poses")
+        self.daemon.until(lambda _: not self._is_told_on(), "the pilot is told")
         took_s = self.poses.last_before_pause_s(from_ns)
         late_s = 1e-3 * (self.daemon.status()["pose_latency_p95_ms"] or 0.0)
         allowed_s = self.strain.allowed_s(limit_s, from_ns) + max(0.0, late_s - LATENCY_S)
@@ -234,8 +235,8 @@ class Flying:
     def assert_stops(self) -> None:
         """SIGTERM ends it well, and soon."""
         told_ns = time.monotonic_ns()
-        self.daemon.stop()
-        self.assert_soon(told_ns, time.monotonic_ns(), STOP_S)
+        took_s = self.daemon.stop()
+        self.assert_soon(told_ns, told_ns + round(took_s * 1e9), STOP_S)
 
 
 def source(health: dict[str, Any], name: str) -> dict[str, Any]:
