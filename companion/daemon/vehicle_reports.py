@@ -21,7 +21,6 @@ from companion.dense.obstacles import (
     unknown,
 )
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Pose
 from companion.messages import DepthMap, MapUpdate, PointChunk, Track, TrackState
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
@@ -69,7 +68,6 @@ class VehicleReports:
             self._camera_component = CameraComponent(link, clock, self._stream)
         self.computer_hz = COMPUTER_HZ
         """Rate of the computer's status, at most 5 Hz; 0: none."""
-        self._camera_from_body = Pose.identity()
         self.restart(None)
 
     def restart(self, camera: Camera | None) -> None:
@@ -83,8 +81,6 @@ class VehicleReports:
         self._seen = RecentCloud(), waiting
         """The cloud, which is the thread's of a round alone, and what the next round adds to it."""
         self._known_ns = 0
-        if camera is not None and camera.body_from_camera is not None:
-            self._camera_from_body = camera.body_from_camera.inverse()
 
     def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         """Take a track, a map update, a depth map or points."""
@@ -203,7 +199,7 @@ class VehicleReports:
             return None
         world_from_map = update.georeference.world_from_map
         world_from_body = (
-            world_from_map.apply_to_pose(track.map_from_camera) @ self._camera_from_body
+            world_from_map.apply_to_pose(track.map_from_camera) @ self._camera.camera_from_body
         )
         points, eyes, ages = seen
         is_seen = np.zeros(N_SECTORS, bool)

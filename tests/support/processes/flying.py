@@ -77,12 +77,12 @@ class Flying:
         self.autopilot.fly(at_monotonic_ns=0, arm=False)
         calibration = self.camera.write_calibration(folder / "camera.json")
         self._folder, self._program = folder, program
-        self.daemon = Daemon(
-            folder, "camera.source=network", f"camera.url={self.camera.url}",
+        self._settings = (
+            "camera.source=network", f"camera.url={self.camera.url}",
             f"camera.calibration={calibration}", f"link.url={self.autopilot.url}",
             "feedback.mode=odometry", "depth.enabled=false", *settings,
-            program=program,
         )  # fmt: skip
+        self.daemon = self._made()
         self._start = start
         self._open = ExitStack()
 
@@ -100,6 +100,10 @@ class Flying:
     ) -> None:  # fmt: skip
         self._open.close()
 
+    def _made(self) -> Daemon:
+        """Make a daemon, to be started."""
+        return Daemon(self._folder, *self._settings, program=self._program)
+
     def start(self) -> None:
         """Start the daemon, where that was left for later."""
         self._open.enter_context(self.daemon)
@@ -108,8 +112,9 @@ class Flying:
         """End the daemon by a signal, and start another; when it was sent."""
         sent_ns = time.monotonic_ns()
         self.daemon.send(number)
-        self.daemon.ended(30)
-        self.daemon = Daemon(self._folder, *self.daemon.settings, program=self._program)
+        run = self.daemon.ended(60)
+        assert number is not signal.SIGTERM or run.status == 0, run.status
+        self.daemon = self._made()
         self.start()
         return sent_ns
 
