@@ -17,7 +17,8 @@ from companion.daemon.nodes.kept_chunks import NAME
 from companion.errors import SourceError
 from drivers.system.status_socket import ask_status
 from tests.support.processes.two_namespaces import TwoNamespaces, why_not
-from tests.support.processes.zenoh_nodes import points_in, until
+from tests.support.processes.zenoh_nodes import points_in
+from tests.support.waiting import until
 
 FLIGHT = Path(__file__).parents[2] / "sample" / "survey"
 SLOWER = 3
@@ -114,14 +115,14 @@ def nodes(tmp_path: Path) -> Iterator[Nodes]:
 
 def test_the_ground_is_killed_and_restarted_and_its_map_grows_on(nodes: Nodes) -> None:
     ground, drone = nodes.ground(), nodes.drone()
-    until(lambda: nodes.kept_bytes() > 0, 100, "a cloud on the ground")
+    until(lambda: nodes.kept_bytes() > 0, "a cloud on the ground", 100)
     ground.kill()
     ground.wait()
     n_bytes, n_poses = nodes.kept_bytes(), nodes.pose_n()
-    until(lambda: nodes.pose_n() > n_poses + 15, 60, "poses without the ground")
+    until(lambda: nodes.pose_n() > n_poses + 15, "poses without the ground")
     assert nodes.kept_bytes() == n_bytes
     again = nodes.ground()
-    until(lambda: nodes.kept_bytes() > n_bytes + 1000, 100, "more cloud on the ground")
+    until(lambda: nodes.kept_bytes() > n_bytes + 1000, "more cloud on the ground", 100)
     again.send_signal(signal.SIGTERM)
     assert again.wait(60) == 0
     (folder,) = nodes.folder.glob("ground/*")

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.processes.booted_service import BootedService, told, until
+from tests.support.processes.booted_service import BootedService, told
 from tests.support.processes.container import Container, lacking
+from tests.support.waiting import until
 
 REPOSITORY = Path(__file__).parents[2]
 PACKAGES = sorted((REPOSITORY / "dist").glob("companion_*.deb"))
@@ -129,7 +130,7 @@ def test_killed_it_comes_back(container: Container, service: BootedService) -> N
     before = recordings(container)
     time.sleep(5)  # something to lose
     container.run("kill", "-KILL", service.shown("MainPID"))
-    until(lambda: service.shown("NRestarts") == "1", 30, "another start")
+    until(lambda: service.shown("NRestarts") == "1", "another start")
     service.until_flying()
     assert set(recordings(container)) > set(before)
     assert_readable(container, before)
@@ -141,7 +142,7 @@ def test_what_was_cut_short_is_repaired_unless_armed(
     n_before = int(service.shown("NRestarts"))
     # all its processes, as a power cut; systemd may complain of one that was quicker
     service.systemctl("kill", "--signal=KILL", "companion", check=False)
-    until(lambda: int(service.shown("NRestarts")) > n_before, 60, "another start")
+    until(lambda: int(service.shown("NRestarts")) > n_before, "another start")
     service.until_flying()
     names = recordings(container)[:-1]
     assert "cut short" in verified(container, names[-1])
@@ -151,7 +152,7 @@ def test_what_was_cut_short_is_repaired_unless_armed(
     def all_well() -> bool:
         return not any("cut short" in verified(container, name) for name in names)
 
-    until(all_well, 60, "no recording that is cut short")
+    until(all_well, "no recording that is cut short")
     assert_readable(container, names)
     said = service.run("journalctl", "--unit=companion", "--no-pager", "--lines=200")
     assert "an earlier recording was cut short: " in said and ": repaired, " in said
@@ -169,7 +170,7 @@ def test_a_wedged_pose_loop_is_ended_by_the_watchdog(
         container.run("pkill", "-STOP", "-x", "localisation", check=False)
         time.sleep(0.2)
     told(f"watchdog after {time.monotonic() - began_s:.0f} s")
-    until(lambda: int(service.shown("NRestarts")) > n_before, 60, "another start")
+    until(lambda: int(service.shown("NRestarts")) > n_before, "another start")
     service.until_flying()
     assert_readable(container, before)
 
@@ -256,7 +257,7 @@ def test_a_user_installs_one_of_his_own(container: Container) -> None:
     container.run("loginctl", "enable-linger", "pilot")
     own, service = "/opt/own/bin/companion", BootedService(container, "pilot")
     until(lambda: service.systemctl("is-system-running", check=False).strip() in ("running",
-          "degraded"), 60, "the user's service manager")  # fmt: skip
+          "degraded"), "the user's service manager")  # fmt: skip
     said = service.run(own, "install", "--user", "--config", "/srv/own.toml", "--now")
     told(said.splitlines()[-1])
     unit = home / ".config/systemd/user/companion.service"
@@ -265,7 +266,7 @@ def test_a_user_installs_one_of_his_own(container: Container) -> None:
     service.until_flying()
     time.sleep(5)
     service.run("kill", "-KILL", service.shown("MainPID"))
-    until(lambda: service.shown("NRestarts") == "1", 30, "another start")
+    until(lambda: service.shown("NRestarts") == "1", "another start")
     service.until_flying()
     said = service.run("companion", "flights", "list")
     told(said)

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import random
 import struct
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Coroutine
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,15 +73,6 @@ def split(data: bytes) -> list[Packet]:
     packets = stream.feed(data, 0)
     assert stream.n_bad_bytes == 0
     return packets
-
-
-async def until(holds: Callable[[], bool], timeout_s: float = 3.0) -> None:
-    """Wait for something that ought to come."""
-    for _ in range(round(timeout_s / 0.002)):
-        if holds():
-            return
-        await asyncio.sleep(0.002)
-    raise AssertionError(f"did not come within {timeout_s} s")
 
 
 @dataclass

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from typing import Any
 
 from tests.support.processes.container import Container
+from tests.support.waiting import until
 
 
 class BootedService:
@@ -52,7 +52,7 @@ class BootedService:
             return active and all(sources) and found.get("tracker") in ("tracking", "coasting")
 
         try:
-            until(flies, timeout_s, "a running service that tracks")
+            until(flies, "a running service that tracks", timeout_s)
         except AssertionError:
             told(self._container.run("journalctl", "--no-pager", "--lines=60"))
             raise
@@ -63,11 +63,3 @@ class BootedService:
 def told(*words: object) -> None:
     """Say how far it is, for whoever waits."""
     print(time.strftime("%H:%M:%S"), *words, flush=True)
-
-
-def until(such: Callable[[], Any], timeout_s: float, what: str) -> None:
-    """Wait for something; AssertionError where it does not come in time."""
-    until_s = time.monotonic() + timeout_s
-    while not such():
-        assert time.monotonic() < until_s, f"not within {timeout_s:g} s: {what}"
-        time.sleep(0.5)

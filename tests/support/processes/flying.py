@@ -19,7 +19,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from tests.support.cameras.http_camera import HttpCamera, world_from_body
 from tests.support.processes.daemon_process import PATIENCE_S, PROGRAM, Daemon
 from tests.support.processes.strain import Strain
 
+FlyingT = TypeVar("FlyingT", bound="Flying")
 PathOf = Callable[[int], Pose]
 """`world_from_body` by CLOCK_MONOTONIC, ns."""
 RANGE, IMU = ("DISTANCE_SENSOR",), ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU")
@@ -86,7 +87,7 @@ class Flying:
         self._start = start
         self._open = ExitStack()
 
-    def __enter__(self) -> Flying:
+    def __enter__(self: FlyingT) -> FlyingT:
         with ExitStack() as entering:
             parts = [self.strain, self.camera, self.autopilot]
             for part in parts + [self.daemon] * self._start:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -91,12 +90,3 @@ def points_in(folder: Path) -> int:
     found = re.search(r"element vertex (\d+)", head)
     assert found is not None
     return int(found[1])
-
-
-def until(such: Callable[[], bool], timeout_s: float, what: str) -> float:
-    """Wait for something; how long it took."""
-    began_s = time.monotonic()
-    while not such():
-        assert time.monotonic() - began_s < timeout_s, f"not within {timeout_s:g} s: {what}"
-        time.sleep(0.2)
-    return time.monotonic() - began_s

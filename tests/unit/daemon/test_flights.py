@@ -79,15 +79,15 @@ def test_a_flight_that_was_never_armed_leaves_nothing(
     config = Config(daemon=DaemonConfig(flights=str(tmp_path)))
     flight: Any = flights.begin(config, CAMERA, keep=False)
     mark = flights._mark
-    assert mark is not None and mark.wait(10.0)
+    assert mark is not None and mark.wait(60)
     assert [each.unarmed for each in flights_in(tmp_path)] == [True] and not flown_in(tmp_path)
     if armed:
         flights.keep()
-        assert mark.wait(10.0)
+        assert mark.wait(60)
         assert [each.path for each in flown_in(tmp_path)] == [flight.folder]
     flights.end()
     for thread in list(flights._ending.values()):
-        thread.join(10.0)
+        thread.join(60)
     assert flight.folder.exists() == armed
     assert flights._counter is not None
     flights._counter.close(10.0)
@@ -110,7 +110,7 @@ def test_results_are_waited_for_unless_in_a_hurry(
         written.set()
 
     def finish(_: Any) -> None:
-        said.append("results" if written.wait(10.0) else "none")
+        said.append("results" if written.wait(60) else "none")
 
     flight.hurry, flight.finish = hurry, finish
 

@@ -17,8 +17,8 @@ from tests.support.processes.zenoh_nodes import (
     ground_config,
     points_in,
     topics_of,
-    until,
 )
+from tests.support.waiting import until
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_a_node_goes_on_with_its_map_after_a_restart(tmp_path: Path, closing: Ex
         drone.step(message)
     folder = tmp_path / "ground" / "drone-a-flight"
     kept = folder / NAME
-    until(lambda: kept.exists() and kept.stat().st_size > 2000, 60, "a cloud")
+    until(lambda: kept.exists() and kept.stat().st_size > 2000, "a cloud")
     first.stop()
     n_first, n_kept = points_in(folder), kept.stat().st_size
     assert n_first > 50
@@ -50,7 +50,7 @@ def test_a_node_goes_on_with_its_map_after_a_restart(tmp_path: Path, closing: Ex
     assert points_in(folder) == n_first
     third = Ground(ground_config(endpoint, tmp_path))
     closing.callback(third.stop)
-    until(lambda: kept.stat().st_size > n_kept, 60, "more cloud")
+    until(lambda: kept.stat().st_size > n_kept, "more cloud")
     drone.finish(Finish(hurry=False))  # waits for who fetches
     third.stop()
     assert points_in(folder) > 1.3 * n_first
@@ -70,15 +70,15 @@ def test_the_drone_begins_anew_and_so_does_its_map(tmp_path: Path, closing: Exit
     with topics_of(endpoint, tmp_path) as topics:
         for message in messages[:180]:
             topics.step(message)
-        until(lambda: kept_bytes(folders[0]) > 2000, 60, "a cloud")
+        until(lambda: kept_bytes(folders[0]) > 2000, "a cloud")
     before = kept_bytes(folders[0])
     with topics_of(endpoint, tmp_path) as topics:  # the same flight, another process
         for message in messages[180:]:
             topics.step(message)
-        until(lambda: kept_bytes(folders[0]) > before, 60, "more of this cloud")
+        until(lambda: kept_bytes(folders[0]) > before, "more of this cloud")
     with topics_of(endpoint, tmp_path, "b-flight") as topics:
         for message in messages:
             topics.step(message)
-        until(lambda: kept_bytes(folders[1]) > 2000, 60, "a cloud of the next flight")
+        until(lambda: kept_bytes(folders[1]) > 2000, "a cloud of the next flight")
     ground.stop()
     assert all(points_in(folder) > 50 for folder in folders)

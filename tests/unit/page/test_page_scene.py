@@ -26,7 +26,8 @@ from companion.streaming.items import (
     PoseItem,
     Shown,
 )
-from tests.unit.streaming.test_stream_link import serving, tell, until
+from tests.support.waiting import until
+from tests.unit.streaming.test_stream_link import serving, tell
 from tests.unit.streaming.test_viewer_recording import CAMERA
 
 WORLD = Similarity(2.0, np.eye(3), np.array([10.0, 20.0, -5.0]))

@@ -7,8 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -21,9 +20,9 @@ from companion.runtime.fork_server import ForkServer
 from companion.runtime.stage_process import StageProcess
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stages import stage_named
+from tests.support.waiting import PATIENCE_S, until
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
-PATIENCE_S = 60.0
 DAEMON = """
 import sys, time
 from companion.runtime.fork_server import ForkServer
@@ -56,13 +55,6 @@ class Viewers:
         until(lambda: bool(self.ended))
         self.stage.kill()
         return self.ended[0]
-
-
-def until(such: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + PATIENCE_S
-    while not such():
-        assert time.monotonic() < until_s
-        time.sleep(0.01)
 
 
 @pytest.fixture

@@ -147,7 +147,7 @@ def test_keyframes_and_frames_precede_idle_work() -> None:
 
     worker = BackgroundMapping(turn, idle_work)
     worker.submit(lambda: job("first"))
-    assert begun.wait(5)
+    assert begun.wait(60)
     for k in range(3):
         with turn.tracking():
             order.append(f"frame {k}")
@@ -159,7 +159,7 @@ def test_keyframes_and_frames_precede_idle_work() -> None:
             return []
 
         worker.submit(second)
-        assert done.wait(5)
+        assert done.wait(60)
     enough.set()
     worker.close()
     assert order[:2] == ["first", "begun"]
@@ -177,7 +177,7 @@ def test_close_does_not_wait_for_idle_work() -> None:
 
     worker = BackgroundMapping(MapLock(), forever)
     worker.submit(list)
-    assert begun.wait(5)
+    assert begun.wait(60)
     worker.close()
     assert worker.done() == []
 

@@ -188,7 +188,7 @@ def test_frames_are_tracked_while_the_graph_of_a_loop_is_relaxed(
     def relaxed(*graph: Any) -> list[Similarity]:
         thread = threading.Thread(target=frame)
         thread.start()
-        thread.join(10.0)
+        thread.join(60)
         return relax(*graph)
 
     monkeypatch.setattr(map_merge, "relax", relaxed)

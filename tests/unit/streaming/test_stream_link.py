@@ -3,7 +3,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -18,6 +18,7 @@ from companion.streaming.item_codec import Kind, decode
 from companion.streaming.item_store import ItemStore
 from companion.streaming.items import COARSE, FlightItem, Item, PointsItem, PoseItem, Shown
 from companion.streaming.parts import parts_of
+from tests.support.waiting import until
 from tests.unit.streaming.test_stream_session import add_points, filled
 from tests.unit.streaming.test_viewer_recording import CAMERA
 
@@ -35,7 +36,7 @@ def serving(
         yield exporter, listener.getsockname()[1]
     finally:
         exporter.stop()
-        thread.join(5)
+        thread.join(60)
         listener.close()
         assert not thread.is_alive()
 
@@ -73,15 +74,8 @@ def watching(port: int) -> Iterator[Watching]:
     finally:
         viewer.may_take.set()
         stop.set()
-        thread.join(5)
+        thread.join(60)
         assert not thread.is_alive()
-
-
-def until(such: Callable[[], object], seconds: float = 10.0) -> None:
-    end = time.monotonic() + seconds
-    while not such():
-        assert time.monotonic() < end, "not in time"
-        time.sleep(0.01)
 
 
 def pose(t_ns: int) -> PoseItem:

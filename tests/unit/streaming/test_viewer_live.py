@@ -66,7 +66,7 @@ def test_an_exporter_that_dies_does_not_end_the_flight() -> None:
     with LiveViewer(ViewerConfig(), CAMERA) as viewer:
         assert viewer.stage.alive
         viewer.stage.interrupt()
-        assert viewer.stage.wait(10.0)
+        assert viewer.stage.wait(60)
         assert not viewer.stage.alive
         for seq in range(400):
             viewer.take(flown.frame(seq))
@@ -220,12 +220,12 @@ def test_inbox_blocks_until_there_is_capacity_or_it_is_closed() -> None:
     waiting.join(0.2)
     assert waiting.is_alive()
     inbox.get()
-    waiting.join(5)
+    waiting.join(60)
     assert not waiting.is_alive()
     second = threading.Thread(target=inbox.put, args=(image(2),))
     second.start()
     inbox.close()
-    second.join(5)
+    second.join(60)
     assert not second.is_alive()
     first = inbox.get()
     assert isinstance(first, Frame) and first.seq == 1

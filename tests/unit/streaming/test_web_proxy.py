@@ -41,7 +41,7 @@ def served(data: bytes) -> Iterator[int]:
         thread.start()
         yield server.getsockname()[1]
         server.shutdown(socket.SHUT_RDWR)
-    thread.join(5)
+    thread.join(60)
 
 
 @contextmanager
@@ -156,7 +156,7 @@ def test_a_connection_without_a_descriptor_costs_the_others_nothing(
             time.sleep(0.01)
         refusing = Refusing(monkeypatch, port, 1_000_000)
         stack.enter_context(socket.create_connection((LOOPBACK, port), timeout=10))
-        assert refusing.begun.wait(10)
+        assert refusing.begun.wait(60)
         first.sendall(b"give\n")
         assert all_of(first) == data
         assert refusing.n == 1, "it was not asked again and again"

@@ -212,7 +212,7 @@ def test_unplugged_and_back_under_another_number(webcam: FakeV4l2) -> None:
     feed = CameraFeed(V4l2Camera(config), FlightClock(), config, deliver, warned.append)
     feed.start()
     try:
-        assert came.wait(2)
+        assert came.wait(60)
         webcam.pull_out()
         deadline_s = time.monotonic() + 1
         while feed.health.state != "missing" and time.monotonic() < deadline_s:
@@ -221,7 +221,7 @@ def test_unplugged_and_back_under_another_number(webcam: FakeV4l2) -> None:
         webcam.plug_in(3)
         came.clear()
         plugged_in_s = time.monotonic()
-        assert came.wait(2)
+        assert came.wait(60)
         assert time.monotonic() - plugged_in_s < 1.0
         assert feed.health.state == "running"
         assert feed.health.n_reopened == 1

@@ -26,8 +26,9 @@ from drivers.mavlink.request_limit import EACH_BURST, MOST_ASKERS, RequestLimit
 from drivers.mavlink.status_text import TEXTS_AT_ONCE, WARNINGS_ONLY, TextLimit
 from drivers.mavlink.wire.packet_stream import MavlinkStream, decode
 from tests.support.autopilot.ground_station import asked
-from tests.support.autopilot.mavlink_link import Speaker, until
+from tests.support.autopilot.mavlink_link import Speaker
 from tests.support.autopilot.memory_port import MemoryPort
+from tests.support.waiting_in_loop import until
 
 SECOND = 1_000_000_000
 NUMBER = 31010

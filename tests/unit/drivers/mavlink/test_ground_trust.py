@@ -14,7 +14,8 @@ from drivers.mavlink.command_server import ACCEPTED, Command, CommandServer, Don
 from drivers.mavlink.ground_requests import GroundRequests
 from drivers.mavlink.parameter_server import ParameterServer
 from tests.support.autopilot.fake_wire import free_port
-from tests.support.autopilot.mavlink_link import Speaker, port_at, running, until
+from tests.support.autopilot.mavlink_link import Speaker, port_at, running
+from tests.support.waiting_in_loop import until
 
 NUMBER = 31010
 KEY = bytes(range(32))

@@ -23,8 +23,8 @@ from tests.support.autopilot.mavlink_link import (
     port_at,
     running,
     unknown,
-    until,
 )
+from tests.support.waiting_in_loop import until
 
 HOST = "127.0.0.1"
 KEY = bytes(range(100, 132))
@@ -85,15 +85,15 @@ def test_the_wire_pulled_and_plugged_again(tmp_path: Path) -> None:
             port, heard = port_at(f"serial:{tmp_path}/autopilot:57600"), Heard()
             async with running(port.run(heard)):
                 for _ in range(2):
-                    await until(lambda: port.connected, 1)
+                    await until(lambda: port.connected)
                     heard.messages.clear()
-                    await until(lambda: len(heard.messages) > 3, 1)
+                    await until(lambda: len(heard.messages) > 3)
                     autopilot.unplug()
                     await until(lambda: not port.connected)
                     port.send(heartbeat())
                     autopilot.plug()
                 assert port.n_dropped == 2
-                await until(lambda: port.connected, 1)
+                await until(lambda: port.connected)
 
     asyncio.run(play())
 

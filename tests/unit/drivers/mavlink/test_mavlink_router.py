@@ -30,8 +30,8 @@ from tests.support.autopilot.mavlink_link import (
     running,
     split,
     unknown,
-    until,
 )
+from tests.support.waiting_in_loop import until
 
 HOST = "127.0.0.1"
 

@@ -21,8 +21,9 @@ from drivers.mavlink.wire.transport import link_wire
 from drivers.mavlink.wire.udp_wire import PEER_SILENT_NS, KernelStamps, UdpWire
 from drivers.mavlink.wire.wire import STALLED_NS
 from tests.support.autopilot.fake_wire import PtyWire, free_port
-from tests.support.autopilot.mavlink_link import Ear, Speaker, running, until
+from tests.support.autopilot.mavlink_link import Ear, Speaker, running
 from tests.support.processes.waits import RECLAIMS, Waits
+from tests.support.waiting_in_loop import until
 
 HOST = "127.0.0.1"
 
@@ -179,7 +180,7 @@ def test_a_port_that_is_taken_is_named_and_then_used() -> None:
             async with running(wire.run(Ear())):
                 await until(lambda: "in use" in wire.trouble)
                 taken.close()
-                await until(lambda: wire.connected, 1)
+                await until(lambda: wire.connected)
                 assert wire.trouble == ""
 
     asyncio.run(scene())
@@ -189,7 +190,7 @@ def test_a_name_that_is_none_is_named() -> None:
     async def scene() -> None:
         wire = link_wire(link_endpoint("udpout:no-such-host.invalid:1"))
         async with running(wire.run(Ear())):
-            await until(lambda: "cannot be resolved" in wire.trouble, 6)
+            await until(lambda: "cannot be resolved" in wire.trouble)
 
     asyncio.run(scene())
 
@@ -361,7 +362,7 @@ def test_a_serial_line_has_one_owner(tmp_path: Path) -> None:
             async with running(second.run(Ear())):
                 await until(lambda: "in use by another program" in second.trouble)
                 owning.cancel()
-                await until(lambda: second.connected, 1)
+                await until(lambda: second.connected)
         cable.unplug()
 
     asyncio.run(scene())
@@ -431,7 +432,7 @@ def test_the_baud_rate_is_found(tmp_path: Path, baud: int) -> None:
             cable.unplug()
             await until(lambda: not wire.connected)
             cable.plug()
-            await until(lambda: wire.connected, 1)
+            await until(lambda: wire.connected)
             n_before = len(ear.packets)
             cable.send(speaker.attitude(1))
             await until(lambda: len(ear.packets) == n_before + 1)  # at once at the rate of before

@@ -5,7 +5,7 @@ import math
 import socket
 import struct
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import islice
 from pathlib import Path
@@ -25,6 +25,7 @@ from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import circle
 from tests.support.autopilot.fake_wire import free_port
 from tests.support.flights.sample_faults import read_tlog
+from tests.support.waiting_in_loop import until
 
 CLOCK = FlightClock()
 SAMPLE = Path(__file__).parents[4] / "sample" / "survey"
@@ -42,13 +43,6 @@ async def running(port: PymavlinkPort) -> AsyncIterator[Heard]:
         begun_s = time.monotonic()
         await asyncio.gather(task, return_exceptions=True)
         assert time.monotonic() - begun_s < 1.0
-
-
-async def until(true: Callable[[], Any], timeout_s: float = 5.0) -> None:
-    end_s = time.monotonic() + timeout_s
-    while not true():
-        assert time.monotonic() < end_s, "it did not come about"
-        await asyncio.sleep(0.005)
 
 
 def port_of(url: str, clients: tuple[str, ...] = (), **link: Any) -> PymavlinkPort:
@@ -253,7 +247,7 @@ def test_tcp_comes_back() -> None:
                 await asyncio.sleep(0.2)
                 heard.clear()
                 autopilot.plug()
-                await until(lambda: heard, 2.5)
+                await until(lambda: heard)
                 port.send(mavlink.MAVLink_timesync_message(0, 5))
                 await asyncio.to_thread(autopilot.wait_for, "TIMESYNC")
 
@@ -268,12 +262,12 @@ def test_serial_line_is_found_and_comes_back(tmp_path: Path) -> None:
             await until(lambda: str(device) in port.trouble)
             assert not port.connected
             with FakeAutopilot("px4", f"pty:{device}") as autopilot:
-                await until(lambda: heard, 2.0)
+                await until(lambda: heard)
                 autopilot.unplug()
-                await until(lambda: not port.connected, 2.0)
+                await until(lambda: not port.connected)
                 heard.clear()
                 autopilot.plug()
-                await until(lambda: heard, 2.0)
+                await until(lambda: heard)
                 port.send(mavlink.MAVLink_timesync_message(0, 5))
                 await asyncio.to_thread(autopilot.wait_for, "TIMESYNC")
 
@@ -285,7 +279,7 @@ def test_baud_is_found_out(tmp_path: Path) -> None:
         with FakeAutopilot("px4", f"pty:{tmp_path / 'tty'}:57600") as autopilot:
             port = port_of(autopilot.url.rsplit(":", 1)[0] + ":auto")
             async with running(port) as heard:
-                await until(lambda: "HEARTBEAT" in kinds(heard), 8.0)
+                await until(lambda: "HEARTBEAT" in kinds(heard))
 
     asyncio.run(fly())
 

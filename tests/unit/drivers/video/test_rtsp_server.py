@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 import threading
 import time
-from collections.abc import Callable
 
 import av
 import av.error
@@ -19,18 +18,12 @@ from companion.runtime.stage_protocol import Finish, Setup
 from companion.stages.video_work import NOT_WATCHED, work
 from drivers.video.rtsp_server import RtspServer
 from tests.support.cameras.rtsp_server import missing
+from tests.support.waiting import until
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 WIDTH, HEIGHT, RATE_HZ = 640, 480, 30
 N_BARS = 24
 BAR_PX = WIDTH // N_BARS
-
-
-def until(such: Callable[[], bool], timeout_s: float = 20.0) -> None:
-    until_s = time.monotonic() + timeout_s
-    while not such():
-        assert time.monotonic() < until_s
-        time.sleep(0.01)
 
 
 def picture(ms: int) -> Bytes:
