@@ -42,6 +42,10 @@ class Flown:
 
     begins_unix_s: float = 0.0
     """When its first picture was due."""
+    crowding: float = 1.0
+    """So many times more wanted a processor, on average, than there are: it drops frames then."""
+    first_pose_allowed_s: float = 0.0
+    """After arming; what this machine is given for it."""
     armed_ns: int = 0
     disarmed_ns: int = 0
     before_arming: list[tuple[Path, bool]] = field(default_factory=list)
@@ -116,6 +120,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
             (out.folder,) = daemon.flown()
             out.written = {path.name for path in out.folder.iterdir()}
             out.health_after = daemon.status()
+            now_ns = time.monotonic_ns()
+            out.crowding += strain.withheld_s(begins_ns, now_ns) / (1e-9 * (now_ns - begins_ns))
+            # scale, and one second of proof
+            out.first_pose_allowed_s = strain.allowed_s(12.0, out.armed_ns)
             with Daemon(folder, *settings) as second:  # with the socket of the first
                 out.second = second.ended(60)
             told_ns = time.monotonic_ns()
@@ -165,9 +173,8 @@ def test_odometry_comes_at_thirty_hertz(flown: Flown) -> None:
     rate_hz = (gaps_s < 0.25).sum() / sending_s
     print(f"{rate_hz:.1f} Hz for {sending_s:.1f} s of {came_s[-1] - came_s[0]:.1f} s")
     assert rate_hz > 29.0
-    # from scale and one second of proof to disarming
-    assert came_s[0] - flown.armed_ns * 1e-9 < 12.0
-    assert sending_s > 0.75 * (came_s[-1] - came_s[0])
+    assert came_s[0] - flown.armed_ns * 1e-9 < flown.first_pose_allowed_s
+    assert sending_s > 0.75 / flown.crowding * (came_s[-1] - came_s[0])
 
 
 def test_odometry_is_true(flown: Flown) -> None:
@@ -225,7 +232,7 @@ def test_results_are_left(flown: Flown) -> None:
     on_truth_clock = found.t_s - flown.begins_unix_s + TRUTH.t_s[0]
     result = score(Trajectory(on_truth_clock, found.centres, found.rotations), TRUTH)
     print(f"{result.n_common} frames, {result.ate_sim3_m:.2f} m, scale {result.scale_error:.1%}")
-    assert result.n_common > 0.7 * len(TRUTH.t_s)
+    assert result.n_common > 0.7 / flown.crowding * len(TRUTH.t_s)
     assert result.ate_sim3_m < 0.5
     assert result.scale_error < 0.03
     assert len(read_ply(flown.folder / "cloud.ply")) > 1000

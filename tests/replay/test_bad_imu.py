@@ -27,11 +27,6 @@ def flown(folder: Path, alter: Alter) -> Run:
     return run
 
 
-def n_sent(run: Run) -> int:
-    lines = (run.out / "poses_sent.tum").read_text().splitlines()
-    return sum(not line.startswith("#") for line in lines)
-
-
 def why_not(run: Run) -> str:
     (found,) = [each["first_detail"] for each in run.report["warnings"] if each["what"] == NOT_USED]
     return str(found)
@@ -45,14 +40,14 @@ def test_nothing_is_sent_by_one_that_is_wrong(tmp_path: Path, alter: Alter, word
     run = flown(tmp_path, alter)
     assert words in why_not(run)
     assert run.report["scale"] is None
-    assert n_sent(run) == 0
+    assert run.n_sent == 0
     assert run.report["tracked_share"] > 0.9
 
 
 def test_what_was_sent_before_it_was_saturated_is_metric(tmp_path: Path) -> None:
     run = flown(tmp_path, saturated(19.6133, FAILS_S))
     assert "saturated: its z axis ends at" in why_not(run)
-    assert n_sent(run) > 100
+    assert run.n_sent > 100
     found = score(read_tum(run.out / "poses_sent.tum"), TRUTH)
     assert found.n_common > 20
     assert found.scale_error < 0.05

@@ -26,11 +26,6 @@ def believing(out: Path, *words: str) -> Run:
     return replayed(out, f"telemetry.use={list(words)}")
 
 
-def n_sent(run: Run) -> int:
-    lines = (run.out / "poses_sent.tum").read_text().splitlines()
-    return sum(not line.startswith("#") for line in lines)
-
-
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return replayed(tmp_path_factory.mktemp("everything"))
@@ -40,7 +35,7 @@ def test_everything_is_believed_and_nothing_said_of_it(everything: Run) -> None:
     assert everything.report["believed"] == list(MEASUREMENTS)
     assert "telemetry.use" not in everything.stdout
     assert "is believed" not in (everything.out / "report.html").read_text("utf-8")
-    assert n_sent(everything) > 100
+    assert everything.n_sent > 100
 
 
 def test_each_source_of_positions_is_believed_by_itself(everything: Run, tmp_path: Path) -> None:
@@ -62,12 +57,12 @@ def test_attitude_alone_claims_no_scale(tmp_path: Path) -> None:
     assert run.report["scale"] is None and run.report["metres_per_unit"] is None
     assert run.report["unit"] == "map units" and run.report["origin"] is None
     assert "No metric scale was found" in (run.out / "report.html").read_text("utf-8")
-    assert n_sent(run) == 0
+    assert run.n_sent == 0
 
 
 def test_without_attitude_no_pose_is_sent(everything: Run, tmp_path: Path) -> None:
     """Metric it may be: the tilt of a pose cannot be checked."""
     run = believing(tmp_path, *(word for word in MEASUREMENTS if word != "attitude"))
     assert run.report["tracked_share"] > 0.9
-    assert n_sent(run) == 0
+    assert run.n_sent == 0
     assert "is believed (telemetry.use): without attitude no pose is sent\n" in run.stdout

@@ -30,6 +30,12 @@ class Run:
         report: dict[str, Any] = json.loads((self.out / "report.json").read_text("utf-8"))
         return report
 
+    @property
+    def n_sent(self) -> int:
+        """Poses that a live flight would have sent."""
+        lines = (self.out / "poses_sent.tum").read_text("utf-8").splitlines()
+        return sum(not line.startswith("#") for line in lines)
+
 
 def replay(flight: Path, out: Path, *options: str, timeout_s: float = 280) -> Run:
     """`companion replay`, in a process of its own."""
