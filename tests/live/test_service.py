@@ -8,7 +8,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -16,7 +16,8 @@ import pytest
 
 from companion.daemon.health_watch import PATIENCE_NS
 from companion.daemon.periodic_checks import NO_PROGRESS
-from tests.support.processes.daemon_process import PATIENCE_S, Daemon
+from tests.support.processes.daemon_process import Daemon
+from tests.support.waiting import PATIENCE_S, until
 
 PATTERN = ("camera.source=pattern", "daemon.flight=always", "recorder.enabled=false")
 
@@ -39,13 +40,6 @@ class ServiceManager:
         """When a notice came last."""
         return max((t_s for t_s, text in self.notices if text.startswith(start)), default=None)
 
-    def until(self, such: Callable[[], bool]) -> None:
-        """Wait until it has heard what it should."""
-        until_s = time.monotonic() + PATIENCE_S
-        while not such():
-            assert time.monotonic() < until_s, self.notices
-            time.sleep(0.02)
-
     def close(self) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as last:
             last.sendto(b"", self._socket.getsockname())
@@ -63,11 +57,11 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service
 
 def test_it_is_ready_when_its_stages_are(tmp_path: Path, manager: ServiceManager) -> None:
     with Daemon(tmp_path, *PATTERN, "depth.enabled=false") as daemon:
-        manager.until(lambda: manager.last_s("READY=1") is not None)
+        until(lambda: manager.last_s("READY=1") is not None)
         stages = {stage["name"]: stage for stage in daemon.status()["stages"]}
         assert all(stage["detail"] != "starting" for stage in stages.values()), stages
         daemon.stop()
-        manager.until(lambda: manager.last_s("STOPPING=1") is not None)
+        until(lambda: manager.last_s("STOPPING=1") is not None)
 
 
 def test_without_a_camera_it_is_not_ready(tmp_path: Path, manager: ServiceManager) -> None:
@@ -103,4 +97,4 @@ def test_a_pose_loop_that_hangs_for_good_is_left_to_the_watchdog(
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         daemon.until(lambda health: health["tracker"] == "tracking")
-        manager.until(lambda: (manager.last_s("WATCHDOG=1") or 0.0) > last_s)  # poses: it is alive
+        until(lambda: (manager.last_s("WATCHDOG=1") or 0.0) > last_s)  # poses: it is alive

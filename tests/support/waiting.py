@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-PATIENCE_S = 60.0
-"""So long is waited for what a quiet machine does in a moment: a slow one is no failure."""
+PATIENCE_S = 90.0
+"""So long is waited for what a quiet machine does in seconds: how soon is asked elsewhere."""
 LOOK_EVERY_S = 0.01
 
 

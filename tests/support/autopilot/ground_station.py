@@ -10,9 +10,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from tests.support.waiting import PATIENCE_S
+
 OURS = (1, 197)
-PATIENCE_S = 60.0
-"""Of one who waits for an answer from a machine with much to do."""
 
 
 def asked(message: Any, system: int = 255, component: int = 190) -> Any:

@@ -27,10 +27,9 @@ import psutil
 from companion.errors import SourceError
 from drivers.system.status_socket import ask_status
 from tests.support.processes.program import Run
+from tests.support.waiting import PATIENCE_S
 
 ASK_EVERY_S = 0.05
-PATIENCE_S = 90.0
-"""So long is waited for what a quiet machine does in seconds: how soon is asked elsewhere."""
 PROGRAM = ("-m", "companion")
 NO_GOVERNOR = """
 import sys

@@ -28,8 +28,9 @@ from tests.support.autopilot.fake_autopilot import FakeAutopilot
 from tests.support.autopilot.fake_flight import MadeUpFlight
 from tests.support.autopilot.received_poses import Array, Poses, poses_of
 from tests.support.cameras.http_camera import HttpCamera, world_from_body
-from tests.support.processes.daemon_process import PATIENCE_S, PROGRAM, Daemon
+from tests.support.processes.daemon_process import PROGRAM, Daemon
 from tests.support.processes.strain import Strain
+from tests.support.waiting import PATIENCE_S
 
 FlyingT = TypeVar("FlyingT", bound="Flying")
 PathOf = Callable[[int], Pose]

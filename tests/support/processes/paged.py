@@ -10,7 +10,6 @@ The settings of camera and autopilot are in the file, where the page changes the
 from __future__ import annotations
 
 import signal
-import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -19,6 +18,7 @@ from companion.page.codes import Codes, read_codes
 from tests.support.autopilot.fake_wire import free_port
 from tests.support.processes.daemon_process import Daemon
 from tests.support.processes.flying import Flying
+from tests.support.waiting import until
 
 FILE = """\
 # settings of a test
@@ -64,16 +64,16 @@ class Paged(Flying):
         self.until_served()
         return told_ns
 
-    def until_served(self, timeout_s: float = 30.0) -> None:
+    def until_served(self) -> None:
         """Wait until the page answers."""
-        until_s = time.monotonic() + timeout_s
-        while True:
-            try:
-                with urllib.request.urlopen(self.url, timeout=5):
-                    return
-            except (urllib.error.URLError, OSError):
-                assert time.monotonic() < until_s, "the page does not answer"
-                time.sleep(0.1)
+        until(self._answers, "the page answers")
+
+    def _answers(self) -> bool:
+        try:
+            with urllib.request.urlopen(self.url, timeout=20):
+                return True
+        except (urllib.error.URLError, OSError):
+            return False
 
     def codes(self) -> Codes:
         """Codes of the page."""
