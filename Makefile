@@ -20,10 +20,12 @@ demo: opencl
 # more, one after the other: a machine that others use too may be too busy for one, and in some files
 # one flight goes through all tests.
 test: lint opencl
-	$(BIN)/pytest -m "not real_time" -n 3 --dist loadfile
-	$(BIN)/pytest -m "real_time and not alone" -n 3 --dist loadfile || $(ONCE_MORE)
+	$(BIN)/pytest -m "not real_time" $(THREE)
+	$(BIN)/pytest -m "real_time and not alone" $(THREE) || $(ONCE_MORE)
 	$(BIN)/pytest tests/system tests/firmware || $(ONCE_MORE)
 
+# In the order in which they are found, which is that of tests/conftest.py: the longest files first.
+THREE = -n 3 --dist loadfile --no-loadscope-reorder
 ONCE_MORE = { [ $$? -eq 1 ] && $(BIN)/pytest -m real_time $$($(FAILED_FILES)); }
 FAILED_FILES := $(BIN)/python -c "import json; \
   failed = json.load(open('.pytest_cache/v/cache/lastfailed')); \
