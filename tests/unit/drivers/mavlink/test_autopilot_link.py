@@ -759,10 +759,10 @@ def test_commands_are_repeated_and_answers_to_others_ignored() -> None:
             talk.say(mavlink.MAVLink_command_ack_message(401, 0), 0.1)
             assert await asking == NO_ANSWER
             assert [each.confirmation for each in port.of("COMMAND_LONG")][-3:] == [0, 1, 2]
-            asking = asyncio.create_task(heard.link.command(400, 1, timeout_s=0.05, tries=1))
-            await asyncio.sleep(0.02)
+            asking = asyncio.create_task(heard.link.command(400, 1, timeout_s=0.3, tries=1))
+            await asyncio.sleep(0)  # it has asked
             talk.say(mavlink.MAVLink_command_ack_message(400, 5, 10, 0, 1, 197), 0.2)
-            await asyncio.sleep(0.1)  # longer than it would have been waited for
+            await asyncio.sleep(0.6)  # longer than it would have been waited for
             assert not asking.done()
             talk.say(mavlink.MAVLink_command_ack_message(400, 4, 0, 0, 1, 197), 0.3)
             assert await asking == mavlink.MAV_RESULT_FAILED

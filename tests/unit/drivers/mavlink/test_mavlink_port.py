@@ -109,11 +109,13 @@ def test_sequence_numbers_are_each_component_s_own(tmp_path: Path) -> None:
             for i in range(300):
                 port.identity = (1, 191 + i % 2)
                 port.send(heartbeat())
-            await asyncio.sleep(0.02)
             got = bytearray()
-            while data := b"".join(cable.receive()):
-                got += data
-                await asyncio.sleep(0.01)
+
+            def n_got() -> int:
+                got.extend(b"".join(cable.receive()))
+                return len(got)
+
+            await until(lambda: n_got() >= 300 * 21)
             assert port.n_dropped == 0
             packets = [got[i : i + 21] for i in range(0, len(got), 21)]
             for component in (191, 192):

@@ -262,14 +262,17 @@ async def steady(scene: Scene, other: Side, seconds: float = 0.5) -> list[float]
             latencies.append((scene.heard.times_ns[-1] - sent_ns) * 1e-9)
         scene.autopilot.hear()
         other.hear()
-    await asyncio.sleep(0.05)
     n_expected = round(seconds * 100)
-    assert len(scene.heard.of("ATTITUDE")) - n_before == n_expected
-    ours = [p for p in scene.autopilot.hear() if p.message_id == 30 and p.component == 197]
-    assert len(ours) == n_expected
+
+    def came() -> tuple[int, int, int]:
+        """Attitudes: to us, ours to the autopilot, and all of both to the other client."""
+        ours = [p for p in scene.autopilot.hear() if p.message_id == 30 and p.component == 197]
+        n_other = sum(p.message_id == 30 for p in other.hear())
+        return len(scene.heard.of("ATTITUDE")) - n_before, len(ours), n_other
+
+    await until(lambda: min(came()) >= n_expected and came()[2] >= 2 * n_expected)
+    assert came() == (n_expected, n_expected, 2 * n_expected)
     assert scene.port.n_dropped == 0
-    # the other client got all of both as well
-    assert sum(p.message_id == 30 for p in other.hear()) == 2 * n_expected
     return latencies
 
 
