@@ -201,7 +201,9 @@ def test_a_new_map_raises_the_reset_counter(flying: Flying, ground: GroundStatio
     flying.daemon.line("ground: a new map begins", after_ns=began_ns)
     flying.daemon.line("flight over", after_ns=began_ns)
     assert json.loads((flying.daemon.flights / before["flight"] / "report.json").read_text())
-    assert all((path / "flight.mcap").exists() for path in flying.daemon.flown())
+    flying.daemon.until(
+        lambda _: all((path / "flight.mcap").exists() for path in flying.daemon.flown()), "recorded"
+    )
     flying.until_sending(MAP_S)
     assert flying.poses.resets[-1] >= n_resets
 
