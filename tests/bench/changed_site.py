@@ -53,9 +53,10 @@ def path(lines: list[tuple[float, float, float]], yaw_rad: float) -> Callable[[f
     return at
 
 
-def site(work: Path, seed: int, after: bool) -> SiteMap:
-    """The map of the flight before or after."""
-    kept = work / f"{seed}_{'after' if after else 'before'}.map"
+def site(work: Path, seed: int, after: bool, known: SiteMap | None = None) -> SiteMap:
+    """The map of the flight before or after, the latter flown in a `known` one too."""
+    name = f"{seed}_{'after' if after else 'before'}{'_in_map' if known else ''}"
+    kept = work / f"{name}.map"
     if kept.exists():
         return read_site_map(kept).site
     ground = Terrain(seed, plane=True, pattern=leaves)
@@ -65,17 +66,33 @@ def site(work: Path, seed: int, after: bool) -> SiteMap:
     lines = [(-14.0, 14.0, -7.0), (14.0, -14.0, 0.0), (-14.0, 14.0, 7.0)]
     if after:
         lines = [(14.0, -14.0, 5.0), (-14.0, 14.0, -1.0), (14.0, -14.0, -6.0)]
-    flown = fly(CAMERA, path(lines, 0.5 if after else 0.0), ground, 24.0, RATE_HZ)
+    ned_from_body = path(lines, 0.5 if after else 0.0)
+    flown = fly(CAMERA, ned_from_body, ground, 24.0, RATE_HZ, site=known)
     made = flown.stage.site_map("after" if after else "before", None)
     assert made is not None
+    n_points = len(made.points.positions)
     print(
-        f"{'after' if after else 'before'}: {len(made.keyframes)} keyframes, "
-        f"{len(made.points.positions)} points, {flown.placed_share:.0%} placed",
+        f"{name}: {len(made.keyframes)} keyframes, {n_points} points, "
+        f"{flown.placed_share:.0%} placed; {', '.join(flown.warnings)}",
         flush=True,
     )
     work.mkdir(parents=True, exist_ok=True)
     write_site_map(kept, made)
     return made
+
+
+def of_before(site: SiteMap) -> tuple[int, int]:
+    """Points of the first flight alone: on top of what went or moved; all others."""
+    of_first = np.zeros(len(site.points.positions), bool)
+    for keyframe in (k for k, part in zip(site.keyframes, site.part_of, strict=True) if not part):
+        of_first[keyframe.point_ids[keyframe.point_ids >= 0]] = True
+    on_things = np.zeros(len(of_first), bool)
+    at = site.points.positions
+    for kind, size, height, there, _, _ in THINGS:
+        if kind != "new":
+            inside = np.abs(at[:, :2] - np.array(there) - size / 2).max(1) < size / 2
+            on_things |= inside & (np.abs(at[:, 2] + height) < 0.25)
+    return int((of_first & on_things).sum()), int((of_first & ~on_things).sum())
 
 
 def main() -> None:
@@ -104,6 +121,13 @@ def main() -> None:
                 off = near[0].moved_m[:2] - (np.array(then) - np.array(there))
                 told += f", its shift off by {np.linalg.norm(off):.2f} m"
         print(f"{kind} {size} m wide, {height} m high: {told}")
+    (on_before, rest_before), (on_after, rest_after) = (
+        of_before(each) for each in (before, site(options.work, options.seed, True, before))
+    )
+    print(
+        f"flown in and saved again: {on_after} of {on_before} points on what went are left, "
+        f"{rest_after} of {rest_before} others"
+    )
     for each in unclaimed:
         print(
             f"FALSE {each.kind} at {each.centre_m.round(1)}, {len(each.points_m)} points, "

@@ -13,6 +13,7 @@ from companion.app.replay.poses_sent import PosesSent
 from companion.config import Config
 from companion.config_file import load_config
 from companion.estimation.localisation import LocalisationStage
+from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (
     Pose,
@@ -24,6 +25,7 @@ from companion.messages import Bytes, Frame, KeyframeAdded, Odometry, Track, War
 from companion.products.flight_result import FlightResult
 from companion.products.trajectory_error import Path, PathErrors, path_errors
 from companion.runtime.in_order import in_order_of_time
+from companion.slam.map.site_map import SiteMap
 from companion.telemetry import (
     AttitudeSample,
     ImuSample,
@@ -167,9 +169,11 @@ class Flown:
 def fly(
     camera: Camera, ned_from_body: PathOf, terrain: Terrain, seconds: float, rate_hz: float,
     *, told: bool = True, dropout_s: tuple[float, float] = (0.0, 0.0), exposure_s: float = 0.0,
-    imu_seed: int | None = None, settings: Sequence[str] = (),
+    imu_seed: int | None = None, settings: Sequence[str] = (), site: SiteMap | None = None,
 ) -> Flown:  # fmt: skip
     """Fly, in lockstep; without `told` there is no telemetry, and the mount is not known.
+
+    With `site` it is flown in the map of an earlier flight.
 
     From the first to the second time of `dropout_s` the picture is white. Frames are stamped in the
     middle of an exposure, in which what moves blurs. With `imu_seed` there is a noisy IMU, too.
@@ -178,9 +182,9 @@ def fly(
     if not told:
         camera = replace(camera, body_from_camera=None)
     config = load_config(None, list(settings))
-    flown = Flown(
-        LocalisationStage(config, camera, lambda _: nullcontext()), sent=PosesSent(config)
-    )
+    use = None if site is None else SiteUse(site, camera, None)
+    stage = LocalisationStage(config, camera, lambda _: nullcontext(), site=use)
+    flown = Flown(stage, sent=PosesSent(config))
     n = round(seconds * rate_hz)
     poses = [(_ns(k / rate_hz), ned_from_body(k / rate_hz) @ mount) for k in range(n)]
     within_s = exposure_s * (np.arange(N_EXPOSED) / N_EXPOSED - 0.5 + 0.5 / N_EXPOSED)
