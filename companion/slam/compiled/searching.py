@@ -23,6 +23,8 @@ from companion.slam.compiled.compiling import (
 Words = NDArray[np.uint64]
 
 CELL_PX = 32.0
+RUN = 32
+"""Features whose distances to an epipolar line are looked at together: most runs have none near."""
 N_NEAREST = 12
 """Features examined around a pixel."""
 _FAR = np.float32(1000.0)
@@ -151,25 +153,37 @@ def search_along(
     3) of the first.
     """
     n, far = len(rays), 1000
-    off = np.empty(n, np.float32)
     best_of_a, bits_of_a = np.full(len(lines), -1, np.int64), np.full(len(lines), far, np.int64)
     second_of_a = np.full(len(lines), far, np.int64)
     best_of_b, bits_of_b = np.full(n, -1, np.int64), np.full(n, far, np.int64)
+    # along rows, and what is left of the last run beyond reach
+    n_runs = -(-n // RUN)
+    along, within = np.zeros((3, n_runs * RUN), np.float32), np.zeros(n_runs * RUN)
+    along[:, :n], within[:n] = rays.T, reach
+    off = np.empty(RUN, np.float32)
     for a in range(len(lines)):
         x, y, z = lines[a, 0], lines[a, 1], lines[a, 2]
-        for b in range(n):
-            off[b] = abs(x * rays[b, 0] + y * rays[b, 1] + z * rays[b, 2])
-        for b in range(n):
-            if not off[b] < reach[b] or abs(octaves_a[a] - octaves_b[b]) > max_octave_gap:
+        for start in range(0, n_runs * RUN, RUN):
+            n_near = 0
+            for k in range(RUN):
+                off[k] = abs(
+                    x * along[0, start + k] + y * along[1, start + k] + z * along[2, start + k]
+                )
+                n_near += off[k] < within[start + k]
+            if n_near == 0:
                 continue
-            bits = _differing_bits(words_a[a], words_b[b])
-            if bits < bits_of_a[a]:
-                second_of_a[a] = bits_of_a[a]
-                best_of_a[a], bits_of_a[a] = b, bits
-            elif bits < second_of_a[a]:
-                second_of_a[a] = bits
-            if bits < bits_of_b[b]:
-                best_of_b[b], bits_of_b[b] = a, bits
+            for k in range(RUN):
+                b = start + k
+                if not off[k] < within[b] or abs(octaves_a[a] - octaves_b[b]) > max_octave_gap:
+                    continue
+                bits = _differing_bits(words_a[a], words_b[b])
+                if bits < bits_of_a[a]:
+                    second_of_a[a] = bits_of_a[a]
+                    best_of_a[a], bits_of_a[a] = b, bits
+                elif bits < second_of_a[a]:
+                    second_of_a[a] = bits
+                if bits < bits_of_b[b]:
+                    best_of_b[b], bits_of_b[b] = a, bits
     good = np.zeros(len(lines), np.bool_)
     for a in range(len(lines)):
         b = best_of_a[a]

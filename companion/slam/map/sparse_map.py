@@ -14,6 +14,7 @@ import numpy as np
 from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Bytes
+from companion.slam.compiled.observing import n_marked, observed
 from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.features.patches import Patches, cut, level_of
@@ -291,9 +292,7 @@ class SlamMap:
 
     def observations_of(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
         """Features and living points (same length) that a keyframe observes."""
-        ids = keyframe.point_ids
-        features = np.flatnonzero((ids >= 0) & self.alive[np.maximum(ids, 0)])
-        return features, ids[features]
+        return observed(keyframe.point_ids, self.alive)
 
     def update_geometry(self, points: Ints, keyframes: list[Keyframe]) -> None:
         """Recompute viewing direction and base distance of `points` from `keyframes`.
@@ -326,13 +325,13 @@ class SlamMap:
         Only candidates that are frequent among the latest observers of the points are counted.
         """
         points = points[self.alive[points]]
-        mask = np.zeros(self.n_points + 1, bool)
+        mask = np.zeros(self.n_points, bool)
         mask[points] = True
         observations_of = self.observers[points].ravel()
         keys, often = np.unique(observations_of[observations_of >= 0], return_counts=True)
         order = np.lexsort((keys, -often))[:MAX_COVISIBLE_CANDIDATES]
         near = [self.keyframes[k] for k in keys[order].tolist() if k in self.keyframes]
-        counts = [(int(np.count_nonzero(mask[k.point_ids])), k.keyframe_id) for k in near]
+        counts = [(n_marked(k.point_ids, mask), k.keyframe_id) for k in near]
         return sorted((c for c in counts if c[0] >= minimum), key=lambda c: (-c[0], c[1]))
 
     def pose_of(self, keyframe_id: int) -> Pose | None:

@@ -113,3 +113,15 @@ def test_one_observation_moves_as_several_do(slam_map: SlamMap) -> None:
     slam_map.add_observations(keyframe, np.array([feature]), np.array([kept]))
     for name, values in moved.items():
         np.testing.assert_array_equal(getattr(slam_map, name), values)
+
+
+def test_dead_points_are_not_observed(slam_map: SlamMap) -> None:
+    keyframe = slam_map.keyframes[7]
+    keyframe.point_ids[::3] = -1
+    slam_map.alive[keyframe.point_ids[1::6]] = False
+    ids = keyframe.point_ids
+    features = np.flatnonzero((ids >= 0) & slam_map.alive[np.maximum(ids, 0)])
+    found, points = slam_map.observations_of(keyframe)
+    assert 0 < len(features) < np.count_nonzero(ids >= 0)
+    np.testing.assert_array_equal(found, features)
+    np.testing.assert_array_equal(points, ids[features])
