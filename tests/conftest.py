@@ -22,7 +22,8 @@ LONGEST = (
     "test_two_nodes", "test_flown_by_vision", "test_as_flown", "test_ground_control",
     "test_whole_flight", "test_stage_faults", "test_page_in_browser", "test_set_up_in_browser",
     "test_autopilot_link", "test_autopilot_faults", "test_restart_in_flight", "test_recording",
-    "test_camera_faults", "test_device_faults",
+    "test_camera_faults", "test_device_faults", "test_service", "test_armed_settings",
+    "test_daemon_limits",
 )  # fmt: skip
 """Files in real time that take most of a minute or more. They begin first, for workers of
 pytest-xdist to end together; of what only computes the whole replays begin first."""

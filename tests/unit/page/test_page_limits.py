@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 
 from companion.page import bounded_server
 from tests.support.served_page import ELSEWHERE, HERE, ServedPage
+from tests.support.waiting import until
 
 
 @pytest.fixture
@@ -89,10 +89,7 @@ def test_who_takes_no_answer_is_closed(served: ServedPage, monkeypatch: pytest.M
         peer.sendall(request)
         assert peer.recv(12) == b"HTTP/1.1 200"
         assert get(served) == 200  # others are served meanwhile
-        until_s = time.monotonic() + 10
-        while served.server.server_state.connections:
-            assert time.monotonic() < until_s
-            time.sleep(0.01)
+        until(lambda: not served.server.server_state.connections)
 
 
 def test_there_are_so_many_connections_and_no_more(
@@ -108,10 +105,7 @@ def test_there_are_so_many_connections_and_no_more(
             while True:  # until all eight have been accepted
                 get(served)
         assert len(peers) == 8
-    until_s = time.monotonic() + 10
-    while served.server.server_state.connections:
-        assert time.monotonic() < until_s
-        time.sleep(0.01)
+    until(lambda: not served.server.server_state.connections)
     assert get(served) == 200
 
 

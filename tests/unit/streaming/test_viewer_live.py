@@ -44,6 +44,7 @@ def hanging_peer() -> Iterator[str]:
         yield f"rerun+http://127.0.0.1:{server.getsockname()[1]}/proxy"
 
 
+@pytest.mark.real_time
 def test_a_viewer_that_hangs_neither_stalls_nor_outlives_the_flight() -> None:
     frames = [image(seq) for seq in range(30)]
     with hanging_peer() as address:

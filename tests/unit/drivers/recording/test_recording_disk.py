@@ -105,6 +105,7 @@ def test_the_oldest_flights_make_room_but_not_those_to_be_kept(small_disk: Path)
     assert opened(small_disk / "2026-01-01T00-00-00Z").n_frames == 75
 
 
+@pytest.mark.real_time
 def test_a_slow_disk_makes_nobody_wait_and_costs_pictures_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

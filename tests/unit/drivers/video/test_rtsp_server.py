@@ -39,6 +39,7 @@ def told_ms(grey: Bytes) -> int:
     return sum(int(row[BAR_PX * bit + BAR_PX // 2] > 127) << bit for bit in range(N_BARS))
 
 
+@pytest.mark.real_time
 def test_a_stage_shows_what_it_is_given_and_works_only_while_somebody_watches() -> None:
     config = Config(
         camera=CameraConfig(rate_hz=RATE_HZ), video=VideoConfig(listen="127.0.0.1:0"),
