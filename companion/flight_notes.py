@@ -1,4 +1,4 @@
-"""Notes of a flight beside its measurements: bytes of the link, steps of the pose gate, health.
+"""Notes of a flight beside its measurements: bytes of the link, steps of the gates, health.
 
 They go to the recording, for a replay as flown.
 """
@@ -30,19 +30,17 @@ class LinkReads:
 
 @dataclass(frozen=True, slots=True)
 class GateStep:
-    """One call of the pose gate, with its inputs; see `estimation.gate_journal`.
+    """One call of a gate of what the autopilot is sent; see `estimation.gate.gate_journal`.
 
-    `t_ns` is the time of the call, `n_attitudes` the number of attitudes since the begin of the
-    flight. `counter` is the reset counter afterwards; `counter_sent` is True once this boot of the
-    autopilot was sent a pose, `sent` if the autopilot was heard, so that a pose of this call went
-    out.
+    `t_ns` is the time of the call, `n_samples` the number of samples that the gate took since the
+    begin of the flight. `sent` is True if what this call gave went out; `values` are its inputs
+    that nothing else in the recording tells.
     """
 
     t_ns: int
+    gate: str
     what: str
-    n_attitudes: int
-    counter: int
-    counter_sent: bool
+    n_samples: int
     sent: bool
     values: Mapping[str, Any]
 

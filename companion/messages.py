@@ -165,7 +165,8 @@ class FrameTracked:
 
     `n_samples` of telemetry had been taken since the beginning. `mapping_point` is where mapping
     stood, see `companion.slam.mapping.mapping_worker.MapLock`; `feature_ratio` the load level.
-    `has_picture` is False of a FrameOverdue.
+    `has_picture` is False of a FrameOverdue. `origin` is that of local NED in latitude, longitude
+    (degrees) and altitude (m), where it was told since the frame before and a site map is in use.
     """
 
     t_ns: int
@@ -174,6 +175,17 @@ class FrameTracked:
     mapping_point: int
     feature_ratio: float
     has_picture: bool = True
+    origin: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SiteMapUsed:
+    """The map of an earlier flight that this one uses: its file, revision and BLAKE2b digest."""
+
+    t_ns: int
+    path: str
+    revision: int
+    digest: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -382,5 +394,5 @@ class ClockReport:
 Message = (
     Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
     | PointChunk | Warned | Georeferenced | FrameTracked | FrameOverdue | OpticalFlow
-    | LandingTarget
+    | LandingTarget | SiteMapUsed
 )  # fmt: skip

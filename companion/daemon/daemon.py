@@ -29,25 +29,17 @@ from companion.daemon.link_watch import LinkWatch
 from companion.daemon.loop_delay import measure_loop_delay
 from companion.daemon.page_child import PageChild, SettingsSource
 from companion.daemon.periodic_checks import PeriodicChecks
-from companion.daemon.pose.flow_sender import FlowSender
-from companion.daemon.pose.global_sender import GlobalSender
-from companion.daemon.pose.kept_counter import counter_path
-from companion.daemon.pose.landing_sender import LandingSender
-from companion.daemon.pose.pose_sender import PoseSender
-from companion.daemon.pose.source_switch import SourceSwitch
+from companion.daemon.pose.senders import Senders
 from companion.daemon.recorder_notes import RecorderNotes
 from companion.daemon.status_document import StatusDocument
 from companion.daemon.stop_request import StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
-from companion.estimation.satellites.satellite_watch import doubts
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import (
     NO_PICTURE,
     Frame,
     Georeferenced,
-    LandingTarget,
     Odometry,
-    OpticalFlow,
     Warned,
 )
 from companion.meters import LatencyMeter
@@ -57,8 +49,6 @@ from companion.runtime.stage_protocol import ResultsWritten, Snapshot
 from companion.runtime.stage_start import Start
 from companion.telemetry import (
     ArmedSample,
-    AttitudeSample,
-    PositionSample,
     Telemetry,
     belief_in_words,
 )
@@ -107,11 +97,7 @@ class Daemon:
             camera_source(config.camera), clock, config.camera, self._on_frame, self._on_warned
         )
         self._link: AutopilotLink | None = None
-        self._sender: PoseSender | None = None
-        self._flow_sender: FlowSender | None = None
-        self._landing_sender: LandingSender | None = None
-        self._global_sender: GlobalSender | None = None
-        self._source_switch: SourceSwitch | None = None
+        self._senders: Senders | None = None
         self._reports: VehicleReports | None = None
         self._ground: GroundControl | None = None
         link_watch: LinkWatch | None = None
@@ -122,39 +108,23 @@ class Daemon:
             self._link = AutopilotLink(
                 config.link, port, clock, self._on_telemetry, self._on_warned
             )
-            self._sender = PoseSender(
-                config.feedback, self._link, clock, counter_path(config.daemon.flights),
-                self._on_warned, lambda step: self._flights.take(step),
-            )  # fmt: skip
-            self._flow_sender = FlowSender(config.feedback, self._link, clock)
-            if config.landing.marker != "off":
-                self._landing_sender = LandingSender(
-                    config.landing, self._link, clock, config.telemetry.use
-                )
-            if config.feedback.global_position != "off":
-                self._global_sender = GlobalSender(
-                    config.feedback, self._link, clock, config.telemetry.use
-                )
-            if config.gps.switch_source:
-                self._source_switch = SourceSwitch(
-                    config.gps, self._link, clock, self._sends_poses,
-                    lambda: self._flights.current, self._on_warned,
-                )  # fmt: skip
+            self._senders = Senders(
+                config, self._link, clock, self._on_warned, lambda step: self._flights.take(step)
+            )
             date = AutopilotDate(self._link)
         dates = FlightDates(
             clock, lambda: date.ahead_ns if date is not None else None, clock_is_set
         )
         self._flights = flights = Flights(clock, journal, self._listener, self._facts, dates, start)
         self._watch = watch = HealthWatch(
-            config, clock, journal, self._feed, self._link, self._sender, self._flow_sender,
-            self._landing_sender, self._global_sender, flights, self._loop_delay,
-        )  # fmt: skip
+            config, clock, journal, self._feed, self._link, self._senders, flights, self._loop_delay
+        )
         watch.set_by_ground = settings.by_ground
         self._notes = RecorderNotes(clock, flights, watch, self._link)
         if self._link is not None:
             self._reports = VehicleReports(self._link, clock, watch, config)
         self._starts = starts = FlightStarts(
-            settings, self._feed, flights, self._sender, self._reports, watch, journal, self._stop,
+            settings, self._feed, flights, self._senders, self._reports, watch, journal, self._stop,
             lambda why: self._on_warned(Warned(clock.now_ns(), NOT_BEGUN, why)),
         )  # fmt: skip
         if self._link is not None and self._reports is not None and config.control.enabled:
@@ -231,11 +201,9 @@ class Daemon:
             self._recovery.run(),
         ]
         feedback = self._settings.config.feedback
-        for part in (self._link, self._sender, self._reports, self._ground, self._page):
+        for part in (self._link, self._senders, self._reports, self._ground, self._page):
             if part is not None:
                 work.append(part.run())
-        if self._source_switch is not None:
-            work.append(self._source_switch.run())
         if self._link is not None and feedback.set_origin:
             keeper = OriginKeeper(
                 feedback, self._link, self._journal.say,
@@ -274,32 +242,12 @@ class Daemon:
                 self._soon(self._tell_pilot, text)
         self._soon(self._flights.take, warning)
 
-    def _take_doubt(self, warning: Warned) -> None:
-        """Take a change of the current flight's verdict on satellites; in the event loop."""
-        doubted = doubts(warning)
-        if doubted is None:
-            return
-        if self._global_sender is not None:
-            self._global_sender.doubt_satellites(doubted)
-        if self._source_switch is not None:
-            self._source_switch.doubt_satellites(doubted)
-
     def _on_telemetry(self, sample: Telemetry) -> None:
         """Take a sample; in the event loop."""
         self._flights.take(sample)
-        if isinstance(sample, AttitudeSample):
-            if self._sender is not None:
-                self._sender.take_attitude(sample)
-            if self._flow_sender is not None:
-                self._flow_sender.take_attitude(sample)
-            if self._landing_sender is not None:
-                self._landing_sender.take_attitude(sample)
-            if self._global_sender is not None:
-                self._global_sender.take_attitude(sample)
-        elif isinstance(sample, PositionSample):
-            if self._global_sender is not None:
-                self._global_sender.take_position(sample)
-        elif isinstance(sample, ArmedSample):
+        if self._senders is not None:
+            self._senders.take_sample(sample)
+        if isinstance(sample, ArmedSample):
             self._starts.set_armed(sample.armed)
 
     def _listener(self, flight: LiveFlight) -> Listener:
@@ -312,7 +260,8 @@ class Daemon:
 
             return lambda message: self._soon(later, message)
 
-        take_doubt = current(self._take_doubt)
+        senders = self._senders
+        take_doubt = current(senders.take_doubt if senders is not None else _nothing)
 
         def warned(warning: Warned) -> None:
             self._on_warned(warning)
@@ -321,8 +270,8 @@ class Daemon:
         reports = self._reports if self._settings.config.feedback.obstacle_distance else None
         return Listener(
             odometry=current(self._on_odometry),
-            flow=current(self._on_flow),
-            landing=current(self._on_landing),
+            flow=current(senders.take_flow if senders is not None else _nothing),
+            landing=current(senders.take_landing if senders is not None else _nothing),
             georeferenced=current(self._on_georeferenced),
             warned=warned,
             localisation_died=lambda: self._soon(self._starts.localisation_died, flight),
@@ -336,25 +285,13 @@ class Daemon:
     def _on_odometry(self, odometry: Odometry) -> None:
         if odometry.seq < NO_PICTURE:
             self._watch.take_odometry(odometry)
-        if self._sender is not None:
-            self._sender.take(odometry)
-        if self._global_sender is not None:
-            self._global_sender.of_flight(self._flights.current)
-            self._global_sender.take(odometry)
+        if self._senders is not None:
+            self._senders.take_odometry(odometry)
 
     def _on_georeferenced(self, told: Georeferenced) -> None:
         self._watch.take_georeference(told)
-        if self._global_sender is not None:
-            self._global_sender.of_flight(self._flights.current)
-            self._global_sender.take_georeference(told)
-
-    def _on_flow(self, flow: OpticalFlow) -> None:
-        if self._flow_sender is not None:
-            self._flow_sender.take(flow)
-
-    def _on_landing(self, target: LandingTarget) -> None:
-        if self._landing_sender is not None:
-            self._landing_sender.take(target)
+        if self._senders is not None:
+            self._senders.take_georeference(told)
 
     def _on_snapshot(self, snapshot: Snapshot) -> None:
         if self._ground is not None:
@@ -369,12 +306,8 @@ class Daemon:
     def _reconfigured(self, old: Config, config: Config) -> None:
         self._checks.reconfigure(old, config)
         self._watch.reconfigure(config)
-        if self._sender is not None:
-            self._sender.reconfigure(config.feedback)
-        if self._flow_sender is not None:
-            self._flow_sender.reconfigure(config.feedback)
-        if self._global_sender is not None:
-            self._global_sender.reconfigure(config.feedback)
+        if self._senders is not None:
+            self._senders.reconfigure(config.feedback)
         self._starts.reconfigure(old, config)
 
     # -- what the parts ask for -----------------------------------------------------------------
@@ -395,9 +328,6 @@ class Daemon:
         report = self._link.clock_filter.report() if self._link is not None else None
         return None if report is None else report.offset_s - self._clock.epoch_ns * 1e-9
 
-    def _sends_poses(self) -> bool:
-        return self._sender is not None and self._sender.health().sending
-
     def _is_heard(self) -> bool:
         return self._link is not None and self._link.alive
 
@@ -414,6 +344,10 @@ class Daemon:
             self._loop.call_soon_threadsafe(call, *arguments)
         except RuntimeError:
             pass
+
+
+def _nothing(_message: object) -> None:
+    """Take a message that goes nowhere: there is no autopilot."""
 
 
 async def _run(load: Callable[[], Config], start: Start, source: SettingsSource) -> int:

@@ -15,7 +15,7 @@ from companion.daemon.control.settings_in_force import SettingsInForce
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.live_flight import LiveFlight, makes_depth
 from companion.daemon.health_watch import HealthWatch
-from companion.daemon.pose.pose_sender import PoseSender
+from companion.daemon.pose.senders import Senders
 from companion.daemon.stop_request import BAD_INPUT, StopRequest
 from companion.daemon.vehicle_reports import VehicleReports
 from companion.errors import CompanionError
@@ -44,12 +44,12 @@ class FlightStarts:
 
     def __init__(
         self, settings: SettingsInForce, feed: CameraFeed, flights: Flights,
-        sender: PoseSender | None, reports: VehicleReports | None, watch: HealthWatch,
+        senders: Senders | None, reports: VehicleReports | None, watch: HealthWatch,
         journal: Journal, stop: StopRequest, not_begun: Callable[[str], None],
     ) -> None:  # fmt: skip
         self._loop = asyncio.get_running_loop()
         self._settings, self._feed, self._flights = settings, feed, flights
-        self._sender, self._reports, self._watch = sender, reports, watch
+        self._senders, self._reports, self._watch = senders, reports, watch
         self._journal, self._stop, self._not_begun = journal, stop, not_begun
         self.camera: Camera | None = None
         """Calibrated camera; None before its first frame."""
@@ -161,7 +161,7 @@ class FlightStarts:
 
     @property
     def _always(self) -> bool:
-        return self.config.daemon.flight == "always" or self._sender is None
+        return self.config.daemon.flight == "always" or self._senders is None
 
     @property
     def _on_ground(self) -> bool:
@@ -212,16 +212,16 @@ class FlightStarts:
             self._try_again(error, take_up)
 
     def _begin(self, camera: Camera, take_up: bool) -> None:
-        if self._sender is not None:
-            self._sender.restart()
+        if self._senders is not None:
+            self._senders.restart()
         if self._reports is not None:
             self._reports.restart(camera)
         self._watch.restart()
         flight = self._flights.begin(self.config, camera, take_up, keep=not self._on_ground)
         self._watch.flight_due = False
         self._begin_rest()
-        if self._sender is not None:
-            self._sender.begin_flight(flight.believed)
+        if self._senders is not None:
+            self._senders.begin_flight(flight.believed)
 
     def _try_again(self, error: OSError | RuntimeError, take_up: bool = True) -> None:
         self._not_begun(in_words(error))

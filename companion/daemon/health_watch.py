@@ -16,16 +16,10 @@ from companion import __version__
 from companion.config import Config
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.viewing import VIEWERS
-from companion.daemon.pose.flow_sender import FlowSender
-from companion.daemon.pose.global_sender import GlobalSender
-from companion.daemon.pose.landing_sender import LandingSender
-from companion.daemon.pose.pose_sender import PoseSender
+from companion.daemon.pose.senders import Senders, SentHealth
 from companion.health import (
     ComputerLoad,
-    FeedbackHealth,
-    FlowHealth,
     Health,
-    LandingHealth,
     StageHealth,
 )
 from companion.messages import Georeferenced, Odometry, TrackState, Warned
@@ -72,17 +66,12 @@ class HealthWatch:
         journal: Journal,
         feed: CameraFeed,
         link: AutopilotLink | None,
-        sender: PoseSender | None,
-        flow_sender: FlowSender | None,
-        landing_sender: LandingSender | None,
-        global_sender: GlobalSender | None,
+        senders: Senders | None,
         flights: Flights,
         loop_delay: LatencyMeter,
     ) -> None:
         self._clock, self._journal, self._flights = clock, journal, flights
-        self._feed, self._link, self._sender = feed, link, sender
-        self._flow_sender, self._landing_sender = flow_sender, landing_sender
-        self._global_sender = global_sender
+        self._feed, self._link, self._senders = feed, link, senders
         self._loop_delay = loop_delay
         self._began_ns = clock.now_ns()
         self._config, self._believed = config.daemon, config.telemetry.use
@@ -258,6 +247,7 @@ class HealthWatch:
         now_ns, flight = self._clock.now_ns(), self._flights.current
         odometry = self._odometry if flight is not None else None
         pose = self._pose.health(now_ns)
+        sent = self._senders.health() if self._senders is not None else SentHealth()
         sources = [self._feed.health] + ([self._link.health] if self._link is not None else [])
         return Health(
             t_ns=now_ns,
@@ -268,18 +258,10 @@ class HealthWatch:
             quality=odometry.quality if odometry is not None else -1,
             scale=self._scale,
             pose_latency_p95_ms=pose.latency_p95_ms,
-            feedback=self._sender.health() if self._sender is not None else FeedbackHealth(),
-            flow=self._flow_sender.health() if self._flow_sender is not None else FlowHealth(),
-            landing=(
-                self._landing_sender.health()
-                if self._landing_sender is not None
-                else LandingHealth()
-            ),
-            global_position=(
-                self._global_sender.health()
-                if self._global_sender is not None
-                else FeedbackHealth()
-            ),
+            feedback=sent.feedback,
+            flow=sent.flow,
+            landing=sent.landing,
+            global_position=sent.global_position,
             flight=flight.folder.name if flight and flight.folder and flight.kept else "",
             load=self.load,
             degradation=self._governor.level.number,

@@ -6,7 +6,7 @@ The attitude predicts the next pose of the tracker, its keyframes georeference t
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
@@ -115,6 +115,8 @@ class LocalisationStage:
         self._samples: list[Telemetry] = []
         """Telemetry since the last frame: taken with the next, while nothing is mapped."""
         self._n_samples = 0
+        self._origin: GeoOrigin | None = None
+        """The origin of local NED, where it was told since the last frame."""
         self._pruned_ns: int | None = None
         self._resumption = MapResumption(
             camera, config.features, self._tracker, self._attitude, self._motion,
@@ -150,12 +152,14 @@ class LocalisationStage:
         if isinstance(message, FrameOverdue):
             return self._without_frame(message)
         if isinstance(message, GeoOrigin):
-            self._site.take_origin(message)
+            self._origin = message
         elif isinstance(message, Telemetry):
             self._samples.append(message)
         return []
 
     def _take_samples(self) -> None:
+        if self._origin is not None:
+            self._site.take_origin(self._origin)
         for sample in self._samples:
             if not is_believed(sample, self._config.telemetry.use):
                 continue
@@ -237,10 +241,7 @@ class LocalisationStage:
                 with self._times("shutter"):
                     said = shutter.end(self._tracker.view_of(frame.seq), self._tracker.map)
                 yield from said
-            yield FrameTracked(
-                frame.t_ns, frame.seq, self._n_samples, self._tracker.map_lock.point,
-                self._tracker.feature_ratio,
-            )  # fmt: skip
+            yield self._frame_tracked(frame.t_ns, frame.seq, has_picture=True)
         yield from self._flow_of(frame)
 
     def _without_frame(self, overdue: FrameOverdue) -> Iterator[Message]:
@@ -255,10 +256,14 @@ class LocalisationStage:
             if found is not None:
                 yield found
             self._prune(t_ns)
-            yield FrameTracked(
-                t_ns, overdue.seq, self._n_samples, self._tracker.map_lock.point,
-                self._tracker.feature_ratio, has_picture=False,
-            )  # fmt: skip
+            yield self._frame_tracked(t_ns, overdue.seq, has_picture=False)
+
+    def _frame_tracked(self, t_ns: int, seq: int, has_picture: bool) -> FrameTracked:
+        origin, self._origin = self._origin, None
+        return FrameTracked(
+            t_ns, seq, self._n_samples, self._tracker.map_lock.point, self._tracker.feature_ratio,
+            has_picture, None if origin is None or not self._site.in_use else astuple(origin),
+        )  # fmt: skip
 
     def _flow_of(self, frame: Frame) -> Iterator[Message]:
         """Optical flow for the autopilot, and for the way from a lift-off to a metric map."""

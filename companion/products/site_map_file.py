@@ -137,6 +137,15 @@ def write_site_map(path: Path, site: SiteMap) -> None:
         part.unlink(missing_ok=True)
 
 
+def digest_of(path: Path) -> str:
+    """BLAKE2b digest of a file, by which a flight's recording knows the map that it used."""
+    digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    with path.open("rb") as file:
+        while data := file.read(1 << 20):
+            digest.update(data)
+    return digest.hexdigest()
+
+
 def read_head(path: Path) -> SiteHead:
     """The head of a file; SiteMapError where it cannot be read."""
     with closing(_opened(path)) as file:

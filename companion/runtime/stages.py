@@ -24,6 +24,7 @@ from companion.messages import (
     MapUpdate,
     Odometry,
     PointChunk,
+    SiteMapUsed,
     Track,
     Warned,
 )
@@ -93,8 +94,8 @@ STAGES = (
     Stage(
         "recorder",
         (
-            Frame, *TELEMETRY, LinkReads, HealthNote, Warned, FrameTracked, GateStep, Odometry,
-            LandingTarget, MapUpdate, PointChunk,
+            Frame, *TELEMETRY, LinkReads, HealthNote, Warned, FrameTracked, GateStep, SiteMapUsed,
+            Odometry, LandingTarget, MapUpdate, PointChunk,
         ),
         nice=5, frames=Frames.EVERY, answer_s=60.0, hurried_s=0.3, with_flight=True, in_folder=True,
     ),

@@ -13,10 +13,11 @@ import numpy as np
 from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.site.site_use import SiteUse
-from companion.messages import Frame, Georeferenced, MapUpdate, Message, Warned
+from companion.messages import Frame, Georeferenced, MapUpdate, Message, SiteMapUsed, Warned
 from companion.products.site_map_file import (
     SITE_MAP,
     SiteMapError,
+    digest_of,
     map_path,
     read_site_map,
     write_site_map,
@@ -48,6 +49,8 @@ class _Localisation(Work):
             )
         self._setup = setup
         self._said: list[tuple[str, str]] = []
+        self._site_used: SiteMapUsed | None = None
+        """Told with the first frame."""
         self._stage = LocalisationStage(
             setup.config, setup.camera, self.times, background=setup.is_live, site=self._site(setup)
         )
@@ -63,8 +66,9 @@ class _Localisation(Work):
         """The site map to be used; SiteMapError of a replay, while a flight goes on without."""
         if not setup.config.map.use:
             return None
+        path = map_path(setup.config.map.use).absolute()
         try:
-            read = read_site_map(map_path(setup.config.map.use))
+            read, digest = read_site_map(path), digest_of(path)
             features = setup.config.features
             if (read.site.scale_factor, read.site.n_levels) != (
                 features.scale_factor, features.n_levels,
@@ -79,6 +83,8 @@ class _Localisation(Work):
                 raise
             self._said.append((MAP_NOT_USED, str(error)))
             return None
+        if setup.is_live:
+            self._site_used = SiteMapUsed(0, str(path), read.site.revision, digest)
         if read.damaged:
             self._said.append((MAP_DAMAGED, f"{len(read.damaged)} parts are left out"))
         return SiteUse(read.site, setup.camera, setup.origin, setup.is_live)
@@ -129,6 +135,9 @@ class _Localisation(Work):
         for what, detail in self._said:
             yield Warned(frame.t_ns, what, detail)
         self._said.clear()
+        if self._site_used is not None:
+            yield replace(self._site_used, t_ns=frame.t_ns)
+            self._site_used = None
         for out in self._stage.step(frame):
             yield out
             if isinstance(out, MapUpdate):

@@ -25,7 +25,7 @@ from companion.pilot_messages import PilotText
 from companion.telemetry import ArmedSample, LandedSample, Telemetry
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
-from drivers.mavlink.commands import NO_ANSWER, TRIES, Commands
+from drivers.mavlink.commands import AUTOPILOT, NO_ANSWER, TRIES, Commands, command_long
 from drivers.mavlink.imu_rate import ImuNews, ImuRate
 from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.other_companion import OtherCompanion
@@ -48,7 +48,6 @@ TIMESYNC_S = 0.1
 MAX_ROUND_TRIP_NS = 2_000_000_000
 MAX_QUESTIONS = 64
 """TIMESYNC requests without an answer that are remembered."""
-AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 REFUSALS = (
     mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
 )  # fmt: skip
@@ -179,13 +178,10 @@ class AutopilotLink:
         self, command: int, *params: float, timeout_s: float = ANSWER_S, tries: int = TRIES
     ) -> int:
         """Send a COMMAND_LONG until acknowledged: a MAV_RESULT, or NO_ANSWER (-1)."""
-        values = [*params, *[0.0] * (7 - len(params))]
         system = self._target()
 
         def make(attempt: int) -> Any:
-            return mavlink.MAVLink_command_long_message(
-                system, AUTOPILOT, command, attempt, *values
-            )
+            return command_long(system, command, attempt, *params)
 
         return await self._commands.ask(command, make, timeout_s, tries)
 

@@ -16,8 +16,21 @@ TRIES = 3
 MOST_PATIENCE_S = 30.0
 """Longest wait after an acknowledgement "in progress"."""
 
+AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
+
 MakeCommand = Callable[[int], Any]
 """Makes the message of a try, counted from 0."""
+
+
+def command_long(system: int, command: int, attempt: int, *params: float) -> Any:
+    """COMMAND_LONG to the autopilot of a system; `attempt` counts repetitions, from 0."""
+    values = [*params, *[0.0] * (7 - len(params))]
+    return mavlink.MAVLink_command_long_message(system, AUTOPILOT, command, attempt, *values)
+
+
+def source_set_command(system: int, number: int) -> Any:
+    """The command to fly on a source set of ArduPilot's EKF3, the first time that it is sent."""
+    return command_long(system, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 0, float(number))
 
 
 class Commands:

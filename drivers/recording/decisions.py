@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping
+import struct
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,23 +17,44 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import Config
 from companion.config_file import config_of_text
 from companion.errors import FlightError
-from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.gate_journal import GLOBAL, LANDING, POSE, SOURCES
 from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose
-from companion.messages import FrameTracked, Odometry, TrackState
+from companion.messages import FrameTracked, LandingTarget, Odometry, SiteMapUsed, TrackState
 from companion.telemetry import Telemetry
-from drivers.mavlink.measurements.pose_messages import FRAMES, pose_messages
+from drivers.mavlink.measurements.pose_messages import FRAMES
 from drivers.mavlink.vehicle import Firmware
 from drivers.mavlink.wire.packet_stream import MavlinkStream
 from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recorder import CONFIG_TOML, NOTES
 from drivers.recording.recording import Recording
-from drivers.recording.recording_topics import EVENTS, GATE, ODOMETRY, SENT, TRACKING, MavlinkBytes
+from drivers.recording.recording_topics import (
+    EVENTS,
+    GATES,
+    ODOMETRY,
+    SENT,
+    SITE_MAP,
+    TRACKING,
+    MavlinkBytes,
+)
+from drivers.recording.recording_topics import LANDING as LANDING_TARGETS
 
-POSES = {
-    mavlink.MAVLINK_MSG_ID_ODOMETRY, mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE,
-    mavlink.MAVLINK_MSG_ID_VISION_SPEED_ESTIMATE,
+GATE_OF = {
+    mavlink.MAVLINK_MSG_ID_ODOMETRY: POSE,
+    mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE: POSE,
+    mavlink.MAVLINK_MSG_ID_VISION_SPEED_ESTIMATE: POSE,
+    mavlink.MAVLINK_MSG_ID_LANDING_TARGET: LANDING,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_SENSOR: GLOBAL,
+    mavlink.MAVLINK_MSG_ID_GPS_INPUT: GLOBAL,
+}
+"""Gate that let a message of ours through, by its id."""
+GATE_OF_COMMAND = {
+    mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: GLOBAL, mavlink.MAV_CMD_SET_EKF_SOURCE_SET: SOURCES,
 }  # fmt: skip
+"""The same of commands, by their number."""
+COMMANDS = {mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT}
+_COMMAND_AT, _CONFIRMATION_AT = struct.Struct("<28xH"), 32
+"""Place of a command's number in its payload, and of the count of its repetitions."""
 LOSSLESS = {"png", "raw"}
 
 
@@ -44,19 +67,22 @@ class Decisions:
     """True if images are recorded without loss."""
     samples: list[Telemetry] = field(default_factory=list)
     frames: list[FrameTracked] = field(default_factory=list)
-    gate: list[GateStep] = field(default_factory=list)
+    gates: list[GateStep] = field(default_factory=list)
     odometry: dict[int, Odometry] = field(default_factory=dict)
     """Odometry by the number of the frame."""
+    targets: dict[int, LandingTarget] = field(default_factory=dict)
+    """Landing targets by the number of the frame."""
+    site_map: SiteMapUsed | None = None
     events: list[str] = field(default_factory=list)
     """Warnings and good news, in words."""
-    sent: list[tuple[int, bytes]] = field(default_factory=list)
-    """Id and payload of the messages with poses that were sent."""
+    sent: dict[str, list[tuple[int, bytes]]] = field(default_factory=lambda: defaultdict(list))
+    """Id and payload of the messages that were sent, by their gate."""
 
     @property
     def firmware(self) -> Firmware:
         """A firmware whose poses are as those that were sent, by the frame that they state."""
         layout = mavlink.MAVLink_odometry_message.unpacker
-        for kind, payload in self.sent:
+        for kind, payload in self.sent.get(POSE, []):
             if kind == mavlink.MAVLINK_MSG_ID_ODOMETRY:
                 *_, frame, _, _, _, _ = layout.unpack(payload.ljust(layout.size, b"\0"))
                 return next((each for each in FRAMES if FRAMES[each] == frame), "other")
@@ -74,9 +100,8 @@ def decisions_of(recording: Recording) -> Decisions:
     stream = MavlinkStream()
     take: dict[str, Callable[[int, bytes], None]] = {
         TRACKING: lambda t_ns, data: found.frames.append(_of(FrameTracked, t_ns, data)),
-        GATE: lambda t_ns, data: found.gate.append(step_of(t_ns, data)),
+        GATES: lambda t_ns, data: found.gates.append(step_of(t_ns, data)),
         EVENTS: lambda t_ns, data: found.events.append(Log.FromString(data).message),
-        SENT: lambda t_ns, data: found.sent.extend(_poses(stream, data, found.config)),
     }
     for number in range(len(recording.found.chunks)):
         for message in recording.messages(number):
@@ -86,6 +111,14 @@ def decisions_of(recording: Recording) -> Decisions:
             elif topic == ODOMETRY:
                 odometry = _odometry(message.t_ns, json.loads(data))
                 found.odometry[odometry.seq] = odometry
+            elif topic == LANDING_TARGETS:
+                target = _target(message.t_ns, data)
+                found.targets[target.seq] = target
+            elif topic == SITE_MAP:
+                found.site_map = _of(SiteMapUsed, message.t_ns, data)
+            elif topic == SENT:
+                for gate, kind, payload in _gated(stream, data, found.config):
+                    found.sent[gate].append((kind, payload))
             elif is_sample_topic(topic):
                 found.samples.append(sample_of(topic, message.t_ns, data))
     if not found.frames:
@@ -96,10 +129,10 @@ def decisions_of(recording: Recording) -> Decisions:
     return found
 
 
-def payloads_of(pose: PoseToSend, mode: str, firmware: Firmware) -> list[tuple[int, bytes]]:
-    """Id and payload of the messages of a pose."""
+def payloads_of(messages: Iterable[Any]) -> list[tuple[int, bytes]]:
+    """Id and payload of messages, as they are sent."""
     codec = mavlink.MAVLink(None)
-    packed = b"".join(bytes(each.pack(codec)) for each in pose_messages(pose, mode, firmware))
+    packed = b"".join(bytes(each.pack(codec)) for each in messages)
     return [(packet.message_id, packet.payload) for packet in MavlinkStream().feed(packed, 0)]
 
 
@@ -112,15 +145,37 @@ def step_of(t_ns: int, data: bytes) -> GateStep:
 def _of(kind: type[Any], t_ns: int, data: bytes) -> Any:
     given = json.loads(data)
     told = {each.name: given[each.name] for each in dataclasses.fields(kind) if each.name in given}
-    return kind(t_ns, **told)
+    return kind(t_ns=t_ns, **told)
 
 
-def _poses(stream: MavlinkStream, data: bytes, config: Config) -> Iterator[tuple[int, bytes]]:
-    """Id and payload of the packets with poses of this program, not of a client of the router."""
+def _gated(stream: MavlinkStream, data: bytes, config: Config) -> Iterator[tuple[str, int, bytes]]:
+    """Gate, id and payload of the packets of this program, not of a client of the router.
+
+    Of a command that is repeated until it is answered the first counts.
+    """
     taken = MavlinkBytes.FromString(data)
     for packet in stream.feed(taken.data, taken.monotonic_ns):
-        if packet.message_id in POSES and packet.component == config.link.component_id:
-            yield packet.message_id, packet.payload
+        if packet.component != config.link.component_id:
+            continue
+        gate, payload = GATE_OF.get(packet.message_id), packet.payload
+        if packet.message_id in COMMANDS:
+            whole = payload.ljust(_CONFIRMATION_AT + 1, b"\0")
+            gate = GATE_OF_COMMAND.get(*_COMMAND_AT.unpack_from(whole))
+            if packet.message_id == mavlink.MAVLINK_MSG_ID_COMMAND_LONG and whole[_CONFIRMATION_AT]:
+                continue
+        if gate is not None:
+            yield gate, packet.message_id, payload
+
+
+def _target(t_ns: int, data: bytes) -> LandingTarget:
+    target: LandingTarget = _of(LandingTarget, t_ns, data)
+    position, sigma, normals = (
+        None if given is None else np.array(given, float)
+        for given in (target.position_body_m, target.sigma_body_m, target.normals_body)
+    )
+    return dataclasses.replace(
+        target, position_body_m=position, sigma_body_m=sigma, normals_body=normals
+    )
 
 
 def _odometry(t_ns: int, given: Mapping[str, Any]) -> Odometry:

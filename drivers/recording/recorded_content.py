@@ -20,7 +20,14 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
 from companion.flight_notes import GateStep, LinkBytes
 from companion.geometry.transforms import Similarity, quaternion_from_rotation
-from companion.messages import FrameTracked, LandingTarget, Odometry, PointChunk, Warned
+from companion.messages import (
+    FrameTracked,
+    LandingTarget,
+    Odometry,
+    PointChunk,
+    SiteMapUsed,
+    Warned,
+)
 from companion.telemetry import FIELDS, TELEMETRY, Telemetry
 from companion.telemetry_schema import Field
 from drivers.recording.recording_topics import MavlinkBytes, telemetry_topic
@@ -45,7 +52,7 @@ def sample_bytes(sample: Telemetry) -> bytes:
     return json_bytes({f.name: getattr(sample, f.name) for f in FIELDS[type(sample)]})
 
 
-def decision_bytes(decision: FrameTracked | GateStep | LandingTarget) -> bytes:
+def decision_bytes(decision: FrameTracked | GateStep | SiteMapUsed | LandingTarget) -> bytes:
     """A decision, or a landing target, without its time."""
     names = [each.name for each in dataclasses.fields(decision) if each.name != "t_ns"]
     return json_bytes({name: getattr(decision, name) for name in names})

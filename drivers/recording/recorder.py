@@ -22,6 +22,7 @@ from companion.messages import (
     Message,
     Odometry,
     PointChunk,
+    SiteMapUsed,
     Warned,
 )
 from companion.telemetry import Telemetry
@@ -47,7 +48,7 @@ from drivers.recording.recording_topics import (
     CALIBRATION,
     CLOUD,
     EVENTS,
-    GATE,
+    GATES,
     HEALTH,
     LANDING,
     ODOMETRY,
@@ -55,6 +56,7 @@ from drivers.recording.recording_topics import (
     PROFILE,
     RECEIVED,
     SENT,
+    SITE_MAP,
     TIMESYNC,
     TRACKING,
     open_channels,
@@ -63,6 +65,7 @@ from drivers.recording.recording_topics import (
 CAMERA_JSON, CONFIG_TOML = "camera.json", "config.toml"
 NOTES = "companion"
 """Metadata: versions and other facts known at the beginning."""
+_DECISIONS = {FrameTracked: TRACKING, GateStep: GATES, SiteMapUsed: SITE_MAP}
 _TIMESYNC_ID, _TIMES = 111, struct.Struct("<qq")
 MOST_ROUND_TRIP_NS = 2_000_000_000
 
@@ -130,9 +133,8 @@ class Recorder:
             pose = pose_bytes(message)
             if pose is not None:
                 self._put(POSE, message.t_ns, pose, message.seq)
-        elif isinstance(message, FrameTracked | GateStep):
-            topic = TRACKING if isinstance(message, FrameTracked) else GATE
-            self._put(topic, message.t_ns, decision_bytes(message))
+        elif isinstance(message, FrameTracked | GateStep | SiteMapUsed):
+            self._put(_DECISIONS[type(message)], message.t_ns, decision_bytes(message))
         elif isinstance(message, LandingTarget):
             self._put(LANDING, message.t_ns, decision_bytes(message), message.seq)
         elif isinstance(message, Warned):

@@ -33,11 +33,12 @@ RECEIVED, SENT = "/mavlink/received", "/mavlink/sent"
 TIMESYNC = "/mavlink/timesync"
 POSE, ODOMETRY, CLOUD = "/pose", "/odometry", "/cloud"
 EVENTS, HEALTH = "/events", "/health"
-TRACKING, GATE = "/decisions/tracking", "/decisions/pose_gate"
+TRACKING, GATES = "/decisions/tracking", "/decisions/gates"
+SITE_MAP = "/decisions/site_map"
 LANDING = "/landing_target"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
 """Topics of images, of which a flight has one."""
-FROM_PICTURES = frozenset({GREY, POSE, ODOMETRY, CLOUD, TRACKING, GATE, LANDING})
+FROM_PICTURES = frozenset({GREY, POSE, ODOMETRY, CLOUD, TRACKING, GATES, SITE_MAP, LANDING})
 """Topics of what was made of images."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
@@ -139,15 +140,18 @@ TOPICS: dict[str, Any] = {
         {
             "seq": INTEGER, "n_samples": INTEGER, "mapping_point": INTEGER,
             "feature_ratio": NUMBER, "has_picture": FLAG,
+            "origin": {"type": ["array", "null"], "items": NUMBER},
         },
     ),
-    GATE: _Json(
+    GATES: _Json(
         "companion.GateStep",
-        "What the gate of poses to the autopilot was asked, for a replay as flown",
-        {
-            "what": TEXT, "n_attitudes": INTEGER, "counter": INTEGER, "counter_sent": FLAG,
-            "sent": FLAG, "values": OBJECT,
-        },
+        "What a gate of all that the autopilot is sent was asked, for a replay as flown",
+        {"gate": TEXT, "what": TEXT, "n_samples": INTEGER, "sent": FLAG, "values": OBJECT},
+    ),
+    SITE_MAP: _Json(
+        "companion.SiteMapUsed",
+        "The map of an earlier flight in use: its file, revision, and BLAKE2b digest",
+        {"path": TEXT, "revision": INTEGER, "digest": TEXT},
     ),
     LANDING: _Json(
         "companion.LandingTarget",

@@ -91,9 +91,6 @@ class Flown:
             self.feed,
             None,
             None,
-            None,
-            None,
-            None,
             self.flights,
             LatencyMeter(),
         )

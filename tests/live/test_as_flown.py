@@ -1,4 +1,4 @@
-"""A recorded flight is flown again at the desk: the poses that were sent, to the byte."""
+"""A recorded flight is flown again at the desk: what the autopilot was sent, to the byte."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from companion.config import MEASUREMENTS, CameraConfig, TelemetryConfig
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.config import CameraConfig, TelemetryConfig
+from companion.estimation.site.site_use import LOCATED
 from companion.telemetry import MEASURED, PositionSample
 from drivers.recording.decisions import decisions_of
 from drivers.recording.recorded_flight import open_recording
 from tests.support.processes.flying import Flying
 from tests.support.processes.program import Run, replay
 
-FLY_S, LOADED_S = 8.0, 4.0
+LOADED_S = 4.0
+MARKERS_M = 2.0
 ENOUGH = 150
 """Messages with poses, however long they take on a busy machine."""
 BUSY = "while True: pass"
@@ -37,23 +41,29 @@ def load() -> Iterator[None]:
             process.wait()
 
 
-def flown(
-    folder: Path, codec: str, use: tuple[str, ...] = MEASUREMENTS, has_imu: bool = False
-) -> Path:
-    """A flight with load, and with a stage killed; its folder."""
-    codecs = f"recorder.codec={codec}", "recorder.jpeg_quality=90"
-    with Flying(folder, *codecs, f"telemetry.use={list(use)}", has_imu=has_imu) as flying:
+def flown(folder: Path) -> Path:
+    """A flight with load, a stage killed, markers below and satellites gone; its folder."""
+    use = "attitude", "imu", "satellites"
+    with Flying(
+        folder, "recorder.codec=png", f"telemetry.use={list(use)}", "gps.switch_source=true",
+        "landing.marker=apriltag_36h11", "landing.id=0", f"landing.size_m={MARKERS_M}",
+        has_imu=True,
+    ) as flying:  # fmt: skip
+        flying.camera.markers_m = MARKERS_M
         flying.take_off()
         assert flying.daemon.status()["believed"] == list(use)
-        assert bool(flying.daemon.said("is believed (telemetry.use)")) == (use != MEASUREMENTS)
-        time.sleep(FLY_S)
+        assert flying.daemon.said("is believed (telemetry.use)")
+        flying.autopilot.gps = False
+        wait_for_switch(flying, 1)
+        flying.autopilot.gps = True
         flying.daemon.signal_stage("results", signal.SIGKILL)
         with load():
             time.sleep(LOADED_S)
         flying.camera.on = False
         time.sleep(1.0)
         flying.camera.on = True
-        time.sleep(FLY_S)
+        wait_for_switch(flying, 2)
+        flying.autopilot.wait_for("LANDING_TARGET", 20, 60)
         flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
         flying.autopilot.disarm()
         flying.daemon.line("results so far")
@@ -62,16 +72,29 @@ def flown(
     return path
 
 
-def again(path: Path, out: Path) -> tuple[Run, dict[str, Any]]:
-    done = replay(path, out, "--as-flown")
+def wait_for_switch(flying: Flying, n: int) -> None:
+    """Wait until the EKF's sources have been switched so often."""
+    switch = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
+    flying.autopilot.wait_for(
+        "COMMAND_LONG", n, 60, lambda got: bool(got.message.command == switch)
+    )
+
+
+def again(path: Path, out: Path, *options: str) -> tuple[Run, dict[str, Any]]:
+    done = replay(path, out, "--as-flown", *options)
     assert done.status == 0, done.stdout + done.stderr
     found: dict[str, Any] = json.loads((out / "as_flown.json").read_text())
+    for gate in found["by_gate"].values():
+        assert gate["same"] == gate["sent"] == gate["made_again"]
     return done, found
 
 
 def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> None:
-    """Of what was believed: what was not is in the recording as well."""
-    path = flown(tmp_path, "png", ("attitude", "imu", "satellites"), has_imu=True)
+    """Of what was believed: what was not is in the recording as well.
+
+    Another flight goes on in its map.
+    """
+    path = flown(tmp_path)
     done, found = again(path, tmp_path / "again")
     recorded = open_recording(path / "flight.mcap", CameraConfig(), TelemetryConfig())
     with closing(recorded.recording):
@@ -84,12 +107,47 @@ def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> No
     }
     assert found["tracked_again"]
     assert found["frames_same"] == found["frames"] > 100
-    assert found["same"] == found["sent"] == found["made_again"] > 100
+    assert found["targets_same"] == found["targets"] > 100
+    sent = {gate: each["sent"] for gate, each in found["by_gate"].items()}
+    assert sent["pose"] > 100 and sent["landing"] >= 20 and sent["sources"] >= 2
     assert "the same to the byte" in done.stdout
+    in_map_of(path / "site.map", tmp_path / "second")
 
 
-def test_compressed_images_give_the_decisions_of_the_gate_again(tmp_path: Path) -> None:
-    path = flown(tmp_path, "mjpeg")
+def in_map_of(site_map: Path, folder: Path) -> None:
+    """Fly in a site map, and again as flown: with that map, and with no other."""
+    folder.mkdir()
+    with Flying(folder, "recorder.codec=png", f"map.use={site_map}") as flying:
+        flying.take_off()
+        flying.daemon.line(LOCATED, 60.0)
+        flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
+        flying.autopilot.disarm()
+        flying.daemon.line("results so far", 60.0)
+        (path,) = flying.daemon.flown()
+        flying.daemon.stop()
+    moved, other = site_map.rename(folder / "moved.map"), path / "site.map"
+    for options in ((), ("--map", str(other))):
+        refused = replay(path, folder / "refused", "--as-flown", *options)
+        assert refused.status == 1 and "--map FILE names it" in refused.stderr
+    _, found = again(path, folder / "again", "--map", str(moved))
+    assert found["frames_same"] == found["frames"] > 50
+
+
+def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path) -> None:
+    """Of global positions, which go out where poses do not, and no satellites come."""
+    with Flying(
+        tmp_path, "recorder.codec=mjpeg", "feedback.mode=off", "feedback.global_position=sensor"
+    ) as flying:
+        flying.autopilot.arm()
+        flying.daemon.until(lambda health: "GPS" in health["scale"], 60, "a place by satellites")
+        flying.autopilot.gps = False
+        flying.autopilot.wait_for("GLOBAL_POSITION_SENSOR", 20, 60)
+        flying.autopilot.gps = True
+        flying.until_told("global position by vision off", time.monotonic_ns(), 30)
+        flying.autopilot.disarm()
+        flying.daemon.line("results so far", 60.0)
+        (path,) = flying.daemon.flown()
+        flying.daemon.stop()
     _, found = again(path, tmp_path / "again")
     assert not found["tracked_again"]
-    assert found["same"] == found["sent"] == found["made_again"] > 100
+    assert found["by_gate"]["global"]["sent"] >= 20 and set(found["by_gate"]) == {"global"}

@@ -1,28 +1,42 @@
-"""Replay of a recording as flown: the poses sent to the autopilot are computed again and compared.
+"""Replay of a recording as flown: what the autopilot was sent is computed again and compared.
 
-Of images recorded without loss all stages up to the pose gate are replayed: telemetry, frames and
+Of images recorded without loss all stages up to the gates are replayed: telemetry, frames and
 mapping in their recorded order, at the recorded load levels. Else other pixels would give other
-poses: then only the pose gate is replayed, on the recorded odometry.
+poses: then only the gates are replayed, on the recorded odometry and landing targets.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from companion.app.progress import Progress
+from companion.app.replay.sent_again import SentAgain, steps_as_tracked
 from companion.config import Config
 from companion.errors import FlightError, StageError
-from companion.estimation.gate.gate_journal import poses_as_sent
+from companion.estimation.gate.gates_again import placed_values
+from companion.estimation.landing.marker_detector import MarkerDetector
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.map_resumption import MAP_NOT_RECOGNISED, MAP_RESUMED
+from companion.estimation.satellites.satellite_watch import doubts
+from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera
-from companion.messages import Frame, FrameOverdue, Odometry
+from companion.geometry.geodesy import GeoOrigin
+from companion.messages import (
+    Frame,
+    FrameOverdue,
+    LandingTarget,
+    MapUpdate,
+    Message,
+    Odometry,
+    Warned,
+)
 from companion.products.atomic_file import write_atomically
-from companion.telemetry import AttitudeSample
+from companion.products.site_map_file import digest_of, map_path, read_head, read_site_map
 from companion.timing.clock import StageTimes
-from drivers.recording.decisions import Decisions, decisions_of, payloads_of
+from drivers.recording.decisions import Decisions, decisions_of
 from drivers.recording.flights_folder import RECORDING
 from drivers.recording.recorded_flight import open_recording
 
@@ -32,75 +46,126 @@ AS_FLOWN = "as_flown.json"
 def replay_as_flown(
     path: Path, out: Path, config: Config, progress: Progress, notify: Callable[[str], None]
 ) -> None:
-    """Compare the poses with those sent; the result goes to `out`/as_flown.json.
+    """Compare what is sent with what was; the result goes to `out`/as_flown.json.
 
-    The settings are those of the flight. FlightError where its decisions are not recorded,
-    StageError where a pose differs.
+    The settings are those of the flight; where `map.use` of `config` is set, the site map that the
+    flight used is there. FlightError where the flight's decisions are not recorded, or that map is
+    not to be had; StageError where a message differs.
     """
     path = path / RECORDING if path.is_dir() else path
     flight = open_recording(path, config.camera, config.telemetry)
     try:
         told = decisions_of(flight.recording)
-        of_frame = told.odometry
         if any(event.startswith((MAP_RESUMED, MAP_NOT_RECOGNISED)) for event in told.events):
             raise FlightError(
                 f"{path}: this flight began with the map of a process before it, which is not in "
                 "the recording"
             )
+        tracked = Tracked(told.odometry, told.targets)
+        steps = told.gates
         if told.lossless:
+            site = _site_of(told, config, flight.camera)
             n = flight.n_frames_between(flight.start_ns, flight.stop_ns)
             progress.start(n)
-            of_frame = _tracked_again(flight.camera, told, flight.frames(), progress)
+            tracked = _tracked_again(flight.camera, told, site, flight.frames(), progress)
             progress.finish()
+            steps = list(steps_as_tracked(steps, tracked.places, tracked.verdicts))
         else:
             notify(
-                "images were compressed with losses: the recorded odometry goes to the pose gate"
+                "images were compressed with losses: the recorded odometry and landing targets go "
+                "to the gates"
             )
-        made = [
-            payload
-            for step, pose in poses_as_sent(
-                told.config.feedback,
-                told.config.telemetry.use,
-                told.gate,
-                _attitudes(told),
-                lambda seq: _known(of_frame, seq),
-            )
-            if step.sent
-            for payload in payloads_of(pose, told.config.feedback.mode, told.firmware)
-        ]
+        made = SentAgain(told, tracked.odometry, tracked.targets).payloads(steps)
     finally:
         flight.recording.close()
-    n_same = next(
-        (n for n, (ours, sent) in enumerate(zip(made, told.sent, strict=False)) if ours != sent),
-        min(len(made), len(told.sent)),
-    )
-    n_tracked = sum(_same(of_frame.get(seq), odometry) for seq, odometry in told.odometry.items())
+    by_gate = {
+        gate: _compared(made.get(gate, []), told.sent.get(gate, []))
+        for gate in sorted({*made, *told.sent})
+    }
+    n_tracked = sum(_same(tracked.odometry.get(n), each) for n, each in told.odometry.items())
+    n_seen = sum(_same_target(tracked.targets.get(n), each) for n, each in told.targets.items())
     out.mkdir(parents=True, exist_ok=True)
+    totals = {
+        name: sum(each[name] for each in by_gate.values())
+        for name in ("sent", "made_again", "same")
+    }
     found = {
-        "sent": len(told.sent), "made_again": len(made), "same": n_same,
-        "frames": len(told.odometry), "frames_same": n_tracked, "tracked_again": told.lossless,
+        **totals, "by_gate": by_gate,
+        "frames": len(told.odometry), "frames_same": n_tracked,
+        "targets": len(told.targets), "targets_same": n_seen, "tracked_again": told.lossless,
     }  # fmt: skip
     write_atomically(out / AS_FLOWN, json.dumps(found, indent=1).encode())
     if told.lossless:
         notify(f"{n_tracked} of {len(told.odometry)} frames have the same odometry")
-    if n_same < max(len(made), len(told.sent)):
-        raise StageError(
-            f"{path}: {len(told.sent)} messages with poses were sent, {len(made)} are made again; "
-            f"number {n_same + 1} is the first that differs"
+        if told.targets:
+            notify(f"{n_seen} of {len(told.targets)} frames have the same landing target")
+    for gate, each in by_gate.items():
+        if each["same"] < max(each["sent"], each["made_again"]):
+            raise StageError(
+                f"{path}: {each['sent']} messages of the gate `{gate}` were sent, "
+                f"{each['made_again']} are made again; number {each['same'] + 1} is the first that "
+                "differs"
+            )
+    parts = ", ".join(f"{gate} {each['same']}" for gate, each in by_gate.items())
+    notify(
+        f"{totals['same']} messages were sent ({parts}); made again, each is the same to the byte"
+    )
+
+
+@dataclass
+class Tracked:
+    """What the stages gave, by the number of the frame; `places` and `verdicts` in their order."""
+
+    odometry: dict[int, Odometry] = field(default_factory=dict)
+    targets: dict[int, LandingTarget] = field(default_factory=dict)
+    places: list[Mapping[str, object]] = field(default_factory=list)
+    """Of each update of the map its place, see `placed_values`."""
+    verdicts: list[bool] = field(default_factory=list)
+    """True where satellites begin to be doubted, False where that ends."""
+
+    def take(self, message: Message) -> None:
+        """Take an output of localisation."""
+        if isinstance(message, Odometry):
+            self.odometry[message.seq] = message
+        elif isinstance(message, MapUpdate):
+            self.places.append(placed_values(message.georeference))
+        elif isinstance(message, Warned):
+            doubted = doubts(message)
+            if doubted is not None:
+                self.verdicts.append(doubted)
+
+
+def _site_of(told: Decisions, config: Config, camera: Camera) -> SiteUse | None:
+    """The site map that the flight used, None without one; FlightError where it is another."""
+    used = told.site_map
+    if used is None:
+        return None
+    path = map_path(config.map.use or used.path)
+    if not path.exists():
+        raise FlightError(
+            f"{path}: the flight used this map of an earlier flight, revision {used.revision}, and "
+            "it is not there; --map FILE names it where it is now"
         )
-    notify(f"{n_same} messages with poses were sent; made again, each is the same to the byte")
+    if digest_of(path) != used.digest:
+        raise FlightError(
+            f"{path}: the flight used another map of an earlier flight: this one has revision "
+            f"{read_head(path).revision}, that had {used.revision} and the digest {used.digest}; "
+            "--map FILE names it where it is now"
+        )
+    return SiteUse(read_site_map(path).site, camera, origin=None, is_live=True)
 
 
 def _tracked_again(
-    camera: Camera, told: Decisions, frames: Iterator[object], progress: Progress
-) -> dict[int, Odometry]:
-    """Odometry by the number of the frame."""
+    camera: Camera, told: Decisions, site: SiteUse | None, frames: Iterator[object],
+    progress: Progress,
+) -> Tracked:  # fmt: skip
+    """All that the stages give, of the frames that they took in flight."""
     stage = LocalisationStage(
         told.config, camera, StageTimes(), background=True,
-        order=[step.mapping_point for step in told.frames],
+        order=[step.mapping_point for step in told.frames], site=site,
     )  # fmt: skip
-    pictures = (frame for frame in frames if isinstance(frame, Frame))
-    found: dict[int, Odometry] = {}
+    found = Tracked()
+    pictures = _looked_at(frames, camera, told, found)
     n_taken = 0
     try:
         for n_done, step in enumerate(told.frames):
@@ -117,24 +182,38 @@ def _tracked_again(
             for sample in told.samples[n_taken : step.n_samples]:
                 stage.step(sample)
             n_taken = step.n_samples
+            if step.origin is not None:
+                stage.step(GeoOrigin(*step.origin))
             stage.set_effort(step.feature_ratio)
             for out in stage.step(given):
-                if isinstance(out, Odometry):
-                    found[out.seq] = out
+                found.take(out)
             progress.update(n_done + 1, stage.state.value, 0)
+        for _ in pictures:
+            pass
     finally:
         stage.finish(adjust=False)
     return found
 
 
-def _attitudes(told: Decisions) -> list[AttitudeSample]:
-    return [sample for sample in told.samples if isinstance(sample, AttitudeSample)]
+def _looked_at(
+    frames: Iterator[object], camera: Camera, told: Decisions, found: Tracked
+) -> Iterator[Frame]:
+    """Frames one by one, each looked at for the landing marker where it was in flight."""
+    detector = MarkerDetector(told.config.landing, camera) if told.targets else None
+    for frame in frames:
+        if isinstance(frame, Frame):
+            if detector is not None and frame.seq in told.targets:
+                found.targets[frame.seq] = detector.step(frame)
+            yield frame
 
 
-def _known(odometry: dict[int, Odometry], seq: int) -> Odometry:
-    if seq not in odometry:
-        raise FlightError(f"frame {seq} went to the pose gate, and its odometry is not recorded")
-    return odometry[seq]
+def _compared(made: list[tuple[int, bytes]], sent: list[tuple[int, bytes]]) -> dict[str, int]:
+    """Numbers of messages, and of those at the beginning that are the same."""
+    n_same = next(
+        (n for n, (ours, theirs) in enumerate(zip(made, sent, strict=False)) if ours != theirs),
+        min(len(made), len(sent)),
+    )
+    return {"sent": len(sent), "made_again": len(made), "same": n_same}
 
 
 def _same(made: Odometry | None, recorded: Odometry) -> bool:
@@ -146,3 +225,11 @@ def _same(made: Odometry | None, recorded: Odometry) -> bool:
         (made.world_from_body.translation == recorded.world_from_body.translation).all()
         and (made.world_from_body.rotation == recorded.world_from_body.rotation).all()
     )
+
+
+def _same_target(made: LandingTarget | None, recorded: LandingTarget) -> bool:
+    if made is None or made.why_not != recorded.why_not:
+        return False
+    if made.position_body_m is None or recorded.position_body_m is None:
+        return made.position_body_m is recorded.position_body_m
+    return bool((made.position_body_m == recorded.position_body_m).all())

@@ -6,11 +6,15 @@ Runs in the event loop. A pose passes the same gate as one for ODOMETRY, and the
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from dataclasses import asdict, astuple
 
 from companion.config import FeedbackConfig, Measurement
+from companion.estimation.gate.gate_journal import GLOBAL, GateJournal
+from companion.estimation.gate.gates_again import DOUBT, FRAME, LIMITS, PLACED, placed_values
 from companion.estimation.gate.global_gate import GlobalGate
 from companion.estimation.gate.pose_gate import PoseGate
+from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth
 from companion.messages import Georeferenced, Odometry
 from companion.meters import RateMeter
@@ -26,7 +30,10 @@ UNHEARD = "the autopilot is silent"
 
 
 class GlobalSender:
-    """Odometry of the current flight in; the message of `feedback.global_position` out."""
+    """Odometry of the current flight in; the message of `feedback.global_position` out.
+
+    `journal` takes what the gates were asked.
+    """
 
     def __init__(
         self,
@@ -34,10 +41,11 @@ class GlobalSender:
         link: AutopilotLink,
         clock: FlightClock,
         use: Collection[Measurement],
+        journal: Callable[[GateStep], None],
     ) -> None:
         self._config, self._link, self._clock = config, link, clock
         self._poses, self._gate = PoseGate(config, use=use), GlobalGate(config, use)
-        self._flight: object = None
+        self._journal = GateJournal(GLOBAL, journal)
         self._rate = RateMeter()
         self._n_sent, self._sent_ns, self._sigma_m = 0, 0, 0.0
         self._why_not = ""
@@ -48,29 +56,37 @@ class GlobalSender:
         self._config = config
         self._poses.reconfigure(config)
         self._gate.reconfigure(config)
+        self._journal.step(LIMITS, self._clock.now_ns(), {"limits": asdict(config)})
 
     def take_attitude(self, sample: AttitudeSample) -> None:
         """Take an attitude of the autopilot."""
+        self._journal.sample()
         self._poses.take_attitude(sample)
 
     def take_position(self, sample: PositionSample) -> None:
         """Take a position of the autopilot."""
+        self._journal.sample()
         self._gate.take_position(sample)
 
     def take_georeference(self, told: Georeferenced) -> None:
         """Take the newest place of the map."""
         self._gate.take_georeference(told.georeference)
+        self._journal.step(PLACED, self._clock.now_ns(), placed_values(told.georeference))
 
-    def of_flight(self, flight: object) -> None:
-        """Begin anew with another flight: its localisation knows nothing of the one before."""
-        if flight is not self._flight:
-            self._flight = flight
-            self._poses.restart()
-            self._gate.restart()
+    def begin_flight(self, use: Collection[Measurement]) -> None:
+        """Begin anew with another flight: its localisation knows nothing of the one before.
+
+        Of telemetry it believes what is in `use`.
+        """
+        satellites_ns = self._gate.satellites_ns
+        self._poses, self._gate = PoseGate(self._config, use=use), GlobalGate(self._config, use)
+        self._gate.satellites_ns = satellites_ns
+        self._journal.begin(self._clock.now_ns(), {"satellites_ns": satellites_ns})
 
     def doubt_satellites(self, doubted: bool) -> None:
         """Satellites are doubted, or are not any more."""
         self._gate.doubted = doubted
+        self._journal.step(DOUBT, self._clock.now_ns(), {"doubted": doubted})
 
     def take(self, odometry: Odometry) -> None:
         """Take the odometry of a frame, and send its position if due and allowed."""
@@ -97,17 +113,28 @@ class GlobalSender:
 
     def _send(self, odometry: Odometry, now_ns: int) -> str:
         """Send a position; else why not."""
-        pose = self._poses.take(odometry, now_ns)
+        pose, origin, vehicle = self._poses.take(odometry, now_ns), None, self._link.vehicle
+        given, message = None, self._config.global_position
+        if pose is not None:
+            origin = self._link.origin
+            given = self._gate.take(pose, origin, now_ns)
+        is_heard = vehicle is not None and self._link.alive
+        due = now_ns - self._sent_ns >= 1e9 / RATES_HZ[message]
+        system = vehicle.system_id if vehicle is not None else 0
+        sent = given is not None and is_heard and due
+        asked = {
+            "seq": odometry.seq, "origin": None if origin is None else astuple(origin),
+            "system": system,
+        }  # fmt: skip
+        self._journal.step(FRAME, now_ns, asked, sent)
         if pose is None:
             return self._poses.why_not
-        given, vehicle = self._gate.take(pose, self._link.origin, now_ns), self._link.vehicle
         if given is None:
             return self._gate.why_not
-        if vehicle is None or not self._link.alive:
+        if not is_heard:
             return UNHEARD
-        message = self._config.global_position
-        if now_ns - self._sent_ns >= 1e9 / RATES_HZ[message]:
-            self._link.send(global_message(given, message, vehicle.system_id, now_ns))
+        if sent:
+            self._link.send(global_message(given, message, system, now_ns))
             self._n_sent, self._sent_ns = self._n_sent + 1, now_ns
             self._sigma_m = given.sigma_horizontal_m
             self._rate.add(now_ns)

@@ -6,12 +6,13 @@ Runs in the event loop. Which positions are sent is decided by
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
-import numpy as np
+from collections.abc import Callable, Collection
 
 from companion.config import LandingConfig, Measurement
+from companion.estimation.gate.gate_journal import LANDING, GateJournal
+from companion.estimation.gate.gates_again import FRAME
 from companion.estimation.landing.landing_gate import LandingGate
+from companion.flight_notes import GateStep
 from companion.health import LandingHealth
 from companion.messages import LandingTarget
 from companion.meters import LatencyMeter, RateMeter
@@ -29,7 +30,7 @@ UNHEARD, NO_POSITION = "the autopilot is silent", "no local position from the au
 class LandingSender:
     """Landing targets of the current flight in; LANDING_TARGET out, or nothing.
 
-    Of telemetry it believes what is in `use`.
+    Of telemetry it believes what is in `use`. `journal` takes what the gate was asked.
     """
 
     def __init__(
@@ -38,17 +39,25 @@ class LandingSender:
         link: AutopilotLink,
         clock: FlightClock,
         use: Collection[Measurement],
+        journal: Callable[[GateStep], None],
     ) -> None:
         self._config, self._link, self._clock = config, link, clock
         self._gate, self._local = LandingGate(use), LocalPosition(link)
+        self._journal = GateJournal(LANDING, journal)
         self._rate, self._latency = RateMeter(), LatencyMeter()
         self._n_sent, self._sent_ns = 0, 0
         self._distance_m: float | None = None
         self._why_not = ""
         self._is_told = False
 
+    def begin_flight(self, use: Collection[Measurement]) -> None:
+        """Begin anew with another flight, of whose telemetry is believed what is in `use`."""
+        self._gate = LandingGate(use)
+        self._journal.begin(self._clock.now_ns(), {})
+
     def take_attitude(self, sample: AttitudeSample) -> None:
         """Take an attitude of the autopilot."""
+        self._journal.sample()
         self._gate.take_attitude(sample)
 
     def take(self, target: LandingTarget) -> None:
@@ -76,19 +85,21 @@ class LandingSender:
     def _send(self, target: LandingTarget, now_ns: int) -> str:
         """Send a position; else why not."""
         passed, vehicle = self._gate.take(target, now_ns), self._link.vehicle
+        own_ned_m, why_not = None, ""
         if passed is None:
-            return self._gate.why_not
-        if vehicle is None or not self._link.alive:
-            return UNHEARD
-        own_ned_m = None
-        if vehicle.firmware == "px4":
+            why_not = self._gate.why_not
+        elif vehicle is None or not self._link.alive:
+            why_not = UNHEARD
+        elif vehicle.firmware == "px4":
             own_ned_m = self._local.at(passed.t_ns)
-            if own_ned_m is None:
-                return NO_POSITION
-        distance_m = float(np.linalg.norm(passed.position_body_m))
-        size_rad = self._config.size_m / distance_m
+            why_not = NO_POSITION if own_ned_m is None else ""
+        asked = {"seq": target.seq, "own_ned_m": own_ned_m}
+        self._journal.step(FRAME, now_ns, asked, sent=not why_not)
+        if passed is None or why_not:
+            return why_not
+        size_rad = self._config.size_m / passed.distance_m
         self._link.send(landing_target_message(passed, size_rad, own_ned_m))
-        self._n_sent, self._sent_ns, self._distance_m = self._n_sent + 1, now_ns, distance_m
+        self._n_sent, self._sent_ns, self._distance_m = self._n_sent + 1, now_ns, passed.distance_m
         self._rate.add(now_ns)
         self._latency.add(now_ns, (now_ns - target.t_ns) * 1e-6)
         return ""

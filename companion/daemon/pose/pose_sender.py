@@ -12,8 +12,8 @@ from pathlib import Path
 
 from companion.config import FeedbackConfig, Measurement
 from companion.daemon.pose.sent_counter import SentCounter
-from companion.estimation.gate.gate_journal import JournaledGate
 from companion.estimation.gate.pose_gate import PoseToSend, Sending
+from companion.estimation.gate.pose_journal import JournaledPoseGate
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.health import FeedbackHealth
@@ -64,7 +64,7 @@ class PoseSender:
         self._config, self._link, self._clock = config, link, clock
         counter, height = ResetCounter(), AutopilotHeight(link)
         self._counter = SentCounter(counter_path, counter, height, link, clock, warn)
-        self._gate = JournaledGate(
+        self._gate = JournaledPoseGate(
             config,
             counter,
             height.down_m,

@@ -1,7 +1,6 @@
 """Switches the sources of ArduPilot's EKF while satellites are doubted, where that is allowed.
 
-It is done while poses are sent only: else the EKF would be left with nothing. A doubt outlives its
-flight in the air, where what begins anew knows nothing of it, and ends on the ground. Runs in the
+Which set is asked for is decided by `companion.estimation.satellites.source_choice`. Runs in the
 event loop.
 """
 
@@ -11,12 +10,16 @@ import asyncio
 from collections.abc import Callable
 
 from companion.config import GpsConfig
+from companion.estimation.gate.gate_journal import SOURCES, GateJournal
+from companion.estimation.gate.gates_again import ANSWERED, ASKED, BOOTED, DOUBT
+from companion.estimation.satellites.source_choice import SourceChoice
+from companion.flight_notes import GateStep
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 
-TICK_S, AGAIN_NS = 0.1, 5_000_000_000
-"""Interval of looks, and of tries after a refusal."""
+TICK_S = 0.1
+"""Interval of looks."""
 TO_VISION = "the EKF's sources are switched to vision"
 TO_SATELLITES = "the EKF's sources are switched to satellites"
 ACCEPTED = 0
@@ -27,7 +30,7 @@ NOT_SWITCHED = "the EKF's sources could not be switched"
 class SourceSwitch:
     """Changes the EKF source set by the verdict on satellites.
 
-    `sending` is True with poses, `flight` gives the current flight, None without one.
+    `sending` is True with poses; `journal` takes what the choice was made of.
     """
 
     def __init__(
@@ -36,23 +39,29 @@ class SourceSwitch:
         link: AutopilotLink,
         clock: FlightClock,
         sending: Callable[[], bool],
-        flight: Callable[[], object],
         warn: Callable[[Warned], None],
+        journal: Callable[[GateStep], None],
     ) -> None:
-        self._config, self._link, self._clock = config, link, clock
-        self._sending, self._flight, self._warn = sending, flight, warn
-        self._doubted = False
-        self._doubted_in: object = None
-        """Flight that has the doubt."""
-        self._switched: bool | None = False
-        """True while the EKF is on the set without satellites, by our command; None where that is
-        not known: a command without an answer may have been obeyed, a reboot forgets it."""
+        self._link, self._clock = link, clock
+        self._sending, self._warn = sending, warn
+        self._choice = SourceChoice(config)
         self._n_reboots = link.clock_filter.n_reboots
-        self._not_before_ns = 0
+        self._journal = GateJournal(SOURCES, journal)
+
+    def begin_flight(self) -> None:
+        """Another flight begins: its localisation knows nothing of a doubt."""
+        choice = self._choice
+        choice.begin_flight()
+        known = {
+            "doubted": choice.doubted, "on_vision": choice.on_vision,
+            "not_before_ns": choice.not_before_ns,
+        }  # fmt: skip
+        self._journal.begin(self._clock.now_ns(), known)
 
     def doubt_satellites(self, doubted: bool) -> None:
         """Satellites are doubted, or are not any more."""
-        self._doubted, self._doubted_in = doubted, self._flight() if doubted else None
+        self._choice.doubt_satellites(doubted)
+        self._journal.step(DOUBT, self._clock.now_ns(), {"doubted": doubted})
 
     async def run(self) -> None:
         """Switch when due; until cancelled."""
@@ -63,27 +72,30 @@ class SourceSwitch:
     async def step(self) -> None:
         """Switch if due."""
         now_ns, vehicle = self._clock.now_ns(), self._link.vehicle
-        if self._doubted and vehicle is not None and not vehicle.armed:
-            self._doubted = self._flight() is self._doubted_in
         if self._n_reboots != self._link.clock_filter.n_reboots:
             self._n_reboots = self._link.clock_filter.n_reboots
-            self._switched = None if self._switched else self._switched
-        if self._doubted == self._switched or now_ns < self._not_before_ns:
-            return
+            self._choice.autopilot_booted()
+            self._journal.step(BOOTED, now_ns, {})
         if vehicle is None or vehicle.firmware != "ardupilot" or not self._link.alive:
             return
-        to_vision = self._doubted
-        if to_vision and not self._sending():
+        before, sending = self._choice.doubted, self._sending()
+        number = self._choice.due(now_ns, vehicle.armed, sending)
+        to_vision = self._choice.doubted
+        if number is not None or to_vision != before:
+            asked = {
+                "armed": vehicle.armed, "sends_poses": sending, "system": vehicle.system_id
+            }  # fmt: skip
+            self._journal.step(ASKED, now_ns, asked, sent=number is not None)
+        if number is None:
             return
-        number = self._config.vision_set if to_vision else self._config.satellites_set
         result = await self._link.set_source_set(number)
-        if result == ACCEPTED:
-            self._switched = to_vision
+        now_ns = self._clock.now_ns()
+        accepted = None if result < 0 else result == ACCEPTED
+        self._choice.answered(to_vision, accepted, now_ns)
+        self._journal.step(ANSWERED, now_ns, {"to_vision": to_vision, "accepted": accepted})
+        if accepted:
             what = TO_VISION if to_vision else TO_SATELLITES
-            self._warn(Warned(self._clock.now_ns(), what, f"set {number}", good=not to_vision))
+            self._warn(Warned(now_ns, what, f"set {number}", good=not to_vision))
             return
-        if result < 0:
-            self._switched = None
-        self._not_before_ns = self._clock.now_ns() + AGAIN_NS
         detail = f"set {number}: MAV_RESULT {result}" if result >= 0 else f"set {number}: no answer"
-        self._warn(Warned(self._clock.now_ns(), NOT_SWITCHED, detail))
+        self._warn(Warned(now_ns, NOT_SWITCHED, detail))

@@ -63,7 +63,8 @@ class GlobalGate:
 
     def __init__(self, config: FeedbackConfig, use: Collection[Measurement]) -> None:
         self._config, self._use = config, use
-        self._satellites_ns: int | None = None
+        self.satellites_ns: int | None = None
+        """Time of the last satellites that were used."""
         self._placed: Georeference | None = None
         self._placed_at_m: Array | None = None
         """Place of the body when satellites last placed the map."""
@@ -75,16 +76,11 @@ class GlobalGate:
         """Change the source that is given out."""
         self._config = config
 
-    def restart(self) -> None:
-        """Another localisation, whose map has no place yet, and which doubts nothing."""
-        self._placed = self._placed_at_m = None
-        self.doubted = False
-
     def take_position(self, sample: PositionSample) -> None:
         """Take a position of the autopilot; those of satellites count."""
         if sample.source is PositionSource.GPS and is_believed(sample, self._use):
             if not self.doubted:
-                self._satellites_ns, self._placed_at_m = sample.t_ns, None
+                self.satellites_ns, self._placed_at_m = sample.t_ns, None
 
     def take_georeference(self, found: Georeference | None) -> None:
         """Take the newest place of the map."""
@@ -117,7 +113,7 @@ class GlobalGate:
             return OTHER_SOURCE
         if self._config.global_position == "gps_input" and "satellites" in self._use:
             return ECHO
-        if self._satellites_ns is not None and now_ns - self._satellites_ns < WITHOUT_NS:
+        if self.satellites_ns is not None and now_ns - self.satellites_ns < WITHOUT_NS:
             if not self.doubted:
                 return IN_USE
         if origin is None or self._placed is None or not self._placed.has_origin:

@@ -46,6 +46,11 @@ class TargetToSend:
     position_body_m: Array
     offset_ned_m: Array
 
+    @property
+    def distance_m(self) -> float:
+        """Distance of the marker from the body."""
+        return float(np.linalg.norm(self.position_body_m))
+
 
 class LandingGate:
     """Decides frame by frame; `why_not` is the reason of the last refusal, "" without one."""

@@ -32,14 +32,18 @@ class SiteInFlight:
             tracker.atlas.on_merge = self._merged
             georeferences.hold(use.slam_map, use.georeference)
 
+    @property
+    def in_use(self) -> bool:
+        """True with a site map."""
+        return self._use is not None
+
     def take_origin(self, origin: GeoOrigin) -> None:
         """Place the map about the origin of local NED."""
         if self._use is None:
             return
-        with self._tracker.map_lock.reading():
-            moved = self._use.set_origin(origin)
-            if moved is not None:
-                self._georeferences.move_held(moved)
+        moved = self._use.set_origin(origin)
+        if moved is not None:
+            self._georeferences.move_held(moved)
 
     def allowed(self, found: LoopClosure) -> bool | None:
         """True if measurements do not contradict the map; None of a loop that is not with it."""

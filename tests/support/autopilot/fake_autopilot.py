@@ -612,6 +612,8 @@ class FakeAutopilot:
             result = ACCEPTED if self.firmware == "px4" and not self.armed else UNSUPPORTED
             if result == ACCEPTED:
                 self.parameters.store()
+        elif command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET and self.firmware == "ardupilot":
+            result = ACCEPTED
         elif command == DO_SET_GLOBAL_ORIGIN and self.knows_do_set_origin:
             # its latitude and longitude have their digits in a COMMAND_INT only
             result = ACCEPTED if got.kind == "COMMAND_INT" else DENIED

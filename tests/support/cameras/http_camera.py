@@ -12,6 +12,7 @@ that scale is found sooner.
     stalled       True: the connection stays, and nothing comes
     frozen        True: the same picture again and again
     size          (width, height) of what it sends
+    markers_m     edge of landing markers that lie on its way; 0: none
     covered       True: it is dark, but for the sensor's noise
     lost          the share of pictures that never leave it, evenly spread
     sent_ns       CLOCK_MONOTONIC of the last picture that a client was sent
@@ -35,11 +36,14 @@ from companion.geometry.transforms import Pose
 from companion.messages import Bytes
 from drivers.camera import pattern_camera
 from drivers.camera.pattern_camera import BODY_FROM_CAMERA, PatternScene, pattern_optics
+from tests.support.flights.marker_ground import CELL_PX, drawn_marker
 
 RATE_HZ = 15.0
 FASTER = 2.0
 LEAD_NS, MOST_LATE_NS = 50_000_000, 20_000_000
 """A picture that could not be sent at the time that it shows is left out."""
+MARKERS_NED_M = ((6.0, 0.0), (-6.0, 0.0))
+"""Places of landing markers: where its circle crosses the north axis."""
 BOUNDARY = b"picture"
 HEAD = (
     b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=" + BOUNDARY + b"\r\n"
@@ -95,6 +99,7 @@ class HttpCamera:
         """Be there, and do as a camera should."""
         self.size, self.on, self.lost = self._full_size, True, 0.0
         self.stalled = self.frozen = self.covered = False
+        self.markers_m = 0.0
 
     def write_calibration(self, path: Path) -> Path:
         """As the daemon is given it."""
@@ -160,6 +165,8 @@ class HttpCamera:
         if self._last is None or not self.frozen:
             pose = self._world_from_body(monotonic_ns) @ BODY_FROM_CAMERA
             self._last = self._scene.picture(self._optics, pose)[1]
+            if self.markers_m:
+                self._last = self._with_markers(self._last, pose)
         seen = self._last
         if self.covered:
             seen = np.asarray(self._noise.integers(0, 8, seen.shape), np.uint8)
@@ -168,3 +175,23 @@ class HttpCamera:
         done, data = cv2.imencode(".jpg", seen[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
         assert done
         return bytes(data)
+
+    def _with_markers(self, picture: Bytes, pose: Pose) -> Bytes:
+        """The picture with markers flat on the ground, whose tops point north."""
+        sheet = np.repeat(drawn_marker("apriltag_36h11", 0)[..., None], 3, axis=2)
+        n = len(sheet)
+        half = n * self.markers_m / (n - 2 * CELL_PX) / 2
+        corners = half * np.array([[1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0]])
+        texels = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32) - 0.5
+        for north, east in MARKERS_NED_M:
+            there = pose.inverse().apply(corners + [north, east, 0.0])
+            if there[:, 2].min() <= 0.1:
+                continue
+            turned = cv2.getPerspectiveTransform(
+                texels, self._optics.project(there).astype(np.float32)
+            )
+            size = picture.shape[1::-1]
+            drawn = cv2.warpPerspective(sheet, turned, size, flags=cv2.INTER_AREA)
+            mask = cv2.warpPerspective(np.full((n, n), 255, np.uint8), turned, size)
+            picture = np.where(mask[..., None] > 127, drawn, picture)
+        return picture

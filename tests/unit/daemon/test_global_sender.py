@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import math
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.config import MEASUREMENTS, FeedbackConfig
+from companion.app.replay.sent_again import SentAgain
+from companion.config import MEASUREMENTS, Config, FeedbackConfig
 from companion.daemon.pose.global_sender import UNHEARD, GlobalSender
+from companion.estimation.gate.gate_journal import GLOBAL
 from companion.estimation.gate.global_gate import NOT_PLACED
+from companion.flight_notes import GateStep
 from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry.transforms import Pose, Similarity
 from companion.messages import Georeference, Georeferenced, Odometry, TrackState
 from companion.telemetry import AttitudeSample, PositionSample, PositionSource, Telemetry
+from drivers.recording.decisions import Decisions, payloads_of
 from tests.support.autopilot.memory_link import SetClock, listen, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
+from tests.support.flights.recorded_steps import recorded
 
 MS = 1_000_000
 Message = Literal["sensor", "estimate", "gps_input"]
@@ -38,8 +44,12 @@ class Vehicle:
         self.clock, self.port, self.message = SetClock(), MemoryPort(), message
         self.link = memory_link(self.port, self.clock, self._deliver)
         use = set(MEASUREMENTS) - ({"satellites"} if message == "gps_input" else set())
+        self.steps: list[GateStep] = []
+        self.samples: list[Telemetry] = []
+        self.odometry: dict[int, Odometry] = {}
+        self.use = tuple(use)
         self.sender = GlobalSender(
-            FeedbackConfig(global_position=message), self.link, self.clock, use
+            FeedbackConfig(global_position=message), self.link, self.clock, use, self.steps.append
         )
         asyncio.run(listen(self.link))
         self._hear()
@@ -50,8 +60,7 @@ class Vehicle:
             ),
             self.clock.t_ns,
         )  # fmt: skip
-        placed = Georeference(Similarity.identity(), 0.002, 0.01, "GPS", 40, 0.6)
-        self.sender.take_georeference(Georeferenced(self.clock.t_ns, placed))
+        self.place()
         self.seq = 0
 
     def _deliver(self, sample: Telemetry) -> None:
@@ -60,21 +69,28 @@ class Vehicle:
     def _hear(self) -> None:
         self.port.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), self.clock.t_ns)
 
+    def place(self) -> None:
+        placed = Georeference(Similarity.identity(), 0.002, 0.01, "GPS", 40, 0.6)
+        self.sender.take_georeference(Georeferenced(self.clock.t_ns, placed))
+
     def run(self, seconds: float, satellites: bool = False) -> list[Any]:
         n_before = len(self.sent)
         for _ in range(round(seconds * 20)):
             self.clock.t_ns += 50 * MS
             self.seq += 1
             now_ns = self.clock.t_ns
-            self.sender.take_attitude(AttitudeSample(now_ns, LEVEL, np.zeros(3)))
+            attitude = AttitudeSample(now_ns, LEVEL, np.zeros(3))
+            self.samples.append(attitude)
+            self.sender.take_attitude(attitude)
             if satellites:
-                self.sender.take_position(PositionSample(now_ns, PositionSource.GPS, PLACE))
-            self.sender.take(
-                Odometry(
-                    self.seq, now_ns - LATENCY_NS, TrackState.TRACKING, 1, 90,
-                    Pose(np.eye(3), PLACE), np.zeros(3), 0.1, 0.05, 0.005, 0.01,
-                )
+                position = PositionSample(now_ns, PositionSource.GPS, PLACE)
+                self.samples.append(position)
+                self.sender.take_position(position)
+            self.odometry[self.seq] = Odometry(
+                self.seq, now_ns - LATENCY_NS, TrackState.TRACKING, 1, 90,
+                Pose(np.eye(3), PLACE), np.zeros(3), 0.1, 0.05, 0.005, 0.01,
             )  # fmt: skip
+            self.sender.take(self.odometry[self.seq])
         return self.sent[n_before:]
 
     @property
@@ -148,7 +164,7 @@ def test_another_localisation_begins_without_a_place() -> None:
     vehicle = Vehicle("sensor")
     vehicle.sender.doubt_satellites(True)
     assert vehicle.run(3.0, satellites=True) != []
-    vehicle.sender.of_flight("another")
+    vehicle.sender.begin_flight(vehicle.use)
     vehicle.run(0.2)
     assert vehicle.run(3.0, satellites=True) == []
     assert vehicle.run(8.0) == []
@@ -160,3 +176,31 @@ def test_switched_off_it_is_silent() -> None:
     vehicle.run(3.0)
     vehicle.sender.reconfigure(FeedbackConfig())
     assert vehicle.run(2.0) == []
+
+
+@pytest.mark.parametrize("message", ["sensor", "estimate", "gps_input"])
+def test_its_journal_gives_the_messages_again(message: Message) -> None:
+    """Of a flight that begins while satellites are there, of which nothing came with it."""
+    vehicle = Vehicle(message)
+    vehicle.run(3.0, satellites=True)
+    vehicle.samples.clear()
+    vehicle.steps.clear()
+    n_before = len(vehicle.sent)
+    vehicle.sender.begin_flight(vehicle.use)
+    vehicle.place()
+    vehicle.run(7.0)
+    vehicle.run(0.5, satellites=True)
+    vehicle.sender.doubt_satellites(True)
+    vehicle.run(3.0, satellites=True)
+    vehicle.sender.reconfigure(FeedbackConfig(global_position=message, min_quality=95))
+    vehicle.run(1.0)
+    feedback = FeedbackConfig(global_position=message)
+    told = Decisions(replace(Config(), feedback=feedback), lossless=True)
+    told = replace(
+        told, config=replace(told.config, telemetry=replace(told.config.telemetry, use=vehicle.use))
+    )
+    told.samples.extend(vehicle.samples)
+    steps = [recorded(step) for step in vehicle.steps]
+    made = SentAgain(told, vehicle.odometry, {}).payloads(steps)
+    assert len(vehicle.sent) >= n_before + 4
+    assert made == {GLOBAL: payloads_of(vehicle.sent[n_before:])}

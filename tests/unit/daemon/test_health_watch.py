@@ -25,7 +25,7 @@ def watch_of(flight: Any, folder: Path) -> HealthWatch:
     config = replace(config, daemon=replace(config.daemon, flights=str(folder)))
     parts: tuple[Any, ...] = (
         config, clock, Journal({}), SimpleNamespace(health=SourceHealth("camera")), None, None,
-        None, None, None, SimpleNamespace(current=flight), LatencyMeter(),
+        SimpleNamespace(current=flight), LatencyMeter(),
     )  # fmt: skip
     return HealthWatch(*parts)
 

@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.config import MEASUREMENTS, LandingConfig
+from companion.app.replay.sent_again import SentAgain
+from companion.config import MEASUREMENTS, Config, LandingConfig
 from companion.daemon.pose.landing_sender import NO_POSITION, UNHEARD, LandingSender
+from companion.estimation.gate.gate_journal import LANDING
 from companion.estimation.landing.landing_gate import STALE
 from companion.estimation.landing.marker_detector import NOT_SEEN
+from companion.flight_notes import GateStep
 from companion.geometry.transforms import quaternion_from_euler
 from companion.messages import LandingTarget
 from companion.telemetry import AttitudeSample, Telemetry
+from drivers.recording.decisions import Decisions, payloads_of
 from tests.support.autopilot.memory_link import SetClock, listen, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
+from tests.support.flights.recorded_steps import recorded
 
 MS = 1_000_000
 LATENCY_NS = 50 * MS
 HEADING_RAD = 0.5 * np.pi
 BELOW = np.array([0.5, 0.1, 4.0])
+MARKER = LandingConfig("apriltag_36h11", 0, 0.4)
 VELOCITY = np.array([1.0, 0.0, 0.5])
 
 
@@ -33,9 +40,10 @@ class Vehicle:
         self.clock, self.port, self.autopilot = SetClock(), MemoryPort(), autopilot
         self.began_ns = self.clock.t_ns
         self.link = memory_link(self.port, self.clock, self._deliver)
-        self.sender = LandingSender(
-            LandingConfig("apriltag_36h11", 0, 0.4), self.link, self.clock, MEASUREMENTS
-        )
+        self.steps: list[GateStep] = []
+        self.attitudes: list[AttitudeSample] = []
+        self.targets: dict[int, LandingTarget] = {}
+        self.sender = LandingSender(MARKER, self.link, self.clock, MEASUREMENTS, self.steps.append)
         self.positions = True
         asyncio.run(listen(self.link))
 
@@ -51,7 +59,8 @@ class Vehicle:
             self.clock.t_ns += 20 * MS
             now_ns = self.clock.t_ns
             level = quaternion_from_euler(0.0, 0.0, HEADING_RAD)
-            self.sender.take_attitude(AttitudeSample(now_ns, level, np.zeros(3)))
+            self.attitudes.append(AttitudeSample(now_ns, level, np.zeros(3)))
+            self.sender.take_attitude(self.attitudes[-1])
             boot_ms = (now_ns - self.began_ns) // MS + 10_000
             if now_ns % (100 * MS) == 0:
                 self.port.hear(
@@ -69,10 +78,13 @@ class Vehicle:
         return self.sent[n_before:]
 
     def target(self, t_ns: int, seen: bool) -> LandingTarget:
-        if not seen:
-            return LandingTarget(1, t_ns, why_not=NOT_SEEN)
-        up = np.array([[0.0, 0.0, -1.0]])
-        return LandingTarget(1, t_ns, BELOW, np.full(3, 0.01), up, 50.0)
+        seq, up = len(self.targets), np.array([[0.0, 0.0, -1.0]])
+        self.targets[seq] = (
+            LandingTarget(seq, t_ns, BELOW, np.full(3, 0.01), up, 50.0)
+            if seen
+            else LandingTarget(seq, t_ns, why_not=NOT_SEEN)
+        )
+        return self.targets[seq]
 
     @property
     def sent(self) -> list[Any]:
@@ -145,3 +157,24 @@ def test_nothing_is_sent_too_late_to_a_silent_autopilot_or_without_a_marker() ->
     for n in range(4):
         vehicle.sender.take(vehicle.target(t_ns - 40 * MS + n * MS, seen=True))
     assert vehicle.sender.health().why_not == UNHEARD
+
+
+@pytest.mark.parametrize("vehicle", [ardupilot(), px4()], ids=["ardupilot", "px4"])
+def test_its_journal_gives_the_messages_again(vehicle: Vehicle) -> None:
+    vehicle.run(0.3)
+    vehicle.attitudes.clear()
+    n_before = len(vehicle.sent)
+    vehicle.sender.begin_flight(MEASUREMENTS)
+    vehicle.run(0.5)
+    vehicle.positions = False
+    vehicle.run(0.6, late_ns=70 * MS)
+    vehicle.run(0.3, seen=False)
+    vehicle.positions = True
+    vehicle.run(0.5)
+    told = Decisions(replace(Config(), landing=MARKER), lossless=True)
+    told.samples.extend(vehicle.attitudes)
+    steps = [recorded(step) for step in vehicle.steps]
+    steps = steps[[step.what for step in steps].index("begin") :]
+    made = SentAgain(told, {}, vehicle.targets).payloads(steps)
+    assert len(vehicle.sent) > n_before + 15
+    assert made == {LANDING: payloads_of(vehicle.sent[n_before:])}

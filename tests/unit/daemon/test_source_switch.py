@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.config import GpsConfig
+from companion.app.replay.sent_again import SentAgain
+from companion.config import Config, GpsConfig
 from companion.daemon.pose.source_switch import (
-    AGAIN_NS,
     NOT_SWITCHED,
     TO_SATELLITES,
     TO_VISION,
     SourceSwitch,
 )
+from companion.estimation.gate.gate_journal import SOURCES
+from companion.estimation.satellites.source_choice import AGAIN_NS
+from companion.flight_notes import GateStep
 from companion.messages import Warned
+from drivers.recording.decisions import Decisions, payloads_of
 from tests.support.autopilot.memory_link import SetClock, listen, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
+from tests.support.flights.recorded_steps import recorded
 
 SWITCH = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
+GPS = GpsConfig(True, 3, 1)
 
 
 class Vehicle:
@@ -30,16 +37,18 @@ class Vehicle:
         self.clock, self.port = SetClock(), MemoryPort()
         self.link = memory_link(self.port, self.clock, lambda _: None)
         self.warned: list[Warned] = []
+        self.steps: list[GateStep] = []
         self.sending, self.result = True, mavlink.MAV_RESULT_ACCEPTED
         self.switch = SourceSwitch(
-            GpsConfig(True, 3, 1), self.link, self.clock, lambda: self.sending,
-            lambda: self.flight, self.warned.append,
+            GPS, self.link, self.clock, lambda: self.sending, self.warned.append,
+            self.steps.append,
         )  # fmt: skip
-        self.autopilot, self.flight = autopilot, object()
+        self.autopilot = autopilot
 
     async def begin(self) -> None:
         await listen(self.link)
         self.hear(armed=True)
+        self.switch.begin_flight()
 
     def hear(self, armed: bool) -> None:
         mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
@@ -146,12 +155,41 @@ def test_a_doubt_outlives_its_flight_in_the_air_only() -> None:
         await vehicle.begin()
         vehicle.switch.doubt_satellites(True)
         await vehicle.step()
-        vehicle.flight = object()  # localisation has died in the air
+        vehicle.switch.begin_flight()  # localisation has died in the air
         await vehicle.step()
         assert vehicle.sets == [3]
         vehicle.hear(armed=False)
         await vehicle.step()
         assert vehicle.sets == [3, 1]
+
+    asyncio.run(fly())
+
+
+def test_another_flight_asks_again_what_its_journal_has() -> None:
+    """Also of what the flight before has left: a doubt, and the set that is flown on."""
+
+    async def fly() -> None:
+        vehicle = Vehicle()
+        await vehicle.begin()
+        vehicle.switch.doubt_satellites(True)
+        await vehicle.step()
+        vehicle.steps.clear()
+        n_before = len(vehicle.commands)
+        vehicle.switch.begin_flight()
+        for armed in (True, False, True):
+            vehicle.hear(armed)
+            await vehicle.step()
+        vehicle.result = mavlink.MAV_RESULT_DENIED
+        vehicle.switch.doubt_satellites(True)
+        await vehicle.step()
+        await vehicle.step()
+        vehicle.result = mavlink.MAV_RESULT_ACCEPTED
+        vehicle.clock.t_ns += AGAIN_NS
+        await vehicle.step()
+        told = Decisions(replace(Config(), gps=GPS), lossless=True)
+        made = SentAgain(told, {}, {}).payloads([recorded(step) for step in vehicle.steps])
+        assert vehicle.sets[n_before:] == [1, 3, 3]
+        assert made == {SOURCES: payloads_of(vehicle.commands[n_before:])}
 
     asyncio.run(fly())
 

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from companion.config import Config
+from companion.estimation.gate.gate_journal import POSE as POSES
 from companion.estimation.gate.pose_gate import PoseToSend
 from companion.geometry.transforms import Pose
+from drivers.mavlink.measurements.pose_messages import pose_messages
 from drivers.mavlink.vehicle import Firmware
 from drivers.recording.decisions import Decisions, payloads_of
 
@@ -22,11 +24,13 @@ POSE = PoseToSend(
 def test_poses_are_made_again_for_the_firmware_that_they_were_sent_to(
     firmware: Firmware, mode: str
 ) -> None:
-    sent = payloads_of(POSE, mode, firmware)
-    told = Decisions(Config(), lossless=True, sent=sent)
-    assert payloads_of(POSE, mode, told.firmware) == sent
+    sent = payloads_of(pose_messages(POSE, mode, firmware))
+    told = Decisions(Config(), lossless=True, sent={POSES: sent})
+    assert payloads_of(pose_messages(POSE, mode, told.firmware)) == sent
 
 
 def test_what_one_firmware_gets_another_does_not() -> None:
-    to_px4, to_ardupilot = (payloads_of(POSE, "odometry", each) for each in ("px4", "ardupilot"))
-    assert to_px4 != to_ardupilot
+    def sent(firmware: Firmware) -> list[tuple[int, bytes]]:
+        return payloads_of(pose_messages(POSE, "odometry", firmware))
+
+    assert sent("px4") != sent("ardupilot")

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from companion.config import MEASUREMENTS, FeedbackConfig, Measurement
-from companion.estimation.gate.gate_journal import JournaledGate, poses_as_sent
+from companion.estimation.gate.gate_journal import POSE, given_again
 from companion.estimation.gate.pose_gate import PoseToSend
+from companion.estimation.gate.pose_journal import JournaledPoseGate, PoseGateAgain
 from companion.estimation.gate.reset_counter import ResetCounter
 from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import Odometry, TrackState
 from companion.telemetry import AttitudeSample
-from drivers.recording.decisions import step_of
 from drivers.recording.recorded_content import decision_bytes
+from tests.support.flights.recorded_steps import recorded
 
 MS = 1_000_000
 
@@ -46,7 +47,7 @@ class Flight:
                 counter.booted(int(self.rng.integers(1, 255)))
             return ""
 
-        gate = JournaledGate(
+        gate = JournaledPoseGate(
             config, counter, lambda t_ns: -12.5 + 1e-10 * (t_ns - 10**12), may_start,
             lambda: self.now_ns, lambda: self.heard, self.steps.append,
         )  # fmt: skip
@@ -75,7 +76,7 @@ class Flight:
             self.odometry[seq] = odometry
             self._came(gate.take(odometry, self.now_ns))
 
-    def _poll(self, gate: JournaledGate) -> None:
+    def _poll(self, gate: JournaledPoseGate) -> None:
         for _ in range(2):
             self.now_ns += 2 * MS
             self._came(gate.due(self.now_ns))
@@ -84,7 +85,7 @@ class Flight:
         if pose is not None:
             self.given.append(pose)
 
-    def _attitude(self, gate: JournaledGate) -> None:
+    def _attitude(self, gate: JournaledPoseGate) -> None:
         turned = quaternion_from_euler(0.02, -0.03, 1e-9 * (self.now_ns - 10**12) * 0.2)
         sample = AttitudeSample(self.now_ns - 5 * MS, turned, np.array([0.0, 0.0, 0.2]))
         self.attitudes.append(sample)
@@ -103,17 +104,11 @@ class Flight:
         )  # fmt: skip
 
 
-def recorded(step: GateStep) -> GateStep:
-    """A step as it comes back from a recording."""
-    return step_of(step.t_ns, decision_bytes(step))
-
-
 def made_again(flight: Flight, steps: list[GateStep]) -> list[PoseToSend]:
-    made = poses_as_sent(
-        FeedbackConfig(mode="odometry"), flight.use, steps, flight.attitudes,
-        flight.odometry.__getitem__,
-    )  # fmt: skip
-    return [pose for _, pose in made]
+    config = FeedbackConfig(mode="odometry")
+    gate = PoseGateAgain(config, flight.use, flight.odometry.__getitem__)
+    made = given_again({POSE: gate}, steps, flight.attitudes)
+    return [pose for _, pose in made if isinstance(pose, PoseToSend)]
 
 
 @pytest.mark.parametrize("n", range(2))
@@ -143,11 +138,11 @@ def test_a_step_that_is_missing_shows() -> None:
 def test_attitudes_that_are_not_believed_are_counted_and_allow_no_pose() -> None:
     flight = Flight(np.random.default_rng(3), use=("imu", "satellites"))
     flight.fly(300)
-    assert flight.steps[-1].n_attitudes == len(flight.attitudes) == 900
+    assert flight.steps[-1].n_samples == len(flight.attitudes) == 900
     assert flight.given == made_again(flight, [recorded(step) for step in flight.steps]) == []
 
 
 def test_steps_are_read_back_to_the_last_bit() -> None:
-    step = GateStep(123, "frame", 4, 2, True, False, {"seq": 9, "down_m": -0.1234567890123456789})
+    step = GateStep(123, POSE, "frame", 4, True, {"seq": 9, "down_m": -0.1234567890123456789})
     assert json.loads(decision_bytes(step))["values"]["down_m"] == -0.1234567890123456789
     assert recorded(step) == step
