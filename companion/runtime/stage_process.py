@@ -28,11 +28,18 @@ from companion.runtime.stage_protocol import (
 )
 from companion.runtime.stage_start import NOT_STARTED, UNKNOWN_STATUS, Start
 from companion.runtime.stages import QUEUE_BYTES, UNREAD_BYTES, Frames, Stage, drop_policy
+from companion.telemetry import TELEMETRY
 from companion.timing.clock import monotonic_s
 
 FRAME = Frame.__name__
 GATHER_S = 0.05
-"""Small messages gather for this long, or until a frame; localisation gets each at once."""
+"""Small messages gather for this long, or until a frame;"""
+HELD_S = 0.02
+"""samples for localisation, which takes them with its next frame only, for this long: a frame never
+waits for more than a few of them to be opened."""
+MOST_HELD = 64
+"""Samples of some 200 bytes each: a packet holds INLINE_BYTES of them."""
+SAMPLES = {kind.__name__ for kind in TELEMETRY}
 BY_DRIVER = (
     signal.SIGABRT, signal.SIGALRM, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV,
 )  # fmt: skip
@@ -77,6 +84,9 @@ class StageProcess:
             lambda parcel: policy(parcel.kind), lambda parcel: parcel.n_bytes, QUEUE_BYTES
         )
         self._is_prompt = stage.frames is Frames.NEWEST
+        self._held: list[Parcel] = []
+        """Samples that gather for one packet."""
+        self._held_since_s = 0.0
         self._puts = threading.Lock()
         """Keeps what is sent at once in order with what waits."""
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -160,6 +170,7 @@ class StageProcess:
         """Ask it for its last results and its end."""
         self.asked_to_end = True
         with self._puts:
+            self._let_go()
             self._outbox.put(Parcel.of(finish))
             self._outbox.close()
 
@@ -217,19 +228,39 @@ class StageProcess:
             self._outbox.put(parcel)
             return
         with self._puts:
-            if not (self._outbox.is_idle and self._is_sent(parcel)):
+            if parcel.kind not in SAMPLES:
+                self._let_go()
+                self._go([parcel])
+                return
+            now_s = monotonic_s()
+            if not self._held:
+                self._held_since_s = now_s
+            self._held.append(parcel)
+            if now_s - self._held_since_s >= HELD_S or len(self._held) >= MOST_HELD:
+                self._let_go()
+
+    def _let_go(self) -> None:
+        """Send the samples that have gathered."""
+        if self._held:
+            held, self._held = self._held, []
+            self._go(held)
+
+    def _go(self, parcels: list[Parcel]) -> None:
+        if not (self._outbox.is_idle and self._are_sent(parcels)):
+            for parcel in parcels:
                 self._outbox.put(parcel)
 
-    def _is_sent(self, parcel: Parcel) -> bool:
-        """Send a message without waiting; whether it could be."""
-        if parcel.is_shared and self._n_sent - self._n_taken > UNREAD_BYTES:
+    def _are_sent(self, parcels: list[Parcel]) -> bool:
+        """Send messages in one packet without waiting; whether they could be."""
+        first = parcels[0]
+        if first.is_shared and self._n_sent - self._n_taken > UNREAD_BYTES:
             return False
         try:
-            parcel.send(self._socket, socket.MSG_DONTWAIT)
+            Parcel.send_together(parcels, self._socket, socket.MSG_DONTWAIT)
         except OSError:  # full, or gone, of which the thread that sends will learn
             return False
-        if parcel.is_shared:
-            self._n_sent += parcel.n_bytes  # the thread that counts them else waits for a message
+        if first.is_shared:
+            self._n_sent += first.n_bytes  # the thread that counts them else waits for a message
         return True
 
     def _write(self) -> None:

@@ -18,6 +18,7 @@ from companion.messages import Frame, MapUpdate
 from companion.runtime.stage_protocol import DriverAtWork, Finish, SetLoadLevel, Setup
 from companion.runtime.stage_work import Work
 from companion.runtime.stages import Death, Frames, Stage
+from companion.telemetry import ArmedSample
 
 UNUSABLE = "unusable"
 """Name of a folder of which no stage can make anything."""
@@ -69,6 +70,8 @@ class TinyWork(Work):
             yield from self._do(message)
         elif isinstance(message, Frame):
             yield Said(message.t_ns, "frame", str(message.seq))
+        elif isinstance(message, ArmedSample):
+            yield Said(message.t_ns, "sample", str(message.t_ns))
         elif isinstance(message, SetLoadLevel):
             yield Said(0, "load", str(message.level))
         elif isinstance(message, MapUpdate):
