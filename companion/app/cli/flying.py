@@ -33,6 +33,7 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
         signals.defer()
         return run_depth_node(config, lambda: signals.received is not None)
+    import companion.daemon.shared_imports  # noqa: F401
     from companion.runtime.fork_server import ForkServer
 
     with ForkServer(copy=True) as server:  # before there are threads and what only the daemon needs
