@@ -25,12 +25,12 @@ from companion.pilot_messages import PilotText
 from companion.telemetry import ArmedSample, LandedSample, Telemetry
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
+from drivers.mavlink.clock_exchange import ClockExchange
 from drivers.mavlink.commands import AUTOPILOT, NO_ANSWER, TRIES, Commands, command_long
 from drivers.mavlink.imu_rate import ImuNews, ImuRate
 from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.other_companion import OtherCompanion
 from drivers.mavlink.status_text import TextLimit, status_text
-from drivers.mavlink.timesync_message import TimesyncMessage, timesync_target
 from drivers.mavlink.vehicle import Vehicle, is_autopilot, vehicle_of
 from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.wire import run_together
@@ -45,9 +45,6 @@ WATCH_S, ORIGIN_S = 0.1, 5.0
 ANSWER_S, REQUEST_S = 1.0, 0.4
 TIMESYNC_S = 0.1
 """Interval of requests, as PX4's own."""
-MAX_ROUND_TRIP_NS = 2_000_000_000
-MAX_QUESTIONS = 64
-"""TIMESYNC requests without an answer that are remembered."""
 REFUSALS = (
     mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
 )  # fmt: skip
@@ -74,6 +71,9 @@ class AutopilotLink:
         self.alive = False
         """True while the autopilot is heard."""
         self.clock_filter = ClockFilter()
+        self._clocks = ClockExchange(
+            clock, self.clock_filter, self.send, lambda: self.port.identity
+        )
         self.samples = LiveSamples(self.clock_filter, deliver, warn)
         self._meter = SourceMeter("autopilot")
         self._rates: defaultdict[str, RateMeter] = defaultdict(RateMeter)
@@ -97,12 +97,11 @@ class AutopilotLink:
         self._strangers: set[int] = set()
         self._missing: set[int] = set()
         self._said_of_imu = ""
-        self._questions: dict[int, None] = {}
         port.identity = (config.system_id or FIRST_SYSTEM, config.component_id)
         self._on: dict[int, Take] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._take_heartbeat,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._take_landed,
-            mavlink.MAVLINK_MSG_ID_TIMESYNC: self._take_timesync,
+            mavlink.MAVLINK_MSG_ID_TIMESYNC: self._clocks.take,
             mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._take_acknowledgement,
         }
 
@@ -293,27 +292,12 @@ class AutopilotLink:
     def _take_landed(self, message: Any, receive_ns: int) -> None:
         self._deliver(LandedSample(receive_ns, landed(message)))
 
-    def _take_timesync(self, message: Any, receive_ns: int) -> None:
-        targets = zip(timesync_target(message), self.port.identity, strict=True)
-        if any(target not in (0, ours) for target, ours in targets):
-            return
-        if message.tc1 == 0:  # the autopilot asks, and states its own time in doing so
-            middle_ns = receive_ns + (self._clock.now_ns() - receive_ns) // 2
-            asker = message.get_srcSystem(), message.get_srcComponent()
-            self.send(TimesyncMessage(middle_ns, message.ts1, asker))
-            if message.ts1 > 0:
-                self.clock_filter.one_way(message.ts1, receive_ns)
-        elif message.ts1 in self._questions:  # answers to others are none of ours
-            del self._questions[message.ts1]
-            if message.tc1 > 0 and 0 <= receive_ns - message.ts1 <= MAX_ROUND_TRIP_NS:
-                self.clock_filter.exchange(message.ts1, message.tc1, receive_ns)
-
     def _take_acknowledgement(self, message: Any, _receive_ns: int) -> None:
         self._commands.answered(message, self.port.identity)
 
     def _rebooted(self, now_ns: int) -> None:
         self._n_reboots = self.clock_filter.n_reboots
-        self._questions.clear()
+        self._clocks.restart()
         self._restart_rates(rebooted=True)
         self._warn(Warned(now_ns, "autopilot rebooted", "its boot time went back"))
 
@@ -340,11 +324,7 @@ class AutopilotLink:
     async def _compare_clocks(self) -> None:
         while True:
             if self.vehicle is not None:
-                while len(self._questions) >= MAX_QUESTIONS:
-                    del self._questions[next(iter(self._questions))]
-                now_ns = self._clock.now_ns()
-                self._questions[now_ns] = None
-                self.send(TimesyncMessage(0, now_ns, (self.vehicle.system_id, AUTOPILOT)))
+                self._clocks.ask(self.vehicle.system_id)
             await asyncio.sleep(TIMESYNC_S)
 
     async def _watch(self) -> None:
