@@ -26,7 +26,14 @@ from companion.telemetry import ArmedSample, LandedSample, Telemetry
 from companion.timing.clock import FlightClock
 from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.clock_exchange import ClockExchange
-from drivers.mavlink.commands import AUTOPILOT, NO_ANSWER, TRIES, Commands, command_long
+from drivers.mavlink.commands import (
+    AUTOPILOT,
+    NO_ANSWER,
+    TRIES,
+    Commands,
+    command_at,
+    command_long,
+)
 from drivers.mavlink.imu_rate import ImuNews, ImuRate
 from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.other_companion import OtherCompanion
@@ -71,9 +78,7 @@ class AutopilotLink:
         self.alive = False
         """True while the autopilot is heard."""
         self.clock_filter = ClockFilter()
-        self._clocks = ClockExchange(
-            clock, self.clock_filter, self.send, lambda: self.port.identity
-        )
+        self._clocks = ClockExchange(clock, self.clock_filter, self.send, lambda: port.identity)
         self.samples = LiveSamples(self.clock_filter, deliver, warn)
         self._meter = SourceMeter("autopilot")
         self._rates: defaultdict[str, RateMeter] = defaultdict(RateMeter)
@@ -186,16 +191,8 @@ class AutopilotLink:
 
     async def command_at(self, command: int, place: GeoOrigin) -> int:
         """Send a COMMAND_INT for a geodetic position, altitude above mean sea level; likewise."""
-        system = self._target()
-
-        def make(_attempt: int) -> Any:
-            return mavlink.MAVLink_command_int_message(
-                system, AUTOPILOT, mavlink.MAV_FRAME_GLOBAL, command, 0, 0,
-                0.0, 0.0, 0.0, 0.0,
-                round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7), place.altitude_m,
-            )  # fmt: skip
-
-        return await self._commands.ask(command, make, ANSWER_S, TRIES)
+        message = command_at(self._target(), command, place)
+        return await self._commands.ask(command, lambda _attempt: message, ANSWER_S, TRIES)
 
     async def set_source_set(self, number: int) -> int:
         """Fly on a source set of ArduPilot's EKF3 (EK3_SRC1_… is 1): likewise."""

@@ -8,6 +8,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.geometry.geodesy import GeoOrigin
 from drivers.system.within import within
 
 NO_ANSWER = -1
@@ -26,6 +27,15 @@ def command_long(system: int, command: int, attempt: int, *params: float) -> Any
     """COMMAND_LONG to the autopilot of a system; `attempt` counts repetitions, from 0."""
     values = [*params, *[0.0] * (7 - len(params))]
     return mavlink.MAVLink_command_long_message(system, AUTOPILOT, command, attempt, *values)
+
+
+def command_at(system: int, command: int, place: GeoOrigin) -> Any:
+    """COMMAND_INT to the autopilot of a system, for a place; altitude above mean sea level."""
+    return mavlink.MAVLink_command_int_message(
+        system, AUTOPILOT, mavlink.MAV_FRAME_GLOBAL, command, 0, 0,
+        0.0, 0.0, 0.0, 0.0,
+        round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7), place.altitude_m,
+    )  # fmt: skip
 
 
 def source_set_command(system: int, number: int) -> Any:
