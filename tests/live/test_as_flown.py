@@ -110,24 +110,29 @@ def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> No
     assert "the same to the byte" in done.stdout
 
 
+def ended(flying: Flying) -> Path:
+    """The folder of the flight, once it has left all results: its map, too."""
+    flying.autopilot.disarm()
+    flying.daemon.send(signal.SIGINT)
+    assert flying.daemon.ended(120).status == 0
+    (path,) = flying.daemon.flown()
+    return path
+
+
 def test_a_flight_in_the_map_of_an_earlier_one_is_flown_again_in_that_map(tmp_path: Path) -> None:
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
     with Flying(tmp_path / "first", "recorder.enabled=false") as flying:
         flying.take_off()
         flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
-        flying.autopilot.disarm()
-        (path,) = flying.daemon.flown()
-        flying.daemon.stop()
+        path = ended(flying)
     site_map = path / "site.map"
     settings = "recorder.codec=png", f"map.use={site_map}"
     with Flying(tmp_path / "second", *settings) as flying:
         flying.take_off()
         flying.daemon.line(LOCATED, 60.0)
         flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
-        flying.autopilot.disarm()
-        (path,) = flying.daemon.flown()
-        flying.daemon.stop()
+        path = ended(flying)
     moved, other = site_map.rename(tmp_path / "moved.map"), path / "site.map"
     assert other.exists()
     for options in ((), ("--map", str(other))):
