@@ -114,7 +114,7 @@ def replay_as_flown(
 
 @dataclass
 class Tracked:
-    """What the stages gave, by the number of the frame; `places` and `verdicts` in their order."""
+    """Output of the stages, by the number of the frame; `places` and `verdicts` in their order."""
 
     odometry: dict[int, Odometry] = field(default_factory=dict)
     targets: dict[int, LandingTarget] = field(default_factory=dict)

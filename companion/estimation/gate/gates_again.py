@@ -126,7 +126,7 @@ class SourceChoiceAgain:
 
 
 def placed_values(found: Georeference | None) -> dict[str, object]:
-    """What the gate of global positions takes of a map's place; empty without one."""
+    """Values of a map's place that the gate of global positions takes; empty without one."""
     if found is None:
         return {}
     return {
