@@ -5,6 +5,7 @@ A calibration that is not fit for flight is refused with the reason, and nothing
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -45,6 +46,8 @@ LEAST_FITTED, LIVE_FIT_EVERY = 8, 5
 """Views of a live camera before the first lens fit, and between two fits."""
 READ_S = 0.25
 """Longest read of a live camera, so that Ctrl-C is noticed."""
+SHOWN_ACROSS, SHOWN_DOWN = 16, 12
+"""Cells of the coverage that is shown."""
 MIN_FOUND = 0.05
 """Least share of images with the board; below it other boards are tried."""
 N_UNFOUND_KEPT = 12
@@ -255,6 +258,7 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
                 break
             # what to do is said where the board is seen well, else why it is not
             seen_well = problem in ("", "move the board")
+            progress.show(**_facts(covered))
             progress.update(number, wanted if seen_well else problem, len(gathered.views))
     except (KeyboardInterrupt, EndOfPictures):
         pass  # the views so far must suffice; if they do not, the reason is given
@@ -263,6 +267,21 @@ def _watch(source: CameraSource, gathered: _Gathered, model: str, progress: Prog
         progress.finish()
     if not gathered.n_searched:
         raise InputError(f"{source.name}: no picture came")
+
+
+def _facts(covered: Coverage) -> dict[str, object]:
+    """Coverage of the picture: its share, and rows of it, "#" where the board was."""
+    down, across = covered.seen.shape
+    rows = np.linspace(0, down, SHOWN_DOWN + 1).astype(int)
+    columns = np.linspace(0, across, SHOWN_ACROSS + 1).astype(int)
+    cells = [
+        "".join(
+            "#" if covered.seen[a:b, c:d].mean() > 0.5 else "."
+            for c, d in itertools.pairwise(columns)
+        )
+        for a, b in itertools.pairwise(rows)
+    ]
+    return {"share": round(covered.share, 3), "covered": cells}
 
 
 def _judged(gathered: _Gathered, called: str, model: str) -> Calibration:

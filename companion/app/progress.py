@@ -1,8 +1,9 @@
-"""Progress of a replay or a calibration."""
+"""Progress of a replay or a calibration: as a bar for people, as JSON for programs."""
 
 from __future__ import annotations
 
-from typing import TextIO
+import json
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn
@@ -19,6 +20,9 @@ class Progress:
 
     def update(self, done: int, state: str, n_points: int) -> None:
         """Called after each frame: frames done, state, points (or views) so far."""
+
+    def show(self, **facts: Any) -> None:
+        """Called before an update that has more to tell, in plain types."""
 
     def finish(self) -> None:
         """Called after the last frame."""
@@ -54,6 +58,27 @@ class TerminalProgress(Progress):
     def finish(self) -> None:
         """Leave the bar as it stands."""
         self._bar.stop()
+
+
+class JsonProgress(Progress):
+    """A line of JSON for each update: `done`, `total` (0 where unknown), `state`, `count`."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._facts: dict[str, Any] = {"total": 0}
+
+    def start(self, total_frames: int) -> None:
+        """Take the total."""
+        self._facts["total"] = total_frames
+
+    def show(self, **facts: Any) -> None:
+        """Take what the lines from now on have too."""
+        self._facts |= facts
+
+    def update(self, done: int, state: str, n_points: int) -> None:
+        """Write a line."""
+        self._facts |= {"done": done, "state": state, "count": n_points}
+        print(json.dumps(self._facts), file=self._stream, flush=True)
 
 
 class _PerSecond(ProgressColumn):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from types import FrameType
+from typing import Any
 
 from companion.app.progress import Progress
 
@@ -63,6 +64,9 @@ class _StoppableProgress(Progress):
     def start(self, total_frames: int) -> None:
         self._inner.start(total_frames)
         self._signals.defer()
+
+    def show(self, **facts: Any) -> None:
+        self._inner.show(**facts)
 
     def update(self, done: int, state: str, n_points: int) -> None:
         self._inner.update(done, state, n_points)

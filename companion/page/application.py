@@ -13,12 +13,17 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from companion.page.access import Access
+from companion.page.background_work import BackgroundWork
 from companion.page.daemon_watch import DaemonWatch
 from companion.page.facts import Facts
 from companion.page.flight_views import FlightViews
+from companion.page.flown import FlownFlights
 from companion.page.gate import Gate
+from companion.page.lens_views import LensViews
+from companion.page.mount_views import MountViews
 from companion.page.now_views import NowViews
 from companion.page.pairing_views import PairingViews
+from companion.page.replay_views import ReplayViews
 from companion.page.scene import Scene
 from companion.page.setting_views import SettingViews
 from companion.page.setup_views import SetupViews
@@ -32,12 +37,16 @@ def application(
     """The application; `clock` gives seconds, `say` takes a line for the journal."""
     flights = Path(facts.config.daemon.flights).resolve()
     site = Site(facts, flights, Access(flights, clock, say), watch, scene)
-    settings = SettingViews(site)
+    settings, work, flown = SettingViews(site), BackgroundWork(facts, watch), FlownFlights(flights)
+    replays = ReplayViews(site, work, flown)
     routes: list[Route | Mount] = [
         *NowViews(site).routes(),
-        *FlightViews(site).routes(),
+        *FlightViews(site, flown, replays).routes(),
+        *replays.routes(),
         *settings.routes(),
         *SetupViews(site, settings).routes(),
+        *LensViews(site, work, settings).routes(),
+        *MountViews(site, work, settings).routes(),
         *PairingViews(site).routes(),
         Mount("/static", StaticFiles(directory=str(files("companion.page") / "static"))),
     ]

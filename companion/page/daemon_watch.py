@@ -47,6 +47,12 @@ class DaemonWatch:
         """Port of the exporter by the newest status; 0 where unknown."""
         return int(self._document.get("viewers_port") or 0)
 
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of the camera's images by the newest status; None where unknown."""
+        size = self._document.get("size")
+        return (int(size[0]), int(size[1])) if size else None
+
     def order(self, word: str) -> None:
         """Ask the daemon to `reload` or to `restart`."""
         sys.stdout.write(f"{word}\n")

@@ -37,15 +37,8 @@ class Doctor:
                 arguments += ["--write", "--yes"]
                 for name in set_names:
                     arguments += ["--only", name]
-            self.found = await _document([*arguments, *_configuration(self._facts)])
+            self.found = await _document([*arguments, *self._facts.arguments()])
             return self.found
-
-
-def _configuration(facts: Facts) -> list[str]:
-    out = ["--config", str(facts.path)] if facts.path is not None else []
-    for override in facts.overrides:
-        out += ["--set", override]
-    return [*out, "--set", f"expert.daemon.socket={facts.socket}"]
 
 
 async def _document(arguments: Sequence[str]) -> dict[str, Any]:

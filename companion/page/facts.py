@@ -41,6 +41,13 @@ class Facts:
         """Configuration of the file as it is now, with what goes over it; ConfigError."""
         return load_config(self.path, self.overrides, lambda _: None)
 
+    def arguments(self) -> list[str]:
+        """Arguments by which another command has configuration and socket of the daemon."""
+        out = ["--config", str(self.path)] if self.path is not None else []
+        for override in self.overrides:
+            out += ["--set", override]
+        return [*out, "--set", f"expert.daemon.socket={self.socket}"]
+
     @property
     def overridden(self) -> frozenset[str]:
         """Keys given on the command line."""

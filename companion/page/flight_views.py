@@ -11,6 +11,7 @@ from starlette.routing import Route
 
 from companion.errors import FlightError
 from companion.page.flown import FlownFlights
+from companion.page.replay_views import ReplayViews
 from companion.page.site import Form, Site
 
 SANDBOX = (
@@ -24,9 +25,8 @@ MOST_SHOWN = 200
 class FlightViews:
     """See the module."""
 
-    def __init__(self, site: Site) -> None:
-        self._site = site
-        self._flown = FlownFlights(site.flights)
+    def __init__(self, site: Site, flown: FlownFlights, replays: ReplayViews) -> None:
+        self._site, self._flown, self._replays = site, flown, replays
 
     def routes(self) -> list[Route]:
         """Routes of this view."""
@@ -59,7 +59,7 @@ class FlightViews:
         except FlightError as error:
             return await self._site.refused(request, str(error), 404)
         return await self._site.render(
-            request, "flight.html.j2", flight=flight,
+            request, "flight.html.j2", flight=flight, **self._replays.values(name),
             files=[(file, quote(file), mb) for file, mb in files],
         )  # fmt: skip
 
@@ -93,6 +93,8 @@ class FlightViews:
 
     async def _delete(self, request: Request, form: Form) -> Response:
         name = request.path_params["name"]
+        if self._replays.is_replayed(name):
+            return await self._site.refused(request, f"{name}: is being replayed", 409)
         try:
             await asyncio.to_thread(self._flown.delete, name)
         except FlightError as error:

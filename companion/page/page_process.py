@@ -33,8 +33,9 @@ def main() -> int:
     """Serve; the exit status."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the daemon
     os.nice(NICE)
-    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (MOST_FILES, MOST_FILES))
+    for limit, most in ((resource.RLIMIT_DATA, MEMORY_BYTES), (resource.RLIMIT_NOFILE, MOST_FILES)):
+        beyond = resource.getrlimit(limit)[1]  # which heavy work may use, in processes of its own
+        resource.setrlimit(limit, (most, beyond))
     try:
         with open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
             file.write(OUT_OF_MEMORY_FIRST)

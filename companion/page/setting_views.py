@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_type_hints
 
@@ -104,9 +105,13 @@ class SettingViews:
         if not wanted:
             return self._site.done(request, to, "Nothing was changed.")
         try:
-            changes = await asyncio.to_thread(self._file.set, wanted)
+            return await self.keep(request, to, wanted)
         except CompanionError as error:
             return await self._site.refused(request, str(error), 409)
+
+    async def keep(self, request: Request, to: str, wanted: Mapping[str, Any]) -> Response:
+        """Set keys in the file, and go to a view; ConfigError."""
+        changes = await asyncio.to_thread(self._file.set, wanted)
         return self._taken_over(request, to, changes)
 
     async def _undo(self, request: Request, form: Form) -> Response:

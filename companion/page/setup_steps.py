@@ -71,11 +71,7 @@ def _lens(status: Mapping[str, Any], config: Config) -> Step:
     if own:
         return Step("lens", "Lens", "done", "This camera brings its own calibration.")
     found = f"Not calibrated: taken to be {camera.assumed_hfov_deg:g} degrees wide, undistorted."
-    todo = (
-        "Print a board (companion calibrate --print-board board.pdf), then companion calibrate "
-        "--live --name front, and set the file below."
-    )
-    return Step("lens", "Lens", "todo", found, todo)
+    return Step("lens", "Lens", "todo", found, "Calibrate it with a board, below.")
 
 
 def _mount(status: Mapping[str, Any], config: Config) -> Step:
@@ -83,7 +79,7 @@ def _mount(status: Mapping[str, Any], config: Config) -> Step:
         return Step("mount", "Mount", "unknown", "Known once the camera runs.")
     if not status.get("mount_known"):
         found = "It is not known how the camera sits on the drone: no pose is sent."
-        return Step("mount", "Mount", "todo", found, "State its angles below.")
+        return Step("mount", "Mount", "todo", found, "Find it by hand, or state its angles, below.")
     for each in status.get("warnings") or ():
         if each["what"] == MOUNT_GOOD:
             break

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
+import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from companion.app.cli.options import Command, configuration, json_option
-from companion.app.progress import progress_on
+from companion.app.progress import JsonProgress, progress_on
 from companion.app.stopping import StopSignals
+from companion.config import Config
 from companion.config_file import load_config
 from companion.errors import InputError
+
+if TYPE_CHECKING:
+    from drivers.camera.camera_source import CameraSource
 
 
 def _devices(arguments: argparse.Namespace, signals: StopSignals) -> int:
@@ -37,19 +44,58 @@ def _calibrate(arguments: argparse.Namespace, signals: StopSignals) -> int:
         paper = print_board(arguments.board, arguments.print_board)
         print(f"{arguments.print_board}: print it on {paper}, at 100 %")
         return 0
-    if arguments.live == (arguments.source is not None):
-        raise InputError("wanted a video, a folder of images, or --live, and one of them only")
+    if [arguments.live, arguments.running, arguments.source is not None].count(True) != 1:
+        raise InputError(
+            "wanted a video, a folder of images, --live or --running, and one of them only"
+        )
     if arguments.name is None:
         raise InputError("--name is missing: a name for the camera, as in --name front")
     config = load_config(arguments.config, arguments.set)
-    source = camera_source(config.camera) if arguments.live else arguments.source
+    source = arguments.source
+    if arguments.live:
+        source = camera_source(config.camera)
+    elif arguments.running:
+        source = _running_camera(config)
+    progress = JsonProgress(sys.stdout) if arguments.json else progress_on(sys.stderr, "views")
     report = calibrate(
         source, arguments.board, arguments.name, arguments.out, arguments.model,
-        signals.between_frames(progress_on(sys.stderr, "views")),
+        signals.between_frames(progress),
     )  # fmt: skip
-    print(report)
-    if not arguments.live:
+    if arguments.json:
+        print(json.dumps({"calibration": str(report.toml), "said": str(report)}))
+    else:
+        print(report)
+    if arguments.source is not None:
         signals.take()
+    return 0
+
+
+def _running_camera(config: Config) -> CameraSource:
+    """Camera that the running daemon has, to which this process gives way."""
+    from drivers.recording.running_camera import RunningCamera
+    from drivers.system.low_priority import give_way
+    from drivers.system.status_socket import found_socket_path
+
+    give_way(os.getpid())
+    return RunningCamera(found_socket_path(config.daemon.socket))
+
+
+def _mount(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    from companion.app.mount_command import mount_by_hand, mount_of_flight
+    from drivers.system.low_priority import give_way
+    from drivers.system.status_socket import found_socket_path
+
+    if arguments.running == (arguments.flight is not None):
+        raise InputError("wanted a flight, or --running, and one of them only")
+    config = load_config(arguments.config, arguments.set)
+    progress = JsonProgress(sys.stdout) if arguments.json else progress_on(sys.stderr, "samples")
+    progress = signals.between_frames(progress)
+    if arguments.running:
+        give_way(os.getpid())  # to the daemon, which sees the same pictures
+        found = mount_by_hand(found_socket_path(config.daemon.socket), config, progress)
+    else:
+        found = mount_of_flight(arguments.flight, config, progress)
+    print(json.dumps(dataclasses.asdict(found)) if arguments.json else found)
     return 0
 
 
@@ -63,7 +109,12 @@ def _doctor(arguments: argparse.Namespace, signals: StopSignals) -> int:
     )  # fmt: skip
 
 
-COMMANDS: dict[str, Command] = {"devices": _devices, "calibrate": _calibrate, "doctor": _doctor}
+COMMANDS: dict[str, Command] = {
+    "devices": _devices,
+    "calibrate": _calibrate,
+    "mount": _mount,
+    "doctor": _doctor,
+}
 
 
 def add_parsers(commands: Any) -> None:
@@ -82,7 +133,8 @@ def add_parsers(commands: Any) -> None:
     )
 
     calibrate = commands.add_parser(
-        "calibrate", parents=[configuration()], help="calibrate a camera by a board held before it",
+        "calibrate", parents=[configuration(), json_option()],
+        help="calibrate a camera by a board held before it",
         description="Find a camera's focal length, centre and distortion from views of a board; "
         "writes OUT/NAME.toml, for camera.calibration, and a picture beside it.",
     )  # fmt: skip
@@ -91,6 +143,9 @@ def add_parsers(commands: Any) -> None:
     )
     calibrate.add_argument(
         "--live", action="store_true", help="take the views from the configured camera, now"
+    )
+    calibrate.add_argument(
+        "--running", action="store_true", help="take them from the camera that a daemon has, now"
     )
     calibrate.add_argument(
         "--board", default="charuco:7x5:0.04:0.03:DICT_5X5_100", metavar="BOARD",
@@ -108,6 +163,17 @@ def add_parsers(commands: Any) -> None:
     )  # fmt: skip
     calibrate.add_argument(
         "--print-board", type=Path, metavar="FILE", help="only write the board, .pdf or .png"
+    )
+
+    mount = commands.add_parser(
+        "mount", parents=[configuration(), json_option()],
+        help="find how the camera sits on the vehicle, by turning both",
+        description="Compare rotations of the camera with those of the autopilot, in a recorded "
+        "flight or while the vehicle is turned by hand; prints the lines of [mount].",
+    )  # fmt: skip
+    mount.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT", help="as for replay")
+    mount.add_argument(
+        "--running", action="store_true", help="of the running daemon, disarmed, while it is turned"
     )
 
     doctor = commands.add_parser(

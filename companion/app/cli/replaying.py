@@ -11,6 +11,7 @@ from typing import Any
 from companion.app.cli.options import (
     Command,
     configuration,
+    json_option,
     made_folder,
     names,
     seconds,
@@ -19,7 +20,7 @@ from companion.app.cli.options import (
     whole_within,
     within,
 )
-from companion.app.progress import progress_on
+from companion.app.progress import JsonProgress, progress_on
 from companion.app.stopping import StopSignals
 from companion.config import Config, MapConfig
 from companion.config_file import load_config
@@ -52,7 +53,8 @@ def _replay(arguments: argparse.Namespace, signals: StopSignals) -> int:
         from companion.products.export.exports import check_formats
 
         check_formats(config.export)
-    progress = signals.between_frames(progress_on(sys.stderr))
+    shown = JsonProgress(sys.stdout) if arguments.json else progress_on(sys.stderr)
+    progress = signals.between_frames(shown)
     if arguments.as_flown:
         if arguments.paced or (arguments.start, arguments.stop) != (None, None):
             raise InputError(
@@ -164,7 +166,7 @@ def add_parsers(commands: Any) -> None:
         help="seconds added to the log's times, instead of finding them by rotation",
     )  # fmt: skip
 
-    how = argparse.ArgumentParser(add_help=False, parents=[configuration(), timing])
+    how = argparse.ArgumentParser(add_help=False, parents=[configuration(), timing, json_option()])
     how.add_argument(
         "--start", type=seconds, metavar="S", help="leave out what comes before this second"
     )

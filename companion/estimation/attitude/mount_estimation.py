@@ -11,6 +11,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.estimation.attitude.attitude_history import AttitudeHistory
 from companion.geometry.transforms import Array, rotation_from_vector, vectors_from_rotations
@@ -75,6 +76,10 @@ class MountEstimator:
     def __len__(self) -> int:
         return len(self._samples)
 
+    def state(self, body_from_camera: Array) -> None:
+        """State another mount, from which the next estimate begins."""
+        self._stated = body_from_camera
+
     def reset(self) -> None:
         """Clear rotations, which are not comparable between maps."""
         self._waiting.clear()
@@ -91,13 +96,34 @@ class MountEstimator:
             if measured is not None:
                 self._samples.append(_Sample(t_ns, rotation, *measured))
 
+    def attitudes(self) -> Array:
+        """Attitudes `ned_from_body` (N, 3, 3) of all samples."""
+        return np.array([s.ned_from_body for s in self._samples]).reshape(-1, 3, 3)
+
+    def rotations(self) -> tuple[Array, Array] | None:
+        """Rotation vectors (N, 3) of the camera and of the body over all pairs, each in its axes.
+
+        None with too few.
+        """
+        samples = list(self._samples)
+        pairs = _pairs(len(samples))
+        if len(pairs) < MIN_PAIRS:
+            return None
+        i, j = pairs.T
+        camera = np.stack([s.map_from_camera for s in samples])
+        body = np.stack([s.ned_from_body for s in samples])
+        return (
+            vectors_from_rotations(np.matmul(camera[i].transpose(0, 2, 1), camera[j])),
+            vectors_from_rotations(np.matmul(body[i].transpose(0, 2, 1), body[j])),
+        )
+
     def estimate(self) -> MountEstimate | None:
         """Mount and offset from all pairs; None with too few."""
         samples = list(self._samples)
-        pairs = [(i, i + lag) for lag in LAGS for i in range(len(samples) - lag)]
+        pairs = _pairs(len(samples))
         if len(pairs) < MIN_PAIRS:
             return None
-        i, j = np.array(pairs).T
+        i, j = pairs.T
         t_s = np.array([s.t_ns - samples[0].t_ns for s in samples]) * 1e-9
         camera = np.stack([s.map_from_camera for s in samples])
         body = np.stack([s.ned_from_body for s in samples])
@@ -136,3 +162,9 @@ class MountEstimator:
             float(sigmas[3]), float(np.median(np.linalg.norm(error, axis=1))),
             float(np.median(rotation_size)),
         )  # fmt: skip
+
+
+def _pairs(n_samples: int) -> NDArray[np.int64]:
+    """Pairs (N, 2) of samples that are some LAGS apart."""
+    pairs = [(i, i + lag) for lag in LAGS for i in range(n_samples - lag)]
+    return np.array(pairs, np.int64).reshape(-1, 2)
