@@ -14,6 +14,7 @@ that scale is found sooner.
     size          (width, height) of what it sends
     markers_m     edge of landing markers that lie on its way; 0: none
     covered       True: it is dark, but for the sensor's noise
+    shown         a function that gives the picture to be seen instead: grey, of any size
     lost          the share of pictures that never leave it, evenly spread
     sent_ns       CLOCK_MONOTONIC of the last picture that a client was sent
 """
@@ -100,14 +101,17 @@ class HttpCamera:
         self.size, self.on, self.lost = self._full_size, True, 0.0
         self.stalled = self.frozen = self.covered = False
         self.markers_m = 0.0
+        self.shown: Callable[[], Bytes] | None = None
 
-    def write_calibration(self, path: Path) -> Path:
-        """As the daemon is given it."""
+    def write_calibration(self, path: Path, mounted: bool = True) -> Path:
+        """As the daemon is given it; unless `mounted`, without the mount."""
         c, mount = self._optics, BODY_FROM_CAMERA.matrix().tolist()
         content = {
             "width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
             "distortion_model": "none", "body_from_camera": mount,
         }  # fmt: skip
+        if not mounted:
+            del content["body_from_camera"]
         path.write_text(json.dumps(content))
         return path
 
@@ -168,6 +172,8 @@ class HttpCamera:
             if self.markers_m:
                 self._last = self._with_markers(self._last, pose)
         seen = self._last
+        if self.shown is not None:
+            seen = np.asarray(cv2.cvtColor(self.shown(), cv2.COLOR_GRAY2RGB), np.uint8)
         if self.covered:
             seen = np.asarray(self._noise.integers(0, 8, seen.shape), np.uint8)
         if seen.shape[1::-1] != self.size:

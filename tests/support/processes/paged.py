@@ -16,8 +16,9 @@ from pathlib import Path
 
 from companion.page.codes import Codes, read_codes
 from tests.support.autopilot.fake_wire import free_port
+from tests.support.cameras.http_camera import world_from_body
 from tests.support.processes.daemon_process import Daemon
-from tests.support.processes.flying import Flying
+from tests.support.processes.flying import Flying, PathOf
 from tests.support.waiting import until
 
 FILE = """\
@@ -39,15 +40,23 @@ enabled = {depth}
 
 
 class Paged(Flying):
-    """See above; `depth` makes the dense map too. Further settings are as after `--set`."""
+    """See above; `depth` makes the dense map too, `path` is another one to fly.
 
-    def __init__(self, folder: Path, *settings: str, depth: bool = False) -> None:
+    Unless `mounted` nobody knows how the camera sits. Further settings are as after `--set`.
+    """
+
+    def __init__(
+        self, folder: Path, *settings: str, depth: bool = False, path: PathOf = world_from_body,
+        mounted: bool = True,
+    ) -> None:  # fmt: skip
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self.config = folder / "companion.toml"
         self._over_it = (f"page.listen=127.0.0.1:{self.port}", *settings)
         self._depth = depth
-        super().__init__(folder, url=f"udpout:127.0.0.1:{free_port()}")
+        super().__init__(folder, url=f"udpout:127.0.0.1:{free_port()}", path=path)
+        if not mounted:
+            self.camera.write_calibration(folder / "camera.json", mounted=False)
 
     def _made(self) -> Daemon:
         if not self.config.exists():
