@@ -24,6 +24,7 @@ from companion.page.mount_views import MountViews
 from companion.page.now_views import NowViews
 from companion.page.pairing_views import PairingViews
 from companion.page.replay_views import ReplayViews
+from companion.page.rerun_views import RerunViews
 from companion.page.scene import Scene
 from companion.page.setting_views import SettingViews
 from companion.page.setup_views import SetupViews
@@ -48,6 +49,7 @@ def application(
         *LensViews(site, work, settings).routes(),
         *MountViews(site, work, settings).routes(),
         *PairingViews(site).routes(),
+        *RerunViews(site).routes(),
         Mount("/static", StaticFiles(directory=str(files("companion.page") / "static"))),
     ]
 

@@ -11,6 +11,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from companion.page.remedies import OF_REASON, OTHER, remedy
+from companion.page.rerun_views import viewer_link
 from companion.page.setup_steps import source
 from companion.page.site import Site, is_number
 
@@ -20,7 +21,6 @@ WORDS = {
     "tracking": "Tracking", "standing": "Standing", "coasting": "Coasting",
     "initialising": "The map is being begun", "lost": "Lost", "starting": "Starting",
 }  # fmt: skip
-RERUN_PORT, RERUN_GRPC_PORT = 9090, 9876
 
 
 class NowViews:
@@ -66,11 +66,8 @@ class NowViews:
         return Response(found, media_type="application/json")
 
     async def _map(self, request: Request) -> Response:
-        host = request.url.hostname or "127.0.0.1"
-        host = f"[{host}]" if ":" in host else host
-        shown = f"rerun%2Bhttp://{host}:{RERUN_GRPC_PORT}/proxy"
         is_web = self._site.facts.config.daemon.viewer == "web"
-        rerun = f"http://{host}:{RERUN_PORT}/?url={shown}&theme=dark" if is_web else ""
+        rerun = viewer_link(request.headers.get("host", "")) if is_web else ""
         return await self._site.render(request, "map.html.j2", rerun=rerun)
 
     async def _values(self) -> dict[str, Any]:

@@ -1,0 +1,138 @@
+"""The Rerun viewer through the page's own port, and so behind its codes.
+
+Its files and its stream come from the viewer on board (`daemon.viewer = "web"`), which listens on
+loopback: those who may look on need no other port. Its page asks for the stream at the root of
+whoever served it, by the name of a gRPC service.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import AsyncIterator
+from importlib.metadata import PackageNotFoundError, version
+from urllib.parse import quote
+
+import httpx
+from starlette.background import BackgroundTask
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from companion.page.site import Site
+
+LOOPBACK = "127.0.0.1"
+WEB_PORT, GRPC_PORT = 9090, 9876
+"""Of the viewer on board."""
+SERVICE = re.compile(r"rerun\.[\w.]+")
+CONTENT = {
+    "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-inline' "
+    "'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "worker-src 'self' blob:; connect-src 'self' data: blob:; object-src 'none'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
+}
+"""Its page has scripts and styles in it, and compiles its program."""
+FOREIGN = re.compile(rb"<link[^>]*https://[^>]*>")
+"""Fonts from elsewhere: nothing here comes from the internet."""
+KEPT = "private, max-age=604800"
+"""The program is 43 MB; its address names its version."""
+PASSED_ON = ("content-type", "grpc-timeout", "x-grpc-web", "x-user-agent", "accept")
+PASSED_BACK = ("content-type", "content-length", "rerun-final-length", "grpc-status")
+CONNECT_S = 3.0
+SHORT = 1 << 20
+NO_VIEWER = "the Rerun viewer does not run here: daemon.viewer = web"
+
+
+class RerunViews:
+    """See the module."""
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        timeout = httpx.Timeout(None, connect=CONNECT_S)  # a stream may be silent
+        once = httpx.Limits(max_keepalive_connections=0)
+        self._client = httpx.AsyncClient(timeout=timeout, limits=once, trust_env=False)
+
+    def routes(self) -> list[Route]:
+        """Routes of this view."""
+        looking = self._site.looking
+        return [
+            Route(f"{viewer_path()}{{file:path}}", looking(self._file)),
+            Route("/{service}/{method}", looking(self._stream), methods=["POST"]),
+        ]
+
+    async def _file(self, request: Request) -> Response:
+        """A file of the viewer."""
+        file = quote(request.path_params["file"])
+        answer = await self._asked("GET", WEB_PORT, f"/{file}")
+        if answer is None:
+            return PlainTextResponse(NO_VIEWER, 503)
+        headers = _back(answer) | CONTENT
+        if "html" not in headers.get("content-type", "") and answer.is_success:
+            headers["Cache-Control"] = KEPT
+            return _passed(answer, headers)
+        try:
+            body = FOREIGN.sub(b"", (await answer.aread())[:SHORT])
+        finally:
+            await answer.aclose()
+        headers.pop("content-length", None)
+        return Response(body, answer.status_code, headers)
+
+    async def _stream(self, request: Request) -> Response:
+        """Messages of the flight, as its gRPC service sends them."""
+        service, method = request.path_params["service"], request.path_params["method"]
+        if not SERVICE.fullmatch(service):
+            return PlainTextResponse("there is nothing here", 404)
+        headers = {name: request.headers[name] for name in PASSED_ON if name in request.headers}
+        answer = await self._asked(
+            "POST", GRPC_PORT, f"/{service}/{quote(method)}", headers, await request.body()
+        )
+        if answer is None:
+            return PlainTextResponse(NO_VIEWER, 503)
+        return _passed(answer, _back(answer))
+
+    async def _asked(
+        self, method: str, port: int, path: str, headers: dict[str, str] | None = None,
+        body: bytes = b"",
+    ) -> httpx.Response | None:  # fmt: skip
+        """Begin of an answer; None where nobody answers."""
+        request = self._client.build_request(
+            method, f"http://{LOOPBACK}:{port}{path}", headers=headers, content=body
+        )
+        try:
+            return await self._client.send(request, stream=True)
+        except httpx.HTTPError:
+            return None
+
+
+def viewer_path() -> str:
+    """Path of the viewer's page, which names its version."""
+    try:
+        return f"/rerun/{version('rerun-sdk')}/"
+    except PackageNotFoundError:
+        return "/rerun/none/"
+
+
+def viewer_link(host: str) -> str:
+    """Path of the viewer's page with this page's own stream; `host` is HOST:PORT as asked."""
+    stream = quote(f"rerun+http://{host}/proxy", safe="")
+    return f"{viewer_path()}?url={stream}&theme=dark"
+
+
+def _back(answer: httpx.Response) -> dict[str, str]:
+    return {name: answer.headers[name] for name in PASSED_BACK if name in answer.headers}
+
+
+def _passed(answer: httpx.Response, headers: dict[str, str]) -> StreamingResponse:
+    return StreamingResponse(
+        _bytes(answer), answer.status_code, headers, background=BackgroundTask(answer.aclose)
+    )
+
+
+async def _bytes(answer: httpx.Response) -> AsyncIterator[bytes]:
+    """What comes, no faster than the browser takes it."""
+    try:
+        async for data in answer.aiter_raw():
+            yield data
+    except httpx.HTTPError:
+        pass  # the viewer has ended, and with it the stream
+    finally:
+        await answer.aclose()
