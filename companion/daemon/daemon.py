@@ -33,7 +33,7 @@ from companion.daemon.pose.senders import Senders
 from companion.daemon.recorder_notes import RecorderNotes
 from companion.daemon.status_document import StatusDocument
 from companion.daemon.stop_request import StopRequest
-from companion.daemon.vehicle_reports import VehicleReports
+from companion.daemon.vehicle_reports import VehicleReports, flight_recording
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import (
     NO_PICTURE,
@@ -122,7 +122,9 @@ class Daemon:
         watch.set_by_ground = settings.by_ground
         self._notes = RecorderNotes(clock, flights, watch, self._link)
         if self._link is not None:
-            self._reports = VehicleReports(self._link, clock, watch, config)
+            self._reports = VehicleReports(
+                self._link, clock, watch, config, flight_recording(config, flights)
+            )
         self._starts = starts = FlightStarts(
             settings, self._feed, flights, self._senders, self._reports, watch, journal, self._stop,
             lambda why: self._on_warned(Warned(clock.now_ns(), NOT_BEGUN, why)),
@@ -219,6 +221,8 @@ class Daemon:
         """Take a frame; in the camera's thread."""
         self._watch.frame_came(frame.t_ns)
         self._overdue.came(frame, self._clock.now_ns())
+        if self._reports is not None:
+            self._reports.frame(frame)
         if self._starts.camera is None:
             self._soon(self._starts.camera_known)
             return

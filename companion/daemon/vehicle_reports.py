@@ -6,10 +6,12 @@ import asyncio
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 
 from companion.config import Config, FeedbackConfig
+from companion.daemon.flights.flights import Flights
 from companion.daemon.health_watch import HealthWatch
 from companion.dense.fresh_sight import points_found, sectors_seen
 from companion.dense.obstacles import (
@@ -21,9 +23,11 @@ from companion.dense.obstacles import (
     unknown,
 )
 from companion.geometry.camera import Camera
-from companion.messages import DepthMap, MapUpdate, PointChunk, Track, TrackState
+from companion.messages import DepthMap, Frame, MapUpdate, PointChunk, Track, TrackState
 from companion.timing.clock import FlightClock
+from drivers.images.still_pictures import StillPictures
 from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.camera_captures import FlightRecording
 from drivers.mavlink.camera_component import CameraComponent
 from drivers.mavlink.camera_messages import CameraStream
 from drivers.mavlink.command_server import Command
@@ -42,6 +46,8 @@ from drivers.system.own_addresses import own_addresses
 from drivers.video.rtsp_server import PATH
 
 EVERY_NETWORK = ("0.0.0.0", "::", "")
+IMAGES = "images"
+"""Folder of images taken by a ground station's command, among the flights."""
 OBSTACLES_HZ, COMPUTER_HZ = 10.0, 1.0
 MAX_AGE_NS = 200_000_000
 """Age of the image that the pose is from, and of that in which a sector was seen, since exposure;
@@ -58,14 +64,20 @@ class VehicleReports:
     """Sends ONBOARD_COMPUTER_STATUS, by default each second, and OBSTACLE_DISTANCE."""
 
     def __init__(
-        self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, config: Config
-    ) -> None:
+        self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, config: Config,
+        recording: FlightRecording,
+    ) -> None:  # fmt: skip
         self._link, self._clock, self._watch = link, clock, watch
         self._config, self._obstacles = config, config.feedback.obstacle_distance
         self._camera: Camera | None = None
         self._camera_component: CameraComponent | None = None
+        self._stills: StillPictures | None = None
         if config.video.listen:
-            self._camera_component = CameraComponent(link, clock, self._stream)
+            folder = Path(config.daemon.flights) / IMAGES
+            self._stills = StillPictures(folder, config.recorder.least_free_mb)
+            self._camera_component = CameraComponent(
+                link, clock, self._stream, self._stills, recording
+            )
         self.computer_hz = COMPUTER_HZ
         """Rate of the computer's status, at most 5 Hz; 0: none."""
         self.restart(None)
@@ -92,6 +104,11 @@ class VehicleReports:
             self._map = message
         elif self._obstacles:
             self._seen[1].append(message)
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame, in the camera's thread: an image of it may be wanted."""
+        if self._stills is not None:
+            self._stills.frame(frame)
 
     async def run(self) -> None:
         """Send until cancelled."""
@@ -217,3 +234,19 @@ class VehicleReports:
                 eyes = np.concatenate([eyes, np.tile(camera_in_world.translation, (len(found), 1))])
                 ages = np.r_[ages, np.full(len(found), np.inf)]  # of no free space do they tell
         return known_in(obstacles_around(track.t_ns, world_from_body, points, eyes, ages), is_seen)
+
+
+def flight_recording(config: Config, flights: Flights) -> FlightRecording:
+    """Recording of the current flight, for a ground station."""
+
+    def is_kept() -> bool:
+        flight = flights.current
+        return config.recorder.enabled and flight is not None and flight.kept
+
+    def keep() -> str:
+        if not config.recorder.enabled:
+            return "not recorded: recorder.enabled is false"
+        flights.keep()
+        return "" if is_kept() else "not recorded: no flight goes on"
+
+    return FlightRecording(is_kept, keep)

@@ -7,6 +7,7 @@ no others. The protocol: https://mavlink.io/en/services/camera.html.
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.camera_captures import (
+    CAPABILITIES,
+    CameraCaptures,
+    FlightRecording,
+    Stills,
+)
 from drivers.mavlink.camera_messages import (
     INFORMATION,
     STREAM,
@@ -31,15 +38,19 @@ from drivers.mavlink.request_limit import RequestLimit
 
 CAMERA: int = mavlink.MAV_COMP_ID_CAMERA
 HEARTBEAT_S = 1.0
+ROUNDS = 10
+"""Looks in each of these for images that were taken: an answer comes within a tenth of a second."""
+MOST_TOLD = 16
 
 
 class CameraComponent:
     """Answers for the camera, and says that it is there; to be used in the event loop."""
 
     def __init__(
-        self, link: AutopilotLink, clock: FlightClock, stream: Callable[[], CameraStream]
-    ) -> None:
-        self._port = link.port
+        self, link: AutopilotLink, clock: FlightClock, stream: Callable[[], CameraStream],
+        stills: Stills, recording: FlightRecording,
+    ) -> None:  # fmt: skip
+        self._clock, self._port = clock, link.port
         self._port.second_component = CAMERA
         self._limit = RequestLimit()
         began_ns = clock.now_ns()
@@ -47,8 +58,17 @@ class CameraComponent:
         def boot_ms() -> int:
             return (clock.now_ns() - began_ns) // 1_000_000
 
+        def unix_us(t_ns: int) -> int:
+            return (t_ns + clock.behind_ns()) // 1000
+
+        def tell(message: Any) -> None:
+            self._told.append(message)
+
+        self._told: deque[Any] = deque(maxlen=MOST_TOLD)
+        self._captures = CameraCaptures(stills, recording, boot_ms, unix_us, tell)
         made = {
-            INFORMATION: lambda: camera_information(stream(), boot_ms()),
+            **self._captures.messages,
+            INFORMATION: lambda: camera_information(stream(), CAPABILITIES, boot_ms()),
             STREAM: lambda: stream_information(stream()),
             STREAM_STATUS: lambda: stream_status(stream()),
         }
@@ -56,15 +76,25 @@ class CameraComponent:
             {HEARTBEAT: camera_heartbeat, **made}, lambda: {HEARTBEAT: 1.0 / HEARTBEAT_S}, {},
             boot_ms,
         )  # fmt: skip
-        self._commands = CommandServer({**asked.commands, **camera_commands(made)})
+        self._commands = CommandServer(
+            {**asked.commands, **camera_commands(made), **self._captures.commands}
+        )
         link.on_camera_request = self._take
 
     async def run(self) -> None:
         """Say that it is there, until cancelled."""
+        n = 0
         while True:
-            if self._port.connected:
-                self._port.send(camera_heartbeat(), as_second=True)
-            await asyncio.sleep(HEARTBEAT_S)
+            if n % ROUNDS == 0:
+                self._captures.step()
+                if self._port.connected:
+                    self._port.send(camera_heartbeat(), as_second=True)
+            n += 1
+            for answer in self._commands.step(self._clock.now_ns()):
+                self._port.send(answer, as_second=True)
+            while self._told:
+                self._port.send(self._told.popleft(), as_second=True)
+            await asyncio.sleep(HEARTBEAT_S / ROUNDS)
 
     def _take(self, message: Any, now_ns: int) -> None:
         if message.get_msgId() not in COMMANDS:

@@ -14,6 +14,9 @@ from drivers.mavlink.command_server import ACCEPTED, DENIED, Command, Done
 INFORMATION: int = mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION
 STREAM: int = mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION
 STREAM_STATUS: int = mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_STATUS
+CAPTURE_STATUS: int = mavlink.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS
+STORAGE: int = mavlink.MAVLINK_MSG_ID_STORAGE_INFORMATION
+SETTINGS: int = mavlink.MAVLINK_MSG_ID_CAMERA_SETTINGS
 STREAM_ID = 1
 NAME_BYTES, URI_BYTES = 32, 160
 H264: int = mavlink.VIDEO_STREAM_ENCODING_H264
@@ -33,12 +36,13 @@ class CameraStream:
     is_running: bool
 
 
-def camera_information(stream: CameraStream, boot_ms: int) -> Any:
-    """CAMERA_INFORMATION: a camera that streams, and neither records nor takes stills."""
+def camera_information(stream: CameraStream, capabilities: int, boot_ms: int) -> Any:
+    """CAMERA_INFORMATION: a camera that streams, and has these capabilities besides."""
     name = b"companion".ljust(NAME_BYTES, b"\0")
     return mavlink.MAVLink_camera_information_message(
         boot_ms & 0xFFFFFFFF, list(name), list(name), 0, UNKNOWN_MM, UNKNOWN_MM, UNKNOWN_MM,
-        stream.width, stream.height, 0, mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM, 0, b"",
+        stream.width, stream.height, 0, mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM | capabilities, 0,
+        b"",
     )  # fmt: skip
 
 
@@ -72,6 +76,9 @@ def camera_commands(made: Mapping[int, Callable[[], Any]]) -> dict[int, Command]
 
     return {
         mavlink.MAV_CMD_REQUEST_CAMERA_INFORMATION: asked(INFORMATION, False),
+        mavlink.MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS: asked(CAPTURE_STATUS, False),
+        mavlink.MAV_CMD_REQUEST_STORAGE_INFORMATION: asked(STORAGE, False),
+        mavlink.MAV_CMD_REQUEST_CAMERA_SETTINGS: asked(SETTINGS, False),
         mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION: asked(STREAM, True),
         mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_STATUS: asked(STREAM_STATUS, True),
     }

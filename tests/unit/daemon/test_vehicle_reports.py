@@ -26,6 +26,7 @@ from companion.messages import (
     Track,
     TrackState,
 )
+from drivers.mavlink.camera_captures import FlightRecording
 from tests.support.autopilot.memory_link import SetClock, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
 
@@ -62,8 +63,9 @@ class Approach:
         self.link = memory_link(self.port, self.clock, lambda _: None)
         watch: Any = None
         self.reports = VehicleReports(
-            self.link, self.clock, watch, Config(feedback=FeedbackConfig(obstacle_distance=True))
-        )
+            self.link, self.clock, watch, Config(feedback=FeedbackConfig(obstacle_distance=True)),
+            FlightRecording(lambda: False, lambda: ""),
+        )  # fmt: skip
         self.reports.restart(CAMERA)
         self.keyframes: dict[int, Pose] = {}
         self.late: list[tuple[int, DepthMap]] = []

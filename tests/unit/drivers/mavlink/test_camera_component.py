@@ -4,20 +4,30 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import queue
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import LinkConfig, RouterConfig
+from companion.messages import Frame
 from companion.timing.clock import FlightClock
+from drivers.images.still_pictures import Still, StillPictures
 from drivers.mavlink.autopilot_link import AutopilotLink
+from drivers.mavlink.camera_captures import CAPABILITIES, FlightRecording
 from drivers.mavlink.camera_component import CAMERA, CameraComponent
 from drivers.mavlink.camera_messages import CameraStream
 from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 from tests.support.autopilot.fake_wire import free_port
 
+ACCEPTED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
+UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
+FRAME = Frame(0, 1, np.zeros((48, 64), np.uint8), np.zeros((48, 64, 3), np.uint8))
 URI = "rtsp://10.0.0.5:8554/camera"
 STREAM = CameraStream(URI, 640, 480, 30.0, 2000, 75.4, True)
 WITHIN_S = 60.0
@@ -36,8 +46,8 @@ class Ground:
     def say(self, message: Any, system: int = 255, component: int = 190) -> None:
         self._write(message.pack(mavlink.MAVLink(None, system, component)))
 
-    def ask(self, command: int, parameter: float, component: int = CAMERA) -> None:
-        values = [parameter, *[0.0] * 6]
+    def ask(self, command: int, parameter: float, *, third: float = 0.0) -> None:
+        component, values = CAMERA, [parameter, 0.0, third, *[0.0] * 4]
         self.say(mavlink.MAVLink_command_long_message(1, component, command, 0, *values))
 
     async def of_camera(self, kind: str) -> Any:
@@ -65,15 +75,60 @@ async def find_and_ask(ground: Ground) -> None:
     ack = await ground.of_camera("COMMAND_ACK")
     assert (ack.command, ack.result) == (512, mavlink.MAV_RESULT_ACCEPTED)
     told = await ground.of_camera("CAMERA_INFORMATION")
-    assert told.flags == mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM
+    assert told.flags == mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM | CAPABILITIES
     ground.ask(mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION, 0.0)
     assert (await ground.of_camera("VIDEO_STREAM_INFORMATION")).uri == URI
     ground.ask(mavlink.MAV_CMD_REQUEST_MESSAGE, 270.0)
     assert (await ground.of_camera("VIDEO_STREAM_STATUS")).stream_id == 1
-    ground.ask(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0.0)
-    while (ack := await ground.of_camera("COMMAND_ACK")).command != 2000:
-        pass
-    assert ack.result == mavlink.MAV_RESULT_UNSUPPORTED
+    ground.ask(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 0.0)
+    assert await acknowledged(ground, mavlink.MAV_CMD_SET_CAMERA_ZOOM) == UNSUPPORTED
+
+
+async def acknowledged(ground: Ground, command: int) -> int:
+    """Result of a command, once it has one."""
+    while True:
+        ack = await ground.of_camera("COMMAND_ACK")
+        if ack.command == command and ack.result != mavlink.MAV_RESULT_IN_PROGRESS:
+            return int(ack.result)
+
+
+async def take_and_record(ground: Ground, flown: Flown) -> None:
+    """An image, and a recording that is kept."""
+    ground.ask(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0.0, third=1.0)
+    while not (flown.folder / "image-000001.jpg").exists():
+        flown.stills.frame(FRAME)
+        await asyncio.sleep(0.02)
+    assert await acknowledged(ground, mavlink.MAV_CMD_IMAGE_START_CAPTURE) == ACCEPTED
+    told = await ground.of_camera("CAMERA_IMAGE_CAPTURED")
+    assert (told.image_index, told.capture_result, told.file_url) == (1, 1, "image-000001.jpg")
+    ground.ask(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 1.0, third=5.0)  # a series
+    assert await acknowledged(ground, mavlink.MAV_CMD_IMAGE_START_CAPTURE) == DENIED
+    ground.ask(mavlink.MAV_CMD_VIDEO_START_CAPTURE, 0.0)
+    assert await acknowledged(ground, mavlink.MAV_CMD_VIDEO_START_CAPTURE) == ACCEPTED
+    assert flown.kept
+    status = await ground.of_camera("CAMERA_CAPTURE_STATUS")
+    assert (status.video_status, status.image_count) == (1, 1)
+    ground.ask(mavlink.MAV_CMD_VIDEO_STOP_CAPTURE, 0.0)
+    assert await acknowledged(ground, mavlink.MAV_CMD_VIDEO_STOP_CAPTURE) == DENIED
+    assert (await ground.of_camera("STATUSTEXT")).text == "recording goes on until the flight ends"
+
+
+@dataclass
+class Flown:
+    """What the commands act on."""
+
+    folder: Path
+    kept: bool = False
+
+    def __post_init__(self) -> None:
+        self.stills = StillPictures(self.folder, 0.0)
+
+    def recording(self) -> FlightRecording:
+        def keep() -> str:
+            self.kept = True
+            return ""
+
+        return FlightRecording(lambda: self.kept, keep)
 
 
 class Datagrams(asyncio.DatagramProtocol):
@@ -84,13 +139,14 @@ class Datagrams(asyncio.DatagramProtocol):
         self.came.put_nowait(data)
 
 
-async def _flown(through_router: bool) -> None:
+async def _flown(through_router: bool, folder: Path) -> None:
     link_port, client_port, loop = free_port(), free_port(), asyncio.get_running_loop()
     clock, config = FlightClock(), LinkConfig(url=f"udpin:{HOST}:{link_port}")
     router = RouterConfig(clients=(f"tcpin:{HOST}:{client_port}",))
     port = PymavlinkPort(config, router, clock)
     link = AutopilotLink(config, port, clock, lambda _: None, lambda _: None)
-    camera = CameraComponent(link, clock, lambda: STREAM)
+    flown = Flown(folder)
+    camera = CameraComponent(link, clock, lambda: STREAM, flown.stills, flown.recording())
     running = [asyncio.ensure_future(each) for each in (link.run(), camera.run())]
     wire, heard = await loop.create_datagram_endpoint(Datagrams, remote_addr=(HOST, link_port))
     writer: asyncio.StreamWriter | None = None
@@ -112,6 +168,7 @@ async def _flown(through_router: bool) -> None:
             assert writer is not None
             ground = Ground(lambda: reader.read(4096), writer.write)
         await find_and_ask(ground)
+        await take_and_record(ground, flown)
     finally:
         for task in running:
             task.cancel()
@@ -123,5 +180,14 @@ async def _flown(through_router: bool) -> None:
 
 
 @pytest.mark.parametrize("through_router", [False, True], ids=["wire", "router"])
-def test_it_is_found_and_asked(through_router: bool) -> None:
-    asyncio.run(_flown(through_router))
+def test_it_is_found_and_asked(through_router: bool, tmp_path: Path) -> None:
+    asyncio.run(_flown(through_router, tmp_path / "images"))
+
+
+def test_an_image_that_cannot_be_kept_is_said_to_have_failed(tmp_path: Path) -> None:
+    stills, found = StillPictures(tmp_path, least_free_mb=1e12), queue.Queue[Still]()
+    assert stills.request(found.put)
+    assert not stills.request(found.put)  # one at a time
+    stills.frame(FRAME)
+    assert found.get(timeout=WITHIN_S).why == "the disk is full"
+    assert not list(tmp_path.iterdir())

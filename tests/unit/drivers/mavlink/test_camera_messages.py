@@ -32,7 +32,7 @@ def over_the_wire(message: Any) -> Any:
 
 
 def test_it_is_a_camera_that_streams() -> None:
-    got = over_the_wire(camera_information(MADE, 1234))
+    got = over_the_wire(camera_information(MADE, 0, 1234))
     assert (got.resolution_h, got.resolution_v, got.time_boot_ms) == (640, 480, 1234)
     assert got.flags == mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM
     assert bytes(got.model_name).rstrip(b"\0") == b"companion" and got.cam_definition_uri == ""
@@ -63,7 +63,7 @@ def test_addresses_that_are_too_long_are_cut() -> None:
 ])  # fmt: skip
 def test_older_questions_are_answered_too(command: int, kind: int, of_stream: bool) -> None:
     asked = camera_commands({
-        INFORMATION: lambda: camera_information(MADE, 0),
+        INFORMATION: lambda: camera_information(MADE, 0, 0),
         STREAM: lambda: stream_information(MADE), STREAM_STATUS: lambda: stream_status(MADE),
     })[command]  # fmt: skip
     assert asked.only_asks

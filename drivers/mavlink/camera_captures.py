@@ -1,0 +1,147 @@
+"""Images and recordings on the word of a ground station, told as they are.
+
+A recording is that of the flight, which the daemon makes anyway: to start one keeps it, whether the
+motors are armed or not. It goes on until its flight ends, so that it cannot be stopped from here.
+The protocol: https://mavlink.io/en/services/camera.html.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drivers.images.still_pictures import Still
+from drivers.mavlink.camera_messages import CAPTURE_STATUS, SETTINGS, STORAGE
+from drivers.mavlink.command_server import ACCEPTED, BUSY, DENIED, FAILED, Command, Done, Job
+
+CAPABILITIES: int = (
+    mavlink.CAMERA_CAP_FLAGS_CAPTURE_IMAGE
+    | mavlink.CAMERA_CAP_FLAGS_CAPTURE_VIDEO
+    | mavlink.CAMERA_CAP_FLAGS_CAN_CAPTURE_IMAGE_IN_VIDEO_MODE
+)
+NOT_STOPPED = b"recording goes on until the flight ends"
+URL_BYTES = 205
+SINGLE = 1.0
+MIB = 1.048576
+"""In megabytes."""
+
+
+class Stills(Protocol):
+    """Keeps single images; see `StillPictures`."""
+
+    @property
+    def n_taken(self) -> int:
+        """Number of the newest image."""
+
+    @property
+    def free_mb(self) -> float:
+        """Megabytes that there is room for."""
+
+    def request(self, done: Callable[[Still], None]) -> bool:
+        """Keep the next frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlightRecording:
+    """Recording of the flight: whether one is kept, and how to keep one; "" or why it cannot be."""
+
+    is_kept: Callable[[], bool]
+    keep: Callable[[], str]
+
+
+class CameraCaptures:
+    """Commands that take images and keep recordings; `tell` sends a message, from any thread."""
+
+    def __init__(
+        self, stills: Stills, recording: FlightRecording, boot_ms: Callable[[], int],
+        unix_us: Callable[[int], int], tell: Callable[[Any], None],
+    ) -> None:  # fmt: skip
+        self._stills, self._recording = stills, recording
+        self._boot_ms, self._unix_us, self._tell = boot_ms, unix_us, tell
+        self._since_ms: int | None = None
+        self._is_taking = False
+
+    @property
+    def commands(self) -> dict[int, Command]:
+        """Handlers of the commands."""
+        return {
+            mavlink.MAV_CMD_IMAGE_START_CAPTURE: Command(self._image),
+            mavlink.MAV_CMD_IMAGE_STOP_CAPTURE: Command(lambda _: Done(ACCEPTED)),
+            mavlink.MAV_CMD_VIDEO_START_CAPTURE: Command(self._record),
+            mavlink.MAV_CMD_VIDEO_STOP_CAPTURE: Command(self._stop),
+        }
+
+    @property
+    def messages(self) -> dict[int, Callable[[], Any]]:
+        """Messages that can be asked for."""
+        return {CAPTURE_STATUS: self._status, STORAGE: self._storage, SETTINGS: self._settings}
+
+    def step(self) -> None:
+        """Note since when a flight is recorded; to be called once a second."""
+        if not self._recording.is_kept():
+            self._since_ms = None
+        elif self._since_ms is None:
+            self._since_ms = self._boot_ms()
+
+    def _image(self, parameters: Sequence[float]) -> Done | Job:
+        if parameters[2] not in (SINGLE, 0.0) or (parameters[2] == 0.0 and parameters[1] > 0.0):
+            return Done(DENIED)  # a series of images is the recording
+        job = Job()
+
+        def done(still: Still) -> None:
+            self._is_taking = False
+            job.result = FAILED if still.why else ACCEPTED
+            self._tell(self._captured(still))
+
+        if not self._stills.request(done):
+            return Done(BUSY)
+        self._is_taking = True
+        return job
+
+    def _record(self, parameters: Sequence[float]) -> Done:
+        why = self._recording.keep()
+        if why:
+            return Done(FAILED, [_text(why.encode())])
+        self.step()
+        return Done(ACCEPTED, [self._status()])
+
+    def _stop(self, parameters: Sequence[float]) -> Done:
+        if not self._recording.is_kept():
+            return Done(ACCEPTED)
+        return Done(DENIED, [_text(NOT_STOPPED), self._status()])
+
+    def _captured(self, still: Still) -> Any:
+        """CAMERA_IMAGE_CAPTURED; place and attitude are in the recording, and not told here."""
+        return mavlink.MAVLink_camera_image_captured_message(
+            self._boot_ms() & 0xFFFFFFFF, self._unix_us(still.t_ns), 0, 0, 0, 0, 0, [math.nan] * 4,
+            still.number, 0 if still.why else 1, still.path.name.encode()[:URL_BYTES],
+        )  # fmt: skip
+
+    def _status(self) -> Any:
+        now_ms, since_ms = self._boot_ms(), self._since_ms
+        return mavlink.MAVLink_camera_capture_status_message(
+            now_ms & 0xFFFFFFFF, int(self._is_taking), int(since_ms is not None), 0.0,
+            0 if since_ms is None else (now_ms - since_ms) & 0xFFFFFFFF, self._stills.free_mb / MIB,
+            self._stills.n_taken,
+        )  # fmt: skip
+
+    def _storage(self) -> Any:
+        """STORAGE_INFORMATION: what there is room for; sizes in MiB, the others are not known."""
+        return mavlink.MAVLink_storage_information_message(
+            self._boot_ms() & 0xFFFFFFFF, 1, 1, mavlink.STORAGE_STATUS_READY, math.nan, math.nan,
+            self._stills.free_mb / MIB, math.nan, math.nan, mavlink.STORAGE_TYPE_OTHER,
+            b"companion",
+        )  # fmt: skip
+
+    def _settings(self) -> Any:
+        return mavlink.MAVLink_camera_settings_message(
+            self._boot_ms() & 0xFFFFFFFF, mavlink.CAMERA_MODE_VIDEO, math.nan, math.nan
+        )
+
+
+def _text(text: bytes) -> Any:
+    return mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_NOTICE, text[:50])
