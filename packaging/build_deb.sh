@@ -40,6 +40,8 @@ find "$prefix" -name __pycache__ -prune -exec rm -rf {} +
 
 install -D -m 644 config/companion.toml "$root/etc/companion/companion.toml"
 install -D -m 644 systemd/companion.service "$root/usr/lib/systemd/system/companion.service"
+install -D -m 644 systemd/companion-proof.service "$root/usr/lib/systemd/system/companion-proof.service"
+install -D -m 755 packaging/deb/companion-back "$root/usr/sbin/companion-back"
 install -D -m 644 systemd/99-companion.rules "$root/usr/lib/udev/rules.d/99-companion.rules"
 install -D -m 644 LICENSE "$root/usr/share/doc/companion/copyright"
 install -D -m 644 CHANGELOG.md "$root/usr/share/doc/companion/CHANGELOG.md"
@@ -52,7 +54,7 @@ sed -e "s/@VERSION@/$version/" -e "s/@ARCHITECTURE@/$architecture/" -e "s/@PYTHO
   -e "s/@INSTALLED_KB@/$(du -sk "$root" | cut -f1)/" \
   packaging/deb/control >"$root/DEBIAN/control"
 install -m 644 packaging/deb/conffiles "$root/DEBIAN/conffiles"
-install -m 755 packaging/deb/postinst packaging/deb/prerm packaging/deb/postrm "$root/DEBIAN"
+install -m 755 packaging/deb/preinst packaging/deb/postinst packaging/deb/prerm packaging/deb/postrm "$root/DEBIAN"
 
 mkdir -p dist
 deb=dist/companion_${version}_$architecture.deb

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -11,9 +13,12 @@ import pytest
 ROOT = Path(__file__).parents[2]
 EMULATED = ROOT / "packaging/test_aarch64.sh"
 SCRIPTS = sorted(
-    [*ROOT.glob("packaging/*.sh"), *(ROOT / "packaging/deb" / each
-                                     for each in ("postinst", "prerm", "postrm"))]
-)  # fmt: skip
+    [
+        *ROOT.glob("packaging/*.sh"),
+        *(ROOT / "packaging/deb" / each for each in ("preinst", "postinst", "prerm", "postrm")),
+        ROOT / "packaging/deb/companion-back",
+    ]
+)
 
 
 def quoted(name: str) -> str:
@@ -78,3 +83,76 @@ def test_wheel_has_the_sample_flight() -> None:
         assert (ROOT / source).is_file()
         assert place == f"companion/{source}"
     assert settings.count('= "companion/sample/survey/') == 4
+
+
+def made_package(folder: Path, version: str) -> Path:
+    """A package with the scripts of ours that an update needs, and next to nothing in it."""
+    root = folder / version
+    program = root / "opt/companion/bin/companion"
+    unit = root / "usr/lib/systemd/system/companion.service"
+    for path, text in (
+        (program, f"#!/bin/sh\necho companion {version}\n"), (unit, f"# {version}\n"),
+        (root / "DEBIAN/control", f"Package: companion\nVersion: {version}\n"
+         "Architecture: all\nMaintainer: none <none@localhost>\nDescription: a trial\n"),
+    ):  # fmt: skip
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    program.chmod(0o755)
+    for name in ("preinst", "prerm", "postrm"):
+        shutil.copy2(ROOT / "packaging/deb" / name, root / "DEBIAN" / name)
+    package = folder / f"companion_{version}.deb"
+    subprocess.run(["dpkg-deb", "--build", root, package], check=True, capture_output=True)
+    return package
+
+
+@pytest.mark.skipif(not shutil.which("dpkg"), reason="needs dpkg")
+def test_the_version_before_an_update_is_kept_and_comes_back(tmp_path: Path) -> None:
+    root, admin = tmp_path / "root", tmp_path / "root/var/lib/dpkg"
+    for folder in ("info", "updates", "triggers"):
+        (admin / folder).mkdir(parents=True)
+    (admin / "status").touch()
+    yours = root / "var/lib/companion/flights/site.map"
+    yours.parent.mkdir(parents=True)
+    yours.write_text("a map")
+
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    path = f"{tools}:{os.environ['PATH']}"
+
+    def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            command, capture_output=True, text=True, timeout=60, check=False,
+            env={**os.environ, "DPKG_ROOT": str(root), "PROOF_S": "1", "PATH": path},
+        )  # fmt: skip
+
+    def service(ready: bool) -> None:
+        """The only thing that is asked of systemd here."""
+        (tools / "systemctl").write_text(f"#!/bin/sh\nexit {0 if ready else 3}\n")
+        (tools / "systemctl").chmod(0o755)
+
+    def installed(version: str) -> None:
+        forces = "--force-not-root,script-chrootless,depends,bad-path"
+        done = run("dpkg", forces, f"--root={root}", "--install", made_package(tmp_path, version))
+        assert done.returncode == 0, done.stderr
+
+    def is_there() -> tuple[str, str]:
+        said = run(root / "opt/companion/bin/companion").stdout.strip()
+        return said, (root / "usr/lib/systemd/system/companion.service").read_text().strip()
+
+    back = ROOT / "packaging/deb/companion-back"
+    installed("1.0")
+    assert "no version from before an update" in run(back).stderr
+    installed("1.1")
+    assert is_there() == ("companion 1.1", "# 1.1")
+    for version in ("1.0", "1.1", "1.0"):
+        assert run(back).stdout == f"companion-back: companion {version} is in place\n"
+        assert is_there() == (f"companion {version}", f"# {version}")
+    installed("1.2")  # over the one that came back
+    assert is_there() == ("companion 1.2", "# 1.2")
+    service(ready=True)
+    assert run(back, "--unless-ready").stdout.endswith("companion 1.2 is ready and stays\n")
+    assert is_there() == ("companion 1.2", "# 1.2")
+    service(ready=False)
+    assert "not ready within 1 s" in run(back, "--unless-ready").stderr
+    assert is_there() == ("companion 1.0", "# 1.0")
+    assert yours.read_text() == "a map"
