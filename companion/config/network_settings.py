@@ -43,6 +43,9 @@ class VideoConfig:
     """HOST:PORT of an RTSP server, whose path is /camera; "" for none. 0.0.0.0 is every network."""
     kbit_s: Annotated[int, Meta(ge=50, le=50000)] = 2000
     """Bit rate of the video, kbit/s."""
+    overlay: tuple[Literal["points", "horizon", "depth"], ...] = ()
+    """Drawn over the video, some of these: the points that are tracked, the horizon with the points
+    of the compass, the newest depth map in a corner. Pictures of the recording stay as they are."""
 
 
 @dataclass(frozen=True, slots=True)

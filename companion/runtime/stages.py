@@ -113,8 +113,8 @@ STAGES = (
         frame_every_ns=60_000_000,
     ),
     Stage(
-        "video", (Frame,), nice=10, answer_s=30.0, finish_s=3.0, with_flight=True,
-        frame_every_ns=30_000_000,
+        "video", (Frame, Track, Odometry, DepthMap), nice=10, answer_s=30.0, finish_s=3.0,
+        with_flight=True, frame_every_ns=30_000_000,
     ),
     Stage(
         "results",

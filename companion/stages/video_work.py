@@ -7,9 +7,10 @@ from dataclasses import replace
 from typing import Any
 
 from companion.errors import ConfigError
-from companion.messages import Message
+from companion.messages import Frame, Message
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
+from companion.streaming.video_overlay import VideoOverlay
 from drivers.recording.video_codec import H264, h264_of
 from drivers.video.rtsp_server import RtspServer
 
@@ -22,6 +23,7 @@ class _Video(Work):
         config = setup.config
         self._config = replace(config.recorder, h264_kbit_s=config.video.kbit_s)
         self._rate_hz = config.camera.rate_hz
+        self._overlay = VideoOverlay(config.video.overlay, setup.camera)
         self._server = RtspServer(config.video.listen)
         self._encoder: H264 | None = None
         self._size = (0, 0)
@@ -34,6 +36,9 @@ class _Video(Work):
         return self._n_left_out
 
     def step(self, message: Any) -> Iterable[Message]:
+        if not isinstance(message, Frame):
+            self._overlay.take(message)
+            return []
         if not self._server.is_watched or not message.rgb.size:
             self._encoder = None
             self.device = self._server.problem or NOT_WATCHED
@@ -47,7 +52,8 @@ class _Video(Work):
                 return []
             self._size = (width, height)
             self.device = f"watched, by {self._encoder.name}"
-        even = message.rgb[: height & ~1, : width & ~1]
+        rgb = self._overlay.drawn(message.rgb, message.t_ns)
+        even = rgb[: height & ~1, : width & ~1]
         for picture in self._encoder.encode(replace(message, rgb=even)):
             if not self._server.send(h264_of(picture.data) or b""):
                 self._n_left_out += 1
