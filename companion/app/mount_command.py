@@ -31,6 +31,8 @@ from drivers.images.calibration_file import FORWARD_UPRIGHT
 from drivers.recording.recording_tail import RecordingTail, running_recording
 
 LOOK_EVERY_S, SILENT_S = 0.1, 6.0
+MOST_BEHIND_NS = 1_500_000_000
+"""Frames that are older than the newest by more are left out."""
 SAY_EVERY = 5
 """Frames between two results: an estimate takes some ten milliseconds."""
 HOW = {
@@ -99,6 +101,8 @@ def mount_by_hand(socket: Path, config: Config, progress: Progress) -> Mount:
                 continue
             found = seeking.search.result()
             wanted = _wanted(found) if seeking.has_attitude else NO_ATTITUDE
+            if seeking.state is not TrackState.TRACKING:
+                wanted = BEGIN
             progress.show(**_facts(found))
             progress.update(seeking.n_frames, wanted, found.n_samples)
             if found.is_found:
@@ -145,9 +149,12 @@ def _live(tail: RecordingTail) -> Iterator[Message]:
     never, came_s = threading.Event(), monotonic_s()
     while monotonic_s() - came_s < SILENT_S:
         new = tail.read()
-        if any(isinstance(each, Frame) for each in new):
+        frames = [each for each in new if isinstance(each, Frame)]
+        if frames:
             came_s = monotonic_s()
-        yield from new
+        # where this process gets too little time the newest second is enough: the map may be lost
+        since_ns = frames[-1].t_ns - MOST_BEHIND_NS if frames else 0
+        yield from (m for m in new if not isinstance(m, Frame) or m.t_ns > since_ns)
         wait_s(never, LOOK_EVERY_S)
 
 
@@ -163,8 +170,18 @@ def _wanted(found: MountSearched) -> str:
 
 
 def _facts(found: MountSearched) -> dict[str, Any]:
+    estimate = found.estimate
+    known = {} if estimate is None else {
+        "residual_deg": round(math.degrees(estimate.residual_rad), 2),
+        "sigma_deg": np.degrees(estimate.sigma_turn_rad).round(2).tolist(),
+    }  # fmt: skip
     turned = dict(zip(AXES, np.degrees(found.turned_rad).round(1).tolist(), strict=True))
-    return {"turned_deg": turned, "missing": list(found.missing)}
+    return {
+        "turned_deg": turned,
+        "missing": list(found.missing),
+        "fits": found.fits,
+        "found": known,
+    }
 
 
 def _mount(found: MountSearched) -> Mount:

@@ -1,11 +1,12 @@
-"""Pairing of a device by a code, and the end of its session."""
+"""Open to everybody: pairing of a device by a code, the end of its session, our name for BlueOS."""
 
 from __future__ import annotations
 
 from starlette.requests import Request
-from starlette.responses import RedirectResponse, Response
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
 
+from companion import __version__
 from companion.page.access import COOKIE, KEPT_S
 from companion.page.site import Site, is_same_origin, local_path, read_form
 
@@ -25,6 +26,7 @@ class PairingViews:
             Route("/pair", self._ask),
             Route("/pair", self._pair, methods=["POST"]),
             Route("/leave", self._leave, methods=["POST"]),
+            Route("/register_service", self._service),
         ]
 
     async def _ask(self, request: Request) -> Response:
@@ -51,6 +53,14 @@ class PairingViews:
         answer = RedirectResponse("/pair", 303)
         answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
         return answer
+
+    async def _service(self, request: Request) -> Response:
+        """What BlueOS lists of its extensions, which it asks at the ports of this machine."""
+        return JSONResponse({
+            "name": "companion", "description": "Vision position, map and video for the autopilot",
+            "icon": "mdi-map-marker-path", "company": "companion", "version": __version__,
+            "webpage": "", "api": "", "new_page": True,
+        })  # fmt: skip
 
     async def _form(
         self, request: Request, to: str, wrong: str, status_code: int = 200

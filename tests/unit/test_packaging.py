@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -9,6 +10,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
+
+from companion import __version__
+from companion.config_file import load_config
 
 ROOT = Path(__file__).parents[2]
 EMULATED = ROOT / "packaging/test_aarch64.sh"
@@ -75,6 +79,22 @@ def test_container_is_given_what_it_copies() -> None:
     for path in wanted:
         assert (ROOT / path).exists(), path
         assert any(path == each or path.startswith(f"{each}/") for each in kept), path
+
+
+def test_container_tells_blueos_what_it_needs() -> None:
+    """Labels as BlueOS reads them: some are JSON, the version is that of the program."""
+    text = (ROOT / "packaging/Containerfile").read_text("utf-8").replace("\\\n", "")
+    labels = dict(re.findall(r"""(\w+)='([^']*)'""", text))
+    for name in ("tags", "links", "authors", "company", "permissions"):
+        json.loads(labels[name])
+    permissions = json.loads(labels["permissions"])
+    assert permissions["HostConfig"]["NetworkMode"] == "host"
+    kept = [each.split(":")[1] for each in permissions["HostConfig"]["Binds"]]
+    begins = permissions["Entrypoint"][2]
+    assert "/var/lib/companion" in kept and "cd /var/lib/companion" in begins
+    for setting in re.findall(r"--set (\S+)", begins):
+        load_config(None, [setting])
+    assert f'LABEL version="{__version__}"' in text
 
 
 def test_wheel_has_the_sample_flight() -> None:

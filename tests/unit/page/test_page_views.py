@@ -150,3 +150,9 @@ def test_every_view_is_one_that_a_screen_reader_can_walk_through(served: ServedP
                 assert f'<label for="{name}"' in text, (path, head)
         for piece in text.split("<canvas")[1:]:
             assert 'role="img"' in piece.partition(">")[0] and "aria-label" in piece
+
+
+def test_blueos_finds_the_page_by_its_name(served: ServedPage) -> None:
+    told = json.loads(served.ask("GET", "/register_service", peer=ELSEWHERE).text)
+    assert {"name", "description", "icon", "company", "version", "webpage", "api"} <= set(told)
+    assert told["name"] == "companion"
