@@ -27,7 +27,7 @@ from companion.messages import DepthMap, Frame, MapUpdate, PointChunk, Track, Tr
 from companion.timing.clock import FlightClock
 from drivers.images.still_pictures import StillPictures
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.camera_captures import FlightRecording
+from drivers.mavlink.camera_captures import NOTHING_RECORDED, FlightRecording
 from drivers.mavlink.camera_component import CameraComponent
 from drivers.mavlink.camera_messages import CameraStream
 from drivers.mavlink.command_server import Command
@@ -65,7 +65,7 @@ class VehicleReports:
 
     def __init__(
         self, link: AutopilotLink, clock: FlightClock, watch: HealthWatch, config: Config,
-        recording: FlightRecording,
+        recording: FlightRecording = NOTHING_RECORDED,
     ) -> None:  # fmt: skip
         self._link, self._clock, self._watch = link, clock, watch
         self._config, self._obstacles = config, config.feedback.obstacle_distance

@@ -69,7 +69,8 @@ class VideoOverlay:
             return
         pixels = self._camera.project(self._horizon @ (world_from_body @ mount.rotation))
         height, width = out.shape[:2]
-        inside = (pixels > -0.5).all(1) & (pixels < [width - 0.5, height - 0.5]).all(1)
+        size = np.array([width, height])
+        inside = np.asarray(((pixels > -0.5) & (pixels < size - 0.5)).all(1))
         for at in np.flatnonzero(inside):  # nan is outside
             after = (at + 1) % len(pixels)
             a = tuple(np.rint(pixels[at]).astype(int).tolist())

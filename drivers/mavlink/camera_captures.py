@@ -53,6 +53,9 @@ class FlightRecording:
     keep: Callable[[], str]
 
 
+NOTHING_RECORDED = FlightRecording(lambda: False, lambda: "not recorded: no flight goes on")
+
+
 class CameraCaptures:
     """Commands that take images and keep recordings; `tell` sends a message, from any thread."""
 

@@ -26,7 +26,6 @@ from companion.messages import (
     Track,
     TrackState,
 )
-from drivers.mavlink.camera_captures import FlightRecording
 from tests.support.autopilot.memory_link import SetClock, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
 
@@ -63,9 +62,8 @@ class Approach:
         self.link = memory_link(self.port, self.clock, lambda _: None)
         watch: Any = None
         self.reports = VehicleReports(
-            self.link, self.clock, watch, Config(feedback=FeedbackConfig(obstacle_distance=True)),
-            FlightRecording(lambda: False, lambda: ""),
-        )  # fmt: skip
+            self.link, self.clock, watch, Config(feedback=FeedbackConfig(obstacle_distance=True))
+        )
         self.reports.restart(CAMERA)
         self.keyframes: dict[int, Pose] = {}
         self.late: list[tuple[int, DepthMap]] = []
