@@ -55,7 +55,7 @@ class PairingViews:
         return answer
 
     async def _service(self, request: Request) -> Response:
-        """What BlueOS lists of its extensions, which it asks at the ports of this machine."""
+        """Name and version for BlueOS, which asks for them at the ports of this machine."""
         return JSONResponse({
             "name": "companion", "description": "Vision position, map and video for the autopilot",
             "icon": "mdi-map-marker-path", "company": "companion", "version": __version__,

@@ -128,7 +128,7 @@ def _passed(answer: httpx.Response, headers: dict[str, str]) -> StreamingRespons
 
 
 async def _bytes(answer: httpx.Response) -> AsyncIterator[bytes]:
-    """What comes, no faster than the browser takes it."""
+    """Bytes as they come, no faster than the browser takes them."""
     try:
         async for data in answer.aiter_raw():
             yield data

@@ -28,7 +28,7 @@ from drivers.system.status_socket import ask_status
 
 
 class RecordingTail:
-    """What is added to a recording from now on; FlightError where it is none.
+    """Messages added to a recording from now on; FlightError where it is none.
 
     `camera` is that of the flight.
     """
