@@ -29,7 +29,7 @@ SINCE = {
     "camera.readout_ms", "expert.export.mesh_m", "feedback.flow", "feedback.global_position",
     "gps.satellites_set", "gps.switch_source", "gps.vision_set",
     "landing.id", "landing.marker", "landing.size_m", "map.use",
-    "page.listen", "telemetry.use", "video.kbit_s", "video.listen",
+    "page.listen", "telemetry.use", "video.kbit_s", "video.overlay", "video.listen",
 }  # fmt: skip
 """Keys that version did not have."""
 
