@@ -90,9 +90,10 @@ class CameraComponent:
                 if self._port.connected:
                     self._port.send(camera_heartbeat(), as_second=True)
             n += 1
+            n_told = len(self._told)  # of those the acknowledgement goes first
             for answer in self._commands.step(self._clock.now_ns()):
                 self._port.send(answer, as_second=True)
-            while self._told:
+            for _ in range(n_told):
                 self._port.send(self._told.popleft(), as_second=True)
             await asyncio.sleep(HEARTBEAT_S / ROUNDS)
 
