@@ -19,14 +19,14 @@ from tests.support.left_behind import left_since, running, watch_tasks
 from tests.support.processes.steal import FlownAgain
 
 LONGEST = (
-    "test_two_nodes", "test_flown_by_vision", "test_as_flown", "test_ground_control",
-    "test_whole_flight", "test_stage_faults", "test_page_in_browser", "test_set_up_in_browser",
-    "test_autopilot_link", "test_autopilot_faults", "test_restart_in_flight", "test_recording",
-    "test_camera_faults", "test_device_faults", "test_service", "test_armed_settings",
-    "test_daemon_limits",
+    "test_two_nodes", "test_flown_by_vision", "test_stage_faults", "test_as_flown",
+    "test_page_in_browser", "test_autopilot_link", "test_whole_flight", "test_recording",
+    "test_service", "test_dead_reckoning", "test_autopilot_faults", "test_daemon_limits",
+    "test_ground_control", "test_armed_settings", "test_restart_in_flight", "test_device_faults",
+    "test_power_on",
 )  # fmt: skip
-"""Files in real time that take most of a minute or more. They begin first, for workers of
-pytest-xdist to end together; of what only computes the whole replays begin first."""
+"""Files in real time that take two minutes to half of one. They begin first, in this order, for
+workers of pytest-xdist to end together; of what only computes the whole replays begin first."""
 MARKS = {"live": ("real_time",), "system": ("real_time", "alone")}
 """Of the tests in these folders."""
 
@@ -36,7 +36,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: item.path.stem not in LONGEST)
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
     for item in items:
         for mark in MARKS.get(item.path.relative_to(Path(__file__).parent).parts[0], ()):
             item.add_marker(mark)
