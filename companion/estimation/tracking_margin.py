@@ -20,9 +20,10 @@ MAX_PASSED_RATIO = 0.25
 measured and a third to be of use; at this ratio it is seen in four."""
 BORDER_PX = 31
 """No feature is seen nearer to the edge of the picture (the border of cv2.ORB)."""
-FEW_MATCHES = 150
-"""Points matched in a frame: with more a pose is no better. With 50, over drawn ground, the scale
-drifts by 1 % a second."""
+FEW_MATCHES, FEW_OF_FAINT = 100, 150
+"""Points matched in a frame, and where few features are seen: with 150 a pose is as good as it
+gets, with 50, over drawn ground, its scale drifts by 1 % a second. Faint ground is told the sooner,
+as its points go all at once."""
 MIN_FEATURE_RATIO = 0.75
 """Features, of those asked for: fewer are seen where the lowest threshold finds no more, and then
 many of them are noise."""
@@ -87,9 +88,10 @@ class TrackingMargin:
         self._last = view.seq, slam_map, slam_map.positions[view.point_ids[view.point_ids >= 0]]
         if passed > MAX_PASSED_RATIO:
             return TOO_FAST
-        if min(track.n_inliers, track.n_matches) >= FEW_MATCHES * ratio:
-            return ""
-        return TOO_FAINT if faint else TOO_FEW
+        n_matched = min(track.n_inliers, track.n_matches)
+        if faint and n_matched < FEW_OF_FAINT * ratio:
+            return TOO_FAINT
+        return TOO_FEW if n_matched < FEW_MATCHES * ratio else ""
 
     def _passed(self, view: View, slam_map: SlamMap) -> float:
         """Ratio of the last tracked frame's points that are out of the picture; 0 if unknown."""
