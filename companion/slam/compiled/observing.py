@@ -1,4 +1,4 @@
-"""Observation kernels: living points that a keyframe observes, and how many of them are marked."""
+"""Observation kernel: the living points that a keyframe observes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,3 @@ def observed(point_ids: Ints, alive: Bools) -> tuple[Ints, Ints]:
             n += 1
     features = features[:n].copy()
     return features, point_ids[features]
-
-
-@compiled(integers, flags)
-def n_marked(point_ids: Ints, marked: Bools) -> int:
-    """Number of observations whose points are marked; -1 is no point."""
-    n = 0
-    for i in range(len(point_ids)):
-        if point_ids[i] >= 0 and marked[point_ids[i]]:
-            n += 1
-    return n

@@ -14,7 +14,7 @@ import numpy as np
 from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Bytes
-from companion.slam.compiled.observing import n_marked, observed
+from companion.slam.compiled.observing import observed
 from companion.slam.compiled.patch_alignment import STORED
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.features.patches import Patches, cut, level_of
@@ -325,13 +325,13 @@ class SlamMap:
         Only candidates that are frequent among the latest observers of the points are counted.
         """
         points = points[self.alive[points]]
-        mask = np.zeros(self.n_points, bool)
+        mask = np.zeros(self.n_points + 1, bool)
         mask[points] = True
         observations_of = self.observers[points].ravel()
         keys, often = np.unique(observations_of[observations_of >= 0], return_counts=True)
         order = np.lexsort((keys, -often))[:MAX_COVISIBLE_CANDIDATES]
         near = [self.keyframes[k] for k in keys[order].tolist() if k in self.keyframes]
-        counts = [(n_marked(k.point_ids, mask), k.keyframe_id) for k in near]
+        counts = [(int(np.count_nonzero(mask[k.point_ids])), k.keyframe_id) for k in near]
         return sorted((c for c in counts if c[0] >= minimum), key=lambda c: (-c[0], c[1]))
 
     def pose_of(self, keyframe_id: int) -> Pose | None:

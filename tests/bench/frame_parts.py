@@ -1,0 +1,141 @@
+"""Processor time of localisation by its parts, for frames and keyframes; tables of performance.md.
+
+    python -m tests.bench.frame_parts FLIGHT... [--frames N]
+
+In lockstep, without dense mapping; time of the one thread that does it all, so that other work on
+the computer hardly shows. Parts lie within each other as they are indented.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import importlib
+import os
+import time
+from collections import defaultdict
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ[variable] = "1"  # as the program does, before numpy loads
+
+import numpy as np  # noqa: E402
+
+from companion.config import Config  # noqa: E402
+from companion.estimation.localisation import LocalisationStage  # noqa: E402
+from companion.messages import Frame, KeyframeAdded, Odometry  # noqa: E402
+from companion.runtime.in_order import in_order_of_time  # noqa: E402
+from companion.timing.clock import StageTimes  # noqa: E402
+from drivers.open_flight import open_flight  # noqa: E402
+
+LEAD_NS = 10_000_000_000
+SLAM, ESTIMATION = "companion.slam.", "companion.estimation."
+OF_FRAME = {
+    "features": SLAM + "features.orb_features:FeatureExtractor.extract",
+    "  FAST, Harris, angles": SLAM + "features.orb_features:FeatureExtractor._detect",
+    "tracking": SLAM + "tracking.tracker:Tracker._track",
+    "  projecting": SLAM + "map.local_map:Projector.visible",
+    "  search by projection": SLAM + "map.local_map:Projector.search",
+    "  pose optimisation": SLAM + "tracking.frame_tracker:refine_pose",
+    "  patch alignment": SLAM + "tracking.frame_tracker:refine_features",
+    "  local map": SLAM + "tracking.frame_tracker:FrameTracker.update_local_map",
+    "keyframe decision": SLAM + "tracking.tracker:Tracker._needs_keyframe",
+    "telemetry": ESTIMATION + "localisation:LocalisationStage._take_samples",
+    "attitude, checked": ESTIMATION + "localisation:LocalisationStage._check_attitude",
+    "odometry": ESTIMATION + "localisation:LocalisationStage._odometry_of",
+    "motion filter": ESTIMATION + "motion_filter:MotionFilter.correct",
+    "corrections of the map": ESTIMATION + "localisation:LocalisationStage._apply_map_correction",
+    "shutter": ESTIMATION + "shutter.shutter_of_frames:ShutterOfFrames.end",
+    "site map": ESTIMATION + "site.site_in_flight:SiteInFlight.frame",
+}
+OF_KEYFRAME = {
+    "mapping": SLAM + "mapping.atlas:Atlas.insert_keyframe",
+    "  triangulation": SLAM + "mapping.mapper:Mapper._triangulate",
+    "    epipolar search": SLAM + "mapping.mapper:match_epipolar",
+    "  fusion": SLAM + "mapping.mapper:Mapper._extend",
+    "    merging": SLAM + "mapping.mapper:Mapper._merge",
+    "  patch alignment": SLAM + "mapping.mapper:Mapper._refine",
+    "  bundle adjustment": SLAM + "mapping.mapper:Mapper.adjust_locally",
+    "georeference": ESTIMATION + "localisation:LocalisationStage._map_update",
+}
+Times = dict[str, float]
+
+
+def watch(name: str, place: str, spent_ms: Times) -> None:
+    """Let a function add its processor time to `spent_ms`."""
+    module, _, path = place.partition(":")
+    *owners, last = path.split(".")
+    owner: Any = importlib.import_module(module)
+    for each in owners:
+        owner = getattr(owner, each)
+    function = getattr(owner, last)
+
+    @functools.wraps(function)
+    def timed(*values: Any, **named: Any) -> Any:
+        began_ns = time.thread_time_ns()
+        try:
+            return function(*values, **named)
+        finally:
+            spent_ms[name] += (time.thread_time_ns() - began_ns) * 1e-6
+
+    setattr(owner, last, timed)
+
+
+def measured(path: Path, n_frames: int | None, spent_ms: Times) -> tuple[list[Times], list[Times]]:
+    """Times by part, of frames that are no keyframes and of those that are.
+
+    "all" is the whole frame, "pose" until its odometry is there.
+    """
+    config = Config()
+    flight = open_flight(path, config.camera, config.telemetry)
+    samples = [s for s in flight.telemetry().samples if s.t_ns >= flight.start_ns - LEAD_NS]
+    stage = LocalisationStage(config, flight.camera, StageTimes())
+    frames: list[Times] = []
+    keyframes: list[Times] = []
+    for message in in_order_of_time(samples, islice(flight.frames(), n_frames)):
+        began_ns, is_keyframe = time.thread_time_ns(), False
+        for out in stage.step(message):
+            is_keyframe |= isinstance(out, KeyframeAdded)
+            if isinstance(out, Odometry):
+                spent_ms["pose"] = (time.thread_time_ns() - began_ns) * 1e-6
+        if isinstance(message, Frame):
+            spent_ms["all"] = (time.thread_time_ns() - began_ns) * 1e-6
+            (keyframes if is_keyframe else frames).append(dict(spent_ms))
+            spent_ms.clear()
+    return frames, keyframes
+
+
+def table(rows: list[Times], names: list[str]) -> str:
+    """Mean, median and 95th percentile of each part, milliseconds."""
+    out = []
+    for name in names:
+        ms = np.array([row.get(name, 0.0) for row in rows])
+        out.append(f"{name:26s}{ms.mean():8.2f}{np.median(ms):8.2f}{np.percentile(ms, 95):8.2f}")
+    return "\n".join(out)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("flight", nargs="+", type=Path)
+    parser.add_argument("--frames", type=int, help="of each flight, the first ones")
+    options = parser.parse_args()
+    spent_ms: Times = defaultdict(float)
+    for name, place in (
+        OF_FRAME | {"of keyframe: " + k: v for k, v in OF_KEYFRAME.items()}
+    ).items():
+        watch(name, place, spent_ms)
+    for path in options.flight:
+        frames, keyframes = measured(path, options.frames, spent_ms)
+        print(f"\n{path.name}: {len(frames)} frames, mean, median, 95th percentile, ms of a core")
+        print(table(frames, ["all", "pose", *OF_FRAME]))
+        print(f"{len(keyframes)} keyframes")
+        names = [*OF_KEYFRAME]
+        print(table([{k.removeprefix("of keyframe: "): v for k, v in row.items()
+                      if k == "all" or k.startswith("of keyframe: ")} for row in keyframes],
+                    ["all", *names]), flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
