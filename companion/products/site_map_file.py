@@ -316,7 +316,7 @@ def _part(said: dict[str, Any]) -> SitePart:
         width, height, fx, fy, cx, cy, Distortion(said["distortion"]),
         tuple(said["coefficients"]),
         None if mount is None else Pose.from_matrix(np.array(mount)), said["assumed"],
-        said["readout_ms"],
+        said.get("readout_ms"),
     )  # fmt: skip
     return SitePart(said["flight"], said["began_ns"], camera, said["revision"])
 

@@ -30,8 +30,11 @@ MIN_OBSERVERS = 3
 """Keyframes that observe a point which is believed."""
 MAX_BITS, RATIO = 50, 0.8
 """Of descriptors of the same corner, as in the search for points of the map."""
-MIN_MOVED, MIN_MOVED_SHARE = 5, 0.3
-"""Corners of a thing that has moved by one shift, and their share of the smaller side."""
+MIN_MOVED, MIN_MOVED_SHARE = 4, 0.15
+"""Corners of a thing that has moved by one shift, and their share of the smaller side. From another
+side and at another time a quarter of the corners of a thing are known again; of two things none is.
+"""
+
 Kind = Literal["gone", "new", "moved"]
 
 

@@ -50,8 +50,10 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
         for key, keyframe in here.keyframes.items():
             if key not in here.held:
                 mapper.fuse_held(keyframe)
+        _loosen(here, _n_ids(first))
         mapper.adjust_all(ITERATIONS)
     here.held = frozenset()
+    _loosen(here, _n_ids(first))
     mapper.adjust_all(ITERATIONS)
     n_first = len(first.parts)
     part_of_id = dict(zip(_ids(first), first.part_of.tolist(), strict=True)) | {
@@ -65,6 +67,23 @@ def merge_sites(first: SiteMap, other: SiteMap, other_in_first: Similarity) -> S
         here, _placed(here, before), (*first.parts, *newer), part_of_id, georeference,
         revision,
     )  # fmt: skip
+
+
+def _loosen(slam_map: SlamMap, n_first: int) -> None:
+    """Count features of points that both maps observe as detected corners, not as refined ones.
+
+    Each map refined them against a patch of its own, and the corners of two patches are up to a
+    pixel apart: taken as sure as they are among themselves they bend both maps. The keyframes of
+    the first map are those with ids below `n_first`.
+    """
+    seen = np.zeros((2, slam_map.n_points), bool)
+    for key, keyframe in slam_map.keyframes.items():
+        seen[int(key < n_first), slam_map.observations_of(keyframe)[1]] = True
+    in_both = seen[0] & seen[1]
+    for keyframe in slam_map.keyframes.values():
+        features, ids = slam_map.observations_of(keyframe)
+        shared = features[in_both[ids]]
+        keyframe.whitening[shared] = keyframe.features.whitening[shared]
 
 
 def _ids(site: SiteMap) -> list[int]:
