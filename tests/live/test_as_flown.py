@@ -15,6 +15,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig, TelemetryConfig
+from companion.estimation.site.site_use import LOCATED
 from companion.telemetry import MEASURED, PositionSample
 from drivers.recording.decisions import decisions_of
 from drivers.recording.recorded_flight import open_recording
@@ -109,6 +110,38 @@ def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> No
     assert "the same to the byte" in done.stdout
 
 
+def ended(flying: Flying) -> Path:
+    """The folder of the flight, once it has left all results: its map, too."""
+    flying.autopilot.disarm()
+    flying.daemon.send(signal.SIGINT)
+    assert flying.daemon.ended(120).status == 0
+    (path,) = flying.daemon.flown()
+    return path
+
+
+def test_a_flight_in_the_map_of_an_earlier_one_is_flown_again_in_that_map(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+    with Flying(tmp_path / "first", "recorder.enabled=false") as flying:
+        flying.take_off()
+        flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
+        path = ended(flying)
+    site_map = path / "site.map"
+    settings = "recorder.codec=png", f"map.use={site_map}"
+    with Flying(tmp_path / "second", *settings) as flying:
+        flying.take_off()
+        flying.daemon.line(LOCATED)
+        flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
+        path = ended(flying)
+    moved, other = site_map.rename(tmp_path / "moved.map"), path / "site.map"
+    assert other.exists()
+    for options in ((), ("--map", str(other))):
+        refused = replay(path, tmp_path / "refused", "--as-flown", *options)
+        assert refused.status and "--map FILE names it" in refused.stderr
+    _, found = again(path, tmp_path / "again", "--map", str(moved))
+    assert found["frames_same"] == found["frames"] > 50
+
+
 def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path) -> None:
     with Flying(tmp_path, "recorder.codec=mjpeg") as flying:
         flying.take_off()
@@ -120,3 +153,22 @@ def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path)
     _, found = again(path, tmp_path / "again")
     assert not found["tracked_again"]
     assert found["by_gate"]["pose"]["sent"] > 100
+
+
+def test_global_positions_are_made_again_where_poses_are_not_sent(tmp_path: Path) -> None:
+    with Flying(
+        tmp_path, "recorder.codec=mjpeg", "feedback.mode=off", "feedback.global_position=sensor"
+    ) as flying:
+        flying.autopilot.arm()
+        flying.daemon.until(lambda health: "GPS" in health["scale"], "a place by satellites")
+        flying.autopilot.gps = False
+        flying.autopilot.wait_for("GLOBAL_POSITION_SENSOR", 20, 60)
+        flying.autopilot.gps = True
+        flying.until_told("global position by vision off", time.monotonic_ns())
+        flying.autopilot.disarm()
+        flying.daemon.line("results so far")
+        (path,) = flying.daemon.flown()
+        flying.daemon.stop()
+    _, found = again(path, tmp_path / "again")
+    assert not found["tracked_again"]
+    assert found["by_gate"]["global"]["sent"] >= 20 and set(found["by_gate"]) == {"global"}
