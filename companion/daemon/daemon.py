@@ -11,7 +11,7 @@ import asyncio
 import signal
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from companion.config import Config
 from companion.daemon.component_state import POWEROFF
@@ -62,9 +62,11 @@ from drivers.mavlink.origin_keeper import OriginKeeper
 from drivers.mavlink.wire.link_port import link_port
 from drivers.system.clock_is_set import clock_is_set
 from drivers.system.journal import WARNING, Journal
-from drivers.system.metrics import Metrics
 from drivers.system.service_manager import ServiceManager
 from drivers.system.status_socket import StatusSocket, own_socket_path
+
+if TYPE_CHECKING:
+    from drivers.system.metrics import Metrics
 
 LEAST_WAIT_S = 0.005
 NOT_WRITTEN = "the results so far could not be written"
@@ -157,10 +159,11 @@ class Daemon:
         loop.add_signal_handler(signal.SIGTERM, self._stop.stop)
         loop.add_signal_handler(signal.SIGHUP, self._checks.reload)
         socket = StatusSocket(own_socket_path(config.daemon.socket), self._status, self._problem)
-        metrics = Metrics(config.daemon.prometheus_port, self._watch.health, self._problem)
         await socket.start()
+        parts: list[StatusSocket | Metrics] = [socket]
         if config.daemon.prometheus_port:
-            await metrics.start()
+            parts.append(self._metrics(config.daemon.prometheus_port))
+            await parts[-1].start()
         self._feed.start()
         tasks = [loop.create_task(each) for each in self._work()]
         stopped: asyncio.Task[Any] = loop.create_task(self._stop.wait())
@@ -182,8 +185,8 @@ class Daemon:
             for task in (stopped, *tasks):
                 task.cancel()
             await asyncio.gather(stopped, *tasks, return_exceptions=True)
-            await metrics.stop()
-            await socket.stop()
+            for part in reversed(parts):
+                await part.stop()
             await asyncio.wait([feed_closed], timeout=0.2)
             await loop.run_in_executor(None, self._settings.close, WRITE_S)
             if self._ground is not None:
@@ -191,6 +194,11 @@ class Daemon:
             self._service.close()
         self._journal.say("stopped")
         return self._stop.status
+
+    def _metrics(self, port: int) -> Metrics:
+        from drivers.system.metrics import Metrics  # 3 MB of libraries, for who asks for it
+
+        return Metrics(port, self._watch.health, self._problem)
 
     def _work(self) -> list[Coroutine[Any, Any, None]]:
         """Tasks of the event loop, the periodic checks first."""

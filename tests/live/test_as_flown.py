@@ -153,22 +153,3 @@ def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path)
     _, found = again(path, tmp_path / "again")
     assert not found["tracked_again"]
     assert found["by_gate"]["pose"]["sent"] > 100
-
-
-def test_global_positions_are_made_again_where_poses_are_not_sent(tmp_path: Path) -> None:
-    with Flying(
-        tmp_path, "recorder.codec=mjpeg", "feedback.mode=off", "feedback.global_position=sensor"
-    ) as flying:
-        flying.autopilot.arm()
-        flying.daemon.until(lambda health: "GPS" in health["scale"], "a place by satellites")
-        flying.autopilot.gps = False
-        flying.autopilot.wait_for("GLOBAL_POSITION_SENSOR", 20, 60)
-        flying.autopilot.gps = True
-        flying.until_told("global position by vision off", time.monotonic_ns())
-        flying.autopilot.disarm()
-        flying.daemon.line("results so far")
-        (path,) = flying.daemon.flown()
-        flying.daemon.stop()
-    _, found = again(path, tmp_path / "again")
-    assert not found["tracked_again"]
-    assert found["by_gate"]["global"]["sent"] >= 20 and set(found["by_gate"]) == {"global"}
