@@ -1,4 +1,4 @@
-"""Heavy work that the page starts: one at a time, in a process of the lowest priority.
+"""Heavy work that the page starts: one at a time, in a process of low priority.
 
 It is ended as soon as the motors are armed, or nobody knows whether they are.
 """

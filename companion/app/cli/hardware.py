@@ -20,6 +20,9 @@ from companion.errors import InputError
 if TYPE_CHECKING:
     from drivers.camera.camera_source import CameraSource
 
+RUNNING_NICE = 15
+"""Beside a running daemon, as its page."""
+
 
 def _devices(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.devices_command import devices, opencl_devices
@@ -73,16 +76,19 @@ def _calibrate(arguments: argparse.Namespace, signals: StopSignals) -> int:
 def _running_camera(config: Config) -> CameraSource:
     """Camera that the running daemon has, to which this process gives way."""
     from drivers.recording.running_camera import RunningCamera
-    from drivers.system.low_priority import give_way
     from drivers.system.status_socket import found_socket_path
 
-    give_way(os.getpid())
+    _be_nice()
     return RunningCamera(found_socket_path(config.daemon.socket))
+
+
+def _be_nice() -> None:
+    """Take a low priority, unless whoever started this has given it one."""
+    os.setpriority(os.PRIO_PROCESS, 0, max(os.getpriority(os.PRIO_PROCESS, 0), RUNNING_NICE))
 
 
 def _mount(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.mount_command import mount_by_hand, mount_of_flight
-    from drivers.system.low_priority import give_way
     from drivers.system.status_socket import found_socket_path
 
     if arguments.running == (arguments.flight is not None):
@@ -91,7 +97,7 @@ def _mount(arguments: argparse.Namespace, signals: StopSignals) -> int:
     progress = JsonProgress(sys.stdout) if arguments.json else progress_on(sys.stderr, "samples")
     progress = signals.between_frames(progress)
     if arguments.running:
-        give_way(os.getpid())  # to the daemon, which sees the same pictures
+        _be_nice()  # to the daemon, which sees the same pictures
         found = mount_by_hand(found_socket_path(config.daemon.socket), config, progress)
     else:
         found = mount_of_flight(arguments.flight, config, progress)
