@@ -1,0 +1,37 @@
+"""The layout for Foxglove names what a recording has, and shows each of its panels."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from companion.messages import Odometry, TrackState
+from drivers.recording.recorded_content import odometry_bytes
+from drivers.recording.recording_topics import CALIBRATION, CLOUD, EVENTS, IMAGE, ODOMETRY, POSE
+
+LAYOUT = Path(__file__).parents[4] / "config/foxglove_layout.json"
+
+
+def panels(node: Any) -> list[str]:
+    """Panels of a part of the layout."""
+    return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
+
+
+def test_each_panel_is_shown_once() -> None:
+    told = json.loads(LAYOUT.read_text("utf-8"))
+    assert sorted(panels(told["layout"])) == sorted(told["configById"])
+
+
+def test_what_it_shows_is_recorded() -> None:
+    told = json.loads(LAYOUT.read_text("utf-8"))["configById"]
+    assert set(told["3D!companion_map"]["topics"]) == {CLOUD, POSE}
+    image = told["Image!companion_camera"]["imageMode"]
+    assert (image["imageTopic"], image["calibrationTopic"]) == (IMAGE, CALIBRATION)
+    assert told["RosOut!companion_events"]["topicToRender"] == EVENTS
+    fields = json.loads(odometry_bytes(Odometry(0, 0, TrackState.LOST, 0)))
+    paths = [each["value"] for panel in told.values() for each in panel.get("paths", ())]
+    assert paths
+    for path in paths:
+        topic, _, name = path.partition(".")
+        assert topic == ODOMETRY and name in fields
