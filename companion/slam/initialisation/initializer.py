@@ -13,6 +13,7 @@ import numpy as np
 from companion.geometry.transforms import Array, Pose, angle_between
 from companion.slam.features.orb_features import Bools, Features, Ints
 from companion.slam.features.triangulation import consistent, triangulate
+from companion.slam.initialisation.direction_certainty import direction_sigma_rad
 from companion.slam.optimisation.bundle_adjustment import Bundle, adjust
 from companion.slam.optimisation.motion_hypotheses import motion_hypotheses
 from companion.slam.optimisation.rotation_factor import RelativeRotationFactor
@@ -26,6 +27,11 @@ HYPOTHESIS_INLIER_RATIO = 0.6
 """Hypotheses with fewer inliers than this ratio of the best do not compete."""
 MIN_COST_RATIO = 1.15
 """Cost of any competing hypothesis relative to the best, for that to be unambiguous."""
+MAX_DIRECTION_SIGMA_RAD, TURNING_RAD = np.radians(3.0), np.radians(2.0)
+"""Largest standard deviation of the direction of motion of a map that begins while the camera turns
+by so much between its two views. Where it hardly turns, the next frames see the same ground from
+further away and put the map right. Without attitude a plane never gives that certainty, and the
+hypotheses have competed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,7 +244,19 @@ def _refined(
     if ok.sum() < MIN_POINTS or ok.sum() < 0.5 * len(ok):
         return None
     parallax = float(np.arccos(np.clip(np.quantile(cosine[ok], 0.3), -1, 1)))
-    if parallax < min_parallax_rad:
+    if parallax < min_parallax_rad or not _direction_certain(pose, matches, ok):
         return None
     shown = ok & (cosine < np.cos(min(0.3 * min_parallax_rad, np.radians(0.3))))
     return pose, points, ok, shown
+
+
+def _direction_certain(pose: Pose, matches: _Matches, ok: Bools) -> bool:
+    """True if the direction of motion is known well enough for a map that begins in a turn."""
+    prior = matches.rotation_prior
+    if prior is None or angle_between(prior, np.eye(3)) < float(TURNING_RAD):
+        return True
+    sigma_rad = direction_sigma_rad(
+        pose, matches.xa[ok], matches.xb[ok], matches.whitening_a[ok], matches.whitening_b[ok],
+        float(_rotation_factor(prior).sigma_rad[0]),
+    )  # fmt: skip
+    return sigma_rad <= float(MAX_DIRECTION_SIGMA_RAD)
