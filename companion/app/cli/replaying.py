@@ -187,7 +187,7 @@ def add_parsers(commands: Any) -> None:
     )  # fmt: skip
     how.add_argument(
         "--as-flown", action="store_true",
-        help="of a recording: do again what was decided in flight, and compare the poses sent",
+        help="of a recording: do again what was decided in flight, and compare what was sent",
     )  # fmt: skip
 
     replay = commands.add_parser(

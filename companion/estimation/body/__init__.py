@@ -1,1 +1,0 @@
-"""The filter of the body's motion: its state, how that changes, and what corrects it."""
