@@ -64,7 +64,7 @@ def flown(folder: Path) -> Path:
         flying.camera.on = True
         wait_for_switch(flying, 2)
         flying.autopilot.wait_for("LANDING_TARGET", 20, 60)
-        flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
+        flying.autopilot.wait_for("ODOMETRY", ENOUGH, 120)
         flying.autopilot.disarm()
         flying.daemon.line("results so far")
         (path,) = flying.daemon.flown()
@@ -145,7 +145,7 @@ def test_a_flight_in_the_map_of_an_earlier_one_is_flown_again_in_that_map(tmp_pa
 def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path) -> None:
     with Flying(tmp_path, "recorder.codec=mjpeg") as flying:
         flying.take_off()
-        flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
+        flying.autopilot.wait_for("ODOMETRY", ENOUGH, 120)
         flying.autopilot.disarm()
         flying.daemon.line("results so far")
         (path,) = flying.daemon.flown()

@@ -18,7 +18,7 @@ def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
     with Flying(tmp_path_factory.mktemp("covered"), has_imu=True) as begun:
         begun.take_off()
         # the rates of the other messages are measured before the IMU is asked for
-        begun.autopilot.wait_for("ODOMETRY", 600, 60)
+        begun.autopilot.wait_for("ODOMETRY", 600, 120)
         yield begun
 
 
