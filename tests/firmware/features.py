@@ -87,7 +87,6 @@ def spoofed(trial: Trial, figures: Figures) -> None:
     figures.add("pull of 1 m/s: moved, height", down_m.max(), "m", JUMP_M)
     if switched_s is not None:
         manoeuvres.keep_place(trial, figures, "hold on our pose", 10.0)
-        manoeuvres.fly_square(trial, figures, 4.0, 0.15)
     trial.pilot.land()
     trial.firmware.restart()
     restarted_s = time.time()
