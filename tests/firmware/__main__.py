@@ -74,12 +74,12 @@ def main() -> int:
     }
     pairs = (each.partition("=") for each in options.parameter)
     parameters = {name: float(value) for name, _, value in pairs}
-    given["settings"] = tuple(options.set)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # its children end with it
     holds = True
     for name in options.experiments:
         usual = EXPERIMENTS[name][1]
         given["parameters"] = {**usual.parameters, **parameters}
+        given["settings"] = (*usual.settings, *options.set)
         conditions = dataclasses.replace(usual, **given)
         words = [f"fault={each}" for each in options.only]
         holds &= fly(name, options.firmware, options.out, conditions, words).hold
