@@ -170,6 +170,8 @@ class Health:
     landing: LandingHealth = field(default_factory=LandingHealth)
     global_position: FeedbackHealth = field(default_factory=FeedbackHealth)
     """Of the positions in latitude and longitude; `detail` is their standard deviation."""
+    refused: Mapping[str, int] = field(default_factory=dict)
+    """Number of measurements that did not fit the body's motion in this flight, by kind."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain types; a number that is not finite is null."""

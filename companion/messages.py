@@ -90,9 +90,11 @@ class Odometry:
     where the map began. It follows the camera smoothly: later corrections of the map are applied
     with limited slew, and only a discontinuity, which raises `reset_counter`, moves it at once.
     None while lost or without a metric scale. `velocity_world_m_s` (3,); `sigma_position_m` is one
-    standard deviation of the position since the last reset, along each axis, `sigma_attitude_rad`
-    of the tilt about each level axis, `sigma_yaw_rad` of the heading, against north; `quality` is
-    1..100, or -1 while the pose is unknown.
+    standard deviation, along each axis, of the way of the last ten seconds, about as far back as an
+    autopilot's filter remembers; by dead reckoning of the place since the last one that was seen,
+    too. `sigma_attitude_rad` is that of the tilt about each level axis,
+    `sigma_yaw_rad` of the heading, against north; `quality` is 1..100, or -1 while the pose is
+    unknown.
     """
 
     seq: int
@@ -112,6 +114,8 @@ class Odometry:
     """Relative standard deviation of the scale, by which all distances are wrong alike."""
     sigma_by_scale_m: float = 0.0
     """Part of `sigma_position_m` that comes of it."""
+    refused: Mapping[str, int] = field(default_factory=dict)
+    """Number of measurements that did not fit the body's motion, so far, by kind."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

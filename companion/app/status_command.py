@@ -75,6 +75,7 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         ("pose", ", ".join(pose)),
         ("scale", document.get("scale") or "not known"),
         *_belief(document.get("believed", MEASUREMENTS)),
+        *_refused(document.get("refused") or {}),
         ("feedback", _feedback(document.get("feedback") or {})),
         *_flow(document.get("flow") or {}),
         *_landing(document.get("landing") or {}),
@@ -200,6 +201,12 @@ def _processes(processes: Sequence[Mapping[str, Any]]) -> list[str]:
         for each in processes
     ]
     return ["", *_table(("process", "pid", "cores", "memory"), rows)] if rows else []
+
+
+def _refused(refused: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Measurements that did not fit the body's motion, if there are any."""
+    counts = ", ".join(f"{_number(n)} of {kind}" for kind, n in sorted(refused.items()))
+    return [("refused", counts)] if counts else []
 
 
 def _warnings(n_warnings: Mapping[str, Any]) -> list[str]:

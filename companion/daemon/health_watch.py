@@ -257,6 +257,7 @@ class HealthWatch:
             tracker=self._tracker(),
             quality=odometry.quality if odometry is not None else -1,
             scale=self._scale,
+            refused={} if odometry is None else odometry.refused,
             pose_latency_p95_ms=pose.latency_p95_ms,
             feedback=sent.feedback,
             flow=sent.flow,

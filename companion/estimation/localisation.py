@@ -13,16 +13,13 @@ import numpy as np
 from companion.config import Config
 from companion.estimation.attitude.camera_attitude import AttitudeCheck, CameraAttitude
 from companion.estimation.attitude.keyframe_attitudes import clear_since, correct_mount
+from companion.estimation.body.body_filter import BodyFilter, Reckoned
+from companion.estimation.body.reckoning import BodyAttitude
 from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.checkpoint import Checkpoint
 from companion.estimation.georeference.georeferencer import Georeferencer
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial.inertial_navigation import (
-    BodyAttitude,
-    InertialNavigation,
-    Reckoned,
-)
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
 from companion.estimation.lift_off.optical_flow import FlowMeter
 from companion.estimation.lift_off.standing import Standing
@@ -96,10 +93,10 @@ class LocalisationStage:
             sensors_only=config.feedback.gives_position,
         )
         self._acceleration = AccelerationIntegral()
-        self._navigation = InertialNavigation(self._acceleration)
+        self._body = BodyFilter(self._acceleration)
         self._standing = Standing()
         self._odometry = SmoothOdometry(
-            camera, config.feedback.max_jump_m, self._navigation, config.feedback.min_quality
+            camera, config.feedback.max_jump_m, self._body, config.feedback.min_quality
         )
         self._georeferences = SegmentGeoreferences(
             self._georeferencer, self._attitude, self._acceleration, camera.body_from_camera
@@ -233,7 +230,7 @@ class LocalisationStage:
                 yield from self._tracked(frame)
             else:
                 with self._times("shutter"):
-                    frame = shutter.begin(frame, self._attitude, self._motion.filter)
+                    frame = shutter.begin(frame, self._attitude, self._motion)
                 for out in self._tracked(frame):
                     if isinstance(out, Track) and out.seq == frame.seq:
                         out = shutter.of(out)
@@ -254,7 +251,7 @@ class LocalisationStage:
             self._apply_map_correction()
             found = self._odometry.without_frame(overdue.seq, t_ns, self._body_attitude(t_ns))
             if found is not None:
-                yield found
+                yield replace(found, refused=self._body.n_refused)
             self._prune(t_ns)
             yield self._frame_tracked(t_ns, overdue.seq, has_picture=False)
 
@@ -295,7 +292,7 @@ class LocalisationStage:
         )
         predicted = self._predicted(frame.t_ns, attitude, reckoned)
         before = self._tracker.map
-        aligned = predicted is not None and attitude is not None and self._motion.filter.aligned
+        aligned = predicted is not None and attitude is not None and self._motion.aligned
         rotation_in_map = predicted.rotation if predicted is not None and aligned else None
         tracked = self._tracker.step(frame, Prior(predicted, attitude, rotation_in_map))
         other_map = self._tracker.map is not before
@@ -308,7 +305,7 @@ class LocalisationStage:
                 measured = self._attitude.at(message.t_ns)
                 if message.seq == frame.seq or measured is not None:
                     # angular rates are held without attitude; those of backfilled frames are rough
-                    self._motion.filter.correct(message.t_ns, message.map_from_camera, measured)
+                    self._motion.correct(message.t_ns, message.map_from_camera, measured)
                 self._attitude.compare(message, message.map_from_camera.rotation)
                 mount = self._attitude.correction[0]
                 self._georeferences.take(message, None if measured is None else measured @ mount.T)
@@ -402,11 +399,12 @@ class LocalisationStage:
         """Odometry of a track of the active segment, in its own frame."""
         segment = self._tracker.map
         first = segment.keyframes.get(segment.first_keyframe_id)
-        return self._odometry.step(
+        odometry = self._odometry.step(
             track, segment.first_keyframe_id, self._georeferences.of(segment),
-            self._motion.filter.velocity,
+            self._motion.velocity,
             None if first is None else MapView(first.t_ns, first.camera_from_map.inverse()),
         )  # fmt: skip
+        return replace(odometry, refused=self._body.n_refused)
 
     def _body_attitude(self, t_ns: int) -> BodyAttitude | None:
         """Attitude of the body at a frame, where the autopilot's is that of the camera."""
@@ -435,9 +433,9 @@ class LocalisationStage:
         if checked.now_from_before is not None:
             correct_mount(self._tracker.segments, checked.now_from_before)
         if checked.before_from_now_ned is not None:
-            self._motion.filter.correct_attitude(checked.before_from_now_ned)
+            self._motion.correct_attitude(checked.before_from_now_ned)
         if checked.invalid_since_ns is not None:
-            self._motion.filter.discard_alignment()
+            self._motion.discard_alignment()
             clear_since(self._tracker.segments, checked.invalid_since_ns)
         if checked.reinitialise:
             self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)

@@ -25,6 +25,7 @@ from companion.messages import (
     LoopClosed,
     MapUpdate,
     Message,
+    Odometry,
     PointChunk,
     Track,
     Warned,
@@ -97,6 +98,8 @@ class FlightResult:
         self.first_t_ns: int | None = None
         self.last_t_ns: int | None = None
         self.warnings: dict[str, WarningCount] = {}
+        self.refused: Mapping[str, int] = {}
+        """Number of measurements that did not fit the body's motion, by kind."""
         self.update: MapUpdate | None = None
         self.loop_closures: list[LoopClosed] = []
         self._tracks = TrackStore()
@@ -117,6 +120,8 @@ class FlightResult:
             self.last_t_ns = message.t_ns
         elif isinstance(message, Track):
             self._tracks.put(message)
+        elif isinstance(message, Odometry):
+            self.refused = message.refused
         elif isinstance(message, MapUpdate):
             self.update = message
         elif isinstance(message, KeyframeAdded):

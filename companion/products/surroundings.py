@@ -8,7 +8,7 @@ from importlib import metadata
 
 from companion import __version__
 
-LIBRARIES = ("numpy", "opencv-python-headless", "pyopencl", "pymavlink", "filterpy", "rerun-sdk")
+LIBRARIES = ("numpy", "opencv-python-headless", "pyopencl", "pymavlink", "rerun-sdk")
 
 
 def versions() -> dict[str, str]:

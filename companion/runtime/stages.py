@@ -119,8 +119,8 @@ STAGES = (
     Stage(
         "results",
         (
-            Frame, *TELEMETRY, Warned, Health, GeoOrigin, Track, KeyframeAdded, LoopClosed,
-            MapUpdate, DepthMap, PointChunk,
+            Frame, *TELEMETRY, Warned, Health, GeoOrigin, Track, Odometry, KeyframeAdded,
+            LoopClosed, MapUpdate, DepthMap, PointChunk,
         ),
         nice=10, answer_s=180.0, finish_s=180.0, hurried_s=1.6, with_flight=True, in_folder=True,
     ),

@@ -100,6 +100,7 @@ def odometry_bytes(odometry: Odometry) -> bytes:
             "inertial": odometry.inertial,
             "sigma_scale": odometry.sigma_scale,
             "sigma_by_scale_m": odometry.sigma_by_scale_m,
+            "refused": odometry.refused,
         }
     )
 

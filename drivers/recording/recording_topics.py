@@ -132,6 +132,7 @@ TOPICS: dict[str, Any] = {
             "sigma_position_m": NUMBER, "sigma_velocity_m_s": NUMBER, "sigma_attitude_rad": NUMBER,
             "sigma_yaw_rad": NUMBER, "inertial": FLAG,
             "sigma_scale": NUMBER, "sigma_by_scale_m": NUMBER,
+            "refused": OBJECT,
         },
     ),
     TRACKING: _Json(

@@ -12,7 +12,7 @@ beyond the bound that 95 % should be within.
 Place: of the last ten seconds' way in the body's attitude at their beginning, which is what its
 standard deviation is of. All the way: since sending began, the heading aligned over its first ten
 seconds. Velocity: in the body's axes, as it is sent. Heading: against north. Innovations of
-inertial navigation (NIS) likewise, refused ones too, by what was measured.
+the filter (NIS) likewise, refused ones too, by what was measured.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import json
 from collections import defaultdict
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -30,8 +30,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from companion.app.replay.poses_sent import PosesSent
 from companion.config_file import load_config
+from companion.estimation.body.aiding import Model
+from companion.estimation.body.body_state import BodyState
 from companion.estimation.gate.pose_gate import PoseToSend
-from companion.estimation.inertial.inertial_motion import PLACE
 from companion.estimation.localisation import LocalisationStage
 from companion.geometry.transforms import Array
 from companion.messages import Odometry
@@ -81,17 +82,15 @@ class Truth:
 
 
 def watch_innovations(stage: LocalisationStage, found: Squares) -> None:
-    """Keep squared innovations of a stage's inertial navigation as they come."""
-    navigation = stage._navigation
-    correct = navigation._correct
+    """Keep squared innovations of a stage's filter of the body as they come."""
+    corrected = stage._body._corrected
 
-    def watched(t_ns: int, change: Any, seen: Array, *rest: Any, **others: Any) -> float:
-        squared = correct(t_ns, change, seen, *rest, **others)
-        of_three = "place" if seen[:, PLACE].any() else "rest"
-        found[f"NIS {(of_three, 'flow', 'height')[3 - len(seen)]}"].append(squared)
-        return squared
+    def watched(state: BodyState, model: Model) -> tuple[BodyState | None, float]:
+        after, squared = corrected(state, model)
+        found[f"NIS {model.kind.value}"].append(squared)
+        return after, squared
 
-    navigation._correct = watched  # type: ignore[method-assign]
+    stage._body._corrected = watched  # type: ignore[method-assign]
 
 
 def fly(path: Path, denied: bool, seed: int, settings: list[str]) -> Squares:

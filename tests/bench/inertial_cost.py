@@ -1,9 +1,9 @@
-"""Cost of inertial navigation: processor time for each IMU sample and for each frame.
+"""Cost of inertial body: processor time for each IMU sample and for each frame.
 
     python -m tests.bench.inertial_cost [--imu-hz 200] [--seconds 120]
 
 A made-up weaving flight with attitudes at 50 Hz and frames at 30. The first line has all that takes
-samples: integration, verdict, standing. The second, what a frame asks of navigation: one place that
+samples: integration, verdict, standing. The second, what a frame asks of body: one place that
 aids it, and the predictions.
 """
 
@@ -14,8 +14,9 @@ import time
 
 import numpy as np
 
+from companion.estimation.body.aiding import AidedPlace
+from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial.inertial_navigation import AidedPlace, InertialNavigation
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
 from companion.estimation.lift_off.standing import Standing
 from companion.telemetry import AttitudeSample, ImuSample
@@ -30,7 +31,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=120.0)
     options = parser.parse_args()
     integral, standing = AccelerationIntegral(), Standing()
-    judged, navigation = JudgedAcceleration(integral, lambda _: None), InertialNavigation(integral)
+    judged, body = JudgedAcceleration(integral, lambda _: None), BodyFilter(integral)
     samples_s = frames_s = 0.0
     n_frames, next_frame_s = 0, 1.0
     # those of 100 Hz, told so much faster
@@ -53,9 +54,9 @@ def main() -> None:
         n_frames += 1
         begun_s = time.process_time()
         place = AidedPlace(t_ns, weaving(t_ns * faster * 1e-9), np.eye(3), 0.05)
-        navigation.aid(place)
-        navigation.at(t_ns)
-        navigation.at(t_ns + 20_000_000)
+        body.aid(place)
+        body.at(t_ns)
+        body.at(t_ns + 20_000_000)
         frames_s += time.process_time() - begun_s
     core = 100.0 * samples_s / options.seconds
     print(f"samples at {options.imu_hz:.0f} Hz, attitudes beside: {core:.1f} % of a core")

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
+from companion.estimation.body.reckoned_path import BodyPlace
 from companion.estimation.georeference.alignment_sample import AlignmentSample
 from companion.estimation.georeference.displacement_by_velocity import displacement_factor
 from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
@@ -17,7 +18,6 @@ from companion.estimation.georeference.tracked_places import TrackedPlaces
 from companion.estimation.georeference.trajectory_alignment import DISAGREE, Scale
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.judged_acceleration import ByAcceleration
-from companion.estimation.inertial.reckoned_path import BodyPlace
 from companion.geometry.pose_table import PoseTable
 from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Georeference, MapUpdate, Track

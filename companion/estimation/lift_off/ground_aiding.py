@@ -10,13 +10,8 @@ from collections import deque
 
 import numpy as np
 
-from companion.estimation.inertial.inertial_navigation import (
-    AidedFlow,
-    AidedHeight,
-    AidedPlace,
-    AidedRest,
-    InertialNavigation,
-)
+from companion.estimation.body.aiding import AidedFlow, AidedHeight, AidedPlace, AidedRest
+from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.lift_off.lift_off_flow import LiftOffFlow
 from companion.estimation.lift_off.optical_flow import GroundVelocity
 from companion.geometry.transforms import Array
@@ -43,18 +38,18 @@ MAP_AIDED_NS = 500_000_000
 class GroundAiding:
     """Aids inertial navigation on the ground, and from a lift-off until a map has a scale."""
 
-    def __init__(self, navigation: InertialNavigation) -> None:
-        self._navigation = navigation
+    def __init__(self, body: BodyFilter) -> None:
+        self._body = body
         self.stood: AidedPlace | None = None
         """The fixed place while the vehicle stands, else None."""
         self.lift_off_flow = LiftOffFlow()
         """Judge of flow at the last lift-off: only flow that has shown it aids."""
         self._held: deque[AidedPlace | AidedHeight] = deque()
         """Of the latest frames while the vehicle stands; empty when it does not."""
-        self._waiting: list[AidedFlow | AidedHeight | AidedRest] = []
-        """Since the last frame but one: flow is measured late, and all is to come in order."""
+        self._takes_heights = False
+        """True in flight where a barometer is of use: high enough, and no map aids."""
         self._stood_down_m = 0.0
-        self._height_ns = self._flow_ns = self._frame_ns = 0
+        self._height_ns = self._flow_ns = 0
         self._map_aided_ns: int | None = None
 
     def map_aided(self, t_ns: int) -> None:
@@ -63,7 +58,7 @@ class GroundAiding:
 
     def wants_flow(self, t_ns: int) -> bool:
         """True after a lift-off, where no map has placed the body lately."""
-        if self.stood is not None or not self._navigation.knows_ground:
+        if self.stood is not None or not self._body.knows_ground:
             return False
         return self._map_aided_ns is None or t_ns - self._map_aided_ns > MAP_AIDED_NS
 
@@ -71,67 +66,57 @@ class GroundAiding:
         """Take a barometric height; where rotors turn on the ground, they press on the sensor."""
         if rotors and self.stood is not None:
             return
-        if t_ns - self._height_ns >= HEIGHT_EVERY_NS:
-            self._height_ns = t_ns
-            self._waiting.append(AidedHeight(t_ns, height_m))
+        if t_ns - self._height_ns < HEIGHT_EVERY_NS:
+            return
+        self._height_ns = t_ns
+        if self.stood is not None:
+            self._held.append(AidedHeight(t_ns, height_m))
+        elif self._takes_heights:
+            self._body.aid(AidedHeight(t_ns, height_m))
 
     def stand(self, t_ns: int, place_m: Array) -> None:
         """Take a frame of a vehicle that stands: at `place_m` (3,), unless it stood before."""
         held_m = place_m if self.stood is None else self.stood.place_m
-        turn = self._navigation.world_from_attitude
+        turn = self._body.world_from_attitude
         self.stood = AidedPlace(t_ns, held_m, turn, SIGMA_STANDING_M)
-        self._held.extend(h for h in self._before(t_ns) if isinstance(h, AidedHeight))
         self._held.append(self.stood)
-        self._frame_ns = t_ns
         while self._held[0].t_ns < t_ns - STANDING_LAG_NS:
-            self._navigation.aid(self._held.popleft())
+            self._body.aid(self._held.popleft())
 
-    def fly(self, t_ns: int, down_m: float, wants: bool) -> None:
+    def fly(self, down_m: float, wants: bool) -> None:
         """Take a frame of a vehicle that does not stand, at a down coordinate.
 
         `wants` where it is aided from here.
         """
         if self.stood is not None:
             self._stood_down_m = float(self.stood.place_m[2])
-            self._navigation.lift_off(self._stood_down_m + LEGS_M, SIGMA_LEGS_M)
+            self._body.lift_off(self._stood_down_m + LEGS_M, SIGMA_LEGS_M)
             self.lift_off_flow = LiftOffFlow()
         self.stood = None
         self._held.clear()
-        high = self._stood_down_m - down_m > LEAST_HEIGHT_M
-        for measured in self._before(self._frame_ns):
-            if wants and (high or not isinstance(measured, AidedHeight)):
-                self._navigation.aid(measured)
-        self._frame_ns = t_ns
-
-    def _before(self, t_ns: int) -> list[AidedFlow | AidedHeight | AidedRest]:
-        """Take out, in order, what waits from before a time."""
-        found = sorted((m for m in self._waiting if m.t_ns < t_ns), key=lambda m: m.t_ns)
-        self._waiting = [m for m in self._waiting if m.t_ns >= t_ns]
-        return found
+        self._takes_heights = wants and self._stood_down_m - down_m > LEAST_HEIGHT_M
 
     def take_flow(self, measured: GroundVelocity, delay_ns: int) -> bool:
         """Take flow over that ground; autopilot stamps are late by `delay_ns`.
 
         True where it has just been found to contradict the accelerometers: the mount is wrong.
         """
-        reckoned, judge = self._navigation.at(measured.t_ns + delay_ns), self.lift_off_flow
+        reckoned, judge = self._body.at(measured.t_ns + delay_ns), self.lift_off_flow
         if reckoned is None:
             return False
         still = float(np.linalg.norm(measured.velocity_hz)) < STILL_HZ
         if still and judge.agrees is None:
             risen_m = self._stood_down_m - float(reckoned.place_m[2])
             if risen_m < LEGS_M and self._is_due(measured):
-                self._waiting.append(AidedRest(measured.t_ns + delay_ns, SIGMA_STILL_M_S))
+                self._body.aid(AidedRest(measured.t_ns + delay_ns, SIGMA_STILL_M_S))
             return False
-        velocity_m_s = self._navigation.world_from_attitude.T @ reckoned.velocity_m_s
+        velocity_m_s = self._body.world_from_attitude.T @ reckoned.velocity_m_s
         if judge.take(velocity_m_s, reckoned.sigma_velocity_m_s, measured):
             return True
         if not judge.agrees or not self._is_due(measured):
             return False
         covariance_hz2 = measured.covariance_hz2 + SIGMA_FLOW_HZ**2 * np.eye(3)
-        self._waiting.append(
-            AidedFlow(measured.t_ns + delay_ns, measured.velocity_hz, covariance_hz2)
-        )
+        self._body.aid(AidedFlow(measured.t_ns + delay_ns, measured.velocity_hz, covariance_hz2))
         return False
 
     def _is_due(self, measured: GroundVelocity) -> bool:

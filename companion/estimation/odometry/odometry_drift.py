@@ -13,6 +13,10 @@ WINDOW_NS = 10_000_000_000
 SIGMA_DRIFT = 0.005
 """Ratio of path length: drift of a map before adjustment."""
 
+ALONG_ONE = float(np.sqrt(3.841 / 7.815))
+"""A scale that is off shortens a straight way along one axis. Of chi-squares the bound of 95 % is
+3.841 for one degree of freedom and 7.815 for three: stated so, it is that of three axes, too."""
+
 
 class _PathPoint(NamedTuple):
     """Position, path length, and accumulated slew correction at a time."""
@@ -59,7 +63,7 @@ class OdometryDrift:
             self._path.popleft()
         since = self._path[0]
         return Drift(
-            sigma_scale * float(np.linalg.norm(position - since.position)),
+            ALONG_ONE * sigma_scale * float(np.linalg.norm(position - since.position)),
             SIGMA_DRIFT * (path_length_m - since.path_length_m),
             float(np.linalg.norm(slewed - since.slewed)) / np.sqrt(3.0),
         )

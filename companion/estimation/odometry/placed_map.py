@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.estimation.inertial.reckoned_path import BodyPlace
+from companion.estimation.body.reckoned_path import BodyPlace
 from companion.estimation.odometry.odometry_frame import MapView, OdometryFrame
 from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
 from companion.messages import Georeference

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from companion.estimation.body.aiding import AidedPlace
+from companion.estimation.body.body_filter import BodyFilter, Reckoned
+from companion.estimation.body.reckoning import BodyAttitude, Reckoning
+from companion.estimation.camera_motion import SIGMA_DEAD_RECKONING_M_S, ImageVelocity
 from companion.estimation.georeference.trajectory_alignment import SIGMA_YAW_RAD
-from companion.estimation.inertial.inertial_navigation import (
-    AidedPlace,
-    BodyAttitude,
-    InertialNavigation,
-    Reckoned,
-)
-from companion.estimation.inertial.reckoning import Reckoning
 from companion.estimation.lift_off.ground_aiding import GroundAiding
 from companion.estimation.odometry.flown_map import FlownMap, LastPose
 from companion.estimation.odometry.innovation_gate import MIN_CONSISTENT_NS, InnovationGate
@@ -24,13 +21,12 @@ from companion.estimation.odometry.odometry_drift import OdometryDrift
 from companion.estimation.odometry.odometry_frame import MapView, OdometryState
 from companion.estimation.odometry.placed_map import PlacedMap, frame_of
 from companion.estimation.odometry.stand import FLOOR_M, FRESH_NS, SIGMA_ATTITUDE_RAD, Stand
+from companion.estimation.odometry.tracked_velocity import tracked_velocity
 from companion.estimation.odometry.tracking_quality import quality_of
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.messages import Georeference, Odometry, Track, TrackState
 
-SIGMA_DEAD_RECKONING_M_S = 0.3
-"""Standard deviation of the velocity used in dead reckoning."""
 QUALITY_MARGIN = 1.5
 """Below this, times the least quality that is sent, good inertial navigation counts for more: a
 vehicle that turns on the spot sees new ground without parallax."""
@@ -57,7 +53,7 @@ class SmoothOdometry:
     """
 
     def __init__(
-        self, camera: Camera, max_jump_m: float, navigation: InertialNavigation,
+        self, camera: Camera, max_jump_m: float, body: BodyFilter,
         min_quality: int = 1,
     ) -> None:  # fmt: skip
         mount = camera.body_from_camera
@@ -65,14 +61,14 @@ class SmoothOdometry:
         self._size = np.array([camera.width, camera.height], np.float64)
         self._gate = InnovationGate(max_jump_m)
         self._drift = OdometryDrift()
-        self._navigation = navigation
+        self._body = body
         self._least_quality = QUALITY_MARGIN * min_quality
-        self.reckoning = Reckoning(navigation)
+        self.reckoning = Reckoning(body)
         self._velocity = np.zeros(3)
         self._dead_reckoning = False
         self._given = False
         """True once a pose was given out."""
-        self.ground = GroundAiding(navigation)
+        self.ground = GroundAiding(body)
         """From a stand up to a metric map."""
         self._stand = Stand()
         self._heading = LiftOffHeading()
@@ -83,14 +79,13 @@ class SmoothOdometry:
         track: Track,
         segment: int,
         georeference: Georeference | None,
-        velocity_map: tuple[Array, float] | None,
+        velocity_map: ImageVelocity | None,
         first: MapView | None = None,
     ) -> Odometry:
         """Odometry of the frame that has begun.
 
         `segment` identifies the map of the track, `georeference` is that of this map,
-        `velocity_map` the camera velocity in it with its standard deviation, and `first` its first
-        view.
+        `velocity_map` the camera's velocity in it, and `first` its first view.
         """
         found = (
             self._standing(track)
@@ -102,7 +97,7 @@ class SmoothOdometry:
 
     def _of_map(
         self, track: Track, segment: int, georeference: Georeference | None,
-        velocity_map: tuple[Array, float] | None, first: MapView | None,
+        velocity_map: ImageVelocity | None, first: MapView | None,
     ) -> Odometry:  # fmt: skip
         pose, reckoned = track.map_from_camera, self.reckoning.reckoned
         known = track.state in (TrackState.TRACKING, TrackState.DEAD_RECKONING)
@@ -123,7 +118,7 @@ class SmoothOdometry:
             ratio = self._flown.georeferenced(georeference)
             if self._flown.last is not None:
                 place_m = self._flown.last.place_m
-                self._navigation.move(np.eye(3), place_m, place_m, ratio)
+                self._body.move(np.eye(3), place_m, place_m, ratio)
         assert self._flown.placed is not None
         raw = self._flown.placed.world_from_body(pose)
         if track.state is TrackState.DEAD_RECKONING:
@@ -154,25 +149,21 @@ class SmoothOdometry:
         if not within_gate or ceased:
             self._reset()
         self._gate.clear()
-        sigma_velocity = float("inf")
-        if velocity_map is not None:
-            to_world = georeference.world_from_map
-            self._velocity = (
-                frame.from_world.rotation @ to_world.rotation @ velocity_map[0] * to_world.scale
-            )
-            sigma_velocity = velocity_map[1] * to_world.scale
-        if reckoned is not None and reckoned.sigma_velocity_m_s < sigma_velocity:
-            self._velocity = reckoned.velocity_m_s
-            sigma_velocity = reckoned.sigma_velocity_m_s
-        self._flown.last = LastPose(track.t_ns, pose, placed)
-        noise_m = NOISE_INFLATION * track.sigma_position * georeference.world_from_map.scale
-        self._navigation.move(
+        self._body.move(
             placed.rotation @ here.rotation.T, here.translation, placed.translation, 1.0
         )
+        noise_m = NOISE_INFLATION * track.sigma_position * georeference.world_from_map.scale
         if attitude is not None and georeference.sigma_scale < MAX_SIGMA_SCALE_AIDING:
             turned = placed.rotation @ attitude.ned_from_body.T
-            self._navigation.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
+            self._body.aid(AidedPlace(attitude.t_ns, placed.translation, turned, noise_m))
             self.ground.map_aided(track.t_ns)
+        to_world = georeference.world_from_map
+        found = tracked_velocity(
+            None if attitude is None else self._body.moving(attitude.t_ns), velocity_map,
+            to_world.scale * frame.from_world.rotation @ to_world.rotation, noise_m,
+        )  # fmt: skip
+        self._velocity, sigma_velocity = found or (self._velocity, float("inf"))
+        self._flown.last = LastPose(track.t_ns, pose, placed)
         drift = self._drift.add(
             track.t_ns, placed.translation, georeference.sigma_scale, frame.slewed_m
         )
@@ -190,7 +181,7 @@ class SmoothOdometry:
         """Begin poses that are unrelated to those before."""
         self.reset_counter += 1
         self._drift.clear()
-        self._navigation.reset()
+        self._body.reset()
 
     def _sigma_yaw_rad(self, georeference: Georeference | None, noise_rad: float) -> float:
         """Standard deviation of the heading against north.
@@ -220,8 +211,7 @@ class SmoothOdometry:
         elif not standing:
             if self.ground.stood is not None:
                 self._heading.lift_off(t_ns, self.reset_counter, self.ground.stood.place_m)
-            at_ns = t_ns if attitude is None else attitude.t_ns
-            self.ground.fly(at_ns, float(self._place_now()[2]), self.ground.wants_flow(t_ns))
+            self.ground.fly(float(self._place_now()[2]), self.ground.wants_flow(t_ns))
         self.reckoning.begin(t_ns, attitude, self._flown.frame.from_world)
         return self.reckoning.reckoned
 
@@ -315,7 +305,7 @@ class SmoothOdometry:
         self._stand.begins_m, self._stand.in_world = world_m, True
         self._flown.last = self.ground.stood = None
         self.reckoning.clear()
-        self._navigation.reset()
+        self._body.reset()
 
     def _place_now(self) -> Array:
         """Place (3,) of the body as far as it is known: where it begins, if not at all."""
@@ -334,7 +324,7 @@ class SmoothOdometry:
         assert fixed is not None
         if attitude is None:
             return self._none(track)
-        if not self._given and self._navigation.at(track.t_ns) is None:
+        if not self._given and self._body.at(track.t_ns) is None:
             return Odometry(track.seq, track.t_ns, TrackState.STANDING, self.reset_counter)
         placed = Pose(fixed.world_from_attitude @ attitude.ned_from_body, fixed.place_m)
         self._velocity, self._dead_reckoning = np.zeros(3), True
@@ -368,7 +358,7 @@ class SmoothOdometry:
             self.reset_counter += self._given
             self._drift.clear()
             if last is not None and georeference.has_origin:
-                self._navigation.reset()
+                self._body.reset()
         self.reckoning.path.clear()
         self._flown.begin(placed, frame, pose)
         self._dead_reckoning = False
@@ -395,11 +385,11 @@ class SmoothOdometry:
         self._dead_reckoning = False
         self._gate.clear()
         self._drift.clear()
-        self._navigation.reset()
+        self._body.reset()
 
     def forget_reckoned(self) -> None:
         """Forget inertial navigation, and where it had the body: the accelerations were wrong."""
-        self._navigation.forget()
+        self._body.forget()
         self.reckoning.clear()
 
     def discard_map(self, segment: int, tilt_rad: float) -> None:
@@ -412,9 +402,7 @@ class SmoothOdometry:
             return
         share, way_m = float(np.sin(min(tilt_rad, np.pi / 2))), self._flown.way_m()
         speed_m_s = float(np.linalg.norm(self._velocity))
-        self._navigation.doubt(
-            SIGMA_DOUBTED_M + share * way_m, SIGMA_DOUBTED_M_S + share * speed_m_s
-        )
+        self._body.doubt(SIGMA_DOUBTED_M + share * way_m, SIGMA_DOUBTED_M_S + share * speed_m_s)
 
     def correct_map(self, segment: int, t_ns: int, map_from_camera: Pose) -> None:
         """Apply a correction of a map: `map_from_camera` of its last tracked frame now.

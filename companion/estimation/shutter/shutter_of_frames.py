@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
-from companion.estimation.motion_filter import MotionFilter
+from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.shutter.readout_estimation import ReadoutEstimator
 from companion.estimation.shutter.scene_plane import scene_plane
 from companion.geometry.camera import Camera
@@ -65,7 +65,7 @@ class ShutterOfFrames:
         self.watches = True
         """False once the readout is known: nothing that comes later would be said."""
 
-    def begin(self, frame: Frame, attitude: CameraAttitude, motion: MotionFilter) -> Frame:
+    def begin(self, frame: Frame, attitude: CameraAttitude, motion: CameraMotion) -> Frame:
         """The frame as a global shutter would have taken it."""
         self._motion = None
         if self._unrolling is None and not self.watches:
@@ -84,13 +84,13 @@ class ShutterOfFrames:
         return replace(frame, grey=self._unrolling.image(frame.grey, self._motion))
 
     def _way(
-        self, t_ns: int, attitude: CameraAttitude, motion: MotionFilter
+        self, t_ns: int, attitude: CameraAttitude, motion: CameraMotion
     ) -> tuple[Array | None, Array | None]:
         """Velocity of the camera and the plane before it, as for `shutter_motion`."""
-        pose, velocity = motion.predict(t_ns, attitude.at(t_ns)), motion.velocity
+        pose, velocity = motion.carried_on(t_ns, attitude.at(t_ns)), motion.velocity
         if pose is None or velocity is None or self._last is None:
             return None, None
-        return pose.rotation.T @ velocity[0], scene_plane(pose.inverse().apply(self._last))
+        return pose.rotation.T @ velocity.map_units_s, scene_plane(pose.inverse().apply(self._last))
 
     def of(self, track: Track) -> Track:
         """The track of this frame, with the motion by which its image was corrected.

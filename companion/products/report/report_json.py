@@ -61,6 +61,7 @@ def report(
         "stages": {name: dict(times) for name, times in facts.stage_times.items()},
         "kernels": result.kernel_times(),
         "dropped": dict(facts.dropped),
+        "refused": dict(result.refused),
         "believed": list(facts.believed),
         "rates_hz": {name: round(rate, 2) for name, rate in facts.rates_hz.items()},
         "states": dict(Counter(track.state.value for track in result.tracks)),

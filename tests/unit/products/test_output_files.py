@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.geometry.transforms import angle_between, rotation_from_quaternion
-from companion.messages import TrackState
+from companion.messages import Odometry, TrackState
 from companion.products.atomic_file import write_atomically
 from companion.products.cloud import no_cloud
 from companion.products.cloud_ply import ply_parts
@@ -32,6 +32,15 @@ def numbers(result: FlightResult, **changes: object) -> dict[str, Any]:
     made = report(result, flown.facts(**changes), result.poses(), result.cloud(0.5))
     read: dict[str, Any] = json.loads(report_json(made))
     return read
+
+
+def test_report_counts_what_did_not_fit_the_motion() -> None:
+    flight = FlightResult()
+    for message in flown.messages():
+        flight.take(message)
+    assert numbers(flight)["refused"] == {}
+    flight.take(Odometry(1, 10**9, TrackState.TRACKING, 0, refused={"place": 2}))
+    assert numbers(flight)["refused"] == {"place": 2}
 
 
 def test_trajectory_reads_back_as_it_was(result: FlightResult) -> None:

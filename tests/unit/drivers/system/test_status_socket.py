@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -282,6 +283,13 @@ def test_table_says_what_is_believed_where_it_is_not_everything(
 ) -> None:
     lines = status_table({**HEALTH.to_json(), "believed": believed}).splitlines()
     assert [line for line in lines if "believed" in line] == ([row] if row else [])
+
+
+def test_table_says_what_did_not_fit_the_motion_by_kind() -> None:
+    refused = replace(HEALTH, refused={"place": 3, "flow": 12})
+    lines = status_table(refused.to_json()).splitlines()
+    assert [line for line in lines if "refused" in line] == ["refused     12 of flow, 3 of place"]
+    assert not any("refused" in line for line in status_table(HEALTH.to_json()).splitlines())
 
 
 def test_table_of_a_daemon_of_another_version_is_shown_all_the_same() -> None:

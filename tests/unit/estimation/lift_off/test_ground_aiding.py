@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial.inertial_navigation import InertialNavigation
 from companion.estimation.lift_off.ground_aiding import LEGS_M, GroundAiding
 from companion.estimation.lift_off.optical_flow import GroundVelocity
 from companion.geometry.transforms import Array
@@ -22,7 +22,7 @@ class Vehicle:
 
     def __init__(self) -> None:
         self._integral = AccelerationIntegral()
-        self.navigation = InertialNavigation(self._integral)
+        self.navigation = BodyFilter(self._integral)
         self.ground = GroundAiding(self.navigation)
         self.t_ns, self.contradicted = 0, False
         for _ in range(40):
@@ -35,7 +35,7 @@ class Vehicle:
         """By its own measurements; its autopilot's pitch is wrong by `tilted_rad`."""
         for _ in range(round(seconds * 1e9 / STEP_NS)):
             self._measure(accelerates_m_s2, tilted_rad)
-            self.ground.fly(self.t_ns, float(self.place_m[2]), True)
+            self.ground.fly(float(self.place_m[2]), True)
             if flow_hz is not None:
                 seen = GroundVelocity(self.t_ns - STEP_NS // 2, flow_hz, 0.01**2 * np.eye(3))
                 self.contradicted |= self.ground.take_flow(seen, 0)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from companion.config import FeedbackConfig
+from companion.estimation.body.body_filter import BodyFilter
+from companion.estimation.camera_motion import ImageVelocity
 from companion.estimation.gate.pose_gate import PoseGate, PoseToSend
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial.inertial_navigation import InertialNavigation
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose, Similarity
@@ -26,7 +27,7 @@ class Flight:
     """Northward at constant speed; poses may be off by metres."""
 
     def __init__(self, rate_hz: float) -> None:
-        navigation = InertialNavigation(AccelerationIntegral())
+        navigation = BodyFilter(AccelerationIntegral())
         self.odometry = SmoothOdometry(CAMERA, FeedbackConfig().max_jump_m, navigation)
         self.gate = PoseGate(FeedbackConfig(mode="odometry"))
         self.sent: list[tuple[int, PoseToSend]] = []
@@ -56,7 +57,7 @@ class Flight:
             self.seq, t_ns, TrackState.TRACKING, pose, 0, pose, 200, 220, KEYPOINTS_PX,
             sigma_position=0.01, sigma_rotation_rad=0.001,
         )  # fmt: skip
-        velocity = np.array([SPEED_M_S, 0.0, 0.0]), 0.1
+        velocity = ImageVelocity(np.array([SPEED_M_S, 0.0, 0.0]), 0.1)
         self._keep(self.gate.take(self.odometry.step(seen, 0, PLACED, velocity), self.now_ns))
 
     def _keep(self, pose: PoseToSend | None) -> None:

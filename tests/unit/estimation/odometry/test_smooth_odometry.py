@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.estimation.body.body_filter import BodyFilter
+from companion.estimation.body.reckoning import BodyAttitude
+from companion.estimation.camera_motion import ImageVelocity
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial.inertial_navigation import BodyAttitude, InertialNavigation
 from companion.estimation.lift_off.optical_flow import GroundVelocity
 from companion.estimation.odometry.odometry_frame import MapView
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
@@ -20,12 +22,13 @@ from companion.telemetry import AttitudeSample, ImuSample
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 PLACED = Georeference(Similarity(2.0, np.eye(3), np.zeros(3)), 0.01, 0.01, "GPS", 50, 0.3)
 SPEED = 1.0
+VELOCITY = ImageVelocity(np.array([SPEED, 0.0, 0.0]), 0.2)
 """Map units a second, northward; the world's are twice as many metres."""
 
 
 def unaided() -> SmoothOdometry:
     """Odometry of a flight without accelerometers."""
-    return SmoothOdometry(CAMERA, 1.0, InertialNavigation(AccelerationIntegral()))
+    return SmoothOdometry(CAMERA, 1.0, BodyFilter(AccelerationIntegral()))
 
 
 def track(k: int, off: float = 0.0, state: TrackState = TrackState.TRACKING) -> Track:
@@ -39,7 +42,7 @@ def track(k: int, off: float = 0.0, state: TrackState = TrackState.TRACKING) -> 
 
 
 def give(odometry: SmoothOdometry, track: Track) -> Odometry:
-    return odometry.step(track, 0, PLACED, (np.array([SPEED, 0.0, 0.0]), 0.1))
+    return odometry.step(track, 0, PLACED, VELOCITY)
 
 
 def north(odometry: Odometry) -> float:
@@ -87,12 +90,11 @@ def test_heading_sigma_includes_the_pending_correction() -> None:
     turned = Georeference(
         Similarity(2.0, yaw_rotation(north_rad), np.zeros(3)), 0.01, 0.002, "GPS", 90, 0.3
     )
-    velocity = (np.array([SPEED, 0.0, 0.0]), 0.1)
-    after = odometry.step(track(10), 0, turned, velocity)
+    after = odometry.step(track(10), 0, turned, VELOCITY)
     assert after.world_from_body is not None
     assert abs(np.arctan2(*after.world_from_body.rotation[[1, 0], [0, 0]])) < np.radians(0.1)
     assert after.sigma_yaw_rad == pytest.approx(north_rad, rel=0.05)
-    later = [odometry.step(track(k), 0, turned, velocity) for k in range(11, 200)][-1]
+    later = [odometry.step(track(k), 0, turned, VELOCITY) for k in range(11, 200)][-1]
     assert later.sigma_yaw_rad == pytest.approx(
         np.linalg.norm([0.002, noise_rad, floor_rad]), rel=0.01
     )
@@ -157,7 +159,7 @@ def test_accelerometers_carry_the_pose_on(pictures: bool) -> None:
     A frame that comes when a pose was given for a later time already gives none.
     """
     integral = AccelerationIntegral()
-    odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
+    odometry = SmoothOdometry(CAMERA, 1.0, BodyFilter(integral))
     level = np.array([1.0, 0.0, 0.0, 0.0])
     found = []
     for k in range(200):
@@ -176,9 +178,8 @@ def test_accelerometers_carry_the_pose_on(pictures: bool) -> None:
             assert give(odometry, late).world_from_body is None
             continue
         odometry.begin(k * 100_000_000, attitude)
-        velocity = np.array([SPEED, 0.0, 0.0]), 0.1
         seen = Track(k, k * 100_000_000, TrackState.LOST) if blind else track(k)
-        found.append(odometry.step(seen, 0, PLACED, velocity))
+        found.append(odometry.step(seen, 0, PLACED, VELOCITY))
     places = np.array([north(each) for each in found])
     assert np.abs(np.diff(places) - 0.2).max() < 0.02
     assert {each.state for each in found[100:120]} == {TrackState.DEAD_RECKONING}
@@ -197,7 +198,7 @@ def test_another_map_goes_on_from_where_accelerometers_had_its_first_view(
     It is not taken if both differ by more than the gate allows, and accelerometers know better.
     """
     integral = AccelerationIntegral()
-    odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
+    odometry = SmoothOdometry(CAMERA, 1.0, BodyFilter(integral))
     level, placed = np.array([1.0, 0.0, 0.0, 0.0]), replace(PLACED, has_origin=False)
     known: Georeference | None = placed
     found, first = [], Pose(np.eye(3), np.array([50.0, 0.0, 7.0]))
@@ -207,7 +208,6 @@ def test_another_map_goes_on_from_where_accelerometers_had_its_first_view(
             integral.take(ImuSample(t_ns, np.zeros(3), np.array([0.0, 0.0, -9.80665])))
             integral.take(AttitudeSample(t_ns, level))
         odometry.begin(k * 100_000_000, BodyAttitude(k * 100_000_000, np.eye(3)))
-        velocity = np.array([SPEED, 0.0, 0.0]), 0.1
         if k < 100:
             seen, map_number = track(k), 0
         elif k < 120:
@@ -218,7 +218,7 @@ def test_another_map_goes_on_from_where_accelerometers_had_its_first_view(
             half = replace(placed, world_from_map=Similarity(scale, np.eye(3), np.zeros(3)))
             known = half if k >= 140 else None
         view = MapView(12_000_000_000, first) if map_number else None
-        found.append(odometry.step(seen, map_number, known, velocity, view))
+        found.append(odometry.step(seen, map_number, known, VELOCITY, view))
     places = np.array([north(each) for each in found])
     steps = np.diff(places) - 0.2
     assert np.abs(steps[:139]).max() < 0.05
@@ -236,7 +236,7 @@ def test_a_vehicle_that_lifts_off_is_carried_on_by_accelerometers(flow: bool) ->
     that is heard at the times of the same frames.
     """
     integral = AccelerationIntegral()
-    odometry = SmoothOdometry(CAMERA, 1.0, InertialNavigation(integral))
+    odometry = SmoothOdometry(CAMERA, 1.0, BodyFilter(integral))
     level, lift_s, found = np.array([1.0, 0.0, 0.0, 0.0]), 3.0, []
     for k in range(60):
         for step in range(10):

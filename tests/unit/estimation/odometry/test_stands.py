@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.estimation.body.body_filter import BodyFilter
+from companion.estimation.body.reckoning import BodyAttitude
+from companion.estimation.camera_motion import ImageVelocity
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial.inertial_navigation import BodyAttitude, InertialNavigation
 from companion.estimation.odometry.odometry_frame import MapView
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.geometry.camera import Camera
@@ -37,7 +39,7 @@ class Vehicle:
 
     def __init__(self, has_imu: bool = True) -> None:
         self._integral = AccelerationIntegral()
-        navigation = InertialNavigation(self._integral)
+        navigation = BodyFilter(self._integral)
         self.odometry = SmoothOdometry(CAMERA, 1.0, navigation, min_quality=20)
         self._has_imu = has_imu
         self.t_ns = 0
@@ -64,7 +66,9 @@ class Vehicle:
                 n_matches=220, keypoints_px=SPREAD_PX, sigma_position=0.01,
                 sigma_rotation_rad=0.001,
             )  # fmt: skip
-        return self.odometry.step(track, segment, georeference, (np.zeros(3), 0.1), first)
+        return self.odometry.step(
+            track, segment, georeference, ImageVelocity(np.zeros(3), 0.2), first
+        )
 
     def frames(self, n: int, at_m: Array | None = None, *, standing: bool = False) -> Odometry:
         """So many frames alike; the last odometry."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
-from companion.estimation.motion_filter import MotionFilter
+from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.shutter.shutter_of_frames import (
     OTHER_READOUT,
     ROLLING,
@@ -69,7 +69,7 @@ def flown(readout_s: float, stated_ms: float | None = None) -> list[Warned]:
     slam_map = SlamMap(1.2, 8)
     slam_map.positions = np.c_[rng.uniform(-14, 14, (400, 2)), rng.uniform(-2, 0, 400)]
     shutter = ShutterOfFrames(replace(CAMERA, readout_ms=stated_ms))
-    attitude, motion = CameraAttitude(MOUNT), MotionFilter()
+    attitude, motion = CameraAttitude(MOUNT), CameraMotion()
     said = []
     for t_s in np.arange(5.0, 17.0, 0.1).tolist():
         for t in np.arange(t_s, t_s + 0.1, 0.02).tolist():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.estimation.attitude.camera_attitude import CameraAttitude
-from companion.estimation.motion_filter import MotionFilter
+from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.shutter.shutter_of_frames import BY_IMAGES, ShutterOfFrames
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (
@@ -69,7 +69,7 @@ def test_by_attitude_also_where_later_ones_have_not_come() -> None:
     before = difference(seen, still)
     for until_s in (1.0, 0.001):
         shutter = ShutterOfFrames(CAMERA)
-        found = shutter.begin(frame, attitude(until_s), MotionFilter())
+        found = shutter.begin(frame, attitude(until_s), CameraMotion())
         given = shutter.of(track())
         motion = given.shutter_motion
         assert motion is not None and given.keypoints_px is not None
@@ -82,7 +82,7 @@ def test_by_attitude_also_where_later_ones_have_not_come() -> None:
 def test_without_attitude_by_images_which_is_said_once() -> None:
     seen, still = image()
     frame = Frame(0, T_NS, seen, np.zeros((0, 0, 3), np.uint8))
-    shutter, motion, slam_map = ShutterOfFrames(CAMERA), MotionFilter(), SlamMap(1.2, 8)
+    shutter, motion, slam_map = ShutterOfFrames(CAMERA), CameraMotion(), SlamMap(1.2, 8)
     nothing = CameraAttitude(None)
     assert shutter.begin(frame, nothing, motion) is frame, "nothing is known yet"
     assert shutter.of(track()).shutter_motion is None
@@ -102,5 +102,5 @@ def test_without_attitude_by_images_which_is_said_once() -> None:
 def test_of_a_shutter_that_is_not_known_frames_stay_as_they_are() -> None:
     frame = Frame(0, T_NS, image()[0], np.zeros((0, 0, 3), np.uint8))
     shutter = ShutterOfFrames(replace(CAMERA, readout_ms=None))
-    assert shutter.begin(frame, attitude(1.0), MotionFilter()) is frame
+    assert shutter.begin(frame, attitude(1.0), CameraMotion()) is frame
     assert shutter.of(track()).shutter_motion is None

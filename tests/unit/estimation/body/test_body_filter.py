@@ -1,4 +1,4 @@
-"""Inertial navigation: where the body is after seconds without a tracked place, as it states."""
+"""The filter of the body: where it is after seconds without a tracked place, as it states."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from companion.estimation.body.aiding import AidedFlow, AidedHeight, AidedPlace
+from companion.estimation.body.body_filter import BodyFilter
+from companion.estimation.body.body_state import N_STATE, BodyState
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
-from companion.estimation.inertial.inertial_navigation import (
-    AidedFlow,
-    AidedHeight,
-    AidedPlace,
-    InertialNavigation,
-)
 from companion.geometry.transforms import Array, yaw_rotation
 from tests.support.flights.measured_motion import (
     STEP_S,
@@ -37,7 +34,7 @@ class Flown:
     def __init__(self, path: Place, seed: int, seconds: float, barometer: bool = False) -> None:
         self.path, rng = path, np.random.default_rng(seed)
         self.integral = AccelerationIntegral()
-        self.navigation = InertialNavigation(self.integral)
+        self.navigation = BodyFilter(self.integral)
         motion = MeasuredMotion(path, rng, AIDED_S + seconds + STEP_S)
         next_s = 0.0
         for sample in motion.samples():
@@ -115,7 +112,7 @@ def test_a_place_that_cannot_be_is_refused_and_counted() -> None:
     t_ns = round((AIDED_S + 0.5) * 1e9)
     wrong = WORLD_FROM_NED @ weaving(AIDED_S + 0.5) + [4.0, 0.0, 0.0]
     flown.navigation.aid(AidedPlace(t_ns, wrong, WORLD_FROM_NED, SIGMA_M))
-    assert flown.navigation.n_refused == 1
+    assert flown.navigation.n_refused == {"place": 1}
     place, *_ = flown.error(AIDED_S + 0.9)
     assert float(np.linalg.norm(place)) < 0.3
 
@@ -131,12 +128,85 @@ def test_places_refused_for_a_second_are_believed() -> None:
     assert np.linalg.norm(found.place_m - WORLD_FROM_NED @ hovering(0.0) - jump) < 0.2
 
 
-def test_nothing_is_known_without_accelerations() -> None:
-    navigation = InertialNavigation(AccelerationIntegral())
-    for i in range(100):
-        at = AidedPlace(i * 66_000_000, np.zeros(3), np.eye(3), SIGMA_M)
-        navigation.aid(at)
-        assert navigation.at(at.t_ns) is None
+def test_without_accelerations_the_velocity_is_held_for_a_moment() -> None:
+    """Nothing is reckoned, but a tracked body's velocity is known, as well as is stated."""
+    rng, integral, squares = np.random.default_rng(8), AccelerationIntegral(), []
+    navigation = BodyFilter(integral)
+    for t_s in np.arange(0.0, AIDED_S, 1.0 / 15.0).tolist():
+        t_ns = round(t_s * 1e9)
+        seen = weaving(t_s) + rng.normal(scale=SIGMA_M, size=3)
+        navigation.aid(AidedPlace(t_ns, seen, np.eye(3), SIGMA_M))
+        assert navigation.at(t_ns) is None
+        moving = navigation.moving(t_ns)
+        assert moving is not None
+        if t_s > 1.0:
+            off = moving.velocity_m_s - velocity(weaving, t_s)
+            squares.append(float(off @ off) / moving.sigma_velocity_m_s**2 / 3.0)
+    assert 0.1 < float(np.mean(squares)) < 1.5
+    assert navigation.moving(round((AIDED_S + 1.0) * 1e9)) is None
+
+
+def test_accelerations_that_are_not_believed_yet_are_learnt_from_but_not_told() -> None:
+    flown = Flown(weaving, 12, 3.0)
+    flown.integral.believed = False
+    t_ns = round((AIDED_S - 0.02) * 1e9)
+    assert flown.navigation.at(t_ns) is None and flown.navigation.moving(t_ns) is None
+    flown.integral.believed = True
+    place, speed, sigma_m, _ = flown.error(AIDED_S + 2.9)
+    assert np.linalg.norm(place) < 0.5 and np.linalg.norm(speed) < 0.4 and sigma_m < 0.5
+
+
+def test_accelerations_that_cease_do_not_begin_the_motion_anew() -> None:
+    """Velocity and bias go on over a gap of them; they aid again after it."""
+    flown = Flown(weaving, 9, 1.0)
+    known = flown.error(AIDED_S + 0.5)
+    flown.integral.withdraw(round((AIDED_S + 0.6) * 1e9))
+    at = WORLD_FROM_NED @ weaving(AIDED_S + 0.7)
+    flown.navigation.aid(AidedPlace(round((AIDED_S + 0.7) * 1e9), at, WORLD_FROM_NED, SIGMA_M))
+    moving = flown.navigation.moving(round((AIDED_S + 0.7) * 1e9))
+    assert moving is not None
+    off = moving.velocity_m_s - WORLD_FROM_NED @ velocity(weaving, AIDED_S + 0.7)
+    assert np.linalg.norm(known[1]) < 0.2 and np.linalg.norm(off) < 0.6
+    assert moving.sigma_velocity_m_s < 1.0
+
+
+def test_what_comes_late_counts_at_its_own_time() -> None:
+    """Places out of order give what they give in order, to rounding; older ones nothing."""
+    in_order, late = Flown(weaving, 10, 1.5), Flown(weaving, 10, 1.5)
+    rng = np.random.default_rng(11)
+    places = []
+    for t_s in np.linspace(AIDED_S + 0.1, AIDED_S + 1.2, 12).tolist():
+        at = WORLD_FROM_NED @ weaving(t_s) + rng.normal(scale=SIGMA_M, size=3)
+        places.append(AidedPlace(round(t_s * 1e9), at, WORLD_FROM_NED, SIGMA_M))
+    for place in places:
+        in_order.navigation.aid(place)
+    for k in (0, 3, 1, 2, 4, 6, 5, 7, 8, 11, 10, 9):
+        late.navigation.aid(places[k])
+    at_ns = round((AIDED_S + 1.4) * 1e9)
+    expected, found = in_order.navigation.at(at_ns), late.navigation.at(at_ns)
+    assert expected is not None and found is not None
+    np.testing.assert_allclose(found.place_m, expected.place_m, atol=1e-9)
+    np.testing.assert_allclose(found.velocity_m_s, expected.velocity_m_s, atol=1e-9)
+    assert found.sigma_velocity_m_s == pytest.approx(expected.sigma_velocity_m_s)
+    late.navigation.aid(places[2]._replace(place_m=places[2].place_m + 0.05))
+    after = late.navigation.at(at_ns)
+    assert after is not None
+    np.testing.assert_array_equal(after.place_m, found.place_m)
+
+
+def test_a_frame_that_turns_takes_the_covariance_with_it() -> None:
+    """Normalised errors squared stay what they were, but for the unit of the metre."""
+    rng = np.random.default_rng(3)
+    spread = rng.normal(size=(N_STATE, N_STATE)) * np.linspace(0.1, 2.0, N_STATE)
+    state = BodyState(0, rng.normal(size=N_STATE), spread @ spread.T, yaw_rotation(0.2))
+    turn, about, to = yaw_rotation(-1.4), np.array([2.0, 5.0, -3.0]), np.array([1.0, 2.0, 3.0])
+    moved = state.moved(turn, about, to, 1.3)
+    other = state._replace(mean=state.mean + rng.normal(scale=0.1, size=N_STATE))
+    off = other.moved(turn, about, to, 1.3).mean - moved.mean
+    before = other.mean - state.mean
+    assert off @ np.linalg.solve(moved.covariance, off) == pytest.approx(
+        before @ np.linalg.solve(state.covariance, before)
+    )
 
 
 def test_an_imu_that_falls_silent_ends_it() -> None:
@@ -156,7 +226,7 @@ def test_flow_over_the_ground_bounds_the_drift() -> None:
         flow_hz = flow_hz + rng.normal(scale=sigma_hz, size=3) + 5.0 * (k == 20)
         covariance_hz2 = sigma_hz**2 * np.eye(3)
         flown.navigation.aid(AidedFlow(round(t_s * 1e9), flow_hz, covariance_hz2))
-    assert flown.navigation.n_refused == 1
+    assert flown.navigation.n_refused == {"flow": 1}
     place, speed, sigma_m, sigma_m_s = flown.error(AIDED_S + 9.9)
     assert float(np.linalg.norm(place)) < 1.0
     assert float(np.linalg.norm(speed)) < 0.2

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from companion.estimation.inertial.inertial_navigation import (
-    BodyAttitude,
-    InertialNavigation,
-    Reckoned,
-)
-from companion.estimation.inertial.reckoned_path import BodyPlace, ReckonedPath
+from companion.estimation.body.body_filter import BodyFilter, Reckoned
+from companion.estimation.body.reckoned_path import BodyPlace, ReckonedPath
 from companion.geometry.transforms import Array, Pose
 
 MAX_SIGMA_M = 5.0
@@ -18,11 +16,18 @@ GOOD_SIGMA_M = 0.5
 """As long as it is this certain, it counts for more than a map that is poor."""
 
 
+class BodyAttitude(NamedTuple):
+    """Attitude `ned_from_body` (3, 3) of a frame, at its time by the autopilot's stamps."""
+
+    t_ns: int
+    ned_from_body: Array
+
+
 class Reckoning:
     """Attitude of the frame that has begun, and the body by inertial navigation there."""
 
-    def __init__(self, navigation: InertialNavigation) -> None:
-        self._navigation = navigation
+    def __init__(self, body: BodyFilter) -> None:
+        self._body = body
         self.attitude: BodyAttitude | None = None
         self.reckoned: Reckoned | None = None
         """In the frame of the odometry; None where unknown, or too uncertain to be of use."""
@@ -31,7 +36,7 @@ class Reckoning:
 
     def begin(self, t_ns: int, attitude: BodyAttitude | None, odometry_from_world: Pose) -> None:
         """Go on to a frame, with its attitude where that is known."""
-        found = None if attitude is None else self._navigation.at(attitude.t_ns)
+        found = None if attitude is None else self._body.at(attitude.t_ns)
         if found is not None and found.sigma_place_m > MAX_SIGMA_M:
             found = None
         self.attitude, self.reckoned = attitude, found
@@ -42,7 +47,7 @@ class Reckoning:
 
     def rotation(self, attitude: BodyAttitude) -> Array:
         """Rotation (3, 3) of a body in the frame of the odometry, by its attitude."""
-        return np.asarray(self._navigation.world_from_attitude @ attitude.ned_from_body)
+        return np.asarray(self._body.world_from_attitude @ attitude.ned_from_body)
 
     @property
     def is_good(self) -> bool:

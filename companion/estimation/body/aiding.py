@@ -1,0 +1,128 @@
+"""Measurements that aid the body's filter, each as a linear one of its state."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.estimation.body.body_state import BAROMETER, DOWN, GROUND, N_STATE, BodyState
+from companion.estimation.inertial.inertial_motion import PLACE, VELOCITY
+from companion.geometry.transforms import Array
+
+RELIEF = 0.3
+"""Standard deviation of the height of the ground that is seen, as a ratio of the height: houses
+come into sight and go."""
+SIGMA_BAROMETER_M = 0.5
+"""Of a height, with the gusts that press on the sensor."""
+LEAST_SIGMA_PLACE_M, LEAST_SIGMA_FLOW_M_S = 0.005, 0.02
+
+
+class Aid(Enum):
+    """Kinds of measurements."""
+
+    PLACE = "place"
+    FLOW = "flow"
+    HEIGHT = "height"
+    REST = "rest"
+
+
+class AidedPlace(NamedTuple):
+    """A tracked place (3,) of the body, local NED, metres, and `world_from_attitude` (3, 3)."""
+
+    t_ns: int
+    place_m: Array
+    world_from_attitude: Array
+    sigma_m: float
+
+    def moved(self, rotation: Array, about_m: Array, to_m: Array, scale: float) -> AidedPlace:
+        """The same in another frame; see `BodyState.moved`."""
+        return self._replace(
+            place_m=to_m + scale * rotation @ (self.place_m - about_m),
+            world_from_attitude=rotation @ self.world_from_attitude,
+        )
+
+
+class AidedFlow(NamedTuple):
+    """Velocity (3,) over the height above the ground, NED by the autopilot's attitude, 1/s.
+
+    With its covariance (3, 3), 1/s2.
+    """
+
+    t_ns: int
+    velocity_hz: Array
+    covariance_hz2: Array
+
+
+class AidedHeight(NamedTuple):
+    """A barometric height above an arbitrary level, metres, up positive."""
+
+    t_ns: int
+    height_m: float
+
+
+class AidedRest(NamedTuple):
+    """A body that does not move, to a standard deviation along each axis."""
+
+    t_ns: int
+    sigma_m_s: float
+
+
+Aiding = AidedPlace | AidedFlow | AidedHeight | AidedRest
+
+
+class Model(NamedTuple):
+    """Measurement (M,) of `seen` (M, N) parts of the state, with its covariance (M, M).
+
+    `considered` parts are not corrected by it.
+    """
+
+    kind: Aid
+    seen: Array
+    measured: Array
+    covariance: Array
+    considered: tuple[int, ...] = ()
+
+
+def model_of(measured: Aiding, state: BodyState) -> Model | None:
+    """Model of a measurement at the time of a state; None where the state lacks what it is of."""
+    if isinstance(measured, AidedPlace):
+        seen = np.zeros((3, N_STATE))
+        seen[:, PLACE] = np.eye(3)
+        variance = max(measured.sigma_m, LEAST_SIGMA_PLACE_M) ** 2 * np.eye(3)
+        return Model(Aid.PLACE, seen, measured.place_m, variance)
+    if isinstance(measured, AidedRest):
+        seen = np.zeros((3, N_STATE))
+        seen[:, VELOCITY] = np.eye(3)
+        return Model(Aid.REST, seen, np.zeros(3), measured.sigma_m_s**2 * np.eye(3))
+    if isinstance(measured, AidedHeight):
+        if not state.covariance[BAROMETER, BAROMETER] > 0.0:
+            return None
+        seen = np.zeros((1, N_STATE))
+        seen[0, DOWN], seen[0, BAROMETER] = -1.0, 1.0
+        variance = np.full((1, 1), SIGMA_BAROMETER_M**2)
+        return Model(Aid.HEIGHT, seen, np.array([measured.height_m]), variance)
+    return _flow_model(measured, state)
+
+
+def _flow_model(flow: AidedFlow, state: BodyState) -> Model | None:
+    """The level part of flow.
+
+    Velocity is flow times height, which is of the state: the difference is linear in it. But
+    heights are considered only (Schmidt 1966), not corrected: flow is a regressor, and its noise
+    would make them small. The vertical part would tell little for the same reason: at a lift-off
+    velocity and height are small and grow alike.
+    """
+    height_m = state.mean[GROUND] - state.mean[DOWN]
+    if not state.covariance[GROUND, GROUND] > 0.0 or height_m <= 0.0:
+        return None
+    level = state.world_from_attitude[:2]
+    seen = np.zeros((2, N_STATE))
+    seen[:, VELOCITY] = np.eye(2, 3)
+    seen[:, DOWN] = level @ flow.velocity_hz
+    seen[:, GROUND] = -seen[:, DOWN]
+    along = RELIEF * seen[:, DOWN : DOWN + 1]
+    variance = height_m**2 * (level @ flow.covariance_hz2 @ level.T + along @ along.T)
+    variance += LEAST_SIGMA_FLOW_M_S**2 * np.eye(2)
+    return Model(Aid.FLOW, seen, np.zeros(2), variance, considered=(DOWN, GROUND))

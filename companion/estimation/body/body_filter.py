@@ -1,0 +1,294 @@
+"""The filter of the body's motion: one state with its covariance, and all that corrects it.
+
+Rotations are those of the autopilot, which integrates its gyroscopes itself; given them, place,
+velocity, the accelerometers' bias and the tilt are linear, and a Kalman filter of these has no
+point of linearisation to be wrong about (the same model finds the scale, see `inertial_scale`).
+Where no accelerations are to be had, or to be believed, the velocity is held.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.estimation.body.aiding import (
+    LEAST_SIGMA_PLACE_M,
+    SIGMA_BAROMETER_M,
+    AidedHeight,
+    AidedPlace,
+    Aiding,
+    Model,
+    model_of,
+)
+from companion.estimation.body.body_state import (
+    BAROMETER,
+    DOWN,
+    GROUND,
+    N_STATE,
+    BodyState,
+    held,
+    propagated,
+)
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_motion import (
+    BIAS,
+    PLACE,
+    SIGMA_BIAS_M_S2,
+    SIGMA_SPEED_M_S,
+    SIGMA_TILT_M_S2,
+    TILT,
+    VELOCITY,
+    InertialStart,
+)
+from companion.geometry.transforms import Array
+
+START = slice(VELOCITY.start, BIAS.stop)
+MAX_HELD_NS = 400_000_000
+"""Beyond the newest acceleration, the velocity is held for at most so long; and so late a
+measurement may come."""
+SIGMA_HELD_M_S2 = 3.0
+"""Acceleration that may have come since."""
+LEAST_MOVE = 1e-12
+"""Of a frame, metres and radians: less is rounding."""
+REFUSED = {1: 10.83, 2: 13.82, 3: 16.27}
+"""Chi-square that is exceeded once in a thousand times, by degrees of freedom."""
+NORMALISED_TAU = 30
+"""Places, two seconds of them."""
+MAX_REFUSED_NS = 1_000_000_000
+"""Places refused for longer are believed: the filter begins anew."""
+
+
+class Reckoned(NamedTuple):
+    """Place, velocity (3,) each, local NED, metres, and their standard deviations per axis.
+
+    `start` is what another map's scale can be found from.
+    """
+
+    place_m: Array
+    velocity_m_s: Array
+    sigma_place_m: float
+    sigma_velocity_m_s: float
+    start: InertialStart
+
+
+class BodyFilter:
+    """Kalman filter of one body in a frame that changes only by what it is told.
+
+    Each measurement counts at its own time: one that comes before the accelerations up to it
+    waits, and after one that comes late what was measured since is taken again.
+    """
+
+    def __init__(self, integral: AccelerationIntegral) -> None:
+        self._integral = integral
+        self._state = _unknown()
+        self._begun = False
+        self._waiting: deque[Aiding] = deque()
+        self._taken: deque[tuple[BodyState, Aiding]] = deque()
+        """The latest measurements, and the state before each."""
+        self._refused_since_ns: int | None = None
+        self._normalised = 1.0
+        """Mean squared innovation per degree of freedom, of the latest places."""
+        self._n_refused = Counter[str]()
+
+    @property
+    def world_from_attitude(self) -> Array:
+        """Rotation (3, 3) from the autopilot's NED axes to those of the places."""
+        return self._state.world_from_attitude
+
+    @property
+    def knows_ground(self) -> bool:
+        """True where flow over the ground is of use."""
+        return self._begun and float(self._state.covariance[GROUND, GROUND]) > 0.0
+
+    @property
+    def n_refused(self) -> dict[str, int]:
+        """Number of measurements that the innovation gate refused, by kind; others are left out."""
+        return dict(self._n_refused)
+
+    def aid(self, measured: Aiding) -> None:
+        """Add what was measured, at its time by autopilot stamps."""
+        self._waiting.append(measured)
+        self._take_waiting()
+
+    def lift_off(self, ground_down_m: float, sigma_m: float) -> None:
+        """Take the ground that the body has lifted off, at a down coordinate."""
+        self._state = self._state.with_part(GROUND, ground_down_m, sigma_m)
+        self._taken.clear()
+
+    def reset(self) -> None:
+        """Forget place, velocity and heights; bias and tilt are the same in another map."""
+        self._state, self._begun = self._state.without(GROUND, BAROMETER), False
+        self._waiting.clear()
+        self._taken.clear()
+
+    def doubt(self, sigma_m: float, sigma_m_s: float) -> None:
+        """Take that what has aided it was wrong: by how much in place and velocity.
+
+        Bias and tilt are as uncertain as at first again.
+        """
+        covariance = self._state.covariance.copy()
+        doubted = ((PLACE, sigma_m), (VELOCITY, sigma_m_s), (BIAS, SIGMA_BIAS_M_S2))
+        for part, sigma in (*doubted, (TILT, SIGMA_TILT_M_S2)):
+            covariance[part, part] += sigma**2 * np.eye(part.stop - part.start)
+        self._state = self._state._replace(covariance=covariance)
+        self._waiting = deque(each for each in self._waiting if not isinstance(each, AidedPlace))
+        self._taken.clear()
+        self._refused_since_ns = None
+
+    def forget(self) -> None:
+        """Forget all: the accelerations were wrong."""
+        self.reset()
+        self._state = _unknown()._replace(world_from_attitude=self.world_from_attitude)
+
+    def move(self, rotation: Array, about_m: Array, to_m: Array, scale: float) -> None:
+        """Change of the frame: what was at `about_m` is at `to_m`, turned and scaled about it."""
+        change = rotation, about_m, to_m, scale
+        still = scale == 1.0 and np.abs(to_m - about_m).max() < LEAST_MOVE
+        if still and np.abs(rotation - np.eye(3)).max() < LEAST_MOVE:
+            return
+
+        def moved(each: Aiding) -> Aiding:
+            return each.moved(*change) if isinstance(each, AidedPlace) else each
+
+        self._state = self._state.moved(*change)
+        self._waiting = deque(map(moved, self._waiting))
+        self._taken = deque((s.moved(*change), moved(each)) for s, each in self._taken)
+
+    def at(self, t_ns: int) -> Reckoned | None:
+        """Place and velocity at a time by autopilot stamps; None where not known.
+
+        By accelerations from the last measurement that was taken, and not before that.
+        """
+        self._take_waiting()
+        end_ns = min(t_ns, self._integral.newest_ns)
+        if not self._begun or not self._integral.believed:
+            return None
+        if t_ns - end_ns > MAX_HELD_NS or end_ns < self._state.t_ns:
+            return None
+        state = propagated(self._state, end_ns, self._integral)
+        return None if state is None else self._reckoned(state, t_ns)
+
+    def moving(self, t_ns: int) -> Reckoned | None:
+        """The same, with the velocity held where accelerations are missing.
+
+        None while they are there and not believed yet: bias and tilt are learnt by them meanwhile.
+        """
+        found = self.at(t_ns)
+        unproved = self._integral.has_samples and not self._integral.believed
+        if found is not None or unproved or not self._begun:
+            return found
+        if not 0 <= t_ns - self._state.t_ns <= MAX_HELD_NS:
+            return None
+        return self._reckoned(held(self._state, t_ns), t_ns)
+
+    def _reckoned(self, state: BodyState, t_ns: int) -> Reckoned:
+        """Motion at a time by a state of it, or of shortly before."""
+        held_s, mean = (t_ns - state.t_ns) * 1e-9, state.mean
+        # accelerations that do not fit what is seen are stated as less certain
+        unlikely = max(1.0, float(np.sqrt(self._normalised)))
+        sigma_m_s = state.sigma(VELOCITY)
+        sigma_v = unlikely * float(np.hypot(sigma_m_s, SIGMA_HELD_M_S2 * held_s))
+        moved_m = SIGMA_HELD_M_S2 * held_s * held_s / 2.0
+        sigma_p = unlikely * float(
+            np.linalg.norm([state.sigma(PLACE), moved_m, sigma_m_s * held_s])
+        )
+        covariance = unlikely**2 * state.covariance[START, START]
+        covariance[:3, :3] += (SIGMA_HELD_M_S2 * held_s) ** 2 * np.eye(3)
+        velocity_ned_m_s = state.world_from_attitude.T @ mean[VELOCITY]
+        start = InertialStart(t_ns, velocity_ned_m_s, mean[BIAS].copy(), covariance)
+        place_m = mean[PLACE] + held_s * mean[VELOCITY]
+        return Reckoned(place_m, mean[VELOCITY].copy(), sigma_p, sigma_v, start)
+
+    def _take_waiting(self) -> None:
+        """Take all that does not wait for accelerations up to it which are about to come."""
+        while self._waiting:
+            ahead_ns = self._waiting[0].t_ns - self._integral.newest_ns
+            if 0 < ahead_ns <= MAX_HELD_NS:
+                break
+            self._take(self._waiting.popleft())
+
+    def _take(self, measured: Aiding) -> None:
+        """Take a measurement at its time, and again what was measured since."""
+        since = deque[Aiding]()
+        while self._taken and self._taken[-1][1].t_ns > measured.t_ns:
+            self._state, again = self._taken.pop()
+            since.appendleft(again)
+        self._correct_by(measured)
+        for each in since:
+            self._correct_by(each, again=True)
+        while self._taken and self._taken[0][1].t_ns < self._state.t_ns - MAX_HELD_NS:
+            self._taken.popleft()
+
+    def _correct_by(self, measured: Aiding, again: bool = False) -> None:
+        """Correct by what was measured, unless the gate refuses it; count it unless taken again."""
+        if not self._begun:
+            if isinstance(measured, AidedPlace):
+                self._begin(measured)
+            return
+        if measured.t_ns < self._state.t_ns:
+            return  # from before all that is kept
+        before = self._state
+        state = propagated(before, measured.t_ns, self._integral) or held(before, measured.t_ns)
+        if isinstance(measured, AidedPlace):
+            state = state._replace(world_from_attitude=measured.world_from_attitude)
+        if isinstance(measured, AidedHeight) and not state.covariance[BAROMETER, BAROMETER] > 0.0:
+            zero_m = float(before.mean[DOWN]) + measured.height_m
+            self._state = before.with_part(BAROMETER, zero_m, SIGMA_BAROMETER_M)
+            return
+        model = model_of(measured, state)
+        if model is None:
+            return
+        self._taken.append((before, measured))
+        corrected, squared = self._corrected(state, model)
+        if corrected is not None:
+            self._state = corrected
+        if again:
+            return
+        if corrected is None:
+            self._n_refused[model.kind.value] += 1
+        if isinstance(measured, AidedPlace):
+            self._normalised += (squared / 3.0 - self._normalised) / NORMALISED_TAU
+            self._judge(measured, refused=corrected is None)
+
+    def _corrected(self, state: BodyState, model: Model) -> tuple[BodyState | None, float]:
+        """The state corrected, None where the innovation gate refuses; the squared innovation."""
+        seen, spread = model.seen, state.covariance
+        innovation = model.measured - seen @ state.mean
+        gained = seen @ spread
+        expected = gained @ seen.T + model.covariance
+        squared = float(innovation @ np.linalg.solve(expected, innovation))
+        if squared > REFUSED[len(seen)]:
+            return None, squared
+        gain = np.linalg.solve(expected, gained).T
+        gain[list(model.considered)] = 0.0
+        part = gain @ gained
+        spread = spread - part - part.T + gain @ expected @ gain.T
+        covariance = 0.5 * (spread + spread.T)
+        return state._replace(mean=state.mean + gain @ innovation, covariance=covariance), squared
+
+    def _judge(self, place: AidedPlace, refused: bool) -> None:
+        """Begin anew with a place, where places have been refused for too long."""
+        since_ns = self._refused_since_ns if self._refused_since_ns is not None else place.t_ns
+        self._refused_since_ns = since_ns if refused else None
+        if refused and place.t_ns - since_ns > MAX_REFUSED_NS:
+            self._begin(place)
+
+    def _begin(self, place: AidedPlace) -> None:
+        """Place and velocity anew."""
+        state = self._state
+        if not state.covariance[BIAS, BIAS].any():
+            state = state.with_part(BIAS, state.mean[BIAS], SIGMA_BIAS_M_S2)
+            state = state.with_part(TILT, state.mean[TILT], SIGMA_TILT_M_S2)
+        sigma_m = max(place.sigma_m, LEAST_SIGMA_PLACE_M)
+        state = state.with_part(PLACE, place.place_m, sigma_m)
+        state = state.with_part(VELOCITY, np.zeros(3), SIGMA_SPEED_M_S)
+        self._state = state._replace(t_ns=place.t_ns, world_from_attitude=place.world_from_attitude)
+        self._begun, self._refused_since_ns = True, None
+        self._taken.clear()
+
+
+def _unknown() -> BodyState:
+    """A state of which nothing is known."""
+    return BodyState(0, np.zeros(N_STATE), np.zeros((N_STATE, N_STATE)), np.eye(3))

@@ -1,0 +1,116 @@
+"""State of the body's filter: a mean with its covariance, and how both go on with time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
+from companion.estimation.inertial.inertial_motion import BIAS, PLACE, TILT, VELOCITY, motion
+from companion.geometry.transforms import Array
+
+DOWN, GROUND, BAROMETER = PLACE.stop - 1, TILT.stop, TILT.stop + 1
+"""Down coordinates, after the state of `motion`: of the ground below, of the barometer's zero."""
+N_STATE = BAROMETER + 1
+TILT_TAU_S = 20.0
+"""An autopilot's attitude is wrong otherwise after each manoeuvre."""
+BIAS_WALK_M_S2 = 1e-3
+"""Random walk of the bias, m/s2 per root of a second: 0.06 in an hour, by warming."""
+RELIEF_M2_PER_M = 0.1
+"""Random walk of the height of the ground that is seen, over the way in any direction: 1 m after
+10 m."""
+BAROMETER_WALK_M = 0.05
+"""Walk of a barometer's zero with the weather and its temperature, per root of a second: a metre
+in seven minutes."""
+UNMEASURED_M_S2 = 1.5
+"""White acceleration where none is measured, per root of Hz: a copter that gains and loses 1 m/s2
+and more for a second."""
+
+
+class BodyState(NamedTuple):
+    """Mean (N,) and covariance (N, N) at a time, in the frame of the places that aid it.
+
+    The mean begins as that of `motion` does; then the heights of ground and barometer. Those
+    without a variance are not known. `world_from_attitude` (3, 3) goes from the autopilot's NED
+    axes to those of the places.
+    """
+
+    t_ns: int
+    mean: Array
+    covariance: Array
+    world_from_attitude: Array
+
+    def moved(self, rotation: Array, about_m: Array, to_m: Array, scale: float) -> BodyState:
+        """The same in another frame: what was at `about_m` is at `to_m`, turned and scaled."""
+        mean, turn = self.mean.copy(), scale * rotation
+        mean[PLACE] = to_m + turn @ (mean[PLACE] - about_m)
+        mean[GROUND] = to_m[2] + scale * (mean[GROUND] - about_m[2])
+        mean[BAROMETER] += to_m[2] - about_m[2]
+        change = np.eye(N_STATE)
+        change[PLACE, PLACE] = change[VELOCITY, VELOCITY] = turn
+        change[TILT, TILT], change[GROUND, GROUND] = rotation[:2, :2], scale
+        for part in (VELOCITY, TILT):
+            mean[part] = change[part, part] @ mean[part]
+        return BodyState(
+            self.t_ns, mean, change @ self.covariance @ change.T,
+            rotation @ self.world_from_attitude,
+        )  # fmt: skip
+
+    def without(self, *parts: slice | int) -> BodyState:
+        """The same with parts that are not known."""
+        covariance = self.covariance.copy()
+        for part in parts:
+            covariance[part, :] = covariance[:, part] = 0.0
+        return self._replace(covariance=covariance)
+
+    def with_part(self, part: slice | int, value: Array | float, sigma: float) -> BodyState:
+        """The same with a part that is known anew, to a standard deviation on each axis."""
+        state, mean = self.without(part), self.mean.copy()
+        mean[part] = value
+        axes = np.arange(len(mean))[part]
+        state.covariance[axes, axes] = sigma**2
+        return state._replace(mean=mean)
+
+    def sigma(self, part: slice) -> float:
+        """The largest standard deviation of a part along an axis."""
+        return float(np.sqrt(max(np.diag(self.covariance)[part].max(), 0.0)))
+
+
+def propagated(state: BodyState, t_ns: int, integral: AccelerationIntegral) -> BodyState | None:
+    """The state at a later time, by what accelerometers measured; None where that is missing."""
+    change = integral.between(state.t_ns, t_ns)
+    if change is None:
+        return None
+    density, turn = integral.density_m_s2, state.world_from_attitude
+    found = motion(change, turn, density, TILT_TAU_S, N_STATE)
+    mean = found.step @ state.mean
+    mean[PLACE] += found.moved_m
+    mean[VELOCITY] += found.gained_m_s
+    covariance = found.step @ state.covariance @ found.step.T + found.noise
+    return _walked(state, state._replace(t_ns=t_ns, mean=mean, covariance=covariance))
+
+
+def held(state: BodyState, t_ns: int) -> BodyState:
+    """The state at a later time without accelerations: the velocity stays, and is less certain."""
+    dt = (t_ns - state.t_ns) * 1e-9
+    step, noise = np.eye(N_STATE), np.zeros((N_STATE, N_STATE))
+    step[PLACE, VELOCITY] = dt * np.eye(3)
+    variance = UNMEASURED_M_S2**2 * np.eye(3)
+    noise[PLACE, PLACE], noise[VELOCITY, VELOCITY] = dt**3 / 3.0 * variance, dt * variance
+    noise[PLACE, VELOCITY] = noise[VELOCITY, PLACE] = dt**2 / 2.0 * variance
+    covariance = step @ state.covariance @ step.T + noise
+    return _walked(state, state._replace(t_ns=t_ns, mean=step @ state.mean, covariance=covariance))
+
+
+def _walked(before: BodyState, after: BodyState) -> BodyState:
+    """With what else has changed meanwhile."""
+    covariance, dt = after.covariance, (after.t_ns - before.t_ns) * 1e-9
+    if covariance[BIAS, BIAS].any():
+        covariance[BIAS, BIAS] += BIAS_WALK_M_S2**2 * dt * np.eye(3)
+    if covariance[BAROMETER, BAROMETER] > 0.0:
+        covariance[BAROMETER, BAROMETER] += BAROMETER_WALK_M**2 * dt
+    if covariance[GROUND, GROUND] > 0.0:
+        way_m = float(np.linalg.norm(after.mean[PLACE] - before.mean[PLACE]))
+        covariance[GROUND, GROUND] += RELIEF_M2_PER_M * way_m
+    return after
