@@ -38,6 +38,7 @@ class StatusDocument:
             "armed": self._settings.armed,
             "page": config.page.listen,
             "kept": flight is not None and flight.kept,
+            "recording": str(flight.folder.resolve()) if flight and flight.folder else "",
             "flights": str(Path(config.daemon.flights).resolve()),
             "viewers_port": flight.viewing.port if flight and flight.viewing else 0,
             "mount_known": camera is not None and camera.body_from_camera is not None,

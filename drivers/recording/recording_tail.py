@@ -105,9 +105,9 @@ def running_recording(socket: Path) -> Path:
     status = ask_status(socket)
     if status.get("armed"):
         raise SourceError("the motors are armed: nothing is set up now")
-    if not status.get("flight"):
+    if not status.get("recording"):  # of a flight that is not kept either, before arming
         raise SourceError("no flight is recorded now: the camera is not there")
-    found = recordings_in(Path(status["flights"]) / str(status["flight"]))
+    found = recordings_in(Path(str(status["recording"])))
     if not found:
         raise SourceError("nothing is recorded, of which it would be seen: recorder.enabled = true")
     return found[-1]

@@ -54,7 +54,7 @@ def recorded(served: ServedPage, camera: Camera, shown: Shown) -> Iterator[None]
     """A flight that goes on and is recorded: what the camera is shown, attitudes as in hands."""
     folder = served.flights / NAME
     folder.mkdir(parents=True)
-    served.status |= {"flight": NAME, "flights": str(served.flights), "size": [320, 240]}
+    served.status |= {"recording": str(folder), "size": [320, 240]}
     recorder, over = Recorder(folder, Config(), camera, {}), threading.Event()
 
     def film() -> None:
