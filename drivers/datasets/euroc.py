@@ -82,12 +82,15 @@ def _camera(sensor: Path, width: int, height: int) -> Camera:
         raise FlightError(f"{sensor}: distortion_model {name!r} is not known")
     given = [] if model is Distortion.NONE else _list(sensor, said, "distortion_coefficients", 4)
     more = [0.0] if model is Distortion.RADTAN else []  # the format has no k3
-    mounted = said.get("T_BS")
-    matrix = _list(sensor, mounted, "data", 16) if isinstance(mounted, dict) else None
     return Camera(
-        width, height, fx, fy, cx, cy, model, (*given, *more),
-        body_from_camera_of(sensor, None if matrix is None else np.reshape(matrix, (4, 4))),
-    )  # fmt: skip
+        width, height, fx, fy, cx, cy, model, (*given, *more), _body_from_sensor(sensor, said)
+    )
+
+
+def _body_from_sensor(path: Path, said: Mapping[str, Any]) -> Pose | None:
+    mounted = said.get("T_BS")
+    matrix = _list(path, mounted, "data", 16) if isinstance(mounted, dict) else None
+    return body_from_camera_of(path, None if matrix is None else np.reshape(matrix, (4, 4)))
 
 
 def _yaml(path: Path) -> Mapping[str, Any]:
@@ -136,13 +139,18 @@ def _imu(mav: Path) -> LogContent:
 
 
 def _truth(mav: Path, camera: Camera) -> list[TruePose]:
-    listing = mav / "state_groundtruth_estimate0" / "data.csv"
+    """The sequence's own estimate of its path, or else what Vicon measured."""
+    listing, sensor_from_body = mav / "state_groundtruth_estimate0" / "data.csv", Pose.identity()
     if not listing.is_file():
-        return []
-    body_from_camera = camera.body_from_camera or Pose.identity()
+        listing = mav / "vicon0" / "data.csv"
+        if not listing.is_file():
+            return []
+        sensor = mav / "vicon0" / "sensor.yaml"
+        sensor_from_body = (_body_from_sensor(sensor, _yaml(sensor)) or Pose.identity()).inverse()
+    sensor_from_camera = sensor_from_body @ (camera.body_from_camera or Pose.identity())
     out = []
     for t, *words in read_rows(listing, 8):
         values = numbers_of(listing, words[:7])
-        world_from_body = pose_of(listing, values[:3], values[3:])
-        out.append(TruePose(ns_of_whole(listing, t), world_from_body @ body_from_camera))
+        world_from_sensor = pose_of(listing, values[:3], values[3:])
+        out.append(TruePose(ns_of_whole(listing, t), world_from_sensor @ sensor_from_camera))
     return out

@@ -3,7 +3,8 @@
 The format is public (github.com/gopro/gpmf-parser, docs): a key of four letters, a letter for the
 type, a byte for the size of one element and two for their count, then the elements, padded to four
 bytes. Type 0 holds further keys. In a stream (STRM) SCAL divides what follows it, TYPE gives the
-letters of elements made of several types ("?"), STNM its name, ORIN the axes of its fields.
+letters of elements made of several types ("?"), STNM its name, ORIN the axes of its fields. Streams
+with text in their elements, such as the scenes that later cameras recognise, are passed over.
 """
 
 from __future__ import annotations
@@ -64,12 +65,16 @@ def _walk(data: bytes, found: list[GpmfStream]) -> None:
             scale = _numbers(body, kind, size, None)[:, 0]
             if not scale.all():
                 raise GpmfError("a scale of zero")
-        elif kind not in TEXT and key.isalnum() and len(body):
+        elif not _has_text(kind, letters) and key.isalnum() and len(body):
             rows = _numbers(body, kind, size, letters)
             if scale is not None and scale.size in (1, rows.shape[1]):
                 found.append(GpmfStream(key, rows / scale, name, orientation))
             elif scale is None:
                 found.append(GpmfStream(key, rows, name, orientation))
+
+
+def _has_text(kind: str, letters: str | None) -> bool:
+    return not TEXT.isdisjoint(letters or "" if kind == "?" else kind)
 
 
 def _text(body: bytes) -> str:

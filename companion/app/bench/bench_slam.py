@@ -1,11 +1,12 @@
 """Tracking of recorded flights measured against ground truth, without dense mapping.
 
-A flight's truth is `truth/world_from_camera.tum` in its folder. Everything runs in lockstep, so
-that errors are the same in each run; times are not.
+A flight's truth is `truth/world_from_camera.tum` in its folder, or what its format has. Everything
+runs in lockstep, so that errors are the same in each run; times are not.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -19,13 +20,19 @@ from companion.app.progress import Progress
 from companion.config import Config
 from companion.errors import FlightError
 from companion.estimation.localisation import LocalisationStage
-from companion.geometry.transforms import Array, Pose, rotation_from_quaternion
+from companion.geometry.transforms import (
+    Array,
+    Pose,
+    interpolate_rotation,
+    rotation_from_quaternion,
+)
 from companion.messages import Frame, Odometry, Track, TrackState
 from companion.products.flight_result import FlightResult
 from companion.products.surroundings import peak_memory_mb
 from companion.products.trajectory_error import Path, path_errors
 from companion.runtime.in_order import in_order_of_time
 from companion.timing.clock import StageTimes
+from drivers.flight import Flight, TruePose
 from drivers.open_flight import open_flight
 
 LEAD_NS = 10_000_000_000
@@ -34,6 +41,8 @@ FRAME_PARTS = ("features", "tracking", "initialising")
 NEES_NS = 10_000_000_000
 STEP_NS = 500_000_000
 """Longest interval between consecutive odometry poses."""
+TRUTH_GAP_NS = 100_000_000
+"""Longest gap in the truth over which it is interpolated: motion capture drops single samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +89,7 @@ def bench_slam(
     """
     rows = []
     for path in flights:
-        truth = _truth(path)
+        truth = _truth(open_flight(path, config.camera, config.telemetry))
         for fault in FAULTS if faults else (NO_FAULT,):
             rows.append(_run(path, truth, config, fault, above_m, progress))
     if out is not None:
@@ -88,11 +97,38 @@ def bench_slam(
     return rows
 
 
-def _truth(flight: FilePath) -> Path:
-    path = flight / "truth" / "world_from_camera.tum"
-    if not path.exists():
+def _truth(flight: Flight) -> Path:
+    path = flight.path / "truth" / "world_from_camera.tum"
+    if path.exists():
+        return _path_of_rows(np.loadtxt(path, comments="#", ndmin=2))
+    known = sorted(flight.truth(), key=lambda each: each.t_ns)
+    if not known:
         raise FlightError(f"{path}: not there; a bench needs the true path")
-    return _path_of_rows(np.loadtxt(path, comments="#", ndmin=2))
+    return _at_frames(known, flight.times_ns)
+
+
+def _at_frames(known: Sequence[TruePose], frames_ns: Sequence[int]) -> Path:
+    """True poses at the times of the frames, of truth measured at times of its own."""
+    times_ns = [each.t_ns for each in known]
+    out: list[tuple[int, Pose]] = []
+    for t_ns in frames_ns:
+        after = bisect_left(times_ns, t_ns)
+        if after < len(known) and times_ns[after] == t_ns:
+            out.append((t_ns, known[after].world_from_camera))
+        elif 0 < after < len(known) and times_ns[after] - times_ns[after - 1] <= TRUTH_GAP_NS:
+            a, b = known[after - 1], known[after]
+            fraction = (t_ns - a.t_ns) / (b.t_ns - a.t_ns)
+            out.append((t_ns, _between(a.world_from_camera, b.world_from_camera, fraction)))
+    return _path_of(
+        [t_ns for t_ns, _ in out], [(pose.rotation, pose.translation) for _, pose in out]
+    )
+
+
+def _between(a: Pose, b: Pose, fraction: float) -> Pose:
+    return Pose(
+        interpolate_rotation(a.rotation, b.rotation, fraction),
+        (1.0 - fraction) * a.translation + fraction * b.translation,
+    )
 
 
 def _path_of_rows(rows: Array) -> Path:

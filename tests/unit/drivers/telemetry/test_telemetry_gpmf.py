@@ -33,6 +33,13 @@ def test_streams_in_their_units() -> None:
     np.testing.assert_allclose(gyro.rows, [[0.01, -0.02, 0.03]])
 
 
+def test_what_holds_text_is_passed_over() -> None:
+    """Cameras from the HERO8 on name the scenes that they recognise beside their gyroscope."""
+    scenes = klv("TYPE", "c", 1, b"Ff") + klv("SCEN", "?", 8, struct.pack(">4sf", b"SNOW", 0.5))
+    payload = klv("DEVC", "\0", 1, klv("STRM", "\0", 1, scenes) + klv("STRM", "\0", 1, GYRO))
+    assert [stream.key for stream in read_streams(payload)] == ["GYRO"]
+
+
 def test_damage_is_an_error_or_fewer_streams(rng: np.random.Generator) -> None:
     for _ in range(300):
         damaged = bytearray(PAYLOAD)
