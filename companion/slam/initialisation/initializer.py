@@ -142,9 +142,7 @@ def _unit_rays(normalised: Array) -> Array:
 def _best(candidates: list[Pose], matches: _Matches) -> Pose | None:
     scored = []
     for pose in candidates:
-        points, _ = matches.triangulated(pose)
-        ok = matches.consistent(points, pose, 9.0)
-        scored.append((int(ok.sum()), pose))
+        scored.append((int(np.sum(_squared_errors(pose, matches) < 2 * GAMMA)), pose))
     if not scored:
         return None
     scored.sort(key=lambda s: -s[0])
@@ -197,17 +195,33 @@ def _rotation_factor(rotation_prior: Array) -> RelativeRotationFactor:
 
 def _unexplained(pose: Pose, matches: _Matches) -> float:
     """Sum of squared errors of all matches in both views, truncated at the outlier threshold."""
+    return float(np.minimum(_squared_errors(pose, matches), 2 * GAMMA).sum())
+
+
+def _squared_errors(pose: Pose, matches: _Matches) -> Array:
+    """Squared errors (N,) of matches in both views, of the nearest point or of one at infinity.
+
+    Noise puts half of the points that are too far for a parallax behind the cameras. Were they
+    outliers, a motion that gives them a parallax by a wrong rotation would win over the true one.
+    """
     points, _ = matches.triangulated(pose)
     in_b = pose.apply(points)
-    total = np.zeros(len(points))
+    near, behind = np.zeros(len(points)), (points[:, 2] <= 0) | (in_b[:, 2] <= 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         for p, seen, white in (
             (points, matches.xa, matches.whitening_a), (in_b, matches.xb, matches.whitening_b)
         ):  # fmt: skip
-            error = np.matmul(white, (p[:, :2] / p[:, 2:] - seen)[..., None])[..., 0]
-            total += (error * error).sum(1)
-        before = (points[:, 2] > 0) & (in_b[:, 2] > 0)
-    return float(np.where(before & (total < 2 * GAMMA), total, 2 * GAMMA).sum())
+            near += _squared(p, seen, white)
+    far_in_b = np.c_[matches.xa, np.ones(len(points))] @ pose.rotation.T
+    # the best ray lies between the two that are seen, half of the error in each image
+    far = 0.5 * _squared(far_in_b, matches.xb, matches.whitening_b)
+    return np.fmin(np.where(behind, np.inf, near), np.where(far_in_b[:, 2] > 0, far, np.inf))
+
+
+def _squared(points: Array, seen: Array, whitening: Array) -> Array:
+    error = np.matmul(whitening, (points[:, :2] / points[:, 2:] - seen)[..., None])[..., 0]
+    out: Array = (error * error).sum(1)
+    return out
 
 
 def _adjusted(pose: Pose, matches: _Matches, limit: float) -> Pose | None:
