@@ -12,6 +12,7 @@ from companion.slam.initialisation.initializer import TwoViewGeometry, initialis
 FOCAL_PX, N = 500.0, 300
 TURN = rotation_from_vector(np.radians([2.0, -3.0, 4.0]))
 FAR_SHARE = 0.65
+FORWARD_FAR_SHARE = 0.3
 
 
 def features(normalised: Array) -> Features:
@@ -55,3 +56,34 @@ def test_baseline_is_found_among_outliers(seed: int, wrong_share: float) -> None
     assert found is not None
     assert np.degrees(angle_between(found.b_from_a.rotation, TURN)) < 0.3
     assert found.b_from_a.translation[0] < -0.99
+
+
+def flown_forward(way_m: float, seed: int) -> TwoViewGeometry | None:
+    """Forward over the edge of a cliff, most of the picture far away, without attitudes."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(-0.7, 0.7, N), rng.uniform(0.0, 0.4, N)
+    far = round(FORWARD_FAR_SHARE * N)
+    v[:far] = rng.normal(0.0, 0.03, far)
+    depth = np.where(u > 0, 8.0, 30.0) / np.maximum(v, 0.01)  # grass beside the sea below it
+    seen_a = np.c_[u, v]
+    points_b = np.c_[seen_a, np.ones(N)] * depth[:, None] - [0.0, 0.0, way_m]
+    seen_b = points_b[:, :2] / points_b[:, 2:]
+    seen_a, seen_b = (s + rng.normal(scale=0.7 / FOCAL_PX, size=s.shape) for s in (seen_a, seen_b))
+    index = np.arange(N)
+    return initialise(
+        features(seen_a), features(seen_b), index, index, FOCAL_PX, seed, None, np.radians(1.0)
+    )
+
+
+@pytest.mark.parametrize("way_m", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_no_turn_is_seen_in_a_forward_flight(seed: int, way_m: float) -> None:
+    """A wrong turn would give what is far a parallax, and win the sooner."""
+    found = flown_forward(way_m, seed)
+    if found is not None:
+        assert np.degrees(angle_between(found.b_from_a.rotation, np.eye(3))) < 1.0
+        assert found.b_from_a.translation[2] < -0.99
+
+
+def test_a_forward_flight_begins() -> None:
+    assert all(flown_forward(4.0, seed) is not None for seed in range(5))
