@@ -357,7 +357,7 @@ def _keyframe(
     """A keyframe and its part; None where it is damaged."""
     query = "SELECT part, json, features, digest FROM keyframe WHERE id = ?"
     row = _row(file, query, key)
-    if row is None or _digest(*row[:3]) != row[3]:
+    if row is None or _digest(*row[:3]) != row[3] or len(row[2]) % FEATURE.itemsize:
         return None
     part, said = row[0], json.loads(row[1])
     rows = np.frombuffer(row[2], FEATURE)

@@ -17,6 +17,7 @@ from companion.geometry.transforms import Similarity, yaw_rotation
 from companion.products.site_map_file import (
     SITE_MAP,
     SiteMapError,
+    _digest,
     read_head,
     read_site_map,
     write_site_map,
@@ -139,6 +140,20 @@ def test_what_is_damaged_is_left_out_and_named(path: Path, site: SiteMap) -> Non
     seen = np.concatenate([k.point_ids for k in read.site.keyframes])
     assert not lost[seen[seen >= 0]].any()
     assert main(["map", "verify", str(path)]) == 1
+
+
+def test_features_of_another_layout_are_left_out(path: Path) -> None:
+    """Whole by their digest, but not what this version writes."""
+    with closing(sqlite3.connect(path)) as file:
+        part, said, features = file.execute(
+            "SELECT part, json, features FROM keyframe WHERE id = 3"
+        ).fetchone()
+        digest = _digest(part, said, features[:-1])
+        file.execute(
+            "UPDATE keyframe SET features = ?, digest = ? WHERE id = 3", (features[:-1], digest)
+        )
+        file.commit()
+    assert read_site_map(path).damaged == ("keyframe 3",)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
