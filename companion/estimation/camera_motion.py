@@ -208,6 +208,6 @@ class CameraMotion:
             ))
             for t_ns, pose in self._poses
         ]  # fmt: skip
-        self._poses.extend(moved)
+        self._poses = deque(moved, maxlen=N_POSES)
         if self._map_from_ned is not None:
             self._map_from_ned = nearest_rotation(turn @ self._map_from_ned)
