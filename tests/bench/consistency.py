@@ -10,9 +10,10 @@ degree of freedom (NEES): 1 is exact, above it errors are larger than stated. In
 beyond the bound that 95 % should be within.
 
 Place: of the last ten seconds' way in the body's attitude at their beginning, which is what its
-standard deviation is of. All the way: since sending began, the heading aligned over its first ten
-seconds. Velocity: in the body's axes, as it is sent. Heading: against north. Innovations of
-the filter (NIS) likewise, refused ones too, by what was measured.
+standard deviation is of. All the way: the same against errors since sending began, which it does
+not claim to cover; the heading is aligned over the first ten seconds. Velocity: in the body's axes,
+as it is sent. Heading: against north. Innovations of the filter (NIS) likewise, refused ones too,
+by what was measured.
 """
 
 from __future__ import annotations
