@@ -106,8 +106,10 @@ def test_an_agile_flight_relocalises_within_a_second_after_an_image_dropout() ->
         for t in flown.tracks
         if t.map_from_camera is not None and not t.backfilled
     }
-    due = [s for s in after_s if not 5.0 <= s < 7.0]
-    assert sum(round(s, 6) in known_s for s in due) >= 0.95 * len(due)
+    begun_s = min(known_s)  # in a turn the map waits until its direction of motion is certain
+    assert begun_s < 0.5
+    due = [s for s in after_s if begun_s <= s < 5.0 or s >= 7.5]
+    assert sum(round(s, 6) in known_s for s in due) >= 0.98 * len(due)
     assert min(s for s in known_s if s >= 7.0) < 7.5
     assert flown.live_errors().ate_sim3_m < 0.5, "the map goes on where it was"
     assert flown.errors().ate_sim3_m < 0.3
