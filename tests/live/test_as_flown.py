@@ -15,6 +15,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig, TelemetryConfig
+from companion.estimation.gate.global_gate import IN_USE
 from companion.estimation.site.site_use import LOCATED
 from companion.telemetry import MEASURED, PositionSample
 from drivers.recording.decisions import decisions_of
@@ -153,3 +154,24 @@ def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path)
     _, found = again(path, tmp_path / "again")
     assert not found["tracked_again"]
     assert found["by_gate"]["pose"]["sent"] > 100
+
+
+def test_global_positions_are_made_again_where_poses_are_not_sent(tmp_path: Path) -> None:
+    with Flying(
+        tmp_path, "recorder.codec=mjpeg", "feedback.mode=off", "feedback.global_position=sensor"
+    ) as flying:
+        flying.autopilot.arm()
+        flying.daemon.until(
+            lambda health: health["global_position"]["why_not"] == IN_USE, "a place by satellites"
+        )
+        flying.autopilot.gps = False
+        flying.autopilot.wait_for("GLOBAL_POSITION_SENSOR", 20, 120)
+        flying.autopilot.gps = True
+        flying.until_told("global position by vision off", time.monotonic_ns())
+        flying.autopilot.disarm()
+        flying.daemon.line("results so far")
+        (path,) = flying.daemon.flown()
+        flying.daemon.stop()
+    _, found = again(path, tmp_path / "again")
+    assert not found["tracked_again"]
+    assert found["by_gate"]["global"]["sent"] >= 20 and set(found["by_gate"]) == {"global"}
