@@ -152,6 +152,9 @@ NEW_MAP_ARMED = PilotMessage(NOTICE, "new map refused: armed, position in use")
 CLOUD_SAVED = PilotMessage(INFO, "point cloud saved: {n} points", {"n": LONGEST_NUMBER})
 CLOUD_NO_MAP = PilotMessage(NOTICE, "point cloud refused: no map yet")
 CLOUD_NOT_SAVED = PilotMessage(NOTICE, "point cloud not saved, see its log")
+RECORDING_GOES_ON = PilotMessage(NOTICE, "recording ends with the flight only")
+RECORDING_SET_OFF = PilotMessage(NOTICE, "not recorded: recorder.enabled is false")
+RECORDING_NO_FLIGHT = PilotMessage(NOTICE, "not recorded: no flight goes on")
 GROUND_TOO_OFTEN = PilotMessage(NOTICE, "too many ground requests")
 
 # -- of messages themselves -----------------------------------------------------------------

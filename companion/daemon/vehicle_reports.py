@@ -24,6 +24,7 @@ from companion.dense.obstacles import (
 )
 from companion.geometry.camera import Camera
 from companion.messages import DepthMap, Frame, MapUpdate, PointChunk, Track, TrackState
+from companion.pilot_messages import RECORDING_NO_FLIGHT, RECORDING_SET_OFF, PilotText
 from companion.timing.clock import FlightClock
 from drivers.images.still_pictures import StillPictures
 from drivers.mavlink.autopilot_link import AutopilotLink
@@ -243,10 +244,10 @@ def flight_recording(config: Config, flights: Flights) -> FlightRecording:
         flight = flights.current
         return config.recorder.enabled and flight is not None and flight.kept
 
-    def keep() -> str:
+    def keep() -> PilotText | None:
         if not config.recorder.enabled:
-            return "not recorded: recorder.enabled is false"
+            return RECORDING_SET_OFF()
         flights.keep()
-        return "" if is_kept() else "not recorded: no flight goes on"
+        return None if is_kept() else RECORDING_NO_FLIGHT()
 
     return FlightRecording(is_kept, keep)

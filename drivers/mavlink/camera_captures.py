@@ -14,16 +14,17 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.pilot_messages import RECORDING_GOES_ON, RECORDING_NO_FLIGHT, PilotText
 from drivers.images.still_pictures import Still
 from drivers.mavlink.camera_messages import CAPTURE_STATUS, SETTINGS, STORAGE
 from drivers.mavlink.command_server import ACCEPTED, BUSY, DENIED, FAILED, Command, Done, Job
+from drivers.mavlink.status_text import status_text
 
 CAPABILITIES: int = (
     mavlink.CAMERA_CAP_FLAGS_CAPTURE_IMAGE
     | mavlink.CAMERA_CAP_FLAGS_CAPTURE_VIDEO
     | mavlink.CAMERA_CAP_FLAGS_CAN_CAPTURE_IMAGE_IN_VIDEO_MODE
 )
-NOT_STOPPED = b"recording goes on until the flight ends"
 URL_BYTES = 205
 SINGLE = 1.0
 MIB = 1.048576
@@ -47,13 +48,13 @@ class Stills(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FlightRecording:
-    """Recording of the flight: whether one is kept, and how to keep one; "" or why it cannot be."""
+    """Recording of the flight: whether one is kept, and how to keep one; None or why not."""
 
     is_kept: Callable[[], bool]
-    keep: Callable[[], str]
+    keep: Callable[[], PilotText | None]
 
 
-NOTHING_RECORDED = FlightRecording(lambda: False, lambda: "not recorded: no flight goes on")
+NOTHING_RECORDED = FlightRecording(lambda: False, RECORDING_NO_FLIGHT)
 
 
 class CameraCaptures:
@@ -107,15 +108,15 @@ class CameraCaptures:
 
     def _record(self, parameters: Sequence[float]) -> Done:
         why = self._recording.keep()
-        if why:
-            return Done(FAILED, [_text(why.encode())])
+        if why is not None:
+            return Done(FAILED, [status_text(why)])
         self.step()
         return Done(ACCEPTED, [self._status()])
 
     def _stop(self, parameters: Sequence[float]) -> Done:
         if not self._recording.is_kept():
             return Done(ACCEPTED)
-        return Done(DENIED, [_text(NOT_STOPPED), self._status()])
+        return Done(DENIED, [status_text(RECORDING_GOES_ON()), self._status()])
 
     def _captured(self, still: Still) -> Any:
         """CAMERA_IMAGE_CAPTURED; place and attitude are in the recording, and not told here."""
@@ -144,7 +145,3 @@ class CameraCaptures:
         return mavlink.MAVLink_camera_settings_message(
             self._boot_ms() & 0xFFFFFFFF, mavlink.CAMERA_MODE_VIDEO, math.nan, math.nan
         )
-
-
-def _text(text: bytes) -> Any:
-    return mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_NOTICE, text[:50])

@@ -42,7 +42,10 @@ def test_latencies_are_sorted_once_for_a_health(
     )  # fmt: skip
     watch = watch_of(flight, tmp_path)
     pose: Any = SimpleNamespace(
-        t_ns=watch._clock.now_ns() - 20_000_000, state=TrackState.TRACKING, quality=80
+        t_ns=watch._clock.now_ns() - 20_000_000,
+        state=TrackState.TRACKING,
+        quality=80,
+        refused={},
     )
     odometry: Odometry = pose
     watch.take_odometry(odometry)

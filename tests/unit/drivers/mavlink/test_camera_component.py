@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import LinkConfig, RouterConfig
 from companion.messages import Frame
+from companion.pilot_messages import RECORDING_GOES_ON
 from companion.timing.clock import FlightClock
 from drivers.images.still_pictures import Still, StillPictures
 from drivers.mavlink.autopilot_link import AutopilotLink
@@ -51,14 +52,14 @@ class Ground:
         self.say(mavlink.MAVLink_command_long_message(1, component, command, 0, *values))
 
     async def of_camera(self, kind: str) -> Any:
-        """The next message of a kind of component 100."""
+        """The first message of a kind of component 100 that was not taken yet."""
 
         async def search() -> Any:
             while True:
-                for message in list(self._heard):
-                    self._heard.remove(message)
+                for message in self._heard:
                     source = message.get_srcSystem(), message.get_srcComponent()
                     if source == (1, CAMERA) and message.get_type() == kind:
+                        self._heard.remove(message)
                         return message
                 self._heard += self._codec.parse_buffer(bytearray(await self._read())) or []
 
@@ -110,7 +111,7 @@ async def take_and_record(ground: Ground, flown: Flown) -> None:
     assert (status.video_status, status.image_count) == (1, 1)
     ground.ask(mavlink.MAV_CMD_VIDEO_STOP_CAPTURE, 0.0)
     assert await acknowledged(ground, mavlink.MAV_CMD_VIDEO_STOP_CAPTURE) == DENIED
-    assert (await ground.of_camera("STATUSTEXT")).text == "recording goes on until the flight ends"
+    assert (await ground.of_camera("STATUSTEXT")).text == RECORDING_GOES_ON().text
 
 
 @dataclass
@@ -124,9 +125,8 @@ class Flown:
         self.stills = StillPictures(self.folder, 0.0)
 
     def recording(self) -> FlightRecording:
-        def keep() -> str:
+        def keep() -> None:
             self.kept = True
-            return ""
 
         return FlightRecording(lambda: self.kept, keep)
 
@@ -151,11 +151,11 @@ async def _flown(through_router: bool, folder: Path) -> None:
     wire, heard = await loop.create_datagram_endpoint(Datagrams, remote_addr=(HOST, link_port))
     writer: asyncio.StreamWriter | None = None
     try:
-        ground = Ground(heard.came.get, wire.sendto)
+        ground = autopilot = Ground(heard.came.get, wire.sendto)
 
         async def beat() -> None:  # the autopilot's, whose component the camera is
             while True:
-                ground.say(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), 1, 1)
+                autopilot.say(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), 1, 1)
                 await asyncio.sleep(0.2)
 
         running.append(asyncio.ensure_future(beat()))
