@@ -28,7 +28,9 @@ from tests.support.autopilot.fake_wire import free_port
 
 ACCEPTED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
 UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
-FRAME = Frame(0, 1, np.zeros((48, 64), np.uint8), np.zeros((48, 64, 3), np.uint8))
+TAKEN_NS = 1_790_000_000_000_000_000
+"""Of this century: a step of the clock would make a time near zero a negative one."""
+FRAME = Frame(0, TAKEN_NS, np.zeros((48, 64), np.uint8), np.zeros((48, 64, 3), np.uint8))
 URI = "rtsp://10.0.0.5:8554/camera"
 STREAM = CameraStream(URI, 640, 480, 30.0, 2000, 75.4, True)
 WITHIN_S = 60.0
