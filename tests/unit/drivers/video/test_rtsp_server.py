@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import threading
 import time
+from pathlib import Path
 
 import av
 import av.error
@@ -108,6 +109,8 @@ def test_pictures_never_wait_for_a_server_that_is_stopped() -> None:
         child = server._child
         assert child is not None
         child.send_signal(19)  # SIGSTOP
+        stat = Path(f"/proc/{child.pid}/stat")
+        until(lambda: stat.read_text().rpartition(")")[2].split()[0] == "T")
         began_s = time.monotonic()
         taken = [server.send(bytes(100_000)) for _ in range(100)]
         assert time.monotonic() - began_s < 5.0
