@@ -181,6 +181,7 @@ async def _flown(through_router: bool, folder: Path) -> None:
         await asyncio.sleep(0)
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("through_router", [False, True], ids=["wire", "router"])
 def test_it_is_found_and_asked(through_router: bool, tmp_path: Path) -> None:
     asyncio.run(_flown(through_router, tmp_path / "images"))

@@ -102,6 +102,7 @@ def test_a_port_that_is_taken_is_told() -> None:
         first.close()
 
 
+@pytest.mark.real_time
 def test_pictures_never_wait_for_a_server_that_is_stopped() -> None:
     server = RtspServer("127.0.0.1:0")
     try:
