@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from companion import __version__
-from companion.app.merged_maps import Pair, merge_flights, merge_pair
+from companion.app.maps.merged_maps import Pair, merge_flights, merge_pair
 from companion.app.progress import Progress
 from companion.app.replay.replay_command import RecordedInput, replay
 from companion.app.thumbnail import thumbnail

@@ -16,19 +16,19 @@ from companion.page.access import Access
 from companion.page.background_work import BackgroundWork
 from companion.page.daemon_watch import DaemonWatch
 from companion.page.facts import Facts
-from companion.page.flight_views import FlightViews
 from companion.page.flown import FlownFlights
 from companion.page.gate import Gate
-from companion.page.lens_views import LensViews
-from companion.page.mount_views import MountViews
-from companion.page.now_views import NowViews
-from companion.page.pairing_views import PairingViews
-from companion.page.replay_views import ReplayViews
-from companion.page.rerun_views import RerunViews
 from companion.page.scene import Scene
-from companion.page.setting_views import SettingViews
-from companion.page.setup_views import SetupViews
-from companion.page.site import Site
+from companion.page.views.flight_views import FlightViews
+from companion.page.views.lens_views import LensViews
+from companion.page.views.mount_views import MountViews
+from companion.page.views.now_views import NowViews
+from companion.page.views.pairing_views import PairingViews
+from companion.page.views.replay_views import ReplayViews
+from companion.page.views.rerun_views import RerunViews
+from companion.page.views.setting_views import SettingViews
+from companion.page.views.setup_views import SetupViews
+from companion.page.views.site import Site
 
 
 def application(

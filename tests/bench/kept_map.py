@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.app.map_command import merge
+from companion.app.maps.map_command import merge
 from companion.app.replay.replay_command import RecordedInput
 from companion.config_file import load_config
 from companion.estimation.localisation import LocalisationStage

@@ -14,7 +14,7 @@ from companion.errors import InputError
 
 def _map(arguments: argparse.Namespace, signals: StopSignals) -> int:
     """Show, verify, export, merge, prune or save; 1 where a map is damaged."""
-    from companion.app import map_command as maps
+    from companion.app.maps import map_command as maps
 
     if arguments.what == "show":
         print(maps.show(arguments.map, arguments.json))

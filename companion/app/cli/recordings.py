@@ -107,7 +107,7 @@ def _compare(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
 
 def _compare_maps(arguments: argparse.Namespace) -> int:
-    from companion.app.compare_maps import PAGE, changes_in_words, compare_maps
+    from companion.app.maps.compare_maps import PAGE, changes_in_words, compare_maps
 
     if arguments.max_apart is not None or arguments.max_cloud is not None:
         raise InputError("--max-apart and --max-cloud are of two runs, not of --maps")

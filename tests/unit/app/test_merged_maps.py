@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.app.merged_maps import Pair, merge_flights, merge_pair
+from companion.app.maps.merged_maps import Pair, merge_flights, merge_pair
 from companion.geometry.transforms import Array, Similarity
 from companion.products.report.batch_page import batch_page
 from companion.products.site_map_file import SITE_MAP, read_site_map, write_site_map

@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from companion.page import rerun_views
+from companion.page.views import rerun_views
 from companion.streaming.viewer import screen
 from companion.streaming.viewer.web_proxy import free_ports
 from tests.support.served_page import ELSEWHERE, ServedPage

@@ -11,9 +11,9 @@ import pytest
 
 from companion.config import Config
 from companion.config_file import load_config
-from companion.page.now_views import headline
 from companion.page.remedies import OF_REASON, OF_WARNING
 from companion.page.setup_steps import steps
+from companion.page.views.now_views import headline
 from companion.pilot_messages import JOURNAL_ONLY, REASONS, SWITCHED_OFF
 from companion.pilot_messages import OF_WARNING as TOLD
 from drivers.recording.flights_folder import KEEP

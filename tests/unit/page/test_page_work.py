@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.calibration.chart import parse_chart
-from companion.page.lens_views import BOARD
+from companion.page.views.lens_views import BOARD
 from tests.support.served_page import ELSEWHERE, Answer, ServedPage
 
 NAME = "00001-2026-11-19T10-00-00Z"

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.app import map_command
 from companion.app.cli import main
+from companion.app.maps import map_command
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity, yaw_rotation
 from companion.products.site_map_file import (

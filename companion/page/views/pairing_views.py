@@ -8,7 +8,7 @@ from starlette.routing import Route
 
 from companion import __version__
 from companion.page.access import COOKIE, KEPT_S
-from companion.page.site import Site, is_same_origin, local_path, read_form
+from companion.page.views.site import Site, is_same_origin, local_path, read_form
 
 WRONG = "This is not one of the two codes."
 TOO_OFTEN = "Too many attempts: wait half a minute."

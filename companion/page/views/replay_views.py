@@ -16,7 +16,7 @@ from companion.config_file import load_config
 from companion.errors import CompanionError
 from companion.page.background_work import BackgroundWork, Work
 from companion.page.flown import FlownFlights
-from companion.page.site import Form, Site
+from companion.page.views.site import Form, Site
 
 KIND = "replay"
 MOST_LINES = 40

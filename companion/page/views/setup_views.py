@@ -11,9 +11,9 @@ from starlette.routing import Route
 
 from companion.errors import ConfigError
 from companion.page.doctor_process import Doctor
-from companion.page.setting_views import SettingViews
 from companion.page.setup_steps import steps
-from companion.page.site import Form, Site
+from companion.page.views.setting_views import SettingViews
+from companion.page.views.site import Form, Site
 from drivers.camera.camera_devices import cameras
 from drivers.system.serial_devices import serial_devices
 

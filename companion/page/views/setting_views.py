@@ -24,7 +24,7 @@ from companion.daemon.control.reload import needs_restart
 from companion.errors import CompanionError, ConfigError
 from companion.page.setting_texts import PURPOSES, Setting, settings
 from companion.page.settings_file import Change, SettingsFile, shown_value, value_of_text
-from companion.page.site import Form, Site, is_number
+from companion.page.views.site import Form, Site, is_number
 
 SHOWN_CHANGES = 20
 

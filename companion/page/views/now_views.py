@@ -11,9 +11,9 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from companion.page.remedies import OF_REASON, OTHER, remedy
-from companion.page.rerun_views import viewer_link
 from companion.page.setup_steps import source
-from companion.page.site import Site, is_number
+from companion.page.views.rerun_views import viewer_link
+from companion.page.views.site import Site, is_number
 
 RECENT_S = 600.0
 """Age of warnings that are shown here; Health in the journal has all."""

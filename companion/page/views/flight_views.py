@@ -11,8 +11,8 @@ from starlette.routing import Route
 
 from companion.errors import FlightError
 from companion.page.flown import FlownFlights
-from companion.page.replay_views import ReplayViews
-from companion.page.site import Form, Site
+from companion.page.views.replay_views import ReplayViews
+from companion.page.views.site import Form, Site
 
 SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:;"

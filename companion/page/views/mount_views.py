@@ -12,8 +12,8 @@ from starlette.routing import Route
 
 from companion.errors import CompanionError
 from companion.page.background_work import BackgroundWork
-from companion.page.setting_views import SettingViews
-from companion.page.site import Form, Site
+from companion.page.views.setting_views import SettingViews
+from companion.page.views.site import Form, Site
 from drivers.images.calibration_file import read_calibration
 
 KIND = "mount"

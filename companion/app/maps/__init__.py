@@ -1,0 +1,1 @@
+"""The commands about site maps: shown, verified, merged, compared."""

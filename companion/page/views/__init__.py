@@ -1,0 +1,1 @@
+"""The page's views: the routes of each, and the parts that all share (`site.py`)."""
