@@ -71,6 +71,22 @@ def load_config(
         for current in _current({name: text}, f"--set {override}", warn):
             value = _parse(text, current)
             config = with_value(config, current, value, f"--set {override}")
+    return with_fixed_camera_only(config)
+
+
+def with_fixed_camera_only(config: Config) -> Config:
+    """The configuration; ConfigError where it wants of a gimbal what a fixed camera alone gives."""
+    if config.mount.type == "fixed":
+        return config
+    for key, is_set in (
+        ("feedback.flow", config.feedback.flow != "off"),
+        ("landing.marker", config.landing.marker != "off"),
+        ("video.overlay with the horizon", "horizon" in config.video.overlay),
+    ):
+        if is_set:
+            raise ConfigError(
+                f"{key} needs a camera that is fixed to the body: mount.type is gimbal"
+            )
     return config
 
 

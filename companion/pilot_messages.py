@@ -59,6 +59,9 @@ GLOBAL_OFF = PilotMessage(NOTICE, "global position by vision off")
 TRACKING_FAILED = PilotMessage(WARNING, "visual tracking failed: restarting")
 ATTITUDE_MISMATCH = PilotMessage(WARNING, "attitude mismatch: no vision position")
 ATTITUDE_USED = PilotMessage(INFO, "attitude matches again")
+GIMBAL_MISMATCH = PilotMessage(WARNING, "gimbal mismatch: no vision position")
+GIMBAL_SILENT = PilotMessage(WARNING, "gimbal silent: no vision position")
+GIMBAL_USED = PilotMessage(INFO, "gimbal angles used again")
 MAP_TILTED = PilotMessage(WARNING, "map tilted: restarting")
 MAP_RESUMED = PilotMessage(NOTICE, "map resumed after restart")
 MAP_NOT_RESUMED = PilotMessage(NOTICE, "old map not recognised: new map")
@@ -202,6 +205,10 @@ OF_WARNING: Mapping[str, PilotMessage] = {
     "camera does not turn with the body: attitude not used, no vision position": ATTITUDE_MISMATCH,
     "camera mount disagrees with the autopilot's attitude: no vision position": ATTITUDE_MISMATCH,
     "camera turns with the body again: attitude used": ATTITUDE_USED,
+    "the gimbal's angles do not fit the camera: no vision position": GIMBAL_MISMATCH,
+    "the gimbal's angles are not known: no vision position": GIMBAL_SILENT,
+    "the gimbal's angles fit the camera again": GIMBAL_USED,
+    "the gimbal's angles are known again": GIMBAL_USED,
     "map tilted against the autopilot's attitude: begun anew": MAP_TILTED,
     "map resumed after restart": MAP_RESUMED,
     "old map not recognised: new map": MAP_NOT_RESUMED,

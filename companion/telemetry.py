@@ -114,9 +114,27 @@ class AirspeedSample:
     indicated_m_s: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GimbalSample:
+    """Attitude of a gimbal's head (forward, right, down): quaternion w x y z.
+
+    In NED with `yaw_from_north`; else in level axes of which the first points where the vehicle
+    heads.
+    """
+
+    schema: ClassVar[Schema] = Schema(
+        "gimbal",
+        "Attitude of the gimbal's head (FRD): quaternion w x y z; its yaw is from north, or from "
+        "where the vehicle heads",
+    )
+    t_ns: int
+    level_from_head: Array = field(metadata=QUATERNION)
+    yaw_from_north: bool = False
+
+
 Telemetry = (
     AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
-    | AirspeedSample | LandedSample
+    | AirspeedSample | LandedSample | GimbalSample
 )  # fmt: skip
 TELEMETRY: tuple[type[Telemetry], ...] = get_args(Telemetry)
 """In order of their channels in a recording."""
@@ -124,7 +142,7 @@ FIELDS = {kind: fields_of(kind) for kind in TELEMETRY}
 """Fields of each, without its time."""
 MEASURED: Mapping[type[Telemetry] | PositionSource, Measurement | None] = {
     AttitudeSample: "attitude", ImuSample: "imu", RangeSample: "range", HeightSample: "height",
-    AirspeedSample: "airspeed", ArmedSample: None, LandedSample: None,
+    AirspeedSample: "airspeed", ArmedSample: None, LandedSample: None, GimbalSample: "attitude",
     PositionSource.LOCAL: "position", PositionSource.GLOBAL: "position",
     PositionSource.GPS: "satellites",
 }  # fmt: skip

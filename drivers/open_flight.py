@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.config import CameraConfig, TelemetryConfig
+from companion.config import CameraConfig, MountConfig, TelemetryConfig
 from companion.errors import FlightError
 from drivers.datasets.bag_flight import is_bag, is_ros2_folder, open_bag
 from drivers.datasets.euroc import is_euroc, open_euroc
@@ -17,7 +17,7 @@ from drivers.datasets.posed_flight import is_posed_folder, open_posed_flight
 from drivers.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from drivers.datasets.video_flight import is_video, open_video
 from drivers.flight import Flight
-from drivers.images.calibration_file import with_readout
+from drivers.images.calibration_file import with_mount, with_readout
 from drivers.recording.recorded_flight import (
     is_recorded_folder,
     is_recording,
@@ -56,14 +56,18 @@ FOLDERS = (
 
 
 def open_flight(
-    path: Path, config: CameraConfig, telemetry: TelemetryConfig | None = None
-) -> Flight:
+    path: Path, config: CameraConfig, telemetry: TelemetryConfig | None = None,
+    mount: MountConfig | None = None,
+) -> Flight:  # fmt: skip
     """Open a flight of any known format and check all of it but the telemetry.
 
-    FlightError where it is invalid, or of no known format.
+    Of the `mount` only a gimbal counts: fixed cameras bring theirs. FlightError where the flight is
+    invalid, or of no known format.
     """
     flight = format_of(path).open(path, config, telemetry or TelemetryConfig())
     flight.camera = with_readout(flight.camera, config.readout_ms)
+    if mount is not None:
+        flight.camera = with_mount(flight.camera, mount)
     return flight
 
 

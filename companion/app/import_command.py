@@ -29,7 +29,7 @@ def import_flight(
     """
     if out.suffix not in WRITERS:
         raise InputError(f"{out}: wanted is the name of a folder, or of a file ending in .mcap")
-    flight = open_flight(source, config.camera, config.telemetry)
+    flight = open_flight(source, config.camera, config.telemetry, config.mount)
     log = flight.telemetry()
     for remark in log.remarks:
         notify(remark)

@@ -46,6 +46,7 @@ NO_ATTITUDE = "the autopilot's attitude does not come"
 NOT_RIGID = (
     "the camera does not turn as the autopilot does: is it fixed to the vehicle, and calibrated?"
 )
+ON_GIMBAL = "the camera is on a gimbal: there is no mount to be found"
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,8 @@ class Mount:
 def mount_of_flight(path: Path, config: Config, progress: Progress) -> Mount:
     """Mount by a recorded flight; InputError where its rotations do not tell."""
     given = RecordedInput(path, config)
+    if given.flight.camera.gimbal is not None:
+        raise InputError(f"{path}: {ON_GIMBAL}")
     progress.start(given.n_frames)
     seeking = _Seeking(config, given.flight.camera)
     for message in given.messages():
@@ -93,6 +96,8 @@ def mount_by_hand(socket: Path, config: Config, progress: Progress) -> Mount:
     """
     tail = RecordingTail(running_recording(socket))
     try:
+        if tail.camera.gimbal is not None:
+            raise InputError(ON_GIMBAL)
         seeking = _Seeking(config, tail.camera)
         progress.start(0)
         for message in _live(tail):

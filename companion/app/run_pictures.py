@@ -14,13 +14,13 @@ from drivers.open_flight import open_flight
 
 def open_pictures(path: Path, config: Config) -> Iterator[tuple[int, Bytes]]:
     """All images of the flight at `path`, with their times; FlightError where it is none."""
-    flight = open_flight(path, config.camera, config.telemetry)
+    flight = open_flight(path, config.camera, config.telemetry, config.mount)
     return ((frame.t_ns, frame.rgb) for frame in flight.frames() if isinstance(frame, Frame))
 
 
 def pictures_of(run: FinishedRun, path: Path, config: Config) -> FlightPictures:
     """Pictures of the flight at `path`, of which `run` is a replay; FlightError where none."""
-    flight = open_flight(path, config.camera, config.telemetry)
+    flight = open_flight(path, config.camera, config.telemetry, config.mount)
 
     def frames(wanted: Collection[int]) -> Iterator[tuple[int, Bytes]]:
         if not wanted:

@@ -35,6 +35,8 @@ class LinkConfig:
     """Rate of local, global and GPS position, Hz."""
     height_hz: Expert[Annotated[float, Meta(ge=0, le=100)]] = 10.0
     """Rate of pressure and rangefinder, Hz."""
+    gimbal_hz: Expert[Annotated[float, Meta(ge=0, le=100)]] = 20.0
+    """Rate requested of the gimbal's angles, where the camera is on one; 0: as it is sent."""
     silent_after_s: Expert[Annotated[float, Meta(ge=0.2, le=60)]] = 3.0
     """Silence after which the autopilot counts as lost, seconds."""
 

@@ -62,9 +62,16 @@ class MountConfig:
     """Mounting of a live camera on the body, where its calibration file lacks it.
 
     The angles rotate a camera that looks forward, upright: first by yaw to the right, then by pitch
-    upwards, then by roll clockwise about its own axis.
+    upwards, then by roll clockwise about its own axis. On a gimbal they are those of the camera in
+    the gimbal's head, zero as a rule, and the position is that of the head.
     """
 
+    type: Literal["fixed", "gimbal"] = "fixed"
+    """gimbal: its angles come with telemetry, and poses are sent only while they are known."""
+    gimbal_delay_ms: Annotated[float, Meta(ge=-500, le=500)] = 0.0
+    """Delay of the stamps of the gimbal's angles, milliseconds: where its estimate begins."""
+    gimbal_sigma_deg: Annotated[float, Meta(ge=0.01, le=30)] = 1.0
+    """One standard deviation of the gimbal's angles, degrees."""
     known: bool = False
     """The angles below are those of the camera; else the autopilot's attitude cannot be used."""
     roll_deg: Annotated[float, Meta(ge=-180, le=180)] = 0.0

@@ -108,8 +108,9 @@ class Daemon:
             port = link_port(config.link, config.router, clock)
             link_watch = LinkWatch(port, self._on_warned)
             self._link = AutopilotLink(
-                config.link, port, clock, self._on_telemetry, self._on_warned
-            )
+                config.link, port, clock, self._on_telemetry, self._on_warned,
+                config.mount.type == "gimbal",
+            )  # fmt: skip
             self._senders = Senders(
                 config, self._link, clock, self._on_warned, lambda step: self._flights.take(step)
             )

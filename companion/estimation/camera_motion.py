@@ -12,6 +12,7 @@ import numpy as np
 from companion.geometry.transforms import (
     Array,
     Pose,
+    angle_between,
     interpolate_rotation,
     nearest_rotation,
     vector_from_rotation,
@@ -127,6 +128,18 @@ class CameraMotion:
             return Pose(b.rotation, place)
         t0, a = self._poses[-2]
         return Pose(interpolate_rotation(a.rotation, b.rotation, (t_ns - t0) / (t1 - t0)), place)
+
+    def turn_apart(self, t_ns: int, ned_from_camera: Array) -> float:
+        """Angle, rad, between the rotations at a frame by the attitude and by the last images.
+
+        0 where either says nothing.
+        """
+        if not self._poses or t_ns - self._poses[-1][0] > MAX_RATE_SPAN_NS:
+            return 0.0
+        by_images = self.carried_on(t_ns, None)
+        if by_images is None or self._map_from_ned is None:
+            return 0.0
+        return angle_between(by_images.rotation, self._map_from_ned @ ned_from_camera)
 
     def predicted(
         self,

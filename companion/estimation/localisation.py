@@ -19,6 +19,7 @@ from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.checkpoint import Checkpoint
 from companion.estimation.georeference.georeferencer import Georeferencer
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
+from companion.estimation.gimbal.gimbal_head import GimbalHead
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
 from companion.estimation.lift_off.optical_flow import FlowMeter
@@ -52,9 +53,11 @@ from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
 from companion.telemetry import (
     AttitudeSample,
+    GimbalSample,
     HeightSample,
     ImuSample,
     PositionSample,
+    RangeSample,
     Telemetry,
     is_believed,
 )
@@ -64,6 +67,9 @@ FINAL_ITERATIONS = 8
 """Iterations of the final global adjustment; 4 and 16 give the sample flight within 0.1 mm."""
 TELEMETRY_KEPT_NS = 600_000_000_000
 """Older telemetry is only needed at the times of keyframes."""
+MAX_HEAD_TURN_RAD = np.radians(10.0)
+"""Of a gimbal's head from where images have it to where it says it is: at 15 frames/s one that
+begins to turn by 90 degrees a second is 6 degrees off."""
 PRUNE_PERIOD_NS = 60_000_000_000
 NO_CLIMB = "at lift-off it sees another motion than the accelerometers measure; check mount.*"
 
@@ -85,14 +91,15 @@ class LocalisationStage:
         self._camera = camera
         self._times = times
         self._tracker = Tracker(config, camera, times, background, order)
-        self._attitude = CameraAttitude(camera.body_from_camera)
+        self._attitude = CameraAttitude(camera.body_from_camera, camera.gimbal)
+        self._gimbal = None if camera.gimbal is None else GimbalHead(camera.gimbal)
         self._motion = CameraMotion()
         self._georeferencer = Georeferencer(
             config.georeference,
             camera.body_from_camera,
             sensors_only=config.feedback.gives_position,
         )
-        self._acceleration = AccelerationIntegral()
+        self._acceleration = AccelerationIntegral(turns_with_camera=camera.gimbal is None)
         self._body = BodyFilter(self._acceleration)
         self._standing = Standing()
         self._odometry = SmoothOdometry(
@@ -160,6 +167,8 @@ class LocalisationStage:
         for sample in self._samples:
             if not is_believed(sample, self._config.telemetry.use):
                 continue
+            if isinstance(sample, PositionSample) and self._gimbal is not None:
+                sample = self._gimbal.of_head(sample)
             if isinstance(sample, PositionSample) and not self._satellites.may_use(sample):
                 continue
             self._standing.take(sample)
@@ -172,11 +181,22 @@ class LocalisationStage:
                 self._imu.take(sample)
             if isinstance(sample, AttitudeSample):
                 self._satellites.take_time(sample.t_ns)
-                self._attitude.add(sample)
-            else:
-                self._georeferencer.take(sample)
+            for each in self._of_head(sample):
+                if isinstance(each, AttitudeSample):
+                    self._attitude.add(each)
+                else:
+                    self._georeferencer.take(each)
         self._n_samples += len(self._samples)
         self._samples.clear()
+
+    def _of_head(self, sample: Telemetry) -> Iterable[Telemetry]:
+        """A sample as it is of what the camera is fixed to: the body, or a gimbal's head."""
+        if self._gimbal is None:
+            return (sample,)
+        if isinstance(sample, AttitudeSample | GimbalSample):
+            return self._gimbal.take(sample, self._attitude.correction[1])
+        # a rangefinder looks down from the body
+        return () if isinstance(sample, RangeSample) else (sample,)
 
     def set_effort(self, share: float) -> None:
         """Extract this ratio of the features from now on, under load."""
@@ -251,7 +271,7 @@ class LocalisationStage:
             self._apply_map_correction()
             found = self._odometry.without_frame(overdue.seq, t_ns, self._body_attitude(t_ns))
             if found is not None:
-                yield replace(found, refused=self._body.n_refused)
+                yield self._given(found)
             self._prune(t_ns)
             yield self._frame_tracked(t_ns, overdue.seq, has_picture=False)
 
@@ -265,7 +285,7 @@ class LocalisationStage:
     def _flow_of(self, frame: Frame) -> Iterator[Message]:
         """Optical flow for the autopilot, and for the way from a lift-off to a metric map."""
         asked, wanted = (
-            self._config.feedback.flow != "off",
+            self._config.feedback.flow != "off" and self._gimbal is None,
             self._odometry.ground.wants_flow(frame.t_ns),
         )
         if not asked and not wanted:
@@ -273,7 +293,7 @@ class LocalisationStage:
         with self._times("optical flow"):
             flow = self._flow.step(frame, self._attitude)
         if wanted and self._flow.over_ground is not None:
-            delay_ns = self._attitude.correction[1]
+            delay_ns = self._attitude.imu_delay_ns
             if self._odometry.ground.take_flow(self._flow.over_ground, delay_ns):
                 checked = self._attitude.contradicted(frame.t_ns, NO_CLIMB)
                 yield from self._apply_check(checked, self._tracker.map)
@@ -283,6 +303,12 @@ class LocalisationStage:
     def _tracked(self, frame: Frame) -> Iterator[Message]:
         attitude = self._attitude.at(frame.t_ns)
         self._apply_map_correction()
+        if (
+            self._gimbal is not None
+            and attitude is not None
+            and self._motion.turn_apart(frame.t_ns, attitude) > MAX_HEAD_TURN_RAD
+        ):
+            attitude = None  # told in other axes all at once: images alone keep what is tracked
         stands = self._standing.at(frame.t_ns, frame.grey)
         if stands and self.state is TrackState.INITIALISING:
             self._tracker.stand()
@@ -352,6 +378,8 @@ class LocalisationStage:
                 tracker.view_of(frame.seq), tracker.map, tracker.n_features, tracker.feature_ratio,
             )  # fmt: skip
         yield from self._check_attitude(frame.t_ns)
+        if self._gimbal is not None and self._attitude.used:
+            yield from self._gimbal.warnings(frame.t_ns, attitude is not None)
         self._prune(frame.t_ns)
 
     def _prune(self, t_ns: int) -> None:
@@ -404,15 +432,26 @@ class LocalisationStage:
             self._motion.velocity,
             None if first is None else MapView(first.t_ns, first.camera_from_map.inverse()),
         )  # fmt: skip
-        return replace(odometry, refused=self._body.n_refused)
+        return self._given(odometry)
+
+    def _given(self, odometry: Odometry) -> Odometry:
+        """Odometry as it is given out: of the body."""
+        odometry = replace(odometry, refused=self._body.n_refused)
+        if self._gimbal is None:
+            return odometry
+        attitude = None if self._attitude.doubted else self._body_attitude(odometry.t_ns)
+        return self._gimbal.body_of(odometry, None if attitude is None else attitude.ned_from_body)
 
     def _body_attitude(self, t_ns: int) -> BodyAttitude | None:
-        """Attitude of the body at a frame, where the autopilot's is that of the camera."""
+        """Attitude of the body at a frame, where the autopilot's is that of the camera.
+
+        With a gimbal it is that of its head.
+        """
         ned_from_camera = self._attitude.at(t_ns)
         if ned_from_camera is None:
             return None
-        mount, delay_ns = self._attitude.correction
-        return BodyAttitude(t_ns + delay_ns, ned_from_camera @ mount.T)
+        mount = self._attitude.correction[0]
+        return BodyAttitude(t_ns + self._attitude.imu_delay_ns, ned_from_camera @ mount.T)
 
     def _check_attitude(self, t_ns: int) -> list[Warned]:
         if not self._attitude.due(t_ns):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.geometry.gimbal import Gimbal
 from companion.geometry.transforms import Array, Pose
 
 MAX_OFF_AXIS_RAD = np.radians(80.0)
@@ -43,7 +44,8 @@ class Camera:
     """Intrinsics and mount of a camera.
 
     `coefficients` has the length that the model requires. `body_from_camera` is None when unknown
-    (gimbal, hand-held): attitude then does not apply to the camera.
+    (hand-held): attitude then does not apply to the camera. On a `gimbal` it is how the camera sits
+    in the gimbal's head.
     """
 
     width: int
@@ -60,6 +62,8 @@ class Camera:
     readout_ms: float | None = None
     """Time from the exposure of the top row to that of the bottom one; 0 for a global shutter, None
     where unknown."""
+    gimbal: Gimbal | None = None
+    """None of a camera that is fixed to the body."""
 
     @property
     def focal_px(self) -> float:
@@ -80,7 +84,7 @@ class Camera:
         """The same camera without distortion."""
         return Camera(
             self.width, self.height, self.fx, self.fy, self.cx, self.cy,
-            body_from_camera=self.body_from_camera, assumed=self.assumed,
+            body_from_camera=self.body_from_camera, assumed=self.assumed, gimbal=self.gimbal,
         )  # fmt: skip
 
     def distort(self, normalised: Array) -> Array:

@@ -23,6 +23,12 @@ OF_WARNING: Mapping[str, str] = {
     "camera mount disagrees with the autopilot's attitude: no vision position":
         "Correct the angles of [mount], or body_from_camera of the calibration, by what is said.",
     "camera turns with the body again: attitude used": NOTHING,
+    "the gimbal's angles do not fit the camera: no vision position":
+        "Centre the gimbal, or start it anew; its messages must say which axes its yaw is in.",
+    "the gimbal's angles are not known: no vision position":
+        "Have autopilot or gimbal send GIMBAL_DEVICE_ATTITUDE_STATUS; check the gimbal's plugs.",
+    "the gimbal's angles fit the camera again": NOTHING,
+    "the gimbal's angles are known again": NOTHING,
     "map tilted against the autopilot's attitude: begun anew":
         "Once after take-off: nothing to do. Again and again: the mount is stated wrong.",
     "map resumed after restart": NOTHING,

@@ -65,7 +65,7 @@ class VideoOverlay:
 
     def _draw_horizon(self, out: Bytes, world_from_body: Array) -> None:
         mount = self._camera.body_from_camera
-        if mount is None:
+        if mount is None or self._camera.gimbal is not None:
             return
         pixels = self._camera.project(self._horizon @ (world_from_body @ mount.rotation))
         height, width = out.shape[:2]

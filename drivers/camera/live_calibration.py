@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,13 @@ import numpy as np
 from companion.config import CameraConfig, MountConfig
 from companion.errors import ConfigError
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
+from companion.geometry.transforms import Pose
 from drivers.camera.pattern_camera import pattern_optics
 from drivers.images.calibration_file import (
-    FORWARD_UPRIGHT,
     assumed_camera,
+    configured_rotation,
     read_calibration,
+    with_mount,
     with_readout,
 )
 
@@ -45,7 +45,9 @@ def live_camera(
         raise ConfigError(
             "no camera.calibration; give one, or a field of view by camera.assumed_hfov_deg"
         )
-    if mount.known:
+    if mount.type == "gimbal":
+        camera = with_mount(camera, mount)
+    elif mount.known:
         if camera.body_from_camera is not None:
             raise ConfigError(
                 f"{file or 'the test pattern'} says how the camera sits on the body, and so does "
@@ -62,11 +64,7 @@ def live_camera(
 
 def body_from_camera(mount: MountConfig) -> Pose:
     """Mounting of a camera, as configured."""
-    turned = quaternion_from_euler(
-        math.radians(mount.roll_deg), math.radians(mount.pitch_deg), math.radians(mount.yaw_deg)
-    )
-    place = np.array([mount.x_m, mount.y_m, mount.z_m])
-    return Pose(rotation_from_quaternion(turned) @ FORWARD_UPRIGHT, place)
+    return Pose(configured_rotation(mount), np.array([mount.x_m, mount.y_m, mount.z_m]))
 
 
 def _calibration_file(config: CameraConfig) -> Path | None:

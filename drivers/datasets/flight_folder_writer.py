@@ -79,6 +79,8 @@ def camera_json(camera: Camera) -> dict[str, object]:
     }  # fmt: skip
     if camera.body_from_camera is not None:
         said["body_from_camera"] = camera.body_from_camera.matrix().tolist()
+    if camera.gimbal is not None:
+        said["gimbal"] = camera.gimbal.document()
     if camera.assumed:
         said["assumed"] = True
     return said

@@ -12,9 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from companion.config import MountConfig
 from companion.errors import ConfigError, FlightError
 from companion.geometry.camera import COEFFICIENTS, Camera, Distortion
-from companion.geometry.transforms import Array, Pose
+from companion.geometry.gimbal import Gimbal
+from companion.geometry.transforms import (
+    Array,
+    Pose,
+    quaternion_from_euler,
+    rotation_from_quaternion,
+)
 from drivers.images.text_table import numbers_of, read_rows
 
 if sys.version_info >= (3, 11):
@@ -61,8 +68,33 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
     return Camera(
         width, height, fx, fy, cx, cy, model, _coefficients(path, content, model),
         body_from_camera_of(path, content.get("body_from_camera")), content.get("assumed") is True,
-        _readout_ms(path, content),
+        _readout_ms(path, content), _gimbal(path, content),
     )  # fmt: skip
+
+
+def with_mount(camera: Camera, mount: MountConfig) -> Camera:
+    """The camera on the gimbal that is configured, if any.
+
+    Where nothing says how it sits in the gimbal's head, it looks forward there, turned by the
+    configured angles.
+    """
+    if mount.type == "fixed":
+        return camera
+    gimbal = Gimbal(
+        (mount.x_m, mount.y_m, mount.z_m), mount.gimbal_delay_ms, mount.gimbal_sigma_deg
+    )
+    inside = camera.body_from_camera
+    if inside is None:
+        inside = Pose(configured_rotation(mount), np.zeros(3))
+    return dataclasses.replace(camera, body_from_camera=inside, gimbal=gimbal)
+
+
+def configured_rotation(mount: MountConfig) -> Array:
+    """Rotation (3, 3) of a camera by the configured angles."""
+    turned = quaternion_from_euler(
+        math.radians(mount.roll_deg), math.radians(mount.pitch_deg), math.radians(mount.yaw_deg)
+    )
+    return np.asarray(rotation_from_quaternion(turned) @ FORWARD_UPRIGHT)
 
 
 def with_readout(camera: Camera, readout_ms: float) -> Camera:
@@ -133,6 +165,15 @@ def _readout_ms(path: Path, content: Mapping[str, Any]) -> float | None:
             f"is {readout_ms:g}"
         )
     return readout_ms
+
+
+def _gimbal(path: Path, content: Mapping[str, Any]) -> Gimbal | None:
+    if content.get("gimbal") is None:
+        return None
+    try:
+        return Gimbal.of_document(content["gimbal"])
+    except ValueError as error:
+        raise FlightError(f"{path}: {error}") from error
 
 
 def _model(path: Path, content: Mapping[str, Any]) -> Distortion:

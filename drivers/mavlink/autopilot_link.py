@@ -42,6 +42,7 @@ from drivers.mavlink.vehicle import Vehicle, is_autopilot, vehicle_of
 from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.wire import run_together
 from drivers.system.within import within
+from drivers.telemetry.gimbal_messages import GIMBAL_IDS
 from drivers.telemetry.live_samples import LiveSamples
 from drivers.telemetry.mavlink_samples import READERS, landed, wanted
 
@@ -55,7 +56,12 @@ TIMESYNC_S = 0.1
 REFUSALS = (
     mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
 )  # fmt: skip
-COUNTED = {*READERS, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME}
+COUNTED = {
+    *READERS,
+    *GIMBAL_IDS,
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+}
 
 Take = Callable[[Any, int], None]
 
@@ -70,6 +76,7 @@ class AutopilotLink:
         clock: FlightClock,
         deliver: Callable[[Telemetry], None],
         warn: Callable[[Warned], None],
+        on_gimbal: bool = False,
     ) -> None:
         self._config, self.port, self._clock = config, port, clock
         self._deliver, self._warn = deliver, warn
@@ -82,7 +89,7 @@ class AutopilotLink:
         self.samples = LiveSamples(self.clock_filter, deliver, warn)
         self._meter = SourceMeter("autopilot")
         self._rates: defaultdict[str, RateMeter] = defaultdict(RateMeter)
-        self._wanted = MessageRates(wanted(config))
+        self._wanted = MessageRates(wanted(config, on_gimbal))
         self._imu = ImuRate() if config.imu_hz == "auto" else None
         self._commands = Commands(self.send)
         self._text_limit = TextLimit()
@@ -237,6 +244,8 @@ class AutopilotLink:
             if self.other_companion.take(message, self.port.identity, receive_ns):
                 detail = f"component {component} of the same system sends poses"
                 self._warn(Warned(receive_ns, "another companion on the link", detail))
+            if kind in GIMBAL_IDS:
+                self.samples.take_gimbal(message, receive_ns)
             return
         self._heard(receive_ns)
         if self._imu is not None:

@@ -9,6 +9,7 @@ import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
 from companion.geometry.camera import COEFFICIENTS, Camera, Distortion
+from companion.geometry.gimbal import Gimbal
 from companion.geometry.transforms import Pose
 from drivers.recording.recorded_content import serialised, set_time
 
@@ -35,6 +36,8 @@ def camera_document(camera: Camera) -> bytes:
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = mount.rotation, mount.translation
         document["body_from_camera"] = matrix.tolist()
+    if camera.gimbal is not None:
+        document["gimbal"] = camera.gimbal.document()
     return (json.dumps(document, indent=1) + "\n").encode()
 
 
@@ -50,13 +53,16 @@ def camera_of(document: bytes) -> Camera:
         coefficients = tuple(map(float, given["D"]))
         assumed = bool(given["assumed"])
         readout_ms = None if given.get("readout_ms") is None else float(given["readout_ms"])
+        gimbal = None if given.get("gimbal") is None else Gimbal.of_document(given["gimbal"])
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise ValueError(f"not a camera: {error}") from error
     if len(coefficients) != len(COEFFICIENTS[model]) or min(width, height, fx, fy) <= 0:
         raise ValueError("not a camera: numbers are missing")
     if readout_ms is not None and not 0 <= readout_ms < 1e3:
         raise ValueError(f"not a camera: a readout of {readout_ms} ms")
-    return Camera(width, height, fx, fy, cx, cy, model, coefficients, mount, assumed, readout_ms)
+    return Camera(
+        width, height, fx, fy, cx, cy, model, coefficients, mount, assumed, readout_ms, gimbal
+    )
 
 
 def calibration_bytes(camera: Camera, t_ns: int) -> bytes:

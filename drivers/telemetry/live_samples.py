@@ -20,6 +20,7 @@ from companion.messages import Warned
 from companion.telemetry import PositionSample, PositionSource, Telemetry
 from companion.timing.link_clock import ClockFilter
 from companion.timing.stamp_filter import MAX_BOOT_NS
+from drivers.telemetry.gimbal_messages import GIMBAL_IDS, GimbalChoice, gimbal_of, is_stamped
 from drivers.telemetry.live_positions import LivePositions
 from drivers.telemetry.mavlink_samples import (
     ATTITUDE_IDS,
@@ -65,6 +66,7 @@ class LiveSamples:
         self._latest: dict[str, tuple[int, int]] = {}
         """Newest stamp by quantity, and the time that it was given."""
         self._choices = (_Choice(ATTITUDE_IDS, frequent=True), _Choice(IMU_IDS, frequent=False))
+        self._gimbal = GimbalChoice()
         self._wild = ""
         self._warned_ns: dict[str, int] = {}
 
@@ -76,6 +78,9 @@ class LiveSamples:
             return
         if kind == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
             self.gps_searches = searches(message)
+        if kind in GIMBAL_IDS:
+            self.take_gimbal(message, receive_ns)
+            return
         if kind not in READERS and kind != mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
             return
         try:
@@ -83,6 +88,30 @@ class LiveSamples:
                 self._take(kind, message, receive_ns)
         except (ArithmeticError, ValueError) as error:  # numbers that make no sense together
             self._drop(UNUSABLE, receive_ns, f"{message.get_type()}: {error}")
+
+    def take_gimbal(self, message: Any, receive_ns: int) -> None:
+        """Take a message of GIMBAL_IDS, of the autopilot or of the gimbal itself."""
+        if not self._gimbal.takes(message, receive_ns):
+            return
+        name = message.get_type()
+        with np.errstate(all="ignore"):
+            sample = gimbal_of(message)
+        if sample is None or not is_finite(sample):
+            self._drop(UNUSABLE, receive_ns, f"{name}: no attitude")
+            return
+        boot_ns = message.time_boot_ms * 10**6 if is_stamped(message) else None
+        t_ns = receive_ns if boot_ns is None else self._clock.host_ns(boot_ns)
+        if t_ns is None:
+            self.n_dropped["telemetry before the clock was known"] += 1
+            return
+        latest_ns = self._latest.get("GimbalSample", (-1, -1))[1]
+        if t_ns <= latest_ns:
+            self._drop(OUT_OF_ORDER, receive_ns, name)
+        elif t_ns > receive_ns + max(AHEAD_NS, 5 * self._clock.sigma_ns):
+            self._drop(AHEAD, receive_ns, f"{name} by {(t_ns - receive_ns) * 1e-9:.2f} s")
+        else:
+            self._latest["GimbalSample"] = -1, t_ns
+            self._deliver(dataclasses.replace(sample, t_ns=t_ns))
 
     def _take(self, kind: int, message: Any, receive_ns: int) -> None:
         if kind == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME and message.time_unix_usec:

@@ -22,6 +22,7 @@ from companion.telemetry import (
     RangeSample,
     Telemetry,
 )
+from drivers.telemetry.gimbal_messages import GIMBAL_IDS
 from drivers.telemetry.telemetry_log import GeodeticFix
 
 STANDARD_GRAVITY = 9.80665
@@ -63,8 +64,11 @@ class Wanted:
     """True if it is always sent; a position or a range may be unknown."""
 
 
-def wanted(config: LinkConfig) -> list[Wanted]:
-    """Quantities that the samples of a flight need, but an IMU whose rate is to be found."""
+def wanted(config: LinkConfig, on_gimbal: bool = False) -> list[Wanted]:
+    """Quantities that the samples of a flight need, but an IMU whose rate is to be found.
+
+    With a camera `on_gimbal` its angles, which the autopilot may know or not.
+    """
     # both firmwares have all of these; ArduPilot's older versions lack the first of some
     rates = [
         Wanted(ATTITUDE_IDS, config.attitude_hz),
@@ -79,6 +83,8 @@ def wanted(config: LinkConfig) -> list[Wanted]:
         Wanted((mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,), TIME_HZ),
         Wanted((mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,), LANDED_HZ, always=False),
     ]
+    if on_gimbal:
+        rates.append(Wanted(GIMBAL_IDS, config.gimbal_hz, always=False))
     return [each for each in rates if each.rate_hz > 0]
 
 

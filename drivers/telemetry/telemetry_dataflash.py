@@ -19,6 +19,7 @@ from companion.messages import Warned
 from companion.telemetry import (
     ArmedSample,
     AttitudeSample,
+    GimbalSample,
     HeightSample,
     ImuSample,
     PositionSample,
@@ -34,6 +35,7 @@ from drivers.telemetry.telemetry_log import GeodeticFix, LogContent, TelemetryCo
 
 KINDS = frozenset({
     "ATT", "IMU", "XKF1", "NKF1", "EKF1", "POS", "GPS", "RFND", "BARO", "ARM", "EV", "ORGN",
+    "MNT",
 })  # fmt: skip
 FILTERS = ("XKF1", "NKF1", "EKF1")
 GPS_EPOCH_S = 315_964_800
@@ -188,6 +190,18 @@ def _event(values: Values) -> Telemetry | None:
     return {EV_ARMED: ArmedSample(0, True), EV_DISARMED: ArmedSample(0, False)}.get(values["Id"])
 
 
+def _gimbal(values: Values) -> Telemetry | None:
+    """Angles of a gimbal, of version 4.4 and later; a yaw that it does not know is nan."""
+    roll, pitch, yaw, from_north = (
+        math.radians(values.get(key, math.nan)) for key in ("Roll", "Pitch", "YawB", "YawE")
+    )
+    if math.isfinite(roll + pitch + yaw):
+        return GimbalSample(0, quaternion_from_euler(roll, pitch, yaw))
+    if math.isfinite(roll + pitch + from_north):
+        return GimbalSample(0, quaternion_from_euler(roll, pitch, from_north), True)
+    return None
+
+
 def _vector(values: Values, *keys: str) -> Array:
     return np.array([values[key] for key in keys], np.float64)
 
@@ -200,4 +214,5 @@ _SAMPLE_OF = {
     "BARO": _height,
     "ARM": _armed,
     "EV": _event,
+    "MNT": _gimbal,
 }

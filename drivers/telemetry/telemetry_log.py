@@ -21,10 +21,9 @@ from companion.geometry.geodesy import GeoOrigin, ned_from_geodetic, origin_of
 from companion.geometry.transforms import Array
 from companion.messages import ClockReport, Warned
 from companion.telemetry import (
-    ArmedSample,
     AttitudeSample,
+    GimbalSample,
     ImuSample,
-    LandedSample,
     PositionSample,
     PositionSource,
     Telemetry,
@@ -119,7 +118,7 @@ class TelemetryCollector:
         host_ns: HostTimes,
         clock: ClockReport | None,
         warnings: Sequence[Warned] = (),
-        on_host_clock: Sequence[ArmedSample | LandedSample] = (),
+        on_host_clock: Sequence[Telemetry] = (),
     ) -> TelemetryLog:
         """Log on the flight's clock and about one origin; `on_host_clock` already was."""
         times = host_ns(*self.stamps())
@@ -161,6 +160,8 @@ def is_finite(content: Telemetry | GeodeticFix) -> bool:
     # written out, since this runs for every sample of a flight
     if isinstance(content, AttitudeSample):
         return _are_finite(content.ned_from_body)
+    if isinstance(content, GimbalSample):
+        return _are_finite(content.level_from_head)
     if isinstance(content, ImuSample):
         return _are_finite(content.gyro_rad_s) and _are_finite(content.accel_m_s2)
     if isinstance(content, PositionSample):
@@ -249,4 +250,4 @@ class LogContent:
     host_ns: HostTimes | None = None
     clock: ClockReport | None = None
     warnings: tuple[Warned, ...] = ()
-    on_host_clock: tuple[ArmedSample | LandedSample, ...] = ()
+    on_host_clock: tuple[Telemetry, ...] = ()

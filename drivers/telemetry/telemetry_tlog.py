@@ -1,23 +1,26 @@
 """Telemetry of a .tlog, as recorded by a companion or a ground station.
 
-Only the autopilot's own messages are taken, and of those never a simulator's truth (SIM_STATE,
-SIMSTATE, SIM2, HIL_STATE_QUATERNION): a program in flight has none.
+Only the autopilot's own messages, and those of a gimbal, are taken, and never a simulator's truth
+(SIM_STATE, SIMSTATE, SIM2, HIL_STATE_QUATERNION): a program in flight has none.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import compress
 from pathlib import Path
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import Warned
-from companion.telemetry import ArmedSample, LandedSample
+from companion.telemetry import ArmedSample, LandedSample, Telemetry
 from companion.timing.log_clock import BootSegments, estimate_clock
 from companion.timing.stamp_filter import valid_stamps
+from drivers.telemetry.gimbal_messages import GIMBAL_IDS, GimbalChoice, gimbal_of, is_stamped
 from drivers.telemetry.mavlink_samples import (
     ATTITUDE_IDS,
     IMU_IDS,
@@ -26,7 +29,7 @@ from drivers.telemetry.mavlink_samples import (
     landed,
     samples_of,
 )
-from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector
+from drivers.telemetry.telemetry_log import LogContent, TelemetryCollector, is_finite
 from drivers.telemetry.tlog_records import LEAST_US, MOST_US, Record, TlogRecords
 
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
@@ -75,7 +78,8 @@ class _Reader:
         self._collected = TelemetryCollector(name)
         self._exchanges: list[tuple[int, int, int, int]] = []
         self._one_way: list[tuple[int, int, int]] = []
-        self._unstamped: list[ArmedSample | LandedSample] = []
+        self._unstamped: list[Telemetry] = []
+        self._gimbal = GimbalChoice()
         self._segments = BootSegments()
         self._armed: bool | None = None
         self._unix_minus_boot_ns: int | None = None
@@ -84,7 +88,8 @@ class _Reader:
         mine = [
             record
             for record in records
-            if record.system == self._vehicle and record.component == AUTOPILOT_COMPONENT
+            if record.system == self._vehicle
+            and (record.component == AUTOPILOT_COMPONENT or record.message_id in GIMBAL_IDS)
         ]
         counts = Counter(record.message_id for record in mine)
         chosen = _chosen(counts)
@@ -107,6 +112,9 @@ class _Reader:
             return
         receive_ns = record.unix_us * 1000
         kind = record.message_id
+        if kind in GIMBAL_IDS:
+            self._take_gimbal(message, receive_ns)
+            return
         if kind == mavlink.MAVLINK_MSG_ID_TIMESYNC:
             self._take_timesync(message.tc1, message.ts1, receive_ns)
             return
@@ -139,6 +147,18 @@ class _Reader:
         for sample in samples:
             self._collected.add(remote_ns, segment, sample)
 
+    def _take_gimbal(self, message: Any, receive_ns: int) -> None:
+        if not self._gimbal.takes(message, receive_ns):
+            return
+        sample = gimbal_of(message)
+        if sample is None or not is_finite(sample):
+            self._collected.count("gimbal messages without an attitude left out")
+        elif is_stamped(message):
+            boot_ns = message.time_boot_ms * 10**6
+            self._collected.add(boot_ns, self._segments.segment_of(boot_ns), sample)
+        else:
+            self._unstamped.append(replace(sample, t_ns=receive_ns))
+
     def _take_timesync(self, tc1: int, ts1: int, receive_ns: int) -> None:
         if tc1 == 0:  # the autopilot asks, and states its own time in doing so
             segment = self._segments.segment_of(ts1)
@@ -154,6 +174,7 @@ def _chosen(counts: Counter[int]) -> set[int]:
     """Ids of the messages to read: one type for each quantity that several carry."""
     chosen = {
         *READERS,
+        *GIMBAL_IDS,
         mavlink.MAVLINK_MSG_ID_TIMESYNC,
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,

@@ -29,13 +29,14 @@ from companion.telemetry import (
 )
 from companion.timing.log_clock import clock_from_utc
 from companion.timing.stamp_filter import valid_stamps
+from drivers.telemetry.gimbal_messages import device_sample
 from drivers.telemetry.mavlink_samples import FIX_3D, UNIX_SINCE_NS
 from drivers.telemetry.telemetry_log import GeodeticFix, HostTimes, LogContent, TelemetryCollector
 
 TOPICS = [
     "vehicle_attitude", "vehicle_local_position", "vehicle_global_position",
     "vehicle_gps_position", "sensor_gps", "distance_sensor", "vehicle_air_data", "sensor_combined",
-    "vehicle_status", "actuator_armed",
+    "vehicle_status", "actuator_armed", "gimbal_device_attitude_status",
 ]  # fmt: skip
 ARMING_STATE_ARMED = 2
 DOWN = 25
@@ -228,6 +229,18 @@ def _sigma(value: float) -> float | None:
     return float(value) if 0 < value < 1e4 else None
 
 
+def _take_gimbal(collected: TelemetryCollector, columns: Columns) -> None:
+    q = _stacked(columns, "q[0]", "q[1]", "q[2]", "q[3]")
+    failures = columns["failure_flags"].tolist()
+    rows = zip(_stamps_ns(columns), q, columns["device_flags"].tolist(), failures, strict=True)
+    for t_ns, each, flags, failed in rows:
+        sample = device_sample(each, int(flags), int(failed))
+        if sample is not None and t_ns >= 0:
+            collected.add(t_ns, 0, sample)
+        else:
+            collected.count("gimbal messages without an attitude left out")
+
+
 def _take_range(collected: TelemetryCollector, columns: Columns) -> None:
     distance = columns["current_distance"].astype(np.float64)
     within = (distance > np.maximum(columns["min_distance"], 1e-3)) & (
@@ -259,6 +272,7 @@ _TAKERS = {
     "vehicle_local_position": _take_local_position,
     "vehicle_global_position": _take_global_position,
     "distance_sensor": _take_range,
+    "gimbal_device_attitude_status": _take_gimbal,
     "vehicle_air_data": _take_height,
     "vehicle_status": _take_armed,
 }

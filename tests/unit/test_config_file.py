@@ -26,7 +26,8 @@ ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
 SINCE = {
-    "camera.readout_ms", "expert.export.mesh_m", "feedback.flow", "feedback.global_position",
+    "camera.readout_ms", "expert.export.mesh_m", "expert.link.gimbal_hz", "mount.gimbal_delay_ms",
+    "mount.gimbal_sigma_deg", "mount.type", "feedback.flow", "feedback.global_position",
     "gps.satellites_set", "gps.switch_source", "gps.vision_set",
     "landing.id", "landing.marker", "landing.size_m", "map.use",
     "page.listen", "telemetry.use", "video.kbit_s", "video.overlay", "video.listen",
@@ -194,6 +195,16 @@ def test_a_list_of_words_is_any_part_of_them(tmp_path: Path) -> None:
     assert load_config(path, [f"telemetry.use={list(MEASUREMENTS)}"]) == Config()
     twice = refusal(write(tmp_path, '[telemetry]\nuse = ["imu", "imu"]\n'))
     assert "flight.toml: telemetry.use: wanted a list of attitude, imu" in twice
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    ["feedback.flow=optical_flow", "landing.marker=apriltag_36h11", 'video.overlay=["horizon"]'],
+)
+def test_what_a_fixed_camera_alone_gives_is_refused_with_a_gimbal(wanted: str) -> None:
+    load_config(None, [wanted])
+    with pytest.raises(ConfigError, match=r"mount\.type is gimbal"):
+        load_config(None, ["mount.type=gimbal", wanted])
 
 
 def test_written_configuration_reads_back_the_same(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from companion.telemetry import (
     AirspeedSample,
     ArmedSample,
     AttitudeSample,
+    GimbalSample,
     HeightSample,
     ImuSample,
     LandedSample,
@@ -44,6 +45,7 @@ SAMPLES: list[tuple[Telemetry, Measurement | None]] = [
     (AirspeedSample(1, 5.0), "airspeed"),
     (ArmedSample(1, True), None),
     (LandedSample(1, True), None),
+    (GimbalSample(1, LEVEL), "attitude"),
 ]
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 

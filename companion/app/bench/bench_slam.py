@@ -89,7 +89,7 @@ def bench_slam(
     """
     rows = []
     for path in flights:
-        truth = _truth(open_flight(path, config.camera, config.telemetry))
+        truth = _truth(open_flight(path, config.camera, config.telemetry, config.mount))
         for fault in FAULTS if faults else (NO_FAULT,):
             rows.append(_run(path, truth, config, fault, above_m, progress))
     if out is not None:
@@ -140,7 +140,7 @@ def _run(
     path: FilePath, truth: Path, config: Config, fault: Fault, above_m: float | None,
     progress: Progress,
 ) -> BenchRow:  # fmt: skip
-    flight = open_flight(path, config.camera, config.telemetry)
+    flight = open_flight(path, config.camera, config.telemetry, config.mount)
     span = Span(flight.start_ns, flight.stop_ns)
     samples = [s for s in flight.telemetry().samples if s.t_ns >= span.start_ns - LEAD_NS]
     messages = in_order_of_time(

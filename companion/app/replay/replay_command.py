@@ -80,7 +80,7 @@ class RecordedInput:
     def __init__(
         self, path: Path, config: Config, start_s: float | None = None, stop_s: float | None = None
     ) -> None:
-        self.flight = open_flight(path, config.camera, config.telemetry)
+        self.flight = open_flight(path, config.camera, config.telemetry, config.mount)
         self._start_ns, self._stop_ns = _span(self.flight, start_s, stop_s)
         self.log = self.flight.telemetry()
         self.n_frames = self.flight.n_frames_between(self._start_ns, self._stop_ns)

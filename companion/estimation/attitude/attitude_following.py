@@ -76,9 +76,12 @@ class RotationAgreement:
     @property
     def body_fixed(self) -> bool:
         """True if the camera rotates with the body in roll and pitch, and by nothing else."""
+        return bool(np.isfinite(self.gain[:2]).all()) and self.fits
+
+    @property
+    def fits(self) -> bool:
+        """True if the camera turns as a gimbal's head does, which may be not at all."""
         known = np.isfinite(self.gain)
-        if not known[:2].all():
-            return False
         gain, sigma = self.gain[known], self.sigma_gain[known]
         in_range = (gain - sigma > BODY_FIXED_GAIN) & (gain + sigma < MAX_GAIN)
         return bool(in_range.all()) and not self.rotates_independently

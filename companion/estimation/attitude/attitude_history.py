@@ -21,8 +21,12 @@ MAX_EXTRAPOLATION_NS = 120_000_000
 class AttitudeHistory:
     """Recent attitudes of the autopilot, interpolated."""
 
-    def __init__(self, keep: int = 4000, max_gap_ns: int = MAX_GAP_NS) -> None:
+    def __init__(
+        self, keep: int = 4000, max_gap_ns: int = MAX_GAP_NS,
+        max_extrapolation_ns: int = MAX_EXTRAPOLATION_NS,
+    ) -> None:  # fmt: skip
         self._keep, self._max_gap_ns = keep, max_gap_ns
+        self._max_extrapolation_ns = max_extrapolation_ns
         self._samples: list[AttitudeSample] = []
         self._times: list[int] = []
 
@@ -70,7 +74,7 @@ class AttitudeHistory:
             )
         nearest = self._samples[0] if i == 0 else self._samples[-1]
         gap_ns = t_ns - nearest.t_ns
-        if abs(gap_ns) > MAX_EXTRAPOLATION_NS:
+        if abs(gap_ns) > self._max_extrapolation_ns:
             return None
         rotation = rotation_from_quaternion(nearest.ned_from_body)
         if nearest.rates_body_rad_s is None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from companion.estimation.attitude.attitude_following import RotationAgreement, RotationComparison
 from companion.estimation.attitude.attitude_history import AttitudeHistory
+from companion.estimation.attitude.head_yaw import HeadYaw
 from companion.estimation.attitude.map_tilt import MapTilt, RotationOf
 from companion.geometry.transforms import Array, angle_between
 from companion.messages import Warned
@@ -39,6 +40,8 @@ REINITIALISED = "map tilted against the autopilot's attitude: begun anew"
 NOT_BODY_FIXED = "camera does not turn with the body: attitude not used, no vision position"
 MOUNT_DISAGREES = "camera mount disagrees with the autopilot's attitude: no vision position"
 BODY_FIXED_AGAIN = "camera turns with the body again: attitude used"
+GIMBAL_DISAGREES = "the gimbal's angles do not fit the camera: no vision position"
+GIMBAL_AGAIN = "the gimbal's angles fit the camera again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +64,9 @@ class Verdict:
 class AttitudeVerdict:
     """Checks attitudes and tracked frames periodically; the verdict can be revised."""
 
-    def __init__(self, history: AttitudeHistory) -> None:
+    def __init__(self, history: AttitudeHistory, head_yaw: HeadYaw | None = None) -> None:
+        self._head_yaw = head_yaw
+        """Of a gimbal, whose head's attitude it is; None of a camera fixed to the body."""
         self.used = True
         """True while the attitude is taken for that of the camera."""
         self.n_reinitialised = 0
@@ -101,6 +106,8 @@ class AttitudeVerdict:
         """Clear state after another map became active."""
         self._rotations.reset()
         self._reset_tilt()
+        if self._head_yaw is not None:
+            self._head_yaw.reset()
 
     def _reset_tilt(self) -> None:
         self._tilt.reset()
@@ -108,7 +115,10 @@ class AttitudeVerdict:
 
     def due(self, t_ns: int) -> bool:
         """True if a check is due at flight time `t_ns`."""
-        return t_ns >= self._rotations_due_ns or (self.used and t_ns >= self._check_due_ns)
+        doubted = self.used and self._head_yaw is not None and self._head_yaw.doubted
+        return (
+            doubted or t_ns >= self._rotations_due_ns or (self.used and t_ns >= self._check_due_ns)
+        )
 
     def check(
         self, t_ns: int, rotation_of: RotationOf, body_from_camera: Array,
@@ -118,6 +128,14 @@ class AttitudeVerdict:
 
         `ned_from_map` (3, 3) is the georeference rotation, None where unknown.
         """
+        if self.used and self._head_yaw is not None:
+            since_ns = self._head_yaw.moved_since_ns()
+            if since_ns is not None:
+                self._agreed_ns = since_ns
+                off_deg = np.degrees(self._head_yaw.off_rad)
+                return self._reject(
+                    t_ns, GIMBAL_DISAGREES, f"its yaw is {off_deg:+.0f} degrees off"
+                )
         if t_ns >= self._rotations_due_ns:
             self._rotations_due_ns = t_ns + ROTATION_CHECK_NS
             self._agreement = self._rotations.result(body_from_camera)
@@ -133,19 +151,26 @@ class AttitudeVerdict:
         if found is None:
             return None
         self._n_stabilised = self._n_stabilised + 1 if found.stabilised else 0
-        self._n_body_fixed = self._n_body_fixed + 1 if found.body_fixed else 0
+        fits = found.body_fixed if self._head_yaw is None else found.fits
+        self._n_body_fixed = self._n_body_fixed + 1 if fits else 0
         # rotation relative to a young, bending map looks independent, too
         independent = found.rotates_independently and self._consistent
         self._n_independent = self._n_independent + 1 if independent else 0
         if self.used:
-            if found.body_fixed:
+            if fits:
                 self._agreed_ns = t_ns
             if max(self._n_stabilised, self._n_independent) >= N_AGREEING:
                 return self._reject(t_ns, NOT_BODY_FIXED)
         elif self._n_body_fixed >= N_AGREEING and t_ns >= self._not_before_ns:
+            what = BODY_FIXED_AGAIN
+            if self._head_yaw is not None:
+                if not self._head_yaw.fits_again(t_ns):
+                    return None
+                self._head_yaw.believe()
+                what = GIMBAL_AGAIN
             self.used, self.n_reinitialised = True, 0
             self._reset_tilt()  # earlier attitudes were not all those of the camera
-            return Verdict(Warned(t_ns, BODY_FIXED_AGAIN, good=True), mount=self._mount)
+            return Verdict(Warned(t_ns, what, good=True), mount=self._mount)
         return None
 
     def _check_tilt(
@@ -202,15 +227,19 @@ class AttitudeVerdict:
         """Ignore the attitude until rotations agree again."""
         since_ns = self._agreed_ns if self._agreed_ns is not None else 0
         self.used, self._mount = False, what == MOUNT_DISAGREES
+        if self._head_yaw is not None:
+            what = GIMBAL_DISAGREES
         self._not_before_ns = t_ns + self._retry_ns
         self._retry_ns = min(2 * self._retry_ns, MAX_RETRY_NS)
         self._n_stabilised = self._n_independent = self._n_body_fixed = 0
         self._reset_tilt()
-        warning = Warned(t_ns, what, why or _description(self._agreement))
+        warning = Warned(
+            t_ns, what, why or _description(self._agreement, self._head_yaw is not None)
+        )
         return Verdict(warning, invalid_since_ns=since_ns, mount=self._mount)
 
 
-def _description(found: RotationAgreement | None) -> str:
+def _description(found: RotationAgreement | None, of_gimbal: bool) -> str:
     """Findings of the rotation comparison in words, with advice."""
     if found is None:
         return "check how the camera is mounted, and mount.* in the configuration"
@@ -225,5 +254,6 @@ def _description(found: RotationAgreement | None) -> str:
     alone_deg = np.degrees(found.residual_rad)
     return (
         f"of the body's turns it makes this share: {gains or 'unknown'}; turned by "
-        f"{alone_deg:.1f} degrees in half a second by itself; is there a gimbal?"
+        f"{alone_deg:.1f} degrees in half a second by itself; "
+        + ("are its angles in other axes than told?" if of_gimbal else "is there a gimbal?")
     )

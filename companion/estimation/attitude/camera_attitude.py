@@ -1,6 +1,7 @@
 """Camera attitude from the autopilot, with mount and clock corrected in flight.
 
-An attitude that is not that of the camera (gimbal) is ignored.
+An attitude that is not that of the camera (gimbal) is ignored. With a gimbal whose angles are told
+the attitude is that of its head, which takes the place of the body.
 """
 
 from __future__ import annotations
@@ -12,16 +13,20 @@ import numpy as np
 
 from companion.estimation.attitude.attitude_history import AttitudeHistory
 from companion.estimation.attitude.attitude_verdict import AttitudeVerdict, Verdict
+from companion.estimation.attitude.head_yaw import HeadYaw
 from companion.estimation.attitude.map_tilt import RotationOf
 from companion.estimation.attitude.mount_estimation import (
     RATE_STEP_NS,
     MountEstimate,
     MountEstimator,
 )
+from companion.geometry.gimbal import Gimbal
 from companion.geometry.transforms import Array, Pose, angle_between, rotation_from_vector
 from companion.messages import Track, Warned
 from companion.telemetry import AttitudeSample
 
+MAX_HEAD_EXTRAPOLATION_NS = 250_000_000
+"""A head is steadier than a body, and gimbals send their angles 5 times a second."""
 MOUNT_EVERY_NS = 3_000_000_000
 MIN_MOUNT_RAD, MIN_DELAY_S = np.radians(0.3), 0.006
 """Smaller corrections of mount and delay are not applied."""
@@ -51,15 +56,20 @@ class AttitudeCheck(NamedTuple):
 class CameraAttitude:
     """Attitudes of the autopilot, checked against the rotations of the camera."""
 
-    def __init__(self, body_from_camera: Pose | None) -> None:
+    def __init__(self, body_from_camera: Pose | None, gimbal: Gimbal | None = None) -> None:
         self._mounted = body_from_camera is not None
-        self._history = AttitudeHistory()
-        self._verdict = AttitudeVerdict(self._history)
+        self._yaw = None if gimbal is None else HeadYaw(float(np.radians(gimbal.sigma_deg)))
+        self._history = (
+            AttitudeHistory()
+            if gimbal is None
+            else AttitudeHistory(max_extrapolation_ns=MAX_HEAD_EXTRAPOLATION_NS)
+        )
+        self._verdict = AttitudeVerdict(self._history, self._yaw)
         self._invalid_spans: list[tuple[int, int | None]] = []
         """Spans, the last one possibly open, in which the attitude was not that of the camera."""
         self._mount = body_from_camera.rotation if body_from_camera is not None else np.eye(3)
-        self._delay_ns = 0
-        """Estimated delay of autopilot stamps."""
+        self._delay_ns = 0 if gimbal is None else round(gimbal.delay_ms * 1e6)
+        """Estimated delay of autopilot stamps, of a gimbal's with one."""
         self._estimator = MountEstimator(self._mount)
         self._reported = False
         self._due_ns = 0
@@ -118,6 +128,19 @@ class CameraAttitude:
         """Estimated mount rotation `body_from_camera` (3, 3), and delay of stamps, ns."""
         return self._mount, self._delay_ns
 
+    @property
+    def imu_delay_ns(self) -> int:
+        """Delay of the stamps of the autopilot's IMU, taken as that of its attitude.
+
+        With a gimbal the delay is of the gimbal's stamps, and nothing is known of the others.
+        """
+        return self._delay_ns if self._yaw is None else 0
+
+    @property
+    def doubted(self) -> bool:
+        """True if the attitude, a gimbal's, does not fit the newest frame."""
+        return self._yaw is not None and self._yaw.doubted
+
     def resume(
         self, body_from_camera: Array, delay_ns: int, ned_from_camera: dict[int, Array | None]
     ) -> None:
@@ -145,6 +168,9 @@ class CameraAttitude:
                 self._verdict.take_backfilled(track.t_ns, track.keyframe_id, relative.rotation)
             return
         self._estimator.take(track.t_ns, map_from_camera, self._history)
+        head = None if self._yaw is None else self._history.at(track.t_ns + self._delay_ns)
+        if self._yaw is not None and head is not None:
+            self._yaw.take(track.t_ns, map_from_camera, head @ self._mount)
         if track.keyframe_id is not None and track.keyframe_from_camera is not None:
             self._verdict.take(
                 track.t_ns, map_from_camera, track.keyframe_id,

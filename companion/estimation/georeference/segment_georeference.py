@@ -180,7 +180,7 @@ class SegmentGeoreferences:
         begun = self._begun_by_navigation(segment, first)
         start = None if begun is None else begun[0].start
         lever_m = mount.rotation.T @ mount.translation
-        turned, delay_ns = self._attitude.correction
+        turned, delay_ns = self._attitude.correction[0], self._attitude.imu_delay_ns
         estimate = self._inertial.get(key)
         if estimate is None:
             estimate = self._inertial[key] = InertialScale(lever_m, start)

@@ -44,11 +44,12 @@ class Change(NamedTuple):
 class AccelerationIntegral:
     """Integrates what arrives; attitude and IMU may come in any order up to a few samples."""
 
-    def __init__(self) -> None:
+    def __init__(self, turns_with_camera: bool = True) -> None:
+        self._turns_with_camera = turns_with_camera
         self.believed = True
         """False while nobody knows yet whether the samples are right."""
         self.turns = TurnIntegral()
-        """Of the same samples, without the attitude."""
+        """Of the same samples, without the attitude; of a body that turns as the camera does."""
         self._waiting: deque[ImuSample] = deque(maxlen=1000)
         self._attitudes: tuple[AttitudeSample, ...] = ()
         self._series = SampleSeries()
@@ -65,7 +66,8 @@ class AccelerationIntegral:
         """Add a sample; samples of a kind come in order of time."""
         if isinstance(sample, ImuSample):
             self._see_noise(sample)
-            self.turns.take(sample)
+            if self._turns_with_camera:
+                self.turns.take(sample)
             self._waiting.append(sample)
         elif not self._attitudes or sample.t_ns > self._attitudes[-1].t_ns:
             self._attitudes = (*self._attitudes[-1:], sample)

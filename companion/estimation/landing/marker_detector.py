@@ -45,6 +45,7 @@ NOT_SEEN, TWICE, SMALL, NO_SQUARE, AMBIGUOUS = (
     "not in view", "two in view", "too small", "not a flat square", "ambiguous",
 )  # fmt: skip
 NO_MOUNT, NO_CALIBRATION = "camera mount unknown", "camera not calibrated"
+ON_GIMBAL = "camera on a gimbal"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,8 @@ class MarkerDetector:
         """The marker in a frame."""
         mount = self._camera.body_from_camera
         why_not = NO_MOUNT if mount is None else NO_CALIBRATION * self._camera.assumed
+        if self._camera.gimbal is not None:
+            why_not = ON_GIMBAL
         seen = None
         if not why_not:
             seen, why_not = self._seen(frame.grey)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Pose, nearest_rotation, rotation_from_vector
-from tests.support.flights.rendered_flight import GRAVITY_NED, PathOf
+from companion.geometry.transforms import Pose, rotation_from_vector
+from tests.support.flights.rendered_flight import PathOf, leaning_path
 
 RATE_HZ, EXPOSURE_S = 30.0, 1.0 / 100.0
 FORWARD_DOWN = Pose(
@@ -31,15 +31,6 @@ def moving_path(seed: int) -> PathOf:
             -14.0 - 2.0 * np.sin(0.5 * after_s + phases[2]),
         ])  # fmt: skip
 
-    def ned_from_body(after_s: float) -> Pose:
-        step_s = 1e-3
-        here = place_m(after_s)
-        gained = place_m(after_s + step_s) + place_m(after_s - step_s) - 2.0 * here
-        down = GRAVITY_NED - gained / step_s**2
-        down /= np.linalg.norm(down)
-        yaw = TURN_RAD * np.sin(2 * np.pi * TURN_HZ * after_s + phases[3])
-        right = np.cross(down, [np.cos(yaw), np.sin(yaw), 0.0])
-        right /= np.linalg.norm(right)
-        return Pose(nearest_rotation(np.stack([np.cross(right, down), right, down], 1)), here)
-
-    return ned_from_body
+    return leaning_path(
+        place_m, lambda after_s: TURN_RAD * np.sin(2 * np.pi * TURN_HZ * after_s + phases[3])
+    )

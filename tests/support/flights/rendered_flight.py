@@ -17,6 +17,7 @@ from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import (
     Pose,
+    nearest_rotation,
     quaternion_from_rotation,
     rotation_from_vector,
     vector_from_rotation,
@@ -170,15 +171,19 @@ def fly(
     camera: Camera, ned_from_body: PathOf, terrain: Terrain, seconds: float, rate_hz: float,
     *, told: bool = True, dropout_s: tuple[float, float] = (0.0, 0.0), exposure_s: float = 0.0,
     imu_seed: int | None = None, settings: Sequence[str] = (), site: SiteMap | None = None,
+    ned_from_head: PathOf | None = None, beside: Sequence[Telemetry] = (),
 ) -> Flown:  # fmt: skip
     """Fly, in lockstep; without `told` there is no telemetry, and the mount is not known.
 
     With `site` it is flown in the map of an earlier flight.
 
     From the first to the second time of `dropout_s` the picture is white. Frames are stamped in the
-    middle of an exposure, in which what moves blurs. With `imu_seed` there is a noisy IMU, too.
+    middle of an exposure, in which what moves blurs. With `imu_seed` there is a noisy IMU, too. A
+    camera on a gimbal is carried by `ned_from_head`; what that says of itself comes `beside` the
+    telemetry.
     """
     mount = camera.body_from_camera or CAMERA_DOWN
+    carried = ned_from_head or ned_from_body
     if not told:
         camera = replace(camera, body_from_camera=None)
     config = load_config(None, list(settings))
@@ -186,14 +191,14 @@ def fly(
     stage = LocalisationStage(config, camera, lambda _: nullcontext(), site=use)
     flown = Flown(stage, sent=PosesSent(config))
     n = round(seconds * rate_hz)
-    poses = [(_ns(k / rate_hz), ned_from_body(k / rate_hz) @ mount) for k in range(n)]
+    poses = [(_ns(k / rate_hz), carried(k / rate_hz) @ mount) for k in range(n)]
     within_s = exposure_s * (np.arange(N_EXPOSED) / N_EXPOSED - 0.5 + 0.5 / N_EXPOSED)
 
     def picture(k: int) -> Bytes:
         if not exposure_s:
             return terrain.picture(camera, poses[k][1])
         drawn = [
-            terrain.picture(camera, ned_from_body(k / rate_hz + s) @ mount).astype(np.uint16)
+            terrain.picture(camera, carried(k / rate_hz + s) @ mount).astype(np.uint16)
             for s in within_s
         ]
         return np.asarray(sum(drawn) // N_EXPOSED, np.uint8)
@@ -214,6 +219,7 @@ def fly(
     if imu_seed is not None:
         still = inertial_samples(ned_from_body, seconds)
         samples = sorted([*samples, *with_noise(still, imu_seed)], key=lambda s: s.t_ns)
+    samples = sorted([*samples, *beside], key=lambda s: s.t_ns) if beside else samples
     for message in in_order_of_time(samples, pictures()):
         flown.result.take(message)
         flown.sent.take(message)
@@ -237,6 +243,25 @@ def _note(flown: Flown, message: object) -> None:
         flown.keyframes_s.append((message.t_ns - START_NS) * 1e-9)
     elif isinstance(message, Warned):
         flown.warned.append((message.t_ns, message.what))
+
+
+def leaning_path(
+    place_m: Callable[[float], np.ndarray], yaw_rad: Callable[[float], float]
+) -> PathOf:
+    """A copter on a path (3,) in NED, which leans into where it accelerates."""
+
+    def ned_from_body(after_s: float) -> Pose:
+        step_s = 1e-3
+        here = place_m(after_s)
+        gained = place_m(after_s + step_s) + place_m(after_s - step_s) - 2.0 * here
+        down = GRAVITY_NED - gained / step_s**2
+        down /= np.linalg.norm(down)
+        yaw = yaw_rad(after_s)
+        right = np.cross(down, [np.cos(yaw), np.sin(yaw), 0.0])
+        right /= np.linalg.norm(right)
+        return Pose(nearest_rotation(np.stack([np.cross(right, down), right, down], 1)), here)
+
+    return ned_from_body
 
 
 def _ns(after_s: float) -> int:

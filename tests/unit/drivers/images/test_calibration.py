@@ -10,8 +10,14 @@ import pytest
 from companion.config import CameraConfig, MountConfig
 from companion.errors import ConfigError, FlightError
 from companion.geometry.camera import Distortion
+from companion.geometry.gimbal import Gimbal
 from drivers.camera.live_calibration import body_from_camera, live_camera
-from drivers.images.calibration_file import assumed_camera, read_calibration, with_readout
+from drivers.images.calibration_file import (
+    FORWARD_UPRIGHT,
+    assumed_camera,
+    read_calibration,
+    with_readout,
+)
 from drivers.recording.camera_document import camera_document, camera_of
 
 GOOD: dict[str, Any] = {
@@ -222,3 +228,40 @@ def test_a_flight_played_as_camera_has_its_own_calibration(tmp_path: Path) -> No
     config = CameraConfig(source="file", path=str(tmp_path))
     camera, warnings = live_camera(config, MountConfig(), 64, 48)
     assert (camera.fx, warnings) == (50, [])
+
+
+def test_a_gimbal_is_read_and_recorded(tmp_path: Path) -> None:
+    assert read_calibration(write(tmp_path), 64, 48).gimbal is None
+    said = {"place_body_m": [0.1, 0, 0.2], "delay_ms": 30}
+    stated = read_calibration(write(tmp_path, body_from_camera=TURNED, gimbal=said), 64, 48)
+    assert stated.gimbal == Gimbal((0.1, 0.0, 0.2), 30.0, 1.0)
+    assert camera_of(camera_document(stated)).gimbal == stated.gimbal
+    config = CameraConfig(calibration=str(tmp_path / "camera.json"))
+    assert live_camera(config, MountConfig(), 64, 48)[0].gimbal == stated.gimbal
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        3, {"place": [0, 0, 0]}, {"place_body_m": [0, 0]}, {"place_body_m": [0, 0, 200]},
+        {"delay_ms": float("nan")}, {"sigma_deg": 0}, {"sigma_deg": "1"}, {"delay_ms": True},
+    ],
+)  # fmt: skip
+def test_a_gimbal_that_cannot_be_is_refused(tmp_path: Path, wrong: object) -> None:
+    with pytest.raises(FlightError, match=r"camera\.json: gimbal"):
+        read_calibration(write(tmp_path, gimbal=wrong), 64, 48)
+
+
+def test_a_configured_gimbal_carries_a_camera_that_looks_forward(tmp_path: Path) -> None:
+    mount = MountConfig(type="gimbal", x_m=0.1, z_m=0.2, gimbal_sigma_deg=2.0)
+    config = CameraConfig(calibration=str(write(tmp_path)))
+    camera, warnings = live_camera(config, mount, 64, 48)
+    assert camera.gimbal == Gimbal((0.1, 0.0, 0.2), 0.0, 2.0) and not warnings
+    assert camera.body_from_camera is not None
+    np.testing.assert_allclose(camera.body_from_camera.rotation, FORWARD_UPRIGHT, atol=1e-12)
+    assert not camera.body_from_camera.translation.any()
+    inside = live_camera(
+        CameraConfig(calibration=str(write(tmp_path, body_from_camera=TURNED))), mount, 64, 48
+    )[0].body_from_camera
+    assert inside is not None
+    np.testing.assert_allclose(inside.matrix(), np.array(TURNED), atol=1e-12)
