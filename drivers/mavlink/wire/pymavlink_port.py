@@ -47,6 +47,8 @@ class PymavlinkPort:
         self.n_unsigned = 0
         """Packets of the link rejected without a valid signature."""
         self._n_unpacked = 0
+        self._unpacked = ""
+        """The newest message with a field out of its range, and what is wrong with it."""
         self._n_refused = 0
         """Part of `n_unsigned` since the last valid one."""
         self._clock = clock
@@ -73,11 +75,12 @@ class PymavlinkPort:
 
     @property
     def trouble(self) -> str:
-        """Problem of the wire or the router's listeners, for people; "" without one."""
+        """Problem of the wire, of what is sent or of the router's listeners; "" without one."""
         keyless = ""
         if self._n_refused > MANY_REFUSED:
             keyless = f"{self.name}: what comes is not signed with the key of link.signing_key_file"
-        troubles = self._wire.trouble, keyless, self.router.trouble
+        unpacked = f"not sent ({self._n_unpacked}): {self._unpacked}" if self._unpacked else ""
+        troubles = self._wire.trouble, keyless, unpacked, self.router.trouble
         return "; ".join(trouble for trouble in troubles if trouble)
 
     @property
@@ -126,8 +129,9 @@ class PymavlinkPort:
             writer.signing.timestamp = self._signing.next_stamp(self._clock.now_ns())
         try:
             raw = bytes(message.pack(writer))
-        except (struct.error, ValueError, TypeError, OverflowError, AttributeError):
+        except (struct.error, ValueError, TypeError, OverflowError, AttributeError) as error:
             self._n_unpacked += 1
+            self._unpacked = f"{type(message).__name__}: {error}"
             return
         self._seq_out[identity] = (writer.seq + 1) % 256
         self._wire.write(raw)

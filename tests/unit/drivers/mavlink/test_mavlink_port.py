@@ -146,9 +146,10 @@ def free() -> int:
         return int(probe.getsockname()[1])
 
 
-def test_messages_that_cannot_be_packed_are_dropped_and_counted() -> None:
+def test_messages_that_cannot_be_packed_are_dropped_counted_and_said() -> None:
     port = port_at("udpin::14550")
     port.send(mavlink.MAVLink_attitude_message(-1, 0, 0, 0, 0, 0, 0))
+    assert "not sent (1): MAVLink_attitude_message" in port.trouble
     port.send(mavlink.MAVLink_attitude_message(1, "x", 0, 0, 0, 0, 0))
     port.send(object())
     assert port.n_dropped == 3
