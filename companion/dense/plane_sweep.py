@@ -20,6 +20,9 @@ SMALL, LARGE = 3.5, 27.0
 """Penalties of steps by one plane and by more, bits per counted image."""
 EDGE_GREY = 16
 """Grey-level difference at which the large penalty is halved."""
+COARSE_STEP = 2
+"""Planes from one to the next that coarse pixels look at: 1.5 pixels where points move most, which a
+window of five pixels does not miss."""
 SKIPPED_COST = 18
 """Bits per image of planes not evaluated: more than those of a mismatch."""
 COARSE_PATHS = ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -56,7 +59,7 @@ class PlaneSweep:
         self._words = device.buffer(4 * self._n_pixels * MAX_VIEWS)
         self._stale: set[int] = set()
         self._views = device.buffer(4 * 12 * MAX_VIEWS)
-        self._blocks = device.buffer(4 * n)
+        self._blocks, self._first = device.buffer(4 * n), device.buffer(4 * n)
         self._cost, self._sum = device.buffer(PLANES[-1] * n), device.buffer(2 * PLANES[-1] * n)
         self._winner = device.buffer(4 * n)
         self.rho, self.margin, self.noise = (device.buffer(4 * n) for _ in range(3))
@@ -76,25 +79,26 @@ class PlaneSweep:
 
         `projections` (n, 12) are of the images in slots 0 to n - 1.
         """
-        planes = next(n for n in PLANES if n >= n_planes)
-        all_blocks = (1 << -(-n_planes // BLOCK)) - 1
         n = len(projections)
         for slot in sorted(self._stale):
             self._census(self.images[slot], self._words, slot * self._n_pixels, run)
         self._stale.clear()
         dropped = 2 if n >= 5 else 1 if n >= 3 else 0
         self._device.write(self._views, np.ascontiguousarray(projections, np.float32))
-        for coarse in (True, False):
-            if coarse:
-                everywhere = np.full(self._coarse[0] * self._coarse[1], all_blocks, np.uint32)
+        for skip in (COARSE_STEP, 1):
+            every = -(-n_planes // skip)
+            planes = next(n for n in PLANES if n >= every)
+            blocks = (1 << -(-every // BLOCK)) - 1
+            if skip > 1:
+                everywhere = np.full(self._coarse[0] * self._coarse[1], blocks, np.uint32)
                 self._device.write(self._blocks, everywhere)
             else:
                 run(
                     "blocks", self._kernels[planes]["blocks_about"], self.grid, (64, 1), self.rho,
                     *map(np.int32, self._coarse), np.float32(rho_low), np.float32(step),
-                    np.uint32(all_blocks), self._blocks, *map(np.int32, self.grid),
+                    np.uint32(blocks), self._blocks, *map(np.int32, self.grid),
                 )  # fmt: skip
-            self._level(coarse, self._kernels[planes], n, dropped, rho_low, step, run)
+            self._level(skip > 1, self._kernels[planes], n, dropped, rho_low, skip * step, run)
 
     def _level(
         self, coarse: bool, kernels: dict[str, cl.Kernel], n: int, dropped: int,
@@ -105,24 +109,27 @@ class PlaneSweep:
         width, height = map(np.int32, self.size)
         counted = n - dropped
         small, large = int(SMALL * counted), int(LARGE * counted)
-        level = "coarse" if coarse else "fine"
+        level, paths = ("coarse", COARSE_PATHS) if coarse else ("fine", PATHS)
+        elsewhere = int(SKIPPED_COST * counted)
+        run("places", kernels["places"], (grid[1],), (1,), self._blocks, self._first, *grid)
         run(
             f"costs-{level}", kernels["costs"], grid, (16, 1), self._words_r, self._words,
             width, height, self._views, np.int32(n), np.int32(dropped), np.float32(rho_low),
-            np.float32(step), self._blocks, np.int32(SKIPPED_COST * counted), self._cost, *grid,
+            np.float32(step), self._blocks, self._first, np.int32(elsewhere), self._cost, *grid,
             stride,
         )  # fmt: skip
-        for k, (dx, dy) in enumerate(COARSE_PATHS if coarse else PATHS):
+        for k, (dx, dy) in enumerate(paths):
             run(
                 f"aggregate-{level}", kernels["aggregate"], (grid[0] if dy else grid[1],),
-                (8,), self._cost, self._sum, self.reference, width, *grid, stride, np.int32(dx),
+                (8,), self._cost, self._blocks, self._first, self._sum, self.reference, width, *grid, stride, np.int32(dx),
                 np.int32(dy), np.int32(small), np.int32(large), np.int32(EDGE_GREY),
                 np.int32(k == 0),
             )  # fmt: skip
         n_cells = grid[0] * grid[1]
         run(
-            f"winner-{level}", kernels["winner"], (n_cells,), (64,), self._sum, n_cells,
-            np.float32(rho_low), np.float32(step), self._winner, self.margin,
+            f"winner-{level}", kernels["winner"], (n_cells,), (64,), self._sum, self._blocks, self._first, n_cells,
+            np.float32(rho_low), np.float32(step), np.int32(elsewhere * len(paths)), self._winner,
+            self.margin,
         )  # fmt: skip
         run(
             f"median-{level}",
@@ -145,5 +152,5 @@ class PlaneSweep:
 
 def _kernels(device: ComputeDevice, planes: int) -> dict[str, cl.Kernel]:
     program = device.build("sweep.cl", {"PLANES": planes})
-    names = ("census", "costs", "aggregate", "winner", "blocks_about", "median")
+    names = ("census", "costs", "aggregate", "winner", "blocks_about", "places", "median")
     return {name: cl.Kernel(program, name) for name in names}

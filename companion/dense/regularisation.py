@@ -11,6 +11,11 @@ from companion.messages import Floats
 
 HUBER = 0.01
 EDGE_GREY = 12.0
+STEP = np.float32(1.0 / np.sqrt(8.0))
+"""Of both variables; the greatest for which the iteration converges on a grid of pixels."""
+LANES = 8
+"""Pixels of a work-item."""
+GROUP = (8, 16)
 
 
 class Regularisation:
@@ -21,33 +26,44 @@ class Regularisation:
         self._grid = grid
         program = device.build("regularise.cl", {})
         self._dual, self._primal = cl.Kernel(program, "dual"), cl.Kernel(program, "primal")
-        n = grid[0] * grid[1]
-        self._x, self._x_bar, self._edge, self._data, self._weight = (
-            device.buffer(4 * n) for _ in range(5)
+        self._pitch = -(-grid[0] // LANES) * LANES
+        n = self._pitch * (grid[1] + 2)
+        self._x, self._x_bar, self._edge, self._pull, self._share, self._px, self._py = (
+            device.buffer(4 * n) for _ in range(7)
         )
-        self._p = device.buffer(8 * n)
 
     def run(self, data: Floats, weight: Floats, edge: Floats, iterations: int, run: Run) -> Floats:
         """Smoothed `data` (H, W), all f32 of that shape; pixels of weight 0 are filled in."""
         device, (width, height) = self._device, self._grid
+        nothing = np.zeros((height, width), np.float32)
         for buffer, array in (
-            (self._x, data), (self._x_bar, data), (self._data, data), (self._weight, weight),
-            (self._edge, edge), (self._p, np.zeros(2 * height * width, np.float32)),
+            (self._x, data), (self._x_bar, data), (self._edge, edge), (self._px, nothing),
+            (self._py, nothing), (self._pull, STEP * weight * data),
+            (self._share, 1.0 / (1.0 + STEP * weight)),
         ):  # fmt: skip
-            device.write(buffer, np.ascontiguousarray(array, np.float32))
-        w, h, step = np.int32(width), np.int32(height), np.float32(1.0 / np.sqrt(8.0))
+            device.write(buffer, self._framed(array))
+        size = (self._pitch // LANES, height)
+        w, h, pitch = np.int32(width), np.int32(height), np.int32(self._pitch)
+        shrink = np.float32(1.0 / (1.0 + STEP * HUBER))
         for _ in range(iterations):
             run(
-                "dual", self._dual, self._grid, (64, 1), self._x_bar, self._edge, self._p, w, h,
-                step, np.float32(HUBER),
+                "dual", self._dual, size, GROUP, self._x_bar, self._edge, self._px, self._py, w, h,
+                pitch, STEP, shrink,
             )  # fmt: skip
             run(
-                "primal", self._primal, self._grid, (64, 1), self._x, self._x_bar, self._edge,
-                self._p, self._data, self._weight, w, h, step,
+                "primal", self._primal, size, GROUP, self._x, self._x_bar, self._edge, self._px,
+                self._py, self._pull, self._share, h, pitch, STEP,
             )  # fmt: skip
-        out = np.empty((height, width), np.float32)
+        out = np.empty((height + 2, self._pitch), np.float32)
         device.read(out, self._x)
-        return out
+        return np.ascontiguousarray(out[1:-1, :width])
+
+    def _framed(self, array: Floats) -> Floats:
+        """As the kernels have it: rows of `_pitch` numbers, one of zeros above and one below."""
+        (width, height) = self._grid
+        framed = np.zeros((height + 2, self._pitch), np.float32)
+        framed[1:-1, :width] = array
+        return framed
 
 
 def edges(grey: Floats) -> Floats:

@@ -54,6 +54,7 @@ class Verification:
         """
         sweep, config = self._sweep, self._config
         grid = tuple(map(np.int32, sweep.grid))
+        eights = (-(-sweep.grid[0] // 8), sweep.grid[1])
         width, height = map(np.int32, sweep.size)
         stride = np.int32(sweep.stride)
         for counts in (self._good, self._bad, self._similar):
@@ -68,12 +69,12 @@ class Verification:
         )
         for slot, rows in enumerate(projections.astype(np.float32).reshape(-1, 3, 4)):
             run(
-                "follow", self._kernels["follow"], grid, (64, 1), sweep.images[slot], width, height,
+                "follow", self._kernels["follow"], eights, (16, 1), sweep.images[slot], width, height,
                 sweep.rho, *(np.ascontiguousarray(row) for row in rows), self._value, self._change,
                 *grid, stride,
             )  # fmt: skip
             run(
-                "verify", self._kernels["verify"], (-(-sweep.grid[0] // 8), sweep.grid[1]), (16, 1),
+                "verify", self._kernels["verify"], eights, (16, 1),
                 self._grey, self._value, self._change, self._good, self._bad, self._similar, limits,
                 *grid,
             )  # fmt: skip

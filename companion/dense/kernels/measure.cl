@@ -15,41 +15,68 @@
 
 typedef float8 float8_anywhere __attribute__((aligned(4)));
 
-static float bilinear(__global const uchar *image, int width, float x, float y)
+typedef ushort ushort_anywhere __attribute__((aligned(1)));
+
+/* Two pixels beside each other, at 8 places; the left one in the lower byte, as devices are little-endian. */
+static uint8 pairs(__global const uchar *image, int8 at)
 {
-    const int ix = (int)x, iy = (int)y;
-    const float fx = x - ix, fy = y - iy;
-    __global const uchar *p = image + iy * width + ix;
-    const float top = p[0] + fx * ((float)p[1] - p[0]);
-    const float bottom = p[width] + fx * ((float)p[width + 1] - p[width]);
+#define PAIR(i) *(__global const ushort_anywhere *)(image + at.s##i)
+    return (uint8)(PAIR(0), PAIR(1), PAIR(2), PAIR(3), PAIR(4), PAIR(5), PAIR(6), PAIR(7));
+#undef PAIR
+}
+
+static float8 bilinear(__global const uchar *image, int width, float8 x, float8 y)
+{
+    const int8 ix = convert_int8(x), iy = convert_int8(y), at = iy * width + ix;
+    const float8 fx = x - convert_float8(ix), fy = y - convert_float8(iy);
+    const uint8 above = pairs(image, at), below = pairs(image, at + width);
+    const float8 a = convert_float8(above & 255u), b = convert_float8(below & 255u);
+    const float8 top = a + fx * (convert_float8(above >> 8) - a);
+    const float8 bottom = b + fx * (convert_float8(below >> 8) - b);
     return top + fy * (bottom - top);
 }
 
 /* Value and change along the epipolar line at each grid pixel's projection; unseen: value UNSEEN.
- * Grid: grid pixels. m: rows of (3 x 3 | 3), as for costs. */
+ * Grid: (grid_width + 7) / 8 x grid_height, 8 pixels each. m: rows of (3 x 3 | 3), as for costs. */
 __kernel void follow(__global const uchar *image, const int width, const int height,
                      __global const float *rho, const float4 m0, const float4 m1, const float4 m2,
                      __global float *value, __global float *change,
                      const int grid_width, const int grid_height, const int stride)
 {
-    const int gx = get_global_id(0), gy = get_global_id(1);
+    const int gx = 8 * get_global_id(0), gy = get_global_id(1);
     if (gx >= grid_width || gy >= grid_height)
         return;
-    const int cell = gy * grid_width + gx;
-    const float x = gx * stride, y = gy * stride, r = rho[cell];
-    const float qx = m0.x * x + m0.y * y + m0.z + r * m0.w, qy = m1.x * x + m1.y * y + m1.z + r * m1.w;
-    const float qz = m2.x * x + m2.y * y + m2.z + r * m2.w;
-    const float scale = 1.0f / (qz > 1e-6f ? qz : 1e-6f);
-    const float u = qx * scale, v = qy * scale;
-    const float du = (m0.w - u * m2.w) * scale, dv = (m1.w - v * m2.w) * scale;
-    const float length_ = sqrt(du * du + dv * dv), half_ = 0.5f / (length_ > 1e-9f ? length_ : 1e-9f);
-    const float eu = du * half_, ev = dv * half_;
-    const bool seen = qz > 1e-6f && u >= 1.0f && v >= 1.0f && u < width - 2.0f && v < height - 2.0f;
-    const float su = seen ? u : 1.0f, sv = seen ? v : 1.0f;
-    const float before = bilinear(image, width, su - eu, sv - ev);
-    const float behind = bilinear(image, width, su + eu, sv + ev);
-    value[cell] = seen ? 0.5f * (before + behind) : UNSEEN;
-    change[cell] = behind - before;
+    const int cell = gy * grid_width + gx, n = grid_width - gx;
+    float8 r = 0.0f;
+    if (n >= 8)
+        r = *(__global const float8_anywhere *)(rho + cell);
+    else
+        for (int k = 0; k < n; ++k)
+            ((float *)&r)[k] = rho[cell + k];
+    const float8 x = convert_float8((int8)(0, 1, 2, 3, 4, 5, 6, 7) + gx) * (float)stride;
+    const float y = gy * stride;
+    const float8 qx = m0.x * x + (m0.y * y + m0.z) + r * m0.w, qy = m1.x * x + (m1.y * y + m1.z) + r * m1.w;
+    const float8 qz = m2.x * x + (m2.y * y + m2.z) + r * m2.w;
+    const float8 scale = 1.0f / (qz > 1e-6f ? qz : 1e-6f);
+    const float8 u = qx * scale, v = qy * scale;
+    const float8 du = (m0.w - u * m2.w) * scale, dv = (m1.w - v * m2.w) * scale;
+    const float8 square = du * du + dv * dv;
+    const float8 half_ = 0.5f / sqrt(square > 1e-18f ? square : 1e-18f);
+    const float8 eu = du * half_, ev = dv * half_;
+    const int8 seen = (qz > 1e-6f) & (u >= 1.0f) & (v >= 1.0f) & (u < width - 2.0f) & (v < height - 2.0f);
+    const float8 su = seen ? u : 1.0f, sv = seen ? v : 1.0f;
+    const float8 nearer = bilinear(image, width, seen ? su - eu : su, seen ? sv - ev : sv);
+    const float8 farther = bilinear(image, width, seen ? su + eu : su, seen ? sv + ev : sv);
+    const float8 mean = seen ? 0.5f * (nearer + farther) : UNSEEN, difference = farther - nearer;
+    if (n >= 8) {
+        *(__global float8_anywhere *)(value + cell) = mean;
+        *(__global float8_anywhere *)(change + cell) = difference;
+        return;
+    }
+    for (int k = 0; k < n; ++k) {
+        value[cell + k] = ((const float *)&mean)[k];
+        change[cell + k] = ((const float *)&difference)[k];
+    }
 }
 
 /* The reference image on the grid, as float. */

@@ -63,11 +63,20 @@ def costs(
     return out
 
 
+def stored(blocks: NDArray[np.uint32], planes: int) -> NDArray[np.bool_]:
+    """Planes (H, W, planes) that are stored: those of vectors of 16 with a wanted block of 8."""
+    vector = np.arange(planes) // 16
+    return (blocks[..., None] >> (2 * vector).astype(np.uint32) & np.uint32(3)) > 0
+
+
 def aggregate(
-    cost: NDArray[np.uint8], grey: NDArray[np.uint8], dx: int, dy: int, small: int, large: int,
-    soft: int,
+    cost: NDArray[np.uint8], there: NDArray[np.bool_], grey: NDArray[np.uint8], dx: int, dy: int,
+    small: int, large: int, soft: int,
 ) -> Array:  # fmt: skip
-    """The path costs (H, W, planes) of one direction; `grey` (H, W) is on the grid."""
+    """The path costs (H, W, planes) of one direction; `grey` (H, W) is on the grid.
+
+    `there` tells which are stored; 255 - small stands for others.
+    """
     height, width, _ = cost.shape
     out = np.zeros(cost.shape)
     for start in range(width if dy else height):
@@ -78,11 +87,12 @@ def aggregate(
             now = cost[y, x].astype(float)
             if last is not None:
                 path = out[last]
+                low = path[there[last]].min()
                 edge = abs(int(grey[y, x]) - int(grey[last]))
-                jump = path.min() + max(small, large * soft // (soft + edge))
+                jump = min(255, low + max(small, large * soft // (soft + edge)))
                 side = np.minimum(np.r_[np.inf, path[:-1]], np.r_[path[1:], np.inf]) + small
-                now = now + np.minimum(np.minimum(path, side), jump) - path.min()
-            out[y, x] = now
+                now = now + np.minimum(np.minimum(path, side), jump) - low
+            out[y, x] = np.where(there[y, x], now, 255 - small)
             last = (y, x)
             x, y = x + dx, y + dy
             if dy and not 0 <= x < width:
@@ -90,17 +100,21 @@ def aggregate(
     return out
 
 
-def winner(total: Array, rho0: float, step: float) -> tuple[Array, Array]:
-    """Inverse depth and margin of sums (N, planes)."""
+def winner(
+    total: Array, there: NDArray[np.bool_], rho0: float, step: float, most: float
+) -> tuple[Array, Array]:
+    """Inverse depth and margin of sums (N, planes), of those that are stored."""
     rho, margin = np.zeros(len(total)), np.zeros(len(total))
     planes = np.arange(total.shape[1])
     for i, s in enumerate(total):
-        at = int(s.argmin())
+        at = int(np.where(there[i], s, np.inf).argmin())
         shift = 0.0
-        if 0 < at < len(s) - 1 and s[at - 1] + s[at + 1] > 2 * s[at]:
+        beside = 0 < at < len(s) - 1 and there[i, at - 1] and there[i, at + 1]
+        if beside and s[at - 1] + s[at + 1] > 2 * s[at]:
             shift = 0.5 * (s[at - 1] - s[at + 1]) / (s[at - 1] + s[at + 1] - 2 * s[at])
         rho[i] = rho0 + step * (at + shift)
-        margin[i] = (s[np.abs(planes - at) > 2].min() - s[at]) / (s[at] + 1)
+        others = s[there[i] & (np.abs(planes - at) > 2)].min(initial=most)
+        margin[i] = (others - s[at]) / (s[at] + 1)
     return rho, margin
 
 

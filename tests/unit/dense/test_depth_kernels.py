@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,47 @@ def i32(*values: int) -> list[np.int32]:
     return [np.int32(value) for value in values]
 
 
+def some_blocks(rng: np.random.Generator, grid: tuple[int, int]) -> NDArray[np.uint32]:
+    """Blocks of planes (H, W) for a grid (width, height), one or more for each pixel."""
+    return rng.integers(1, 1 << PLANES // 8, grid[::-1]).astype(np.uint32)
+
+
+def placed(device: ComputeDevice, sweep: cl.Program, blocks: NDArray[np.uint32]) -> Placed:
+    """Where the kernels keep vectors of planes of these blocks (H, W)."""
+    height, width = blocks.shape
+    wanted, first = put(device, blocks), put(device, blocks)
+    run(device, sweep, "places", (height,), wanted, first, *i32(width, height))
+    places = np.zeros_like(blocks)
+    device.read(places, first)
+    return Placed(wanted, first, places, reference.stored(blocks, PLANES))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Blocks and places on a device, and the latter here with which planes (H, W, planes) are there."""
+
+    wanted: cl.Buffer
+    first: cl.Buffer
+    places: NDArray[np.uint32]
+    there: NDArray[np.bool_]
+
+    def packed(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values (H, W, planes) as kernels keep them; 0 where nothing is kept."""
+        out = np.zeros_like(values).ravel()
+        for (y, x), place in np.ndenumerate(self.places):
+            kept = values[y, x, self.there[y, x]]
+            out[16 * place : 16 * place + len(kept)] = kept
+        return out
+
+    def unpacked(self, kept: NDArray[Any], otherwise: int = 0) -> NDArray[Any]:
+        """The reverse; `otherwise` where nothing is kept."""
+        out = np.full(self.there.shape, otherwise, kept.dtype)
+        for (y, x), place in np.ndenumerate(self.places):
+            there = self.there[y, x]
+            out[y, x, there] = kept[16 * place : 16 * place + there.sum()]
+        return out
+
+
 def pictures(width: int, height: int, n: int) -> list[NDArray[np.uint8]]:
     big = texture(np.random.default_rng(3), 256)
     return [
@@ -113,30 +155,30 @@ def test_census(device: ComputeDevice, sweep: cl.Program, width: int, height: in
 @pytest.mark.parametrize("stride", [1, 2, 3])
 @pytest.mark.parametrize(("n", "n_dropped"), [(1, 0), (3, 1), (5, 2)])
 def test_costs(
-    device: ComputeDevice, sweep: cl.Program, stride: int, n: int, n_dropped: int
-) -> None:
+    device: ComputeDevice, sweep: cl.Program, rng: np.random.Generator, stride: int, n: int,
+    n_dropped: int,
+) -> None:  # fmt: skip
     width, height = 65, 49
     words = [reference.census(image) for image in pictures(width, height, n + 1)]
     projections = some_projections(width, height, n)
     grid = -(-width // stride), -(-height // stride)
-    out = np.zeros((grid[1], grid[0], PLANES), np.uint8)
+    out = np.zeros(grid[1] * grid[0] * PLANES, np.uint8)
     buffer = put(device, out)
-    blocks = np.full(grid[::-1], 0xFFFFFFFF, np.uint32)
-    blocks[3, 4] = 0b0010
+    blocks = some_blocks(rng, grid)
+    at = placed(device, sweep, blocks)
     rho0, step = np.float32(1 / 30), np.float32((1 / 6 - 1 / 30) / (PLANES - 1))
     run(
         device, sweep, "costs", grid, put(device, words[0]), put(device, np.stack(words[1:])),
         *i32(width, height), put(device, projections), *i32(n, n_dropped), rho0, step,
-        put(device, blocks), np.int32(99), buffer, *i32(*grid, stride),
+        at.wanted, at.first, np.int32(99), buffer, *i32(*grid, stride),
     )  # fmt: skip
     device.read(out, buffer)
     rhos = rho0 + step * np.arange(PLANES)
     want = reference.costs(words[0], words[1:], projections, n_dropped, rhos, stride)
-    looked_at = want[3, 4, 8:16].copy()
-    want[3, 4] = 99
-    want[3, 4, 8:16] = looked_at
+    looked_at = blocks[..., None] >> (np.arange(PLANES) // 8).astype(np.uint32) & np.uint32(1)
+    want = np.where(looked_at, want, 99)
     # float32: a projection falls to the other side of a pixel's edge here and there
-    assert (out == want).mean() > 0.998
+    assert (at.unpacked(out, 99) == want).mean() > 0.998
 
 
 @pytest.mark.parametrize("direction", [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1)])
@@ -149,32 +191,39 @@ def test_aggregate(
     grid = -(-width // stride), -(-height // stride)
     (image,) = pictures(width, height, 1)
     cost = rng.integers(0, 255 - SMALL - LARGE, (grid[1], grid[0], PLANES)).astype(np.uint8)
-    out = rng.integers(0, 9, cost.shape).astype(np.uint16)
+    at = placed(device, sweep, some_blocks(rng, grid))
+    out = rng.integers(0, 9, cost.size).astype(np.uint16)
     before = out.copy()
     buffer = put(device, out)
     for begin in (1, 0):
         run(
-            device, sweep, "aggregate", (grid[0] if direction[1] else grid[1],), put(device, cost),
-            buffer, put(device, image), *i32(width, *grid, stride, *direction, SMALL, LARGE, SOFT),
-            np.int32(begin),
+            device, sweep, "aggregate", (grid[0] if direction[1] else grid[1],),
+            put(device, at.packed(cost)), at.wanted, at.first, buffer, put(device, image),
+            *i32(width, *grid, stride, *direction, SMALL, LARGE, SOFT, begin),
         )  # fmt: skip
         device.read(out, buffer)
         grey = np.ascontiguousarray(image[::stride, ::stride])
-        want = reference.aggregate(cost, grey, *direction, SMALL, LARGE, SOFT)
-        np.testing.assert_array_equal(out, want if begin else 2 * want)
+        want = reference.aggregate(cost, at.there, grey, *direction, SMALL, LARGE, SOFT)
+        want = np.where(at.there, want, 0)
+        np.testing.assert_array_equal(at.unpacked(out), want if begin else 2 * want)
     assert not np.array_equal(out, before)
 
 
 def test_winner(device: ComputeDevice, sweep: cl.Program, rng: np.random.Generator) -> None:
     total = rng.integers(200, 2000, (77, PLANES)).astype(np.uint16)
     total[5], total[6, 0], total[7, -1] = 300, 1, 1  # no best, and bests at the ends
+    blocks = some_blocks(rng, (77, 1))
+    blocks[0, 5:8] = 0b1111
+    at = placed(device, sweep, blocks)
     rho, margin = np.zeros(77, np.float32), np.zeros(77, np.float32)
     buffers = put(device, rho), put(device, margin)
-    where = np.float32(0.25), np.float32(0.01)
-    run(device, sweep, "winner", (77,), put(device, total), np.int32(77), *where, *buffers)
+    run(
+        device, sweep, "winner", (77,), put(device, at.packed(total[None])), at.wanted, at.first,
+        *i32(77), np.float32(0.25), np.float32(0.01), *i32(1500), *buffers,
+    )  # fmt: skip
     device.read(rho, buffers[0])
     device.read(margin, buffers[1])
-    want = reference.winner(total.astype(float), 0.25, 0.01)
+    want = reference.winner(total.astype(float), at.there[0], 0.25, 0.01, 1500)
     np.testing.assert_allclose(rho, want[0], atol=1e-6)
     np.testing.assert_allclose(margin, want[1], rtol=1e-5, atol=1e-6)
 
@@ -228,7 +277,7 @@ def test_follow_and_verify(
     value, change = (put(device, np.zeros(grid[::-1], np.float32)) for _ in range(2))
     rows = [np.ascontiguousarray(row) for row in projection.reshape(3, 4)]
     run(
-        device, measure, "follow", grid, put(device, second), *i32(width, height),
+        device, measure, "follow", (-(-grid[0] // 8), grid[1]), put(device, second), *i32(width, height),
         put(device, rho), *rows, value, change, *i32(*grid, stride),
     )  # fmt: skip
     got = np.zeros((2, grid[1], grid[0]), np.float32)
