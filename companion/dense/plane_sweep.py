@@ -21,8 +21,8 @@ SMALL, LARGE = 3.5, 27.0
 EDGE_GREY = 16
 """Grey-level difference at which the large penalty is halved."""
 COARSE_STEP = 2
-"""Planes from one to the next that coarse pixels look at: 1.5 pixels where points move most, which a
-window of five pixels does not miss."""
+"""Planes from one to the next that coarse pixels look at: 1.5 pixels where points move most, which
+a window of five pixels does not miss."""
 SKIPPED_COST = 18
 """Bits per image of planes not evaluated: more than those of a mismatch."""
 COARSE_PATHS = ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -121,15 +121,15 @@ class PlaneSweep:
         for k, (dx, dy) in enumerate(paths):
             run(
                 f"aggregate-{level}", kernels["aggregate"], (grid[0] if dy else grid[1],),
-                (8,), self._cost, self._blocks, self._first, self._sum, self.reference, width, *grid, stride, np.int32(dx),
-                np.int32(dy), np.int32(small), np.int32(large), np.int32(EDGE_GREY),
-                np.int32(k == 0),
+                (8,), self._cost, self._blocks, self._first, self._sum, self.reference, width,
+                *grid, stride, np.int32(dx), np.int32(dy), np.int32(small), np.int32(large),
+                np.int32(EDGE_GREY), np.int32(k == 0),
             )  # fmt: skip
         n_cells = grid[0] * grid[1]
         run(
-            f"winner-{level}", kernels["winner"], (n_cells,), (64,), self._sum, self._blocks, self._first, n_cells,
-            np.float32(rho_low), np.float32(step), np.int32(elsewhere * len(paths)), self._winner,
-            self.margin,
+            f"winner-{level}", kernels["winner"], (n_cells,), (64,), self._sum, self._blocks,
+            self._first, n_cells, np.float32(rho_low), np.float32(step),
+            np.int32(elsewhere * len(paths)), self._winner, self.margin,
         )  # fmt: skip
         run(
             f"median-{level}",

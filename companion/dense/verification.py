@@ -69,9 +69,9 @@ class Verification:
         )
         for slot, rows in enumerate(projections.astype(np.float32).reshape(-1, 3, 4)):
             run(
-                "follow", self._kernels["follow"], eights, (16, 1), sweep.images[slot], width, height,
-                sweep.rho, *(np.ascontiguousarray(row) for row in rows), self._value, self._change,
-                *grid, stride,
+                "follow", self._kernels["follow"], eights, (16, 1), sweep.images[slot], width,
+                height, sweep.rho, *(np.ascontiguousarray(row) for row in rows), self._value,
+                self._change, *grid, stride,
             )  # fmt: skip
             run(
                 "verify", self._kernels["verify"], eights, (16, 1),

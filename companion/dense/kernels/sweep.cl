@@ -331,12 +331,13 @@ __kernel void blocks_about(__global const float *rho, const int coarse_width, co
     if (gx >= grid_width || gy >= grid_height)
         return;
     const int cx = (gx + 1) / 2, cy = (gy + 1) / 2;
+    const float per_plane = 1.0f / step;
     uint bits = 0;
     for (int j = -2; j <= 1; ++j)
         for (int i = -2; i <= 1; ++i) {
             const float value = rho[inside(cy + j, coarse_height - 1) * coarse_width
                                     + inside(cx + i, coarse_width - 1)];
-            const int plane = (int)((value - rho0) / step + 0.5f);
+            const int plane = (int)((value - rho0) * per_plane + 0.5f);
             bits |= 1u << inside(plane - 2, PLANES - 1) / BLOCK;
             bits |= 1u << inside(plane + 2, PLANES - 1) / BLOCK;
         }
@@ -353,8 +354,7 @@ __kernel void places(__global const uint *blocks, __global uint *first, const in
     for (int x = 0; x < grid_width; ++x) {
         const uint wanted = blocks[y * grid_width + x];
         first[y * grid_width + x] = at;
-        for (int b = 0; b < LANES; ++b)
-            at += IS_WANTED(wanted, b) ? 1 : 0;
+        at += popcount((wanted | wanted >> 1) & 0x55555555u);
     }
 }
 

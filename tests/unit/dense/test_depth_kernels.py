@@ -99,7 +99,7 @@ def placed(device: ComputeDevice, sweep: cl.Program, blocks: NDArray[np.uint32])
 
 @dataclass(frozen=True)
 class Placed:
-    """Blocks and places on a device, and the latter here with which planes (H, W, planes) are there."""
+    """Blocks and places on a device; here the latter, and which planes (H, W, planes) are kept."""
 
     wanted: cl.Buffer
     first: cl.Buffer
@@ -277,8 +277,8 @@ def test_follow_and_verify(
     value, change = (put(device, np.zeros(grid[::-1], np.float32)) for _ in range(2))
     rows = [np.ascontiguousarray(row) for row in projection.reshape(3, 4)]
     run(
-        device, measure, "follow", (-(-grid[0] // 8), grid[1]), put(device, second), *i32(width, height),
-        put(device, rho), *rows, value, change, *i32(*grid, stride),
+        device, measure, "follow", (-(-grid[0] // 8), grid[1]), put(device, second),
+        *i32(width, height), put(device, rho), *rows, value, change, *i32(*grid, stride),
     )  # fmt: skip
     got = np.zeros((2, grid[1], grid[0]), np.float32)
     for array, buffer in zip(got, (value, change), strict=True):
