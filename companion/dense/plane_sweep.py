@@ -60,7 +60,7 @@ class PlaneSweep:
         self._stale: set[int] = set()
         self._views = device.buffer(4 * 12 * MAX_VIEWS)
         self._blocks, self._first = device.buffer(4 * n), device.buffer(4 * n)
-        # a device that leaves out work must not read beyond a buffer: it is found out by its results
+        # a device that leaves out work is found out by its results: it reads beyond no buffer
         device.write(self._first, np.zeros(n, np.uint32))
         self._cost, self._sum = device.buffer(PLANES[-1] * n), device.buffer(2 * PLANES[-1] * n)
         self._winner = device.buffer(4 * n)
