@@ -332,7 +332,8 @@ class LocalisationStage:
                 if message.seq == frame.seq or measured is not None:
                     # angular rates are held without attitude; those of backfilled frames are rough
                     self._motion.correct(message.t_ns, message.map_from_camera, measured)
-                self._attitude.compare(message, message.map_from_camera.rotation)
+                corrected_rad = 0.0 if self._gimbal is None else self._gimbal.corrected_rad
+                self._attitude.compare(message, message.map_from_camera.rotation, corrected_rad)
                 mount = self._attitude.correction[0]
                 self._georeferences.take(message, None if measured is None else measured @ mount.T)
                 if message.seq == frame.seq:

@@ -130,6 +130,8 @@ class AttitudeVerdict:
         """
         if self.used and self._head_yaw is not None:
             since_ns = self._head_yaw.moved_since_ns()
+            if since_ns is None:
+                since_ns = self._head_yaw.far_since_ns(t_ns, ned_from_map)
             if since_ns is not None:
                 self._agreed_ns = since_ns
                 off_deg = np.degrees(self._head_yaw.off_rad)
@@ -139,7 +141,7 @@ class AttitudeVerdict:
         if t_ns >= self._rotations_due_ns:
             self._rotations_due_ns = t_ns + ROTATION_CHECK_NS
             self._agreement = self._rotations.result(body_from_camera)
-            verdict = self._check_rotations(t_ns, self._agreement)
+            verdict = self._check_rotations(t_ns, self._agreement, ned_from_map)
             if verdict is not None:
                 return verdict
         if self.used and t_ns >= self._check_due_ns:
@@ -147,7 +149,9 @@ class AttitudeVerdict:
             return self._check_tilt(t_ns, rotation_of, body_from_camera, ned_from_map)
         return None
 
-    def _check_rotations(self, t_ns: int, found: RotationAgreement | None) -> Verdict | None:
+    def _check_rotations(
+        self, t_ns: int, found: RotationAgreement | None, ned_from_map: Array | None
+    ) -> Verdict | None:
         if found is None:
             return None
         self._n_stabilised = self._n_stabilised + 1 if found.stabilised else 0
@@ -164,6 +168,7 @@ class AttitudeVerdict:
         elif self._n_body_fixed >= N_AGREEING and t_ns >= self._not_before_ns:
             what = BODY_FIXED_AGAIN
             if self._head_yaw is not None:
+                self._head_yaw.far_since_ns(t_ns, ned_from_map)
                 if not self._head_yaw.fits_again(t_ns):
                     return None
                 self._head_yaw.believe()

@@ -158,8 +158,11 @@ class CameraAttitude:
     def _is_invalid(self, t_ns: int) -> bool:
         return any(a <= t_ns and (b is None or t_ns < b) for a, b in self._invalid_spans)
 
-    def compare(self, track: Track, map_from_camera: Array) -> None:
-        """Add a tracked frame with its rotation (3, 3) in the active map."""
+    def compare(self, track: Track, map_from_camera: Array, corrected_rad: float = 0.0) -> None:
+        """Add a tracked frame with its rotation (3, 3) in the active map.
+
+        With a gimbal it counts that the autopilot has corrected its heading by `corrected_rad`.
+        """
         if not self._mounted:
             return
         if track.backfilled:
@@ -170,7 +173,7 @@ class CameraAttitude:
         self._estimator.take(track.t_ns, map_from_camera, self._history)
         head = None if self._yaw is None else self._history.at(track.t_ns + self._delay_ns)
         if self._yaw is not None and head is not None:
-            self._yaw.take(track.t_ns, map_from_camera, head @ self._mount)
+            self._yaw.take(track.t_ns, map_from_camera, head @ self._mount, corrected_rad)
         if track.keyframe_id is not None and track.keyframe_from_camera is not None:
             self._verdict.take(
                 track.t_ns, map_from_camera, track.keyframe_id,

@@ -21,6 +21,7 @@ from companion.geometry.transforms import (
     Pose,
     quaternion_from_rotation,
     rotation_from_quaternion,
+    rotation_from_vector,
     vector_from_rotation,
     yaw_rotation,
 )
@@ -31,6 +32,8 @@ MAX_RATE_SPAN_NS = 300_000_000
 """Samples further apart say nothing of the rate; gimbals send 5 a second at least."""
 RATE_STEP_NS = 60_000_000
 """Over which the body's rate is measured: three attitudes at 50 a second."""
+MAX_CORRECTION_SPAN_NS = 200_000_000
+"""Over longer spans the rates of its ends say nothing."""
 MAX_WAITING = 64
 SILENT_NS = 500_000_000
 """Frames without the head's attitude for so long are reported."""
@@ -50,6 +53,10 @@ class GimbalHead:
         """Those of which the autopilot's heading is still to come."""
         self._last: tuple[int, Array] | None = None
         self._heard_ns: int | None = None
+        self._newest: AttitudeSample | None = None
+        """The autopilot's last attitude."""
+        self.corrected_rad = 0.0
+        """Corrections of the autopilot's heading so far: turns that its own rates do not show."""
         self._unknown_since_ns: int | None = None
         self._reported = False
 
@@ -60,6 +67,7 @@ class GimbalHead:
         """
         if isinstance(sample, AttitudeSample):
             self._vehicle.add(sample)
+            self._see_correction(sample)
         else:
             self._heard_ns = sample.t_ns
             self._waiting.append(sample)
@@ -74,6 +82,18 @@ class GimbalHead:
             if ned_from_head is not None:
                 known.append(self._with_rates(first.t_ns, ned_from_head))
         return known
+
+    def _see_correction(self, sample: AttitudeSample) -> None:
+        last, self._newest = self._newest, sample
+        if last is None or not 0 < sample.t_ns - last.t_ns <= MAX_CORRECTION_SPAN_NS:
+            return
+        if last.rates_body_rad_s is None or sample.rates_body_rad_s is None:
+            return
+        dt_s = (sample.t_ns - last.t_ns) * 1e-9
+        turn = rotation_from_vector(0.5 * dt_s * (last.rates_body_rad_s + sample.rates_body_rad_s))
+        by_rates = rotation_from_quaternion(last.ned_from_body) @ turn
+        told = rotation_from_quaternion(sample.ned_from_body)
+        self.corrected_rad += float(vector_from_rotation(told @ by_rates.T)[2])
 
     def _in_ned(self, sample: GimbalSample, at_ns: int) -> Array | None:
         rotation = rotation_from_quaternion(sample.level_from_head)

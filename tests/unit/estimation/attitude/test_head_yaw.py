@@ -77,3 +77,27 @@ def test_in_another_map_it_has_to_be_steady() -> None:
     assert not any(fits[:80]) and fits[-1]
     watch.believe()
     assert watch.fits_again(t_ns) and not watch.doubted
+
+
+def test_a_correction_of_the_heading_is_no_fault_of_the_gimbal() -> None:
+    """PX4 turns its heading by some degrees a second after a take-off, and what is told with it."""
+    for follows in (True, False):
+        watch = HeadYaw(float(np.radians(0.5)))
+        for k in range(300):
+            corrected = np.radians(15.0) * min(max(0.0, (k - 100) / 50), 1.0)
+            told = yaw_rotation(corrected if follows else 0.0)
+            watch.take(k * S // 15, TILT, told, corrected)
+            assert watch.moved_since_ns() is None and not watch.doubted
+            assert watch.fits_again(k * S // 15)
+
+
+def test_a_yaw_far_from_that_of_the_positions_is_found() -> None:
+    for off_deg, found in ((10.0, False), (35.0, True)):
+        watch, far = HeadYaw(float(np.radians(0.5))), []
+        for k in range(60):
+            t_ns = k * S // 15
+            watch.take(t_ns, TILT, yaw_rotation(np.radians(off_deg)))
+            far.append(watch.far_since_ns(t_ns, TILT.T))
+        assert watch.far_since_ns(t_ns + S, None) is None
+        assert [since for since in far if since is not None][:1] == ([0] if found else [])
+        assert far[:15] == [None] * 15

@@ -118,3 +118,14 @@ def test_silence_is_said_once_and_its_end() -> None:
     said = [w for k in range(40) for w in head.warnings(k * 50 * MS, known=not 10 <= k < 30)]
     assert [each.what for each in said] == [GIMBAL_SILENT, GIMBAL_HEARD]
     assert said[0].t_ns == 1000 * MS and "none was heard" in said[0].detail and said[1].good
+
+
+def test_turns_that_the_rates_do_not_show_are_corrections() -> None:
+    head, rates = GimbalHead(GIMBAL), np.array([0.0, 0.0, 1.0])
+    for k in range(100):
+        heading = 0.02 * k + np.radians(6.0) * min(max(0.0, (k - 40) / 20), 1.0)
+        sample = AttitudeSample(
+            20 * k * MS, quaternion_from_rotation(yaw_rotation(heading)), rates if k else None
+        )
+        head.take(sample, 0)
+    assert head.corrected_rad == pytest.approx(np.radians(6.0), abs=1e-6)
