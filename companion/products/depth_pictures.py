@@ -11,6 +11,8 @@ from companion.messages import Bytes, DepthMap, Floats
 
 MAX_HELD = 12
 WIDTH_PX = 400
+PNG_LEVEL = 6
+"""9 takes six times as long, for 2 % less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +69,7 @@ def picture_of(depth_map: DepthMap) -> DepthPicture:
         [cv2.IMWRITE_JPEG_QUALITY, 80],
     )
     coloured = _at_width(depth_colours(depth_map.depth, near, far), cv2.INTER_NEAREST)
-    _, png = cv2.imencode(".png", coloured, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    _, png = cv2.imencode(".png", coloured, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
     return DepthPicture(
         depth_map.keyframe_id, depth_map.t_ns, jpeg.tobytes(), png.tobytes(), near, far,
         float(known.mean()), depth_map.n_updates,
