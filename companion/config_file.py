@@ -39,6 +39,8 @@ CONSTANTS: Mapping[str, Any] = {
 }  # fmt: skip
 """Keys of version 0.1.0 that are no more, with the value that counts instead."""
 
+KINDS = {"float": "a number", "int": "a whole number", "bool": "true or false", "str": "text"}
+"""Python's types, as whoever sets a key calls them."""
 HIDDEN = "***"
 """Text in place of a password."""
 _PASSWORD = re.compile(r"(://[^:/@\s]*):[^/\s]+@")
@@ -136,7 +138,7 @@ def with_value(config: Config, name: str, value: Any, where: str) -> Config:
         checked = msgspec.convert(value, _types()[name])
     except msgspec.ValidationError as error:
         words = ", ".join(words_of(name))
-        wanted = f"wanted one of {words}" if words else _wanted_list(name) or str(error)
+        wanted = f"wanted one of {words}" if words else _wanted_list(name) or _in_words(error)
         if (limits := number_or_word(name)) is not None:
             word, least, most = limits
             wanted = f"wanted {word} or a number from {least:.15g} to {most:.15g}"
@@ -144,6 +146,15 @@ def with_value(config: Config, name: str, value: Any, where: str) -> Config:
     if listed_words_of(name) and len(set(checked)) < len(checked):
         raise ConfigError(f"{where}: {name}: {_wanted_list(name)}, given is {value!r}")
     return with_values(config, {name: checked})
+
+
+def _in_words(error: msgspec.ValidationError) -> str:
+    """Why a value is invalid, without the names of Python's types."""
+    found = re.match(r"Expected `(\w+)`( [<>]=? \S+)?", str(error))
+    if found is None or found[1] not in KINDS:
+        return str(error)
+    where = " in the list" if "$[" in str(error) else ""
+    return f"wanted {KINDS[found[1]]}{found[2] or ''}{where}"
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:

@@ -53,8 +53,14 @@ def application(
         Mount("/static", StaticFiles(directory=str(files("companion.page") / "static"))),
     ]
 
+    async def unknown(request: Request, error: Exception) -> Response:
+        if request.headers.get("accept", "").startswith("text/html"):
+            return await site.refused(request, "This page has no such view.", 404)
+        return PlainTextResponse("there is nothing here", 404)
+
     async def fault(request: Request, error: Exception) -> Response:
         say(f"the page: {request.url.path}: {type(error).__name__}: {error}")
         return PlainTextResponse("the page has a fault; the journal says which", 500)
 
-    return Gate(Starlette(routes=routes, exception_handlers={Exception: fault}), clock)
+    handlers = {404: unknown, Exception: fault}
+    return Gate(Starlette(routes=routes, exception_handlers=handlers), clock)

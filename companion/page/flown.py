@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,25 @@ from companion.errors import FlightError
 from drivers.recording.flights_folder import (
     KEEP,
     FlightPlace,
+    began_unix_s,
     delete,
     flown_in,
     free_bytes,
     in_order,
+    number_of,
 )
 
-SHOWN = ("report.html", "flight.mcap", "cloud.ply", "trajectory.tum", "report.json", "flight.tlog")
-"""Files named first, in this order."""
+SHOWN = {
+    "report.html": "the flight on one page, with its cloud to be turned",
+    "flight.mcap": "recording: for a replay, and for Foxglove",
+    "cloud.ply": "coloured points, local north, east, down in metres",
+    "trajectory.tum": "path: time, place and attitude of each picture",
+    "site.map": "map to fly by again (map.path)",
+    "report.json": "numbers of the report",
+    "flight.tlog": "MAVLink, for ground stations",
+    "flight.rrd": "for the Rerun viewer",
+}
+"""Files named first, in this order, and what they are."""
 MOST_FILES = 200
 MOST_BYTES = 8 << 20
 """Bytes of a path, or of a report, that are read for the list."""
@@ -44,6 +56,17 @@ class Flown:
     n_points: int | None
     drawing: str
     """Path from above as the points of an SVG polyline, north up; "" without one."""
+
+    @property
+    def title(self) -> str:
+        """Number and time of the flight for its reader, else its name."""
+        number, began_s = number_of(self.name), began_unix_s(self.name)
+        if number is None:
+            return self.name
+        if began_s is None:
+            return f"Flight {number}, the clock was not set"
+        began = datetime.fromtimestamp(began_s, timezone.utc)
+        return f"Flight {number}, {began.day} {began:%b %Y, %H:%M} UTC"
 
 
 class FlownFlights:
@@ -121,11 +144,12 @@ class FlownFlights:
     def _flown(self, place: FlightPlace) -> Flown:
         report, drawing = self._results(place.path)
         duration_s, path_m = report.get("duration_s"), report.get("path_length")
+        n_points = report.get("points")
         return Flown(
             place.path.name, place.n_bytes / MB, place.kept, place.growing,
             duration_s if isinstance(duration_s, (int, float)) else None,
             path_m if isinstance(path_m, (int, float)) else None,
-            str(report.get("unit", "")), report.get("points"), drawing,
+            str(report.get("unit", "")), n_points if isinstance(n_points, int) else None, drawing,
         )  # fmt: skip
 
     def _results(self, folder: Path) -> tuple[dict[str, Any], str]:

@@ -180,7 +180,7 @@ def test_nothing_is_changed_in_flight(page: Any, paged: Paged) -> None:
 def test_the_map_is_moved_by_its_buttons(page: Any, paged: Paged) -> None:
     go(page, paged, "/map")
     told(page, "#above-text", "m/s")
-    for name in ("Nearer", "Further", "All of it", "Follow the drone"):
+    for name in ("Zoom in", "Zoom out", "Show all", "Follow the drone"):
         press(page, name)
     assert page.get_by_role("button", name="Follow the drone").get_attribute("aria-pressed") == (
         "true"

@@ -28,8 +28,10 @@ function again(everyMs, work) {
   next();
 }
 
-// A fragment is some elements with ids; those of the view with the same ids get their content.
+// A fragment is some elements with ids; those of the view with the same ids get their content, where
+// it is another than before: what a reader has opened or filled in meanwhile stays.
 for (const view of document.querySelectorAll("[data-fragment]")) {
+  const previous = new Map();
   again(Number(view.dataset.every), async () => {
     const fresh = document.createElement("template");
     fresh.innerHTML = await (await ask(view.dataset.fragment)).text();
@@ -37,7 +39,8 @@ for (const view of document.querySelectorAll("[data-fragment]")) {
     const before = line && line.textContent;
     for (const part of fresh.content.children) {
       const shown = document.getElementById(part.id);
-      if (!shown || shown.innerHTML === part.innerHTML) { continue; }
+      if (!shown || (previous.get(part.id) ?? shown.innerHTML) === part.innerHTML) { continue; }
+      previous.set(part.id, part.innerHTML);
       const focused = shown.contains(document.activeElement) && document.activeElement.getAttribute("href");
       shown.innerHTML = part.innerHTML;
       const same = focused && shown.querySelector(`[href="${focused}"]`);
@@ -70,7 +73,7 @@ for (const form of document.forms) {
 // What may be changed depends on the motors: the view is loaded anew when they are armed or
 // disarmed, unless somebody is filling in a form.
 let typed = false;
-document.addEventListener("input", () => { typed = true; });
+document.addEventListener("input", (event) => { typed = typed || Boolean(event.target.form); });
 if (document.body.dataset.armed) {
   again(2500, async () => {
     const armed = await (await ask("/now/armed")).text();
@@ -78,6 +81,27 @@ if (document.body.dataset.armed) {
     if (!typed) { location.reload(); return; }
     document.body.dataset.armed = armed;
     for (const button of document.querySelectorAll("main form button")) { button.disabled = armed !== "false"; }
+  });
+}
+
+// The keys that have all the words, in their names or texts; the others are hidden.
+const find = document.getElementById("find");
+if (find) {
+  find.addEventListener("input", () => {
+    const words = find.value.toLowerCase().split(/\s+/).filter(Boolean);
+    for (const group of document.querySelectorAll("details.group")) {
+      let n = 0;
+      for (const field of group.querySelectorAll(".field")) {
+        const has = words.every((word) => field.textContent.toLowerCase().includes(word));
+        field.hidden = !has;
+        n += has;
+      }
+      group.hidden = n === 0;
+      group.open = words.length > 0 && n > 0;
+    }
+    for (const purpose of document.querySelectorAll(".purpose")) {
+      purpose.hidden = !purpose.querySelector("details.group:not([hidden])");
+    }
   });
 }
 
@@ -109,7 +133,10 @@ if (picture) {
   again(200, async () => {
     const answer = await ask(`/now/picture?after=${number}`);
     if (answer.status === 204) {
-      if (performance.now() - sinceMs > 5000 && number >= 0) { text.textContent = "No new picture for some seconds."; }
+      if (performance.now() - sinceMs > 5000 && number >= 0) {
+        text.textContent = "No new picture for some seconds: this is an old one.";
+        picture.classList.add("old");
+      }
       return;
     }
     const found = await answer.json();
@@ -118,6 +145,7 @@ if (picture) {
     await image.decode();
     number = found.number;
     sinceMs = performance.now();
+    picture.classList.remove("old");
     picture.width = image.naturalWidth;
     picture.height = image.naturalHeight;
     context.drawImage(image, 0, 0);
@@ -167,24 +195,60 @@ const above = document.getElementById("above");
 if (above) {
   const context = above.getContext("2d");
   const text = document.getElementById("above-text");
-  let scene = null, zoom = 1, follows = false;
+  let scene = null, zoom = 1, follows = false, scale = 1;
+  let [north, east] = [0, 0];  // how far the view was moved, centimetres
   again(1000, async () => {
     scene = await (await ask("/now/above")).json();
     draw();
   });
   for (const button of document.querySelectorAll("[data-zoom]")) {
     button.addEventListener("click", () => {
-      zoom = Number(button.dataset.zoom) ? zoom * Number(button.dataset.zoom) : 1;
+      const factor = Number(button.dataset.zoom);
+      if (!factor) { setFollows(false); }
+      [zoom, north, east] = factor ? [zoom * factor, north, east] : [1, 0, 0];
       draw();
     });
   }
   const follow = document.querySelector("[data-follow]");
+  function setFollows(wanted) {
+    follows = wanted;
+    follow.setAttribute("aria-pressed", follows);
+    [north, east] = [0, 0];
+    draw();
+  }
   if (follow) {
-    follow.addEventListener("click", () => {
-      follows = !follows;
-      follow.setAttribute("aria-pressed", follows);
+    follow.addEventListener("click", () => setFollows(!follows));
+    moveByHand();
+  }
+
+  // The map is dragged by one finger or the mouse, made larger by two or the wheel.
+  function moveByHand() {
+    const held = new Map();
+    const apart = () => { const [a, b] = [...held.values()]; return Math.hypot(a.x - b.x, a.y - b.y); };
+    above.style.touchAction = "none";
+    above.addEventListener("pointerdown", (event) => {
+      held.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      above.setPointerCapture(event.pointerId);
+    });
+    above.addEventListener("pointermove", (event) => {
+      const was = held.get(event.pointerId);
+      if (!was) { return; }
+      const before = held.size === 2 ? apart() : 0;
+      held.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      const ratio = above.width / above.clientWidth / held.size / scale;
+      east -= (event.clientX - was.x) * ratio;
+      north += (event.clientY - was.y) * ratio;
+      if (before) { zoom *= apart() / before; }
       draw();
     });
+    for (const end of ["pointerup", "pointercancel"]) {
+      above.addEventListener(end, (event) => { held.delete(event.pointerId); });
+    }
+    above.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      zoom *= Math.exp(-event.deltaY / 500);
+      draw();
+    }, { passive: false });
   }
   window.addEventListener("resize", draw);
 
@@ -213,8 +277,9 @@ if (above) {
       return;
     }
     const span = Math.max((n1 - n0) / above.height, (e1 - e0) / above.width, 200 / above.width) * 1.15;
-    const scale = zoom / span;  // pixels for a centimetre
-    const [cn, ce] = follows && scene.here ? scene.here : [(n0 + n1) / 2, (e0 + e1) / 2];
+    scale = zoom / span;  // pixels for a centimetre
+    let [cn, ce] = follows && scene.here ? scene.here : [(n0 + n1) / 2, (e0 + e1) / 2];
+    [cn, ce] = [cn + north, ce + east];
     const x = (e) => above.width / 2 + (e - ce) * scale, y = (n) => above.height / 2 - (n - cn) * scale;
     const dot = 2 * ratio;
     for (let i = 0; i + 2 < scene.points.length; i += 3) {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from urllib.parse import quote
 
 from starlette.requests import Request
@@ -10,7 +11,7 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from companion.errors import FlightError
-from companion.page.flown import FlownFlights
+from companion.page.flown import SHOWN, FlownFlights
 from companion.page.views.replay_views import ReplayViews
 from companion.page.views.site import Form, Site
 
@@ -60,7 +61,7 @@ class FlightViews:
             return await self._site.refused(request, str(error), 404)
         return await self._site.render(
             request, "flight.html.j2", flight=flight, **self._replays.values(name),
-            files=[(file, quote(file), mb) for file, mb in files],
+            files=[(file, quote(file), mb, SHOWN.get(Path(file).name, "")) for file, mb in files],
         )  # fmt: skip
 
     async def _file(self, request: Request) -> Response:

@@ -84,16 +84,17 @@ def headline(status: Mapping[str, Any], problem: str) -> tuple[bool, str]:
     if not status:
         return False, f"companion does not answer: {problem}"
     tracker = str(status.get("tracker", ""))
-    parts = [WORDS.get(tracker, tracker.capitalize())]
+    blind = _is_blind(status)  # then what was tracked last says nothing about now
+    parts = ["No pictures come" if blind else WORDS.get(tracker, tracker.capitalize())]
     feedback = status.get("feedback") or {}
-    good = tracker in ("tracking", "standing")
+    good = tracker in ("tracking", "standing") and not blind
     if feedback.get("mode", "off") == "off":
         parts.append("poses are not sent (feedback.mode is off)")
     elif feedback.get("sending"):
         parts.append(f"{feedback.get('rate_hz') or 0:.0f} poses a second go to the autopilot")
     else:
         good = False
-        parts.append(f"no pose is sent: {feedback.get('why_not') or 'not yet'}")
+        parts.append("no pose is sent" if blind else f"no pose is sent: {_why_not(feedback)}")
     for each in status.get("sources") or ():
         if each.get("state") != "running":
             good = False
@@ -106,7 +107,8 @@ def advice(status: Mapping[str, Any]) -> str:
     feedback = status.get("feedback") or {}
     if not status or feedback.get("mode", "off") == "off" or feedback.get("sending"):
         return ""
-    return OF_REASON.get(feedback.get("why_not") or "no pose yet", OTHER)
+    why = "no frames" if _is_blind(status) else feedback.get("why_not") or "no pose yet"
+    return OF_REASON.get(why, OTHER)
 
 
 def rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -114,7 +116,7 @@ def rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
     if not status:
         return []
     load, feedback = status.get("load") or {}, status.get("feedback") or {}
-    quality = status.get("quality") or -1
+    quality = -1 if _is_blind(status) else status.get("quality") or -1
     out = [
         ("Motors", "armed" if status.get("armed") else "disarmed"),
         ("Quality", f"{quality} of 100" if quality > 0 else "none"),
@@ -133,7 +135,7 @@ def rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Memory", _number(_times(load.get("memory_share"), 100), " %")),
         ("Temperature", _number(load.get("temperature_c"), " °C")),
         ("Disk free", _number(_times(load.get("disk_free_mib"), 1 / 1024), " GiB", 1)),
-        ("Left out", str(status.get("degraded") or "nothing")),
+        ("Reduced", str(status.get("degraded") or "nothing")),
         ("Flight", str(status.get("flight") or "not kept before arming")),
     ]  # fmt: skip
     return out
@@ -153,6 +155,15 @@ def ago(age_s: float) -> str:
     if age_s < 90:
         return f"{max(age_s, 0):.0f} s ago"
     return f"{age_s / 60:.0f} min ago"
+
+
+def _is_blind(status: Mapping[str, Any]) -> bool:
+    """True while the camera gives nothing."""
+    return bool(source(status, "camera").get("state", "running") != "running")
+
+
+def _why_not(feedback: Mapping[str, Any]) -> str:
+    return str(feedback.get("why_not") or "not yet")
 
 
 def _number(value: Any, unit: str, digits: int = 0) -> str:

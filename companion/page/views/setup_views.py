@@ -77,8 +77,9 @@ class SetupViews:
     async def _examine(self, request: Request, form: Form) -> Response:
         if self._doctor.is_busy:
             return await self._site.refused(request, "They are being examined just now.", 409)
-        await self._doctor.examine()
-        return self._site.done(request, "/setup#parameters", "The parameters were examined.")
+        good = "error" not in await self._doctor.examine()
+        said = "The parameters were examined." if good else "The parameters could not be examined."
+        return self._site.done(request, "/setup#parameters", said, good)
 
     async def _set(self, request: Request, form: Form) -> Response:
         name = form.get("name", "")

@@ -98,7 +98,8 @@ class Site:
 
     async def refused(self, request: Request, why: str, status_code: int) -> Response:
         """A page that says why something was not done."""
-        return await self.render(request, "refused.html.j2", status_code, why=why)
+        missing = status_code == 404
+        return await self.render(request, "refused.html.j2", status_code, why=why, missing=missing)
 
     def done(self, request: Request, to: str, what: str, good: bool = True) -> Response:
         """Go to a view, which says what was done."""

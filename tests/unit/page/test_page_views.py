@@ -56,6 +56,14 @@ def test_the_state_is_one_line() -> None:
     assert not good and line == "companion does not answer: no daemon runs"
 
 
+def test_without_pictures_nothing_is_said_to_be_tracked(served: ServedPage) -> None:
+    served.status["sources"][0] = {"name": "camera", "state": "missing"}
+    served.status["feedback"] = {"mode": "odometry", "sending": False, "why_not": "position reset"}
+    text = here(served, "/now/panel").text
+    assert "No pictures come, no pose is sent, camera missing." in text
+    assert "see the camera" in text and "<dt>Quality</dt><dd>none</dd>" in text
+
+
 def test_a_warning_comes_with_what_to_do(served: ServedPage) -> None:
     served.status["warnings"] = [
         {"what": "the camera is frozen", "detail": "<b>", "good": False, "age_s": 3.0},
@@ -85,6 +93,13 @@ def test_steps_tick_themselves_off() -> None:
     assert set(states(status, config, found).values()) == {"done"}
     last = steps(status, config, found)[-1]
     assert last.found == "Ready: 30 poses a second go to the autopilot."
+
+
+def test_it_is_not_called_ready_before_the_parameters_are_examined() -> None:
+    config = load_config(None, ["link.url=udpin::14550", "feedback.mode=odometry"])
+    last = steps(WELL, config, None)[-1]
+    assert last.state == "unknown" and last.found.startswith("30 poses a second go")
+    assert last.to == "#parameters"
 
 
 @pytest.mark.parametrize("change, key, words", [
@@ -121,6 +136,18 @@ def test_a_flight_has_its_files_and_no_others(served: ServedPage) -> None:
 def test_a_report_runs_without_the_session(served: ServedPage) -> None:
     policy = here(served, f"/flights/{NAME}/file/report.html").headers["content-security-policy"]
     assert policy.startswith("sandbox allow-scripts;") and "allow-same-origin" not in policy
+
+
+def test_a_flight_is_called_by_its_number_and_time(served: ServedPage) -> None:
+    assert "<h1" in (text := here(served, f"/flights/{NAME}").text)
+    assert "Flight 2, 20 Nov 2026, 10:00 UTC</h1>" in text and "Open the report" in text
+    assert "It has no report" in here(served, f"/flights/{OTHER}").text
+
+
+def test_what_is_not_there_is_said_in_a_view(served: ServedPage) -> None:
+    answer = served.ask("GET", "/nothing", headers={"host": "localhost", "accept": "text/html"})
+    assert answer.status == 404 and "<nav" in answer.text and "no such view" in answer.text
+    assert here(served, "/static/nothing.js").status == 404
 
 
 def test_flights_are_kept_and_deleted(served: ServedPage) -> None:
