@@ -133,9 +133,10 @@ def advice(views: Sequence[View], covered: Coverage, calibration: Calibration | 
             return f"tilt it {'left and right' if across < down else 'forward and back'}"
     if len(views) < MIN_VIEWS:
         return "more views: near and far, tilted"
-    if calibration is None or faults(calibration):
+    if calibration is None:
         return "more views, held still"
-    return ""
+    wrong = faults(calibration)
+    return wrong[0].rpartition(": ")[2] if wrong else ""
 
 
 def _uncertain(calibration: Calibration) -> list[str]:

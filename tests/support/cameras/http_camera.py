@@ -14,7 +14,8 @@ that scale is found sooner.
     size          (width, height) of what it sends
     markers_m     edge of landing markers that lie on its way; 0: none
     covered       True: it is dark, but for the sensor's noise
-    shown         a function that gives the picture to be seen instead: grey, of any size
+    shown         a function that gives the picture to be seen instead: grey, of any size; it comes
+                  with the sensor's noise, without which a camera would be taken for a frozen one
     lost          the share of pictures that never leave it, evenly spread
     sent_ns       CLOCK_MONOTONIC of the last picture that a client was sent
 """
@@ -173,7 +174,10 @@ class HttpCamera:
                 self._last = self._with_markers(self._last, pose)
         seen = self._last
         if self.shown is not None:
-            seen = np.asarray(cv2.cvtColor(self.shown(), cv2.COLOR_GRAY2RGB), np.uint8)
+            still = cv2.resize(self.shown(), self.size, interpolation=cv2.INTER_AREA)
+            noisy = still.astype(np.int16) + self._noise.integers(-1, 2, still.shape, np.int16)
+            grey = np.clip(noisy, 0, 255).astype(np.uint8)
+            seen = np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), np.uint8)
         if self.covered:
             seen = np.asarray(self._noise.integers(0, 8, seen.shape), np.uint8)
         if seen.shape[1::-1] != self.size:

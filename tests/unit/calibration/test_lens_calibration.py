@@ -209,4 +209,7 @@ def test_advice_is_empty_when_complete() -> None:
     assert advice(views[:2], coverage(views[:2], covered.lit), None)
     assert "corner" in advice(views[:5], coverage(views[:5], covered.lit), None)
     assert "more views" in advice(views, covered, None)
-    assert advice(views, covered, calibrated(RADTAN, CHARUCO, "auto")) == ""
+    found_now = calibrated(RADTAN, CHARUCO, "auto")
+    assert advice(views, covered, found_now) == ""
+    unsure = dataclasses.replace(found_now, sigmas=50.0 * found_now.sigmas)
+    assert advice(views, covered, unsure) == "tilt the board more, and bring it nearer"
