@@ -1,7 +1,7 @@
 // The view in the page: pointer, touch and keys, labels, and the level of detail.
 "use strict";
 
-const PATH = [0.35, 0.67, 1.0], KEYFRAME = [0.98, 0.66, 0.2], RULER = [1.0, 0.93, 0.35];
+const PATH = [1.0, 0.69, 0.13], KEYFRAME = [0.35, 0.67, 1.0], RULER = [1.0, 0.93, 0.35];
 const LEAST_POINTS = 20000;
 const SLOW_MS = 34, FAST_MS = 20; // between pictures, while it moves
 const REST_MS = 180; // so long after the last movement all points are drawn
