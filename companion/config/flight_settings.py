@@ -74,8 +74,8 @@ class ExportConfig:
     """Exports that a replay writes beside its results; `companion export` does so afterwards."""
 
     formats: tuple[str, ...] = ()
-    """ply, pcd, las, laz, copc, dsm, ortho, mosaic, glb, mesh, colmap, nerfstudio, tum, kitti,
-    euroc, gpx, kml, geojson."""
+    """ply, pcd, las, laz, copc, dsm, ortho, mosaic, glb, mesh, textured, tiles, colmap, nerfstudio,
+    tum, kitti, euroc, gpx, kml, geojson."""
     epsg: Expert[Annotated[int, Meta(ge=0, le=999999)]] = 0
     """Projection of clouds and rasters; 0: UTM zone of the flight."""
     cell_m: Expert[Annotated[float, Meta(ge=0, le=1000)]] = 0.0

@@ -27,6 +27,7 @@ class Axes(Enum):
     EAST_NORTH_UP = "local east, north, up in metres"
     GLTF = "x east, y up, z south, in metres from the local zero"
     EARTH = "latitude and longitude in degrees, WGS84"
+    EARTH_CENTRED = "Earth-centred, Earth-fixed metres (ECEF, WGS84), by the transform of the tile"
     MAP = "those of a map's frame"
 
 
@@ -110,7 +111,7 @@ def _placed(run: FinishedRun, axes: Axes | MapFrame) -> list[str]:
     lines = [f"Coordinates: {coordinates}."]
     if against:
         lines.append("Heights: NOT above mean sea level. " + "; ".join(against) + ".")
-    elif axes is Axes.EARTH:
+    elif axes in (Axes.EARTH, Axes.EARTH_CENTRED):
         lines.append(
             "Heights: above mean sea level as the autopilot gives them, not above the ellipsoid."
         )

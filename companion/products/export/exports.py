@@ -22,12 +22,14 @@ from companion.products.export.flight_pictures import FlightPictures
 from companion.products.export.image_mosaic import Mosaic, image_mosaic
 from companion.products.export.map_frame import MapFrame, map_frame
 from companion.products.export.mesh import Mesh, mesh_of
-from companion.products.export.mesh_files import mesh_gltf, mesh_ply
+from companion.products.export.mesh_files import mesh_gltf, mesh_ply, textured_gltf
 from companion.products.export.path_geo import path_geojson, path_gpx, path_kml
 from companion.products.export.path_tables import path_euroc, path_kitti, times_kitti
 from companion.products.export.reconstruction import colmap_files, nerfstudio_files
 from companion.products.export.surface import Surface, surface_of
 from companion.products.export.surface_tiff import mosaic_tiff, orthomosaic_tiff, surface_tiff
+from companion.products.export.textured_mesh import TexturedMesh, textured_mesh
+from companion.products.export.tileset import tileset_files
 from companion.products.run_folder import FinishedRun
 
 
@@ -56,6 +58,11 @@ class Export:
         return mesh_of(self.run.cloud, self.config.mesh_m)
 
     @cached_property
+    def textured(self) -> TexturedMesh:
+        """The same with the flight's pictures on it."""
+        return textured_mesh(self.mesh, self.pictures)
+
+    @cached_property
     def mosaic(self) -> Mosaic:
         """Orthomosaic of the flight's pictures."""
         if not self.run.metric:
@@ -66,7 +73,9 @@ class Export:
     def pictures(self) -> FlightPictures:
         """Pictures of the flight; InputError where it is not given."""
         if self.flight is None:
-            raise InputError("colmap, nerfstudio and mosaic need the pictures: --flight FLIGHT")
+            raise InputError(
+                "colmap, nerfstudio, mosaic and textured need the pictures: --flight FLIGHT"
+            )
         return self.flight
 
     @property
@@ -74,8 +83,8 @@ class Export:
         """Geodetic origin; InputError where unknown."""
         if self.run.origin is None:
             raise InputError(
-                f"{self.run.path}: no place on Earth is known of this run, so that gpx, kml and "
-                "geojson cannot be had"
+                f"{self.run.path}: no place on Earth is known of this run, so that gpx, kml, "
+                "geojson and tiles cannot be had"
             )
         return self.run.origin
 
@@ -142,6 +151,19 @@ PRODUCTS: Mapping[str, Product] = {
         {"mesh.ply": lambda e: mesh_ply(e.mesh)},
         Axes.LOCAL,
         lambda e: _about_mesh(e.mesh, e.run),
+    ),
+    "textured": Product(
+        "mesh with the pictures on it, glTF",
+        {"mesh_textured.glb": lambda e: textured_gltf(e.textured)},
+        Axes.GLTF,
+        lambda e: _about_mesh(e.mesh, e.run) + _about_textures(e.textured),
+    ),
+    "tiles": Product(
+        "mesh on the Earth, 3D Tiles; with the pictures, if the flight is given",
+        {},
+        Axes.EARTH_CENTRED,
+        lambda e: _about_mesh(e.mesh, e.run),
+        lambda e: tileset_files(_tile(e), e.mesh.vertices, e.mesh.cell, e.origin),
     ),
     "colmap": Product(
         "pictures, poses and cloud for COLMAP",
@@ -249,6 +271,17 @@ def _about_mesh(mesh: Mesh, run: FinishedRun) -> list[str]:
         f"Surface: {len(mesh.faces)} triangles in cells of {mesh.cell:g} {unit}, at the mean of "
         "the nearest points of the cloud; edges are rounded by about a cell. It ends where they do."
     ]
+
+
+def _about_textures(textured: TexturedMesh) -> list[str]:
+    return [
+        f"Pictures: {len(textured.patches)}, on {100 * textured.share:.0f} % of the triangles; the "
+        "others, which none shows, have the colours of the cloud. As bright as these, not blended."
+    ]
+
+
+def _tile(export: Export) -> bytes:
+    return mesh_gltf(export.mesh) if export.flight is None else textured_gltf(export.textured)
 
 
 def _about_mosaic(mosaic: Mosaic) -> list[str]:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from companion.errors import InputError
 from companion.geometry.camera import Camera
-from companion.geometry.transforms import Array, Pose
 from companion.messages import Bytes, Floats
 from companion.products.export.flight_pictures import FlightPictures, PlacedPicture
 from companion.products.export.map_frame import MapFrame
+from companion.products.export.picture_sight import depth_buffer, is_uncovered, projected, within
 from companion.products.export.surface import Surface
 
 STEP = 0.08
@@ -24,10 +24,6 @@ SHARPNESS = 6
 """Power of a picture's merit: the best dominates, and seams still fade into each other."""
 LEAST_COSINE = 0.25
 """Steeper views of the ground, 75 degrees from above, are not used."""
-BUFFER_PX = 4
-"""Side of a cell of the depth buffer that tells what is hidden, pixels."""
-HIDDEN = 1.03
-"""Beyond so many times the depth of what is nearest a place is hidden."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,25 +118,24 @@ def _add(
     """
     pose = picture.pose.world_from_camera
     known = np.isfinite(coarse[..., 0])
-    pixels, depth = _seen(coarse[known].astype(np.float64), pose, camera)
+    pixels, depth = projected(coarse[known].astype(np.float64), pose, camera)
     inside = np.zeros(known.shape, bool)
-    inside[known] = _within(pixels, camera) & (depth > 0)
+    inside[known] = within(pixels, camera) & (depth > 0)
     if not inside.any():
         return 0
-    nearest = _depth_buffer(pixels, depth, camera)
+    nearest = depth_buffer(pixels, depth, camera)
     rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
     top, bottom = max(rows[0] - 1, 0), min(rows[-1] + 2, known.shape[0])
     left, right = max(columns[0] - 1, 0), min(columns[-1] + 2, known.shape[1])
     fine_rows = np.arange(int(top * finer), min(int(bottom * finer), sums.shape[0]))
     fine_columns = np.arange(int(left * finer), min(int(right * finer), sums.shape[1]))
     ned, there = _finer(coarse, fine_rows, fine_columns, finer)
-    pixels, depth = _seen(ned.astype(np.float64), pose, camera)
+    pixels, depth = projected(ned.astype(np.float64), pose, camera)
     rays = ned - pose.translation.astype(np.float32)
     cosine = rays[..., 2] / np.maximum(np.linalg.norm(rays, axis=-1), 1e-6)
-    good = there & _within(pixels, camera) & (depth > 0) & (cosine > LEAST_COSINE)
+    good = there & within(pixels, camera) & (depth > 0) & (cosine > LEAST_COSINE)
     at = np.where(good[..., None], pixels, 0)
-    square = np.rint(at).astype(np.int64) // BUFFER_PX
-    good = good & (depth / HIDDEN < nearest[square[..., 1], square[..., 0]])
+    good = good & is_uncovered(at, depth, nearest)
     middle = np.array([camera.width - 1, camera.height - 1]) / 2
     inwards = 1.02 - np.abs((at - middle) / (middle + 1)).max(-1)
     merit = cosine * np.minimum(inwards, 0.5) / np.maximum(depth, 1e-3)
@@ -152,28 +147,6 @@ def _add(
     weights[into] += weight.astype(np.float32)
     sums[into] += weight[..., None].astype(np.float32) * sampled
     return 1
-
-
-def _seen(places: Array, pose: Pose, camera: Camera) -> tuple[Array, Array]:
-    """Pixels (..., 2) and depths (...,) of places (..., 3)."""
-    in_camera = pose.inverse().apply(places)
-    return camera.project(in_camera), in_camera[..., 2]
-
-
-def _within(pixels: Array, camera: Camera) -> NDArray[np.bool_]:
-    inside = (pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])
-    return np.asarray(inside.all(-1))
-
-
-def _depth_buffer(pixels: Array, depth: Array, camera: Camera) -> Floats:
-    """Depth of the nearest surface in and around each square of the picture, inf where none."""
-    shape = camera.height // BUFFER_PX + 1, camera.width // BUFFER_PX + 1
-    good = _within(pixels, camera) & (depth > 0)
-    at = np.rint(pixels[good]).astype(np.int64) // BUFFER_PX
-    out = np.full(shape, np.inf)
-    np.minimum.at(out, (at[:, 1], at[:, 0]), depth[good])
-    # cells may lie farther apart than squares
-    return np.asarray(cv2.erode(out.astype(np.float32), np.ones((3, 3))), np.float32)
 
 
 def _finer(

@@ -30,6 +30,10 @@ REACH_CELLS = 2.5
 LEAST_NEIGHBOURS = 3
 TRIM_CELLS = 1.2
 """The surface goes so far beyond its points."""
+N_ROUGH, N_SPREAD = 12, 2
+MOST_ROUGH = 0.4
+"""Cells by which the planes of the nearest points may scatter: beyond it points are of no surface,
+or of a wrong one."""
 N_SPACING = 2000
 CELLS_PER_SPACING = 2.0
 MAX_CELLS = 400_000_000
@@ -153,12 +157,32 @@ def _merged(vertices: Array, faces: Ints, cell: float) -> tuple[Array, Ints]:
     return vertices[first], joined[proper]
 
 
+def _roughness(vertices: Array, faces: Ints, tree: cKDTree, cloud: Cloud) -> Array:
+    """Scatter (V,) of the distances to the tangent planes of the nearest points.
+
+    The mean over neighbouring vertices, so that what is left out is left out in one piece.
+    """
+    _, index = tree.query(vertices, k=N_ROUGH)
+    offset = vertices[:, None] - cloud.points[index]
+    rough = (offset * cloud.normals[index]).sum(-1).std(1)
+    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    times = np.bincount(ends[:, 0], minlength=len(vertices))
+    for _ in range(N_SPREAD):
+        around = np.bincount(ends[:, 0], rough[ends[:, 1]], len(vertices))
+        rough = 0.5 * (rough + np.where(times > 0, around / np.maximum(times, 1), rough))
+    return np.asarray(rough)
+
+
 def _trimmed(vertices: Array, faces: Ints, tree: cKDTree, cloud: Cloud, cell: float) -> Mesh:
-    """Without what lies beyond the points, with the colours of the nearest of them."""
+    """Without what lies beyond the points or is too rough, with the colours of the nearest."""
     if not len(faces):
         raise InputError("no surface could be found in the cloud")
     away, index = tree.query(vertices, k=4)
-    faces = faces[(away[:, 0] < TRIM_CELLS * cell)[faces].all(1)]
+    good = away[:, 0] < TRIM_CELLS * cell
+    good &= _roughness(vertices, faces, tree, cloud) < MOST_ROUGH * cell
+    faces = faces[good[faces].all(1)]
+    if not len(faces):
+        raise InputError("no surface could be found in the cloud: its points scatter too much")
     used, faces = np.unique(faces, return_inverse=True)
     weight = 1.0 / np.maximum(away[used], 0.1 * cell)
     rgb = (weight[..., None] * cloud.rgb[index[used]]).sum(1) / weight.sum(1, keepdims=True)

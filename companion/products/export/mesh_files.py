@@ -1,14 +1,18 @@
-"""Mesh as PLY and as binary glTF, with colours of its vertices."""
+"""Mesh as PLY and as binary glTF, with colours of its vertices or with pictures."""
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
+import cv2
 import numpy as np
 
 from companion.errors import InputError
+from companion.geometry.transforms import Array
 from companion.products.export.flight_pictures import enu
 from companion.products.export.mesh import Mesh
+from companion.products.export.textured_mesh import Patch, TexturedMesh
 
 VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3)])
@@ -31,13 +35,50 @@ def mesh_ply(mesh: Mesh) -> bytes:
 
 def mesh_gltf(mesh: Mesh) -> bytes:
     """Binary glTF 2.0: x east, y up, z south, metres from the local zero."""
+    return _glb([_coloured(mesh)])
+
+
+def textured_gltf(textured: TexturedMesh) -> bytes:
+    """The same with pictures: one mesh for each, and one in colours where there is none."""
+    parts = [_pictured(patch) for patch in textured.patches]
+    return _glb(parts + [_coloured(textured.rest)] * bool(len(textured.rest.faces)))
+
+
+def _coloured(mesh: Mesh) -> Any:
+    made = _trimesh()
+    return made.Trimesh(_axes(mesh.vertices), mesh.faces, vertex_colors=mesh.rgb, process=False)
+
+
+def _pictured(patch: Patch) -> Any:
+    from PIL import Image
+
+    made = _trimesh()
+    height, width = patch.rgb.shape[:2]
+    # its texture coordinates begin below, at the border of a pixel
+    places = (patch.pixels + 0.5) / [width, height] * [1, -1] + [0, 1]
+    done, jpeg = cv2.imencode(".jpg", patch.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+    assert done
+    material = made.visual.material.PBRMaterial(
+        baseColorTexture=Image.open(io.BytesIO(jpeg.tobytes())), metallicFactor=0.0,
+        roughnessFactor=1.0,
+    )  # fmt: skip
+    visual = made.visual.TextureVisuals(uv=places, material=material)
+    return made.Trimesh(_axes(patch.vertices), patch.faces, visual=visual, process=False)
+
+
+def _axes(vertices_ned: Array) -> Array:
+    east, north, up = enu(vertices_ned).T
+    return np.stack([east, up, -north], 1)
+
+
+def _glb(parts: list[Any]) -> bytes:
+    data: Any = _trimesh().Scene(parts).export(file_type="glb", include_normals=True)
+    return bytes(data)
+
+
+def _trimesh() -> Any:
     try:
         import trimesh
     except ImportError as error:
         raise InputError("glTF needs trimesh: pip install '.[mesh]' in a clone") from error
-    east, north, up = enu(mesh.vertices).T
-    made = trimesh.Trimesh(
-        np.stack([east, up, -north], 1), mesh.faces, vertex_colors=mesh.rgb, process=False
-    )
-    data: Any = made.export(file_type="glb", include_normals=True)
-    return bytes(data)
+    return trimesh

@@ -9,14 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pyproj
 import pytest
 import rasterio
+import trimesh
 from PIL import Image
 
 from companion.config import ExportConfig
 from companion.errors import InputError
 from companion.geometry.camera import Camera
-from companion.geometry.geodesy import GeoOrigin
+from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry.transforms import Array, Pose, quaternion_from_euler
 from companion.geometry.transforms import rotation_from_quaternion as rotation
 from companion.messages import Bytes
@@ -104,6 +106,45 @@ def test_mosaic_has_the_colours_of_the_ground(run: FinishedRun, tmp_path: Path) 
     assert np.quantile(off, 0.99) <= 4
     text = (tmp_path / "mosaic.tif.accuracy.txt").read_text()
     assert "of 6 pictures, cells of 0.1 m" in text
+
+
+def test_textured_mesh_shows_the_ground(run: FinishedRun, tmp_path: Path) -> None:
+    """A triangle's picture has the ground's colours at its corners."""
+    run = replace(run, cloud=replace(run.cloud, rgb=colours(run.cloud.points[:, :2])))
+    (path,) = export_run(run, tmp_path, ExportConfig(formats=("textured",)), flight(run))
+    scene = trimesh.load(path)
+    off, n_faces, n_pictured = [], 0, 0
+    for part in scene.geometry.values():
+        n_faces += len(part.faces)
+        image = getattr(part.visual, "material", None)
+        if image is None:
+            continue
+        n_pictured += len(part.faces)
+        texture = np.asarray(image.baseColorTexture)
+        places = part.visual.uv * [1, -1] + [0, 1]
+        columns, rows = (places * [CAMERA.width, CAMERA.height]).astype(int).T
+        ned = np.stack([-part.vertices[:, 2], part.vertices[:, 0]], 1)
+        off.append(np.abs(texture[rows, columns].astype(int) - colours(ned).astype(int)))
+    assert n_pictured > 0.7 * n_faces
+    # half a pixel of the steepest colour is 3; JPEG and the gain add some
+    assert np.quantile(np.concatenate(off), 0.95) <= 12
+    text = (tmp_path / "mesh_textured.glb.accuracy.txt").read_text()
+    assert f"on {100 * n_pictured / n_faces:.0f} % of the triangles" in text
+
+
+def test_tile_lies_on_the_earth(run: FinishedRun, tmp_path: Path) -> None:
+    """Its middle, brought to the Earth by its transform, is that of the cloud."""
+    (folder,) = export_run(run, tmp_path, ExportConfig(formats=("tiles",)))
+    root = json.loads((folder / "tileset.json").read_text())["root"]
+    earth_from_enu = np.array(root["transform"]).reshape(4, 4).T
+    middle = earth_from_enu @ [*root["boundingVolume"]["box"][:3], 1.0]
+    to_geodetic = pyproj.Transformer.from_crs(4978, 4979, always_xy=True)
+    longitude, latitude, height = to_geodetic.transform(*middle[:3])
+    places = run.cloud.points.astype(np.float64)
+    wanted = geodetic_from_ned((places.min(0) + places.max(0))[None] / 2, ORIGIN)[0]
+    assert [latitude, longitude] == pytest.approx(wanted[:2], abs=3e-6)  # 0.3 m: a cell
+    assert height == pytest.approx(ORIGIN.altitude_m - GROUND_M, abs=0.2)
+    assert trimesh.load(folder / root["content"]["uri"]).geometry
 
 
 def test_colmap_reads_its_model(run: FinishedRun, tmp_path: Path) -> None:
