@@ -179,7 +179,7 @@ def test_a_flight_is_replayed_again(page: Any, paged: Paged) -> None:
 def test_the_viewer_is_opened_through_the_page(page: Any, paged: Paged, browser: Browser) -> None:
     go(page, paged, "/map")
     page.get_by_role("link", name="daemon.viewer").click()
-    page.get_by_label("daemon.viewer").select_option("web")
+    page.get_by_label("daemon.viewer").fill("web")
     press(page, "Save [daemon]")
     page.get_by_text("Changed: daemon.viewer is now web.").wait_for(timeout=PATIENCE_MS)
     page.goto("about:blank")
