@@ -60,6 +60,9 @@ class DistributedConfig:
     """Endpoints to listen at, as tcp/0.0.0.0:7447; none: loopback, if tracking runs here."""
     connect: tuple[str, ...] = ()
     """Endpoints to connect to, as tcp/192.168.1.20:7447."""
+    ros_domain: Annotated[int, Meta(ge=-1, le=232)] = -1
+    """Pose, cloud and keyframes' pictures for ROS 2 too, in this domain, as its rmw_zenoh finds
+    them; -1: none."""
     stages: Expert[tuple[str, ...]] = ("tracking", "depth", "cloud")
     """Stages of this node, as `companion run --stages`: all, tracking alone, or depth and cloud."""
     budget_kbit_s: Expert[Annotated[float, Meta(ge=0, le=1e6)]] = 8000.0

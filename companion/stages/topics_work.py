@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from companion.errors import StageError, StreamError
 from companion.messages import (
     DepthMap,
@@ -37,7 +39,10 @@ from companion.topics.message_codec import (
     keyframe_envelope,
     map_envelope,
     pose_envelope,
+    world_place,
 )
+from drivers.system.ros_messages import image_cdr, odometry_cdr, points_cdr
+from drivers.system.ros_topics import RosTopics
 from drivers.system.zenoh_bus import LAST, URGENT, USUAL, ZenohBus
 
 TOPICS = {"pose": URGENT, "keyframe": USUAL, "map": USUAL, "depth": LAST, "cloud": LAST}
@@ -75,6 +80,9 @@ class Topics(Work):
         self.bus = ZenohBus(config)
         for topic, priority in TOPICS.items():
             self.bus.declare_publisher(topic, priority)
+        self._ros: RosTopics | None = None
+        if config.ros_domain >= 0:
+            self._ros = RosTopics(self.bus, config.ros_domain, config.vehicle)
         self.bus.serve("flight", lambda asked: self.about)
         self.bus.serve("map", lambda asked: self._map())
         self.bus.serve("depth_input", self._depth_input)
@@ -100,7 +108,24 @@ class Topics(Work):
             self._publish("depth", partial(depth_envelope, self._flight, message, self._update))
         elif isinstance(message, PointChunk):
             self._publish("cloud", partial(cloud_envelope, self._flight, message, self._update))
+        if self._ros is not None:
+            self._tell_ros(self._ros, message)
         return self._changes(message.t_ns) if isinstance(message, Frame) else []
+
+    def _tell_ros(self, ros: RosTopics, message: Any) -> None:
+        if isinstance(message, Odometry):
+            ros.publish("odometry", message.t_ns, partial(odometry_cdr, message))
+        elif isinstance(message, PointChunk):
+            ros.publish("points", message.t_ns, partial(self._points, message))
+
+    def _points(self, chunk: PointChunk) -> bytes | None:
+        """Points for ROS in the world, which are not moved later; None without a scale."""
+        world = world_place(chunk.keyframe_id, self._update)
+        if world is None:
+            return None
+        return points_cdr(
+            chunk.t_ns, world.apply(chunk.points_camera.astype(np.float64)), chunk.rgb
+        )
 
     def finish(self, finish: Finish) -> Iterable[Message]:
         """Disconnect; if not in a hurry after the last bundle has been fetched."""
@@ -121,6 +146,9 @@ class Topics(Work):
             if jpeg is not None:
                 made = partial(keyframe_envelope, self._flight, keyframe, update, jpeg)
                 self._publish("keyframe", made)
+                if self._ros is not None:
+                    image = partial(image_cdr, keyframe.t_ns, jpeg)
+                    self._ros.publish("image/compressed", keyframe.t_ns, image)
         if bundle.change is not None and update is not None:
             self._publish("map", partial(map_envelope, self._flight, update))
 

@@ -178,11 +178,17 @@ def points_of(envelope: Envelope, name: str) -> Floats:
     return before
 
 
+def world_place(keyframe_id: int, update: MapUpdate | None) -> Similarity | None:
+    """Transform `world_from_camera` of a keyframe, scale included; None where unknown."""
+    place = update.place_of(keyframe_id) if update is not None else None
+    found = update.georeference if update is not None else None
+    return found.world_from_map @ place if found is not None and place is not None else None
+
+
 def _placed(keyframe_id: int, update: MapUpdate | None) -> dict[str, Any]:
     """`map_from_camera` and `world_from_camera` of a keyframe, null where unknown."""
     place = update.place_of(keyframe_id) if update is not None else None
-    found = update.georeference if update is not None else None
-    world = found.world_from_map @ place if found is not None and place is not None else None
+    world = world_place(keyframe_id, update)
     return {
         "map_from_camera": place_row(place) if place is not None else None,
         "world_from_camera": place_row(world) if world is not None else None,

@@ -42,10 +42,19 @@ class ZenohBus:
             where = ", ".join([*settings["listen/endpoints"], *settings["connect/endpoints"]])
             raise InputError(f"[distributed]: {where}: {_brief(error)}") from error
 
-    def declare_publisher(self, topic: str, priority: str) -> None:
-        """Declare a publisher of a topic."""
+    @property
+    def session_id(self) -> str:
+        """Name of the session on the network."""
+        return str(self._session.info.zid())
+
+    def declare_token(self, key: str) -> None:
+        """Tell others that something of this key is there while the session is."""
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def declare_publisher(self, topic: str, priority: str, key: str = "") -> None:
+        """Declare a publisher of a topic; `key` is another than that of the topic."""
         self._publishers[topic] = self._session.declare_publisher(
-            f"{self._prefix}/{topic}",
+            key or f"{self._prefix}/{topic}",
             priority=getattr(self._zenoh.Priority, priority),
             congestion_control=self._zenoh.CongestionControl.DROP,
         )
@@ -54,9 +63,9 @@ class ZenohBus:
         """True if a declared topic has subscribers."""
         return bool(self._publishers[topic].matching_status.matching)
 
-    def publish(self, topic: str, data: bytes) -> None:
+    def publish(self, topic: str, data: bytes, attachment: bytes | None = None) -> None:
         """Send to all subscribers; dropped where the network does not take it."""
-        self._publishers[topic].put(data)
+        self._publishers[topic].put(data, attachment=attachment)
 
     def serve(self, topic: str, answer: Callable[[bytes], bytes | None]) -> None:
         """Answer queries of a topic; called in a thread of its own, None for no answer."""

@@ -39,9 +39,11 @@ def joined_config(endpoint: str) -> DistributedConfig:
 
 
 @contextmanager
-def topics_of(endpoint: str, flights: Path, flight: str = "a-flight") -> Iterator[Topics]:
+def topics_of(
+    endpoint: str, flights: Path, flight: str = "a-flight", **changes: object
+) -> Iterator[Topics]:
     """The drone's stage of a made-up flight, in this process."""
-    config = replace(Config(), distributed=drone_config(endpoint))
+    config = replace(Config(), distributed=drone_config(endpoint, **changes))
     stage = Topics(Setup(config, topic_flight.CAMERA, flights / flight))
     try:
         yield stage

@@ -6,6 +6,7 @@ import json
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -110,9 +111,11 @@ def test_mosaic_has_the_colours_of_the_ground(run: FinishedRun, tmp_path: Path) 
 
 def test_textured_mesh_shows_the_ground(run: FinishedRun, tmp_path: Path) -> None:
     """A triangle's picture has the ground's colours at its corners."""
-    run = replace(run, cloud=replace(run.cloud, rgb=colours(run.cloud.points[:, :2])))
+    run = replace(
+        run, cloud=replace(run.cloud, rgb=colours(run.cloud.points[:, :2].astype(np.float64)))
+    )
     (path,) = export_run(run, tmp_path, ExportConfig(formats=("textured",)), flight(run))
-    scene = trimesh.load(path)
+    scene: Any = trimesh.load(path)
     off, n_faces, n_pictured = [], 0, 0
     for part in scene.geometry.values():
         n_faces += len(part.faces)
@@ -144,7 +147,8 @@ def test_tile_lies_on_the_earth(run: FinishedRun, tmp_path: Path) -> None:
     wanted = geodetic_from_ned((places.min(0) + places.max(0))[None] / 2, ORIGIN)[0]
     assert [latitude, longitude] == pytest.approx(wanted[:2], abs=3e-6)  # 0.3 m: a cell
     assert height == pytest.approx(ORIGIN.altitude_m - GROUND_M, abs=0.2)
-    assert trimesh.load(folder / root["content"]["uri"]).geometry
+    scene: Any = trimesh.load(folder / root["content"]["uri"])
+    assert scene.geometry
 
 
 def test_colmap_reads_its_model(run: FinishedRun, tmp_path: Path) -> None:
