@@ -27,9 +27,13 @@ def _plan(found: SiteComparison) -> Markup:
         (found.path_before_m, "-", "A"), (found.path_after_m, "--", "B")
     ):  # fmt: skip
         axes.plot(path_m[:, 1], path_m[:, 0], style, color="#9aa0a6", lw=1, label=f"path of {name}")
+    named = set()
     for number, change in enumerate(found.changes, 1):
         colour = [c / 255 for c in COLOURS[change.kind]]
-        axes.plot(change.points_m[:, 1], change.points_m[:, 0], ".", color=colour, ms=3)
+        label = "_" if change.kind in named else change.kind
+        named.add(change.kind)
+        north_m, east_m, _ = change.points_m.T
+        axes.plot(east_m, north_m, ".", color=colour, ms=4, label=label)
         north, east, _ = change.centre_m
         axes.annotate(str(number), (east, north), xytext=(6, 6), textcoords="offset points")
         if change.moved_m is not None:
