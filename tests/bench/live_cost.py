@@ -1,13 +1,14 @@
 """Cost of the live daemon with everything on: processor, memory, copies, latency of the pose.
 
-    python -m tests.bench.live_cost [--seconds 60] [--rounds 1] [--against CLONE]
+    python -m tests.bench.live_cost [--seconds 60] [--rounds 1] [--against CLONE] [--seen]
 
 The test pattern at 640x480 and 30 frames/s, dense map, recorder, exporter for viewers, an autopilot
-to which poses are sent. CLONE is another working tree, of an earlier version say: both are measured
-in turn. What is left out where there is too much to do is not left out here. Memory is the sum of
-proportional set sizes (PSS), without pandas, which an installed program does not have. "Pickled" is
-what the daemon's own process turns into bytes and back. The camera's thread, in the daemon, draws
-the pattern, and closes each frame for the stages.
+to which poses are sent. With --seen page and video are on too, and somebody looks at both. CLONE is
+another working tree, of an earlier version say: both are measured in turn. What is left out where
+there is too much to do is not left out here. Memory is the sum of proportional set sizes (PSS),
+without pandas, which an installed program does not have. "Pickled" is what the daemon's own process
+turns into bytes and back. The camera's thread, in the daemon, draws the pattern, and closes each
+frame for the stages.
 """
 
 from __future__ import annotations
@@ -15,9 +16,14 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import subprocess
 import sys
 import tempfile
+import threading
 import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +87,52 @@ SETTLE_S, UP_S = 15.0, 180.0
 NAMES = {"companion.streaming.export_process": "viewers"}
 
 
+WATCHING = """
+import sys, av
+while True:
+    try:
+        with av.open(sys.argv[1], options={"rtsp_transport": "tcp"}, timeout=20) as stream:
+            for _ in stream.decode(video=0):
+                pass
+    except av.error.FFmpegError:
+        pass
+"""
+LOOKED_AT_S = (("/now/panel", 1.0), ("/now/above", 1.0), ("/now/picture", 0.2))
+
+
+@contextlib.contextmanager
+def onlookers(page: int, video: int) -> Iterator[None]:
+    """Somebody who has the view Now open, and somebody who watches the video; ports."""
+    over = threading.Event()
+
+    def look() -> None:
+        due_s = {path: 0.0 for path, _ in LOOKED_AT_S}
+        while not over.wait(0.02):
+            for path, every_s in LOOKED_AT_S:
+                if time.monotonic() >= due_s[path]:
+                    due_s[path] = time.monotonic() + every_s
+                    with (
+                        contextlib.suppress(OSError),
+                        urllib.request.urlopen(
+                            f"http://127.0.0.1:{page}{path}", timeout=20
+                        ) as answer,
+                    ):
+                        answer.read()
+
+    looking = threading.Thread(target=look)
+    watching = subprocess.Popen(
+        [sys.executable, "-c", WATCHING, f"rtsp://127.0.0.1:{video}/camera"]
+    )
+    looking.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watching.kill()
+        watching.wait()
+        looking.join()
+
+
 def name_of(process: psutil.Process) -> str:
     """Stage of a child of the daemon."""
     name = str(process.name())
@@ -110,7 +162,7 @@ def own(path: Path) -> tuple[int, float]:
     return int(n), float(seconds)
 
 
-def measured(tree: Path, seconds: float) -> dict[str, float]:
+def measured(tree: Path, seconds: float, seen: bool = False) -> dict[str, float]:
     """Figures of one run of the program in a working tree."""
     port = free_port()
     os.chdir(tree)  # from where the program is imported
@@ -125,16 +177,22 @@ def measured(tree: Path, seconds: float) -> dict[str, float]:
             "daemon.flight=always", f"stream.listen=127.0.0.1:{free_port()}",
             f"link.url=udpin:127.0.0.1:{port}", "feedback.mode=odometry",
         )  # fmt: skip
+        page, video = free_port(), free_port()
+        shown = f"page.listen=127.0.0.1:{page}", f"video.listen=127.0.0.1:{video}"
         autopilot = FakeAutopilot("ardupilot", f"udpout:127.0.0.1:{port}")
         program = "-c", COUNTING.format(path=str(pickled))
-        daemon = Daemon(folder, *settings, program=program)
+        daemon = Daemon(folder, *settings, *shown * seen, program=program)
         # names of version 0.1, which both read
         daemon._command = [each.replace("expert.", "") for each in daemon._command]
         if not (tree / "companion" / "page").is_dir():  # a version without a page
             at = daemon._command.index("page.listen=")
             del daemon._command[at - 1 : at + 1]
-        with contextlib.redirect_stdout(sys.stderr), daemon, autopilot:
+        with ExitStack() as running:
+            for part in (contextlib.redirect_stdout(sys.stderr), daemon, autopilot):
+                running.enter_context(part)
             daemon.until(lambda health: health["tracker"] == "tracking", timeout_s=UP_S)
+            if seen:
+                running.enter_context(onlookers(page, video))
             time.sleep(SETTLE_S)
             process = psutil.Process(daemon._running.pid)
             first, first_own = cpu_and_memory(process), own(pickled)
@@ -168,12 +226,13 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--against", type=Path)
+    parser.add_argument("--seen", action="store_true")
     arguments = parser.parse_args()
     trees = [Path(__file__).parents[2]] + ([arguments.against] if arguments.against else [])
     found: dict[Path, list[dict[str, float]]] = {tree: [] for tree in trees}
     for _ in range(arguments.rounds):
         for tree in trees:
-            found[tree].append(measured(tree.absolute(), arguments.seconds))
+            found[tree].append(measured(tree.absolute(), arguments.seconds, arguments.seen))
     keys = sorted({key for runs in found.values() for run in runs for key in run})
     print("| |" + " | ".join(tree.absolute().name for tree in trees) + " |")
     for key in keys:
