@@ -181,7 +181,7 @@ def test_the_viewer_is_opened_through_the_page(page: Any, paged: Paged, browser:
     page.get_by_role("link", name="daemon.viewer").click()
     page.get_by_label("daemon.viewer").fill("web")
     press(page, "Save [daemon]")
-    page.get_by_text("Changed: daemon.viewer is now web.").wait_for(timeout=PATIENCE_MS)
+    page.get_by_text('Changed: daemon.viewer is now "web".').wait_for(timeout=PATIENCE_MS)
     page.goto("about:blank")
     paged.start_again()
     go(page, paged, "/map")
