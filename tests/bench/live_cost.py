@@ -139,20 +139,22 @@ def name_of(process: psutil.Process) -> str:
     if not name.startswith("python"):
         return name
     line = process.cmdline()  # before they had names of their own
-    if "-m" not in line:
-        return "daemon"
+    if "-m" not in line:  # a script: not to be taken for the daemon, whose row it would overwrite
+        return next((Path(word).name for word in line[1:] if word.endswith(".py")), "daemon")
     at = line.index("-m")
     return str(NAMES.get(line[at + 1], line[at + 2] if len(line) > at + 2 else line[at + 1]))
 
 
 def cpu_and_memory(daemon: psutil.Process) -> dict[str, tuple[float, float]]:
     """By process: processor seconds so far, and PSS in MB."""
-    found = {}
+    found: dict[str, tuple[float, float]] = {}
     for each in [daemon, *daemon.children(recursive=True)]:
         with contextlib.suppress(psutil.Error):
             times = each.cpu_times()
             name = "daemon" if each.pid == daemon.pid else name_of(each)
-            found[name] = times.user + times.system, each.memory_full_info().pss / 1e6
+            cpu_s, mb = found.get(name, (0.0, 0.0))  # of a name that two have, the sum
+            cpu_s += times.user + times.system
+            found[name] = cpu_s, mb + each.memory_full_info().pss / 1e6
     return found
 
 
