@@ -149,7 +149,7 @@ def with_value(config: Config, name: str, value: Any, where: str) -> Config:
 
 
 def _in_words(error: msgspec.ValidationError) -> str:
-    """Why a value is invalid, without the names of Python's types."""
+    """The reason why a value is invalid, without the names of Python's types."""
     found = re.match(r"Expected `(\w+)`( [<>]=? \S+)?", str(error))
     if found is None or found[1] not in KINDS:
         return str(error)

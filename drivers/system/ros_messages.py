@@ -7,14 +7,15 @@ forward, left, up.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.store import Typestore
 
 from companion.geometry.transforms import Array, quaternion_from_rotation
 from companion.messages import Bytes, Floats, Odometry
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 POINTS = "sensor_msgs/msg/PointCloud2"
@@ -83,6 +84,8 @@ def image_cdr(t_ns: int, jpeg: bytes) -> bytes:
 @cache
 def _store() -> Typestore:
     """Definitions of messages; those that are used here are the same in all of ROS 2."""
+    from rosbags.typesys import Stores, get_typestore  # here: most flights tell ROS nothing
+
     return get_typestore(Stores.ROS2_HUMBLE)
 
 

@@ -1,7 +1,7 @@
 """Topics for ROS 2 over Zenoh, as its `rmw_zenoh` names and finds them.
 
 A publisher puts CDR at DOMAIN/TOPIC/TYPE/HASH with an attachment (number, time, publisher), and a
-liveliness token tells the ROS graph that it is there (rmw_zenoh, docs/design.md).
+liveliness token tells the ROS graph that it is there (the design page of rmw_zenoh).
 """
 
 from __future__ import annotations

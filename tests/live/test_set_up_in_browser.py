@@ -26,6 +26,7 @@ from drivers.images.calibration_file import read_calibration
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.cameras.board_pictures import CHARUCO, RADTAN, BoardPictures, placings
 from tests.support.processes.paged import Paged
+from tests.support.waiting import until
 
 pytestmark = [
     pytest.mark.continues,
@@ -139,7 +140,7 @@ def test_arming_ends_what_is_heavy(page: Any, paged: Paged) -> None:
     press(page, "Begin anew")
     page.get_by_role("button", name="Stop", exact=True).wait_for(timeout=PATIENCE_MS)
     paged.autopilot.arm()
-    told(page, "Not calibrated: the motors were armed")
+    told(page, "Not calibrated: the motors (were|are) armed")  # by the page, or by what it runs
     page.get_by_text("The motors are armed: nothing can be changed now.").wait_for(
         timeout=PATIENCE_MS
     )
@@ -187,6 +188,8 @@ def test_the_viewer_is_opened_through_the_page(page: Any, paged: Paged, browser:
     go(page, paged, "/map")
     viewer = page.get_by_role("link", name="Open the Rerun viewer of this drone")
     viewer.wait_for(timeout=PATIENCE_MS)
+    address = paged.url + viewer.get_attribute("href")
+    until(lambda: page.request.get(address).status == 200, "the viewer runs")
     with page.expect_response(
         lambda answer: answer.request.method == "POST" and "/rerun." in answer.url,
         timeout=PATIENCE_MS,

@@ -1,4 +1,4 @@
-"""What a picture shows of a surface: where it lies in it, and what hides it."""
+"""Sight of a surface in a picture: the pixels of its places, and those that are hidden."""
 
 from __future__ import annotations
 
