@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from companion.calibration.calibration_verdict import MAX_SIGMA_CENTRE, MAX_SIGMA_FOCAL
 from companion.config_file import load_config
 from companion.geometry.transforms import (
     Pose,
@@ -131,8 +132,10 @@ def test_the_lens_is_calibrated_by_a_board(page: Any, paged: Paged) -> None:
     ).wait_for(timeout=PATIENCE_MS)
     path = load_config(paged.config).camera.calibration
     lens = read_calibration(paged.config.parent / path, *SIZE)
-    assert lens.fx == pytest.approx(RADTAN.fx / 2, rel=0.01)
-    assert lens.cx == pytest.approx((RADTAN.cx + 0.5) / 2 - 0.5, abs=1.5)
+    # three of the standard deviations with which a calibration is accepted
+    assert lens.fx == pytest.approx(RADTAN.fx / 2, rel=3 * MAX_SIGMA_FOCAL)
+    off_px = 3 * MAX_SIGMA_CENTRE * SIZE[0]
+    assert lens.cx == pytest.approx((RADTAN.cx + 0.5) / 2 - 0.5, abs=off_px)
 
 
 def test_arming_ends_what_is_heavy(page: Any, paged: Paged) -> None:
@@ -197,7 +200,10 @@ def test_the_viewer_is_opened_through_the_page(page: Any, paged: Paged, browser:
         viewer.click()
     assert stream.value.status == 200 and RERUN in page.url
     page.goto("about:blank")
-    # the viewer's program warns of itself, and would ask its makers: the page lets it not
+    # the viewer's program warns of itself, and would ask its makers, which the page refuses: what is
+    # said of the refusal, and of the request that failed by it, is all that may be said
     errors = [each for each in browser.complaints if not each.startswith("warning")]
-    assert all("Content Security Policy" in each for each in errors), errors
+    refused = [each for each in errors if "Content Security Policy" in each]
+    assert refused or not errors
+    assert [each for each in errors if each not in refused and "Failed to fetch" not in each] == []
     browser.complaints.clear()
