@@ -27,7 +27,7 @@ SHOWN = {
     "flight.mcap": "recording: for a replay, and for Foxglove",
     "cloud.ply": "coloured points, local north, east, down in metres",
     "trajectory.tum": "path: time, place and attitude of each picture",
-    "site.map": "map to fly by again (map.path)",
+    "site.map": "map to fly in again (map.use)",
     "report.json": "numbers of the report",
     "flight.tlog": "MAVLink, for ground stations",
     "flight.rrd": "for the Rerun viewer",
