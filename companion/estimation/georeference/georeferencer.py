@@ -16,9 +16,11 @@ from companion.config import GeoreferenceConfig
 from companion.estimation.georeference.alignment_sample import AlignmentSample, mean_rotation
 from companion.estimation.georeference.height_scales import HeightScales
 from companion.estimation.georeference.trajectory_alignment import (
+    SIGMA_TILT_RAD,
     SIGMA_VELOCITY_M_S,
     SIGMA_YAW_RAD,
     VELOCITY_TAU_S,
+    Level,
     Scale,
     fit_map,
     reconciled,
@@ -33,6 +35,8 @@ MAX_VELOCITY_AGE_NS = 400_000_000
 """A velocity is extrapolated for at most so long."""
 MAX_SIGMA_ROTATION_RAD = np.radians(8.0)
 MAX_SAMPLES = 400
+SIGMA_BEND_RAD = np.radians(0.1)
+"""Of the level of one part of a map against another."""
 DOWN = np.array([0.0, 0.0, 1.0])
 MAX_SIGMA_SCALE_NEW_MAP = 0.5
 """Largest relative scale error at which a new map is placed."""
@@ -187,7 +191,7 @@ class Georeferencer:
         if len(samples) > MAX_SAMPLES:
             chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_SAMPLES).astype(int))
             samples = [samples[int(i)] for i in chosen]
-        level = mean_rotation(samples)
+        level = levelled(mean_rotation(samples), inertial)
         for source in self._sources:
             if len(self._positions[source]) >= 4:
                 found = self._from_positions(samples, level, source, inertial)
@@ -195,18 +199,15 @@ class Georeferencer:
                     return found
         if level is None:
             return None
-        if inertial is not None and inertial.down_map is not None:
-            # the autopilot's own level is off by half a degree for minutes
-            level = turned_to(level @ inertial.down_map, DOWN) @ level
-        known = self._scales(samples, level, inertial)
-        return self._from_scale(samples, level, reduce(reconciled, known) if known else None)
+        known = self._scale(samples, level.world_from_map, inertial)
+        return self._from_scale(samples, level.world_from_map, known)
 
-    def _scales(
+    def _scale(
         self, samples: list[AlignmentSample], level: Array | None, inertial: Scale | None
-    ) -> list[Scale]:
-        """All scales that do not follow from positions."""
-        by_height = self._heights.of(samples, level)
-        return by_height if inertial is None else [*by_height, inertial]
+    ) -> Scale | None:
+        """Scale by all that is not positions."""
+        known = self._heights.of(samples, level)
+        return reduce(reconciled, known if inertial is None else [*known, inertial], None)
 
     def travelled(self, samples: list[AlignmentSample]) -> tuple[Array, float, str] | None:
         """Displacement (3,) by velocity from the first to the last sample, NED metres.
@@ -226,7 +227,7 @@ class Georeferencer:
         return np.asarray(self._lever_ned([sample])[0])
 
     def _from_positions(
-        self, samples: list[AlignmentSample], level: Array | None, source: PositionSource,
+        self, samples: list[AlignmentSample], level: Level | None, source: PositionSource,
         inertial: Scale | None,
     ) -> Georeference | None:  # fmt: skip
         t_ns = np.array([p.t_ns for p in samples])
@@ -244,8 +245,7 @@ class Georeferencer:
         extent = target - target.mean(0)
         if float(np.linalg.norm(extent, axis=1).max()) < 0.5 * self._config.min_travel_m:
             return None
-        known = self._scales(samples, level, inertial)
-        prior = min(known, key=lambda scale: scale.sigma, default=None)
+        prior = self._scale(samples, None if level is None else level.world_from_map, inertial)
         solution = fit_map(t_ns[ok] * 1e-9, mapped, target, travelled_m[ok], level, prior)
         if solution is None:
             return None
@@ -295,6 +295,20 @@ class Georeferencer:
         return Georeference(
             similarity, sigma, float(SIGMA_YAW_RAD), method, n, 0.0, has_origin=False
         )
+
+
+def levelled(level: Array | None, inertial: Scale | None) -> Level | None:
+    """Rotation (3, 3) from map to world by attitude, with the accelerometers' vertical.
+
+    The autopilot's own is off by half a degree for minutes.
+    """
+    if level is None or inertial is None or inertial.down_map is None:
+        return None if level is None else Level(level, float(SIGMA_TILT_RAD))
+    sigma_rad = float(np.hypot(inertial.sigma_down_rad, SIGMA_BEND_RAD))
+    share = 1.0 / (1.0 + (sigma_rad / float(SIGMA_TILT_RAD)) ** 2)
+    down = share * (level @ inertial.down_map) + (1.0 - share) * DOWN
+    turned = turned_to(down / np.linalg.norm(down), DOWN) @ level
+    return Level(turned, min(sigma_rad, float(SIGMA_TILT_RAD)))
 
 
 def turned_to(first: Array, second: Array) -> Array:

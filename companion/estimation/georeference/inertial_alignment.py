@@ -86,14 +86,15 @@ class _Seen(NamedTuple):
 class Fit(NamedTuple):
     """A scale, its relative standard deviation, the map's vertical, and how well all fits.
 
-    `down_map` (3,) is a unit vector; `log_likelihood` is that of the scale it was weighted for, up
-    to a constant; `squared` the squared normalised residual per degree of freedom, 1 where the
-    model is true.
+    `down_map` (3,) is a unit vector, off by `sigma_down_rad` to each side; `log_likelihood` is that
+    of the scale it was weighted for, up to a constant; `squared` the squared normalised residual
+    per degree of freedom, 1 where the model is true.
     """
 
     scale: float
     sigma: float
     down_map: Array
+    sigma_down_rad: float
     log_likelihood: float
     squared: float
 
@@ -168,7 +169,11 @@ class InertialAlignment:
         found, seen = self._equations(scale, sigma_map), self._seen
         weight = (scale * sigma_map) ** -2
         rights = np.stack([found.by_scale, found.right], 1)
-        solved = cho_solve_banded((found.factor, True), rights, check_finite=False)
+        mean_tilt = np.tile(np.eye(N_STATE)[:, TILT] / self.n_nodes, (self.n_nodes, 1))
+        solved = cho_solve_banded(
+            (found.factor, True), np.concatenate([rights, mean_tilt], 1), check_finite=False
+        )
+        solved, spread = solved[:, :2], mean_tilt.T @ solved[:, 2:]
         squares = np.array([[seen.squares[0], seen.squares[1]], [seen.squares[1], seen.squares[2]]])
         # squared residual of a scale s: (s, 1) times this times (s, 1)
         left = weight * squares - rights.T @ solved
@@ -182,10 +187,12 @@ class InertialAlignment:
         # noise of the map on the regressors, and that of these on themselves
         sigma = float(np.sqrt(signal + 2.0 * max(by_noise, 0.0))) / signal
         best = signal / -float(left[0, 1])
-        state = (solved @ np.array([best, 1.0])).reshape(self.n_nodes, N_STATE)
-        down = GRAVITY_NED_M_S2 + np.r_[state[:, TILT].mean(0), 0.0]
+        tilt_by_scale, tilt = (mean_tilt.T @ solved).T
+        down = GRAVITY_NED_M_S2 + np.r_[best * tilt_by_scale + tilt, 0.0]
+        variance = np.diag(spread) + (sigma * best * tilt_by_scale) ** 2
         return Fit(
             best, sigma, self._level.T @ (down / np.linalg.norm(down)),
+            float(np.sqrt(variance.max()) / np.linalg.norm(down)),
             -0.5 * (squared + found.log_determinant), squared / (3.0 * seen.n),
         )  # fmt: skip
 

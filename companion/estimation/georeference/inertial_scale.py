@@ -95,8 +95,11 @@ class InertialScale:
                 found = self._weighted(aligned)
         if found is None:
             return None
-        sigma = float(np.hypot(np.sqrt(max(found.squared, 1.0)) * found.sigma, SIGMA_SENSITIVITY))
-        return Scale(self._scale, sigma, "accelerometers", aligned.n_nodes, found.down_map)
+        unlikely = float(np.sqrt(max(found.squared, 1.0)))
+        return Scale(
+            self._scale, float(np.hypot(unlikely * found.sigma, SIGMA_SENSITIVITY)),
+            "accelerometers", aligned.n_nodes, found.down_map, unlikely * found.sigma_down_rad,
+        )  # fmt: skip
 
     def _weighted(self, aligned: InertialAlignment) -> Fit | None:
         """Fit with weights for the scale that is found."""

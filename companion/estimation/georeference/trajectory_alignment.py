@@ -38,7 +38,8 @@ DISAGREE = 3.0
 class Scale(NamedTuple):
     """Metres per map unit, relative standard deviation, method, and number of measurements.
 
-    `down_map` is the vertical (3,) of the map, where it was found with the scale.
+    `down_map` is the vertical (3,) of the map, where it was found with the scale, off by
+    `sigma_down_rad` to each side.
     """
 
     scale: float
@@ -46,10 +47,20 @@ class Scale(NamedTuple):
     method: str
     n: int
     down_map: Array | None = None
+    sigma_down_rad: float = np.inf
 
 
-def reconciled(first: Scale, second: Scale) -> Scale:
+class Level(NamedTuple):
+    """A rotation `world_from_map` (3, 3), and the standard deviation of its tilt to each side."""
+
+    world_from_map: Array
+    sigma_tilt_rad: float
+
+
+def reconciled(first: Scale | None, second: Scale) -> Scale:
     """The more certain of two scales; where they contradict, sigma is their difference."""
+    if first is None:
+        return second
     best = min(first, second, key=lambda scale: scale.sigma)
     apart = abs(float(np.log(first.scale / second.scale)))
     if apart < DISAGREE * float(np.hypot(first.sigma, second.sigma)):
@@ -78,20 +89,37 @@ def fit_map(
     mapped: Array,
     target: Array,
     travelled_m: Array,
-    level: Array | None,
+    level: Level | None,
     scale: Scale | None,
 ) -> tuple[Similarity, Array, float] | None:
     """Generalised least squares over (log scale, rotation (3), origin (3)) of N positions.
 
     `mapped` (N, 3), map units, are fitted to `target` (N, 3), metres; `travelled_m` (N, 3) is
-    integrated velocity, nan where missing; `level` the rotation world_from_map by attitude; `scale`
-    a prior on the scale. Returns the similarity, its covariance (7, 7) and the RMS residual in
-    metres; None where nothing fits.
+    integrated velocity, nan where missing; `level` and `scale` are priors. A scale that contradicts
+    the positions is as uncertain as it is off. Returns the similarity, its covariance (7, 7) and
+    the RMS residual in metres; None where nothing fits.
     """
-    estimate = _initial_guess(mapped, target, level)
+    found = _fit(t_s, mapped, target, travelled_m, level, scale)
+    if found is None or scale is None:
+        return None if found is None else found[:3]
+    similarity, covariance, residual_m, (by_positions, sigma) = found
+    apart = abs(float(np.log(scale.scale / by_positions)))
+    if apart < DISAGREE * float(np.hypot(sigma, scale.sigma)):
+        return similarity, covariance, residual_m
+    found = _fit(t_s, mapped, target, travelled_m, level, scale._replace(sigma=apart))
+    return None if found is None else found[:3]
+
+
+def _fit(
+    t_s: Array, mapped: Array, target: Array, travelled_m: Array, level: Level | None,
+    scale: Scale | None,
+) -> tuple[Similarity, Array, float, tuple[float, float]] | None:  # fmt: skip
+    """The same with the scale as certain as it says; last the scale without it, and its sigma."""
+    estimate = _initial_guess(mapped, target, None if level is None else level.world_from_map)
     if not np.isfinite(estimate.scale) or estimate.scale <= 0:
         return None
     keep, cholesky, equations = np.ones(len(t_s), bool), np.eye(len(t_s)), _Equations()
+    alone, by_positions = (np.eye(7), np.zeros(7)), estimate.scale
     for iteration in range(ITERATIONS):
         rotated = estimate.scale * mapped @ estimate.rotation.T
         residual = target - rotated - estimate.translation
@@ -111,11 +139,17 @@ def fit_map(
             r = solve_triangular(cholesky, residual[keep, axis], lower=True)
             equations.add(j, r, len(r))
         _add_displacements(equations, t_s, jacobian, rotated, travelled_m, keep)
-        _add_priors(equations, estimate, level, scale)
+        _add_level(equations, estimate, level)
+        alone = equations.information.copy(), equations.gradient.copy()
+        if scale is not None:
+            equations.information[0, 0] += scale.sigma**-2
+            equations.gradient[0] += np.log(scale.scale / estimate.scale) / scale.sigma**2
         try:
             solved = np.linalg.solve(equations.information, equations.gradient)
+            unaided = np.linalg.solve(*alone)
         except np.linalg.LinAlgError:
             return None
+        by_positions = estimate.scale * float(np.exp(np.clip(unaided[0], -0.5, 0.5)))
         delta = np.asarray(solved, np.float64)
         delta[:4] = np.clip(delta[:4], -0.5, 0.5)
         estimate = Similarity(
@@ -125,8 +159,10 @@ def fit_map(
         )
     inflation = max(equations.chi2 / max(equations.n_rows - 7, 1), 1.0)
     covariance = np.asarray(np.linalg.inv(equations.information) * inflation, np.float64)
+    sigma = float(np.sqrt(np.linalg.inv(alone[0])[0, 0] * inflation))
     error = target - estimate.apply(mapped)
-    return estimate, covariance, float(np.sqrt((error[keep] ** 2).sum(1).mean()))
+    residual_m = float(np.sqrt((error[keep] ** 2).sum(1).mean()))
+    return estimate, covariance, residual_m, (by_positions, sigma)
 
 
 def _add_displacements(
@@ -157,17 +193,13 @@ def _add_displacements(
     )  # fmt: skip
 
 
-def _add_priors(
-    equations: _Equations, estimate: Similarity, level: Array | None, scale: Scale | None
-) -> None:
-    if scale is not None:
-        equations.information[0, 0] += scale.sigma**-2
-        equations.gradient[0] += np.log(scale.scale / estimate.scale) / scale.sigma**2
+def _add_level(equations: _Equations, estimate: Similarity, level: Level | None) -> None:
     weight = np.full(3, 1e-6)
     if level is not None:
-        weight = np.array([SIGMA_TILT_RAD, SIGMA_TILT_RAD, SIGMA_YAW_RAD]) ** -2
-        rotation_error = vector_from_rotation(estimate.rotation @ level.T)
-        equations.gradient[1:4] -= weight * rotation_error
+        tilt_rad = level.sigma_tilt_rad
+        weight = np.array([tilt_rad, tilt_rad, float(SIGMA_YAW_RAD)]) ** -2
+        error_rad = vector_from_rotation(estimate.rotation @ level.world_from_map.T)
+        equations.gradient[1:4] -= weight * error_rad
     equations.information[1:4, 1:4] += np.diag(weight)
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.estimation.georeference.trajectory_alignment import DRIFT_TAU_S
 from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
 
 MAX_SLEW_M_S = 0.15
@@ -111,6 +112,16 @@ class OdometryFrame:
             self, from_world=Pose(turn, at - turn @ body_m), settled_from_world=settled,
             slewed_m=self.slewed_m + at - here_m,
         )  # fmt: skip
+
+
+def drift_m(residual_m: float, span_s: float) -> float:
+    """What satellites are off by over minutes, by what they scatter by over a time.
+
+    Of an error that lasts for `DRIFT_TAU_S` little shows in a few seconds: their mean is off by it.
+    """
+    spans = max(span_s / DRIFT_TAU_S, 1e-3)
+    seen = 1.0 - 2.0 / spans * (1.0 - (1.0 - float(np.exp(-spans))) / spans)
+    return residual_m / float(np.sqrt(seen))
 
 
 def _near_world(settled_from_world: Pose, body_m: Array, within_m: float) -> Pose:

@@ -18,7 +18,7 @@ from companion.estimation.odometry.flown_map import FlownMap, LastPose
 from companion.estimation.odometry.innovation_gate import MIN_CONSISTENT_NS, InnovationGate
 from companion.estimation.odometry.lift_off_heading import LiftOffHeading
 from companion.estimation.odometry.odometry_drift import OdometryDrift
-from companion.estimation.odometry.odometry_frame import MapView, OdometryState
+from companion.estimation.odometry.odometry_frame import MapView, OdometryState, drift_m
 from companion.estimation.odometry.placed_map import PlacedMap, frame_of
 from companion.estimation.odometry.stand import FLOOR_M, FRESH_NS, SIGMA_ATTITUDE_RAD, Stand
 from companion.estimation.odometry.tracked_velocity import tracked_velocity
@@ -134,8 +134,10 @@ class SmoothOdometry:
         here, attitude = frame.from_world @ raw, self.reckoning.attitude
         if last is not None:
             dt_s = min((track.t_ns - last.t_ns) * 1e-9, 1.0)
+            span_s = 0.0 if first is None else (track.t_ns - first.t_ns) * 1e-9
+            within_m = drift_m(georeference.residual_m, span_s)
             frame = self._heading.turned(
-                frame.slewed(raw, dt_s, georeference.residual_m), track.t_ns, raw,
+                frame.slewed(raw, dt_s, within_m), track.t_ns, raw,
                 None if attitude is None else attitude.ned_from_body, self.reset_counter, dt_s,
             )  # fmt: skip
         placed = frame.from_world @ raw

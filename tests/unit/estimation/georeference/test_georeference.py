@@ -145,6 +145,20 @@ def test_rangefinder_contradicted_by_barometer_is_uncertain(scale: float, known:
     assert (georeferencer.solve(kept) is not None) is known
 
 
+def test_positions_do_not_follow_a_rangefinder_that_they_contradict() -> None:
+    """A range may be of other ground than a young map has there, by 15 % all the while."""
+    kept, ned = places()
+    georeferencer = reference(ned, np.zeros_like(ned), None)
+    for i in range(400):
+        georeferencer.take(RangeSample(T0 + i * 100_000_000, 1.15 * 30.0))
+    found = georeferencer.solve(kept)
+    assert found is not None
+    assert "rangefinder" in found.method
+    off = abs(np.log(found.world_from_map.scale / TRUTH.scale))
+    assert off < 0.01
+    assert off < 3.0 * found.sigma_scale
+
+
 def test_no_measurements_give_none() -> None:
     kept, _ = places()
     assert Georeferencer(GeoreferenceConfig(), None).solve(kept) is None

@@ -173,7 +173,7 @@ def test_what_is_stated_is_what_it_is_off_by() -> None:
 
 def test_the_vertical_is_better_than_the_autopilots() -> None:
     """A body that turns tells a tilt of its attitude from a bias of its accelerometers."""
-    own, found = [], []
+    own, found, stated = [], [], []
     for seed in range(6):
         flight = Flight(weaving, seed)
         scale = flight.scale()
@@ -181,10 +181,14 @@ def test_the_vertical_is_better_than_the_autopilots() -> None:
         down = np.array([0.0, 0.0, 1.0])
         own.append(_angle_rad(flight.tilt.T @ down, down))
         found.append(_angle_rad(scale.down_map, MAP_FROM_NED @ down))
+        stated.append(scale.sigma_down_rad)
     print(
         f"off by {np.degrees(found).round(2)} degrees, the autopilot by {np.degrees(own).round(2)}"
     )
     assert np.sqrt(np.mean(np.square(found))) < 0.4 * np.sqrt(np.mean(np.square(own)))
+    off = np.mean(np.square(found)) / np.mean(np.square(stated)) / 2.0
+    print(f"stated {np.degrees(stated).round(2)} degrees to each side: {off:.2f} of it, squared")
+    assert 0.2 < off < 3.0
 
 
 def _angle_rad(first: Array, second: Array) -> float:

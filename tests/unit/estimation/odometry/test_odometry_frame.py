@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.estimation.odometry.odometry_frame import MAX_WITHIN_M, OdometryFrame
+from companion.estimation.odometry.odometry_frame import MAX_WITHIN_M, OdometryFrame, drift_m
 from companion.geometry.transforms import Array, Pose, yaw_angle, yaw_rotation
 
 BODY = Pose(yaw_rotation(0.7), np.array([30.0, -20.0, -8.0]))
@@ -86,3 +86,18 @@ def test_a_turn_about_a_place_turns_what_is_owed() -> None:
     settled = later(turned, BODY)
     np.testing.assert_allclose(place(settled, BODY), wanted_m, atol=1e-6)
     assert yaw_angle(settled.from_world.rotation) == pytest.approx(turn_rad)
+
+
+@pytest.mark.parametrize("span_s", [2.0, 10.0, 60.0, 1000.0])
+def test_satellites_that_drift_scatter_less_in_a_short_time_than_they_are_off(
+    span_s: float,
+) -> None:
+    """Over 400 ways of an error of one metre that lasts for 40 s."""
+    rng, dt_s = np.random.default_rng(1), span_s / 100
+    held = np.exp(-dt_s / 40.0)
+    off = np.empty((100, 400))
+    off[0] = rng.normal(size=400)
+    for k in range(1, 100):
+        off[k] = held * off[k - 1] + np.sqrt(1.0 - held**2) * rng.normal(size=400)
+    residual_m = float(np.sqrt(off.var(axis=0).mean()))
+    assert drift_m(residual_m, span_s) == pytest.approx(1.0, abs=0.1)
