@@ -2,9 +2,10 @@
 
 On the ground a compass is disturbed by what lies there; ArduPilot aligns its heading anew on the
 way up, in one step (EKF3: "in-flight yaw alignment complete"). A frame that kept the first would be
-skew against the autopilot's for the whole flight. Only that step is followed: what its heading
-drifts by otherwise is its own error, and an autopilot that finds its heading by our poses would
-drift with a frame that follows.
+skew against the autopilot's for the whole flight. PX4's step goes by a single reading of its
+compass: its heading swings for seconds after it, by 14 degrees to either side in its simulator, so
+that the mean after a step is followed. What a heading drifts by otherwise is its own error, and an
+autopilot that finds its heading by our poses would drift with a frame that follows.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from companion.geometry.transforms import Array, Pose, yaw_angle
 
 WITHIN_NS = 20_000_000_000
 """After a lift-off; ArduPilot aligns its heading below five metres."""
+AVERAGED_NS = 10_000_000_000
+"""After a step; PX4's heading takes six to eight seconds to settle."""
 NEAR_M = 3.0
 """Level way from the lift-off within which turning about it moves the body but little."""
 STEP_RAD, STEP_NS = np.radians(1.5), 120_000_000
@@ -33,19 +36,28 @@ class _LiftOff(NamedTuple):
     place_m: Array
 
 
+class _Step(NamedTuple):
+    """Time of the last step, and the mean of the N headings since, against ours at the lift-off."""
+
+    t_ns: int
+    mean_rad: float
+    n: int
+
+
 class LiftOffHeading:
     """Turns the frame about the place of the last lift-off, slowly."""
 
     def __init__(self) -> None:
         self._last: _LiftOff | None = None
-        self._off: tuple[int, float] | None = None
-        """Time, and the autopilot's heading against ours then."""
-        self._owed_rad = 0.0
-        """Part of the steps that the frame has not turned by yet."""
+        self._before: tuple[int, float] | None = None
+        """Time, and the autopilot's heading against ours as it was at the lift-off."""
+        self._step: _Step | None = None
+        self._turned_rad = 0.0
 
     def lift_off(self, t_ns: int, reset_counter: int, place_m: Array) -> None:
         """Take the place (3,) of a lift-off, in the frame as it is between two resets."""
-        self._last, self._off, self._owed_rad = _LiftOff(t_ns, reset_counter, place_m), None, 0.0
+        self._last, self._before = _LiftOff(t_ns, reset_counter, place_m), None
+        self._step, self._turned_rad = None, 0.0
 
     def turned(
         self, frame: OdometryFrame, t_ns: int, world_from_body: Pose, ned_from_body: Array | None,
@@ -60,14 +72,28 @@ class LiftOffHeading:
         if last.reset_counter != reset_counter or way_m > NEAR_M:
             self._last = None
             return frame
-        off_rad = yaw_angle(ned_from_body @ placed.rotation.T)
-        if self._off is not None and t_ns - last.t_ns < WITHIN_NS:
-            before_ns, before_rad = self._off
-            change_rad = (off_rad - before_rad + np.pi) % (2 * np.pi) - np.pi
-            if abs(change_rad) > STEP_RAD and t_ns - before_ns <= STEP_NS:
-                self._owed_rad += change_rad
+        off_rad = yaw_angle(ned_from_body @ placed.rotation.T) + self._turned_rad
+        self._average(t_ns, off_rad, t_ns - last.t_ns < WITHIN_NS)
+        self._before = t_ns, off_rad
+        owed_rad = 0.0 if self._step is None else self._step.mean_rad - self._turned_rad
         most_rad = float(MAX_SLEW_RAD_S) * dt_s
-        step_rad = float(np.clip(self._owed_rad, -most_rad, most_rad))
-        self._owed_rad -= step_rad
-        self._off = t_ns, off_rad - step_rad
-        return frame.turned(last.place_m, step_rad, placed.translation) if step_rad else frame
+        by_rad = float(np.clip(owed_rad, -most_rad, most_rad))
+        self._turned_rad += by_rad
+        return frame.turned(last.place_m, by_rad, placed.translation) if by_rad else frame
+
+    def _average(self, t_ns: int, off_rad: float, may_step: bool) -> None:
+        """Begin a mean with each step; else take another heading into that which has begun."""
+        step, before = self._step, self._before
+        if before is not None and may_step and t_ns - before[0] <= STEP_NS:
+            change_rad = _within_half_turn(off_rad - before[1])
+            if abs(change_rad) > STEP_RAD:
+                now_rad = before[1] + change_rad
+                self._step = _Step(t_ns, now_rad, 1)
+                return
+        if step is not None and t_ns - step.t_ns < AVERAGED_NS:
+            more_rad = _within_half_turn(off_rad - step.mean_rad) / (step.n + 1)
+            self._step = _Step(step.t_ns, step.mean_rad + more_rad, step.n + 1)
+
+
+def _within_half_turn(angle_rad: float) -> float:
+    return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)

@@ -312,3 +312,18 @@ def test_after_lift_off_it_follows_a_step_of_the_autopilots_heading(
     else:
         assert headings_rad == pytest.approx(np.zeros(80), abs=1e-6)
         np.testing.assert_allclose(places[-1], away, atol=0.01)
+
+
+def test_after_lift_off_a_heading_that_swings_is_followed_to_its_mean() -> None:
+    """As PX4's after it aligned anew: 14 degrees to one side, back within seconds."""
+    vehicle, settles_rad = Vehicle(), np.radians(2.0)
+    vehicle.frames(20, standing=True)
+    first = MapView(vehicle.t_ns + STEP_NS, Pose(np.eye(3), np.zeros(3)))
+    vehicle.frames(20)
+    for _ in range(10):
+        vehicle.frame(np.zeros(3), first=first)
+    for k in range(140):
+        swing_rad = np.radians(14.0) * np.exp(-k / 20.0) * np.cos(k / 8.0)
+        found = vehicle.frame(np.zeros(3), heading_rad=settles_rad + swing_rad)
+    assert found.world_from_body is not None
+    assert yaw_angle(found.world_from_body.rotation) == pytest.approx(settles_rad, abs=0.01)
