@@ -57,7 +57,7 @@ ON_OUR_POSE: dict[str, dict[str, float]] = {
     },
     "PX4": {
         "EKF2_EV_CTRL": 7, "EKF2_HGT_REF": 0, "EKF2_EV_DELAY": 0, "EKF2_EV_NOISE_MD": 0,
-        "COM_ARM_WO_GPS": 1,
+        "EKF2_EVP_NOISE": 0.05, "EKF2_EVV_NOISE": 0.05, "COM_ARM_WO_GPS": 1,
     },
 }  # fmt: skip
 """What docs/autopilots.md asks for."""
