@@ -58,7 +58,8 @@ MOST_TRACKS = 16
 MOST_WAITING = 4
 """Depth maps and chunks between two rounds; of more the newest count. One takes a megabyte."""
 UNKNOWN_AFTER_NS = 3_000_000_000
-"""Unknown distances are sent for so long after the last known ones: then nothing is."""
+"""Unknown distances are sent for so long after the last known ones: then nothing is. Before the
+first they are sent, too: ArduPilot cannot be armed while its proximity sensor says nothing."""
 
 
 class VehicleReports:
@@ -93,7 +94,7 @@ class VehicleReports:
         waiting: deque[DepthMap | PointChunk] = deque(maxlen=MOST_WAITING)
         self._seen = RecentCloud(), waiting
         """The cloud, which is the thread's of a round alone, and what the next round adds to it."""
-        self._known_ns = 0
+        self._known_ns: int | None = None
 
     def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         """Take a track, a map update, a depth map or points."""
@@ -193,7 +194,7 @@ class VehicleReports:
         found = self._obstacles_now(now_ns, track, list(self._tracks), update, cloud)
         if found is not None:
             self._known_ns = now_ns
-        elif now_ns - self._known_ns > UNKNOWN_AFTER_NS:
+        elif self._known_ns is not None and now_ns - self._known_ns > UNKNOWN_AFTER_NS:
             return None
         told: object = obstacle_distance(unknown(now_ns) if found is None else found)
         return told

@@ -177,6 +177,8 @@ class LocalisationStage:
                 self._odometry.ground.take_height(
                     sample.t_ns, sample.height_m, self._standing.armed
                 )
+            if isinstance(sample, RangeSample):
+                self._odometry.ground.take_range(sample.t_ns, sample.distance_m)
             if isinstance(sample, AttitudeSample | ImuSample):
                 self._imu.take(sample)
             if isinstance(sample, AttitudeSample):

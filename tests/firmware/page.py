@@ -22,6 +22,8 @@ STYLE = (
     ".ok{background:#e3f4e1}pre{background:#f6f6f6;padding:1em;overflow:auto;max-height:22em}"
     "svg{max-width:100%;height:auto}td.n{text-align:right;font-variant-numeric:tabular-nums}"
 )
+FARTHEST_M = 1e4
+"""PX4 tells places 5000 km away until it has an origin."""
 TRUE, BELIEVED, SENT = "#1f1f1f", "#2b7bba", "#d95f02"
 
 
@@ -102,7 +104,11 @@ def _plots(folder: Path) -> str:
         ("autopilot", BELIEVED, "LOCAL_POSITION_NED"),
         ("sent", SENT, "COMPANION/ODOMETRY"),
     ):
-        heard = [(t_s, m.x, m.y, m.z) for t_s, m in messages_heard(folder / "ground.tlog", kind)]
+        heard = [
+            (t_s, m.x, m.y, m.z)
+            for t_s, m in messages_heard(folder / "ground.tlog", kind)
+            if max(abs(m.x), abs(m.y)) < FARTHEST_M
+        ]
         series.append((name, colour, np.array(heard, float).reshape(-1, 4)))
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     grid = figure.add_gridspec(3, 2)

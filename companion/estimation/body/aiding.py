@@ -17,6 +17,8 @@ come into sight and go."""
 SIGMA_BAROMETER_M = 0.5
 """Of a height, with the gusts that press on the sensor."""
 LEAST_SIGMA_PLACE_M, LEAST_SIGMA_FLOW_M_S = 0.005, 0.02
+SIGMA_RANGE_M, SIGMA_RANGE_RATIO = 0.1, 0.03
+"""Of a rangefinder, which sits elsewhere on the body than the camera, over grass and stones."""
 
 
 class Aid(Enum):
@@ -25,6 +27,7 @@ class Aid(Enum):
     PLACE = "place"
     FLOW = "flow"
     HEIGHT = "height"
+    RANGE = "range"
     REST = "rest"
 
 
@@ -62,6 +65,13 @@ class AidedHeight(NamedTuple):
     height_m: float
 
 
+class AidedRange(NamedTuple):
+    """Height of the body above the ground below it, metres, by a rangefinder."""
+
+    t_ns: int
+    height_m: float
+
+
 class AidedRest(NamedTuple):
     """A body that does not move, to a standard deviation along each axis."""
 
@@ -69,7 +79,7 @@ class AidedRest(NamedTuple):
     sigma_m_s: float
 
 
-Aiding = AidedPlace | AidedFlow | AidedHeight | AidedRest
+Aiding = AidedPlace | AidedFlow | AidedHeight | AidedRange | AidedRest
 
 
 class Model(NamedTuple):
@@ -103,7 +113,22 @@ def model_of(measured: Aiding, state: BodyState) -> Model | None:
         seen[0, DOWN], seen[0, BAROMETER] = -1.0, 1.0
         variance = np.full((1, 1), SIGMA_BAROMETER_M**2)
         return Model(Aid.HEIGHT, seen, np.array([measured.height_m]), variance)
+    if isinstance(measured, AidedRange):
+        return _range_model(measured, state)
     return _flow_model(measured, state)
+
+
+def _range_model(measured: AidedRange, state: BodyState) -> Model | None:
+    """The height above a ground that walks by its relief: it learns of the body and of the ground.
+
+    None where no ground is known: nothing tells yet that what is below the body is what it sees.
+    """
+    if not state.covariance[GROUND, GROUND] > 0.0:
+        return None
+    seen = np.zeros((1, N_STATE))
+    seen[0, GROUND], seen[0, DOWN] = 1.0, -1.0
+    variance = SIGMA_RANGE_M**2 + (SIGMA_RANGE_RATIO * measured.height_m) ** 2
+    return Model(Aid.RANGE, seen, np.array([measured.height_m]), np.full((1, 1), variance))
 
 
 def _flow_model(flow: AidedFlow, state: BodyState) -> Model | None:

@@ -18,6 +18,7 @@ from companion.estimation.body.aiding import (
     SIGMA_BAROMETER_M,
     AidedHeight,
     AidedPlace,
+    AidedRest,
     Aiding,
     Model,
     model_of,
@@ -58,6 +59,9 @@ NORMALISED_TAU = 30
 """Places, two seconds of them."""
 MAX_REFUSED_NS = 1_000_000_000
 """Places refused for longer are believed: the filter begins anew."""
+SHOCK_NS = 500_000_000
+"""Rest refused for so long is believed: a blow has stopped the body. Accelerometers sample it too
+seldom to measure it, and what they are off by afterwards is no bias."""
 
 
 class Reckoned(NamedTuple):
@@ -88,6 +92,7 @@ class BodyFilter:
         self._taken: deque[tuple[BodyState, Aiding]] = deque()
         """The latest measurements, and the state before each."""
         self._refused_since_ns: int | None = None
+        self._shaken_since_ns: int | None = None
         self._normalised = 1.0
         """Mean squared innovation per degree of freedom, of the latest places."""
         self._n_refused = Counter[str]()
@@ -101,6 +106,12 @@ class BodyFilter:
     def knows_ground(self) -> bool:
         """True where flow over the ground is of use."""
         return self._begun and float(self._state.covariance[GROUND, GROUND]) > 0.0
+
+    def over_ground(self) -> tuple[float, float]:
+        """Height above the ground at the last measurement, metres, and its standard deviation."""
+        seen = np.zeros(N_STATE)
+        seen[GROUND], seen[DOWN] = 1.0, -1.0
+        return float(seen @ self._state.mean), float(np.sqrt(seen @ self._state.covariance @ seen))
 
     @property
     def n_refused(self) -> dict[str, int]:
@@ -251,6 +262,8 @@ class BodyFilter:
         if isinstance(measured, AidedPlace):
             self._normalised += (squared / 3.0 - self._normalised) / NORMALISED_TAU
             self._judge(measured, refused=corrected is None)
+        if isinstance(measured, AidedRest):
+            self._judge_rest(state, measured, refused=corrected is None)
 
     def _corrected(self, state: BodyState, model: Model) -> tuple[BodyState | None, float]:
         """The state corrected, None where the innovation gate refuses; the squared innovation."""
@@ -274,6 +287,15 @@ class BodyFilter:
         self._refused_since_ns = since_ns if refused else None
         if refused and place.t_ns - since_ns > MAX_REFUSED_NS:
             self._begin(place)
+
+    def _judge_rest(self, state: BodyState, rest: AidedRest, refused: bool) -> None:
+        """Take a body to rest, with a state at its time, where that was refused for too long."""
+        since_ns = self._shaken_since_ns if self._shaken_since_ns is not None else rest.t_ns
+        self._shaken_since_ns = since_ns if refused else None
+        if refused and rest.t_ns - since_ns >= SHOCK_NS:
+            self._state = state.with_part(VELOCITY, np.zeros(3), rest.sigma_m_s)
+            self._shaken_since_ns = None
+            self._taken.clear()
 
     def _begin(self, place: AidedPlace) -> None:
         """Place and velocity anew."""

@@ -18,8 +18,7 @@ TILT_TAU_S = 20.0
 BIAS_WALK_M_S2 = 1e-3
 """Random walk of the bias, m/s2 per root of a second: 0.06 in an hour, by warming."""
 RELIEF_M2_PER_M = 0.1
-"""Random walk of the height of the ground that is seen, over the way in any direction: 1 m after
-10 m."""
+"""Random walk of the height of the ground below, over the level way: 1 m after 10 m."""
 BAROMETER_WALK_M = 0.05
 """Walk of a barometer's zero with the weather and its temperature, per root of a second: a metre
 in seven minutes."""
@@ -111,6 +110,6 @@ def _walked(before: BodyState, after: BodyState) -> BodyState:
     if covariance[BAROMETER, BAROMETER] > 0.0:
         covariance[BAROMETER, BAROMETER] += BAROMETER_WALK_M**2 * dt
     if covariance[GROUND, GROUND] > 0.0:
-        way_m = float(np.linalg.norm(after.mean[PLACE] - before.mean[PLACE]))
+        way_m = float(np.linalg.norm((after.mean[PLACE] - before.mean[PLACE])[:2]))
         covariance[GROUND, GROUND] += RELIEF_M2_PER_M * way_m
     return after

@@ -1,7 +1,7 @@
 """Aiding of inertial navigation from the ground up to a metric map: a place to stand on, then flow.
 
-Velocity is optical flow times the height over the ground that the vehicle stood on, which barometer
-and accelerometers know, as they know the vertical.
+Velocity is optical flow times the height over the ground that the vehicle stood on, which
+rangefinder, barometer and accelerometers know, as they know the vertical.
 """
 
 from __future__ import annotations
@@ -10,7 +10,13 @@ from collections import deque
 
 import numpy as np
 
-from companion.estimation.body.aiding import AidedFlow, AidedHeight, AidedPlace, AidedRest
+from companion.estimation.body.aiding import (
+    AidedFlow,
+    AidedHeight,
+    AidedPlace,
+    AidedRange,
+    AidedRest,
+)
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.lift_off.lift_off_flow import LiftOffFlow
 from companion.estimation.lift_off.optical_flow import GroundVelocity
@@ -29,8 +35,12 @@ STILL_HZ = 0.25
 SIGMA_STILL_M_S = STILL_HZ * LEGS_M
 """Flow below it is of a vehicle that stands, and the velocity it may have on such legs. However
 a camera sits, it sees nothing move there: this aids before a lift-off has shown the mount."""
+USEFUL_SIGMA_M_S = 0.15
+"""Of rest, by flow of nothing over the ground: by accelerometers a vehicle that touches down, and
+whose map is lost there, goes on sinking (see `SHOCK_NS`)."""
 HEIGHT_EVERY_NS, LEAST_HEIGHT_M = 200_000_000, 2.0
 """Lower, what the rotors blow is reflected by the ground, and presses on a barometer."""
+RANGE_EVERY_NS = 100_000_000
 MAP_AIDED_NS = 500_000_000
 """A map that has placed the body lately makes flow needless."""
 
@@ -46,10 +56,10 @@ class GroundAiding:
         """Judge of flow at the last lift-off: only flow that has shown it aids."""
         self._held: deque[AidedPlace | AidedHeight] = deque()
         """Of the latest frames while the vehicle stands; empty when it does not."""
-        self._takes_heights = False
-        """True in flight where a barometer is of use: high enough, and no map aids."""
-        self._stood_down_m = 0.0
-        self._height_ns = self._flow_ns = 0
+        self._takes_ranges = self._takes_heights = False
+        """True in flight where no map aids; for a barometer, high enough, too."""
+        self._stood_down_m, self._upright = 0.0, 1.0
+        self._height_ns = self._range_ns = self._flow_ns = 0
         self._map_aided_ns: int | None = None
 
     def map_aided(self, t_ns: int) -> None:
@@ -74,19 +84,26 @@ class GroundAiding:
         elif self._takes_heights:
             self._body.aid(AidedHeight(t_ns, height_m))
 
+    def take_range(self, t_ns: int, distance_m: float) -> None:
+        """Take the distance to the ground along the body's down axis."""
+        if self._takes_ranges and t_ns - self._range_ns >= RANGE_EVERY_NS:
+            self._range_ns = t_ns
+            self._body.aid(AidedRange(t_ns, distance_m * self._upright))
+
     def stand(self, t_ns: int, place_m: Array) -> None:
         """Take a frame of a vehicle that stands: at `place_m` (3,), unless it stood before."""
         held_m = place_m if self.stood is None else self.stood.place_m
         turn = self._body.world_from_attitude
         self.stood = AidedPlace(t_ns, held_m, turn, SIGMA_STANDING_M)
+        self._takes_ranges = False
         self._held.append(self.stood)
         while self._held[0].t_ns < t_ns - STANDING_LAG_NS:
             self._body.aid(self._held.popleft())
 
-    def fly(self, down_m: float, wants: bool) -> None:
+    def fly(self, down_m: float, wants: bool, upright: float) -> None:
         """Take a frame of a vehicle that does not stand, at a down coordinate.
 
-        `wants` where it is aided from here.
+        `wants` where it is aided from here; `upright` is the cosine of its tilt.
         """
         if self.stood is not None:
             self._stood_down_m = float(self.stood.place_m[2])
@@ -94,6 +111,7 @@ class GroundAiding:
             self.lift_off_flow = LiftOffFlow()
         self.stood = None
         self._held.clear()
+        self._takes_ranges, self._upright = wants, max(upright, 0.0)
         self._takes_heights = wants and self._stood_down_m - down_m > LEAST_HEIGHT_M
 
     def take_flow(self, measured: GroundVelocity, delay_ns: int) -> bool:
@@ -116,8 +134,19 @@ class GroundAiding:
         if not judge.agrees or not self._is_due(measured):
             return False
         covariance_hz2 = measured.covariance_hz2 + SIGMA_FLOW_HZ**2 * np.eye(3)
+        if still:
+            self._rest(measured, covariance_hz2, delay_ns)
         self._body.aid(AidedFlow(measured.t_ns + delay_ns, measured.velocity_hz, covariance_hz2))
         return False
+
+    def _rest(self, measured: GroundVelocity, covariance_hz2: Array, delay_ns: int) -> None:
+        """Aid by rest, to what a body may move by, as high as it may be, that shows so little."""
+        height_m, sigma_m = self._body.over_ground()
+        moves_hz = float(np.linalg.norm(measured.velocity_hz))
+        most_hz = float(np.hypot(moves_hz, np.sqrt(np.diag(covariance_hz2).max())))
+        sigma_m_s = most_hz * (max(abs(height_m), LEGS_M) + 2.0 * sigma_m)
+        if sigma_m_s < USEFUL_SIGMA_M_S:
+            self._body.aid(AidedRest(measured.t_ns + delay_ns, sigma_m_s))
 
     def _is_due(self, measured: GroundVelocity) -> bool:
         """True once in FLOW_EVERY_NS."""

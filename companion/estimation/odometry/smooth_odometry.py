@@ -213,7 +213,10 @@ class SmoothOdometry:
         elif not standing:
             if self.ground.stood is not None:
                 self._heading.lift_off(t_ns, self.reset_counter, self.ground.stood.place_m)
-            self.ground.fly(float(self._place_now()[2]), self.ground.wants_flow(t_ns))
+            self.ground.fly(
+                float(self._place_now()[2]), self.ground.wants_flow(t_ns),
+                1.0 if attitude is None else float(attitude.ned_from_body[2, 2]),
+            )  # fmt: skip
         self.reckoning.begin(t_ns, attitude, self._flown.frame.from_world)
         return self.reckoning.reckoned
 

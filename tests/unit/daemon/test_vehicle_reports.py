@@ -197,8 +197,11 @@ def test_an_old_image_makes_everything_unknown_and_then_silent() -> None:
     assert approach.fly(1e-9 * UNKNOWN_AFTER_NS, tracked=False) == []
 
 
-def test_nothing_is_sent_before_anything_is_known() -> None:
-    assert Approach().now() == []
+def test_before_anything_is_known_all_is_unknown() -> None:
+    """ArduPilot cannot be armed while its proximity sensor says nothing."""
+    approach = Approach()
+    assert set(approach.now()) == {UNKNOWN}
+    assert set(approach.fly(1e-9 * UNKNOWN_AFTER_NS + 1.0, 0.0, tracked=False)) == {UNKNOWN}
 
 
 @pytest.mark.parametrize("radius_m", [0.05, 0.1])

@@ -30,12 +30,15 @@ class Vehicle:
             self.ground.stand(self.t_ns, STOOD_M)
 
     def go_on(
-        self, seconds: float, accelerates_m_s2: Array, tilted_rad: float, flow_hz: Array | None
-    ) -> None:
+        self, seconds: float, accelerates_m_s2: Array, tilted_rad: float, flow_hz: Array | None,
+        range_m: float | None = None,
+    ) -> None:  # fmt: skip
         """By its own measurements; its autopilot's pitch is wrong by `tilted_rad`."""
         for _ in range(round(seconds * 1e9 / STEP_NS)):
             self._measure(accelerates_m_s2, tilted_rad)
-            self.ground.fly(float(self.place_m[2]), True)
+            self.ground.fly(float(self.place_m[2]), True, 1.0)
+            if range_m is not None:
+                self.ground.take_range(self.t_ns, range_m)
             if flow_hz is not None:
                 seen = GroundVelocity(self.t_ns - STEP_NS // 2, flow_hz, 0.01**2 * np.eye(3))
                 self.contradicted |= self.ground.take_flow(seen, 0)
@@ -47,10 +50,29 @@ class Vehicle:
         return found.place_m
 
     @property
+    def bias_m_s2(self) -> Array:
+        found = self.navigation.at(self.t_ns)
+        assert found is not None
+        return found.start.bias_body_m_s2
+
+    @property
     def velocity_m_s(self) -> Array:
         found = self.navigation.at(self.t_ns)
         assert found is not None
         return found.velocity_m_s
+
+    def land(self, flow_hz: Array | None) -> None:
+        """Up for two seconds over ground that it sees sink, down for two, and 10 s on the ground.
+
+        Its accelerometers have measured half of the blow: it goes on at half a metre a second.
+        """
+        for up_m_s2 in (1.0, -1.0, -1.0, 0.5):
+            for _ in range(20):
+                down_m_s = float(self.velocity_m_s[2]) - 0.5 * up_m_s2 * STEP_NS * 1e-9
+                height_m = max(STOOD_M[2] + LEGS_M - float(self.place_m[2]), LEGS_M)
+                sinking_hz = np.array([0.0, 0.0, down_m_s / height_m])
+                self.go_on(STEP_NS * 1e-9, np.array([0.0, 0.0, -up_m_s2]), 0.0, sinking_hz)
+        self.go_on(10.0, np.zeros(3), 0.0, flow_hz)
 
     def _measure(self, accelerates_m_s2: Array, tilted_rad: float) -> None:
         for _ in range(STEP_NS // IMU_STEP_NS):
@@ -83,3 +105,27 @@ def test_a_picture_in_which_nothing_moves_holds_no_vehicle_that_has_risen() -> N
     vehicle.go_on(2.0, up_and_north, 0.0, np.zeros(3))
     assert STOOD_M[2] - vehicle.place_m[2] > 10.0 * LEGS_M
     assert vehicle.velocity_m_s[0] > 0.5 * (2.0 - 0.7)
+
+
+def test_a_vehicle_that_has_touched_down_sinks_no_further() -> None:
+    """Its map is lost there, and a picture in which nothing moves shows that it is at rest."""
+    unaided, aided = Vehicle(), Vehicle()
+    unaided.land(None)
+    aided.land(np.array([0.005, -0.01, 0.0]))
+    assert unaided.place_m[2] - STOOD_M[2] > 3.0 and unaided.velocity_m_s[2] > 0.3
+    assert np.linalg.norm(aided.velocity_m_s) < 0.02
+    assert aided.place_m[2] - STOOD_M[2] < 0.6
+    assert np.abs(aided.bias_m_s2).max() < 0.01
+
+
+def test_a_rangefinder_tells_the_height_of_a_climb() -> None:
+    """Its accelerometers measure 0.3 m/s2 too much."""
+    unaided, aided = Vehicle(), Vehicle()
+    for k in range(80):
+        measured_m_s2 = np.array([0.0, 0.0, -0.3 - (1.0 if k < 20 else 0.0)])
+        seconds = (k + 1) * STEP_NS * 1e-9
+        risen_m = 0.5 * min(seconds, 1.0) ** 2 + max(seconds - 1.0, 0.0)
+        unaided.go_on(STEP_NS * 1e-9, measured_m_s2, 0.0, None)
+        aided.go_on(STEP_NS * 1e-9, measured_m_s2, 0.0, None, LEGS_M + risen_m)
+    assert STOOD_M[2] - unaided.place_m[2] - risen_m > 1.5
+    assert abs(STOOD_M[2] - aided.place_m[2] - risen_m) < 0.3
