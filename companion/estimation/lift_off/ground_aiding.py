@@ -41,6 +41,10 @@ whose map is lost there, goes on sinking (see `SHOCK_NS`)."""
 HEIGHT_EVERY_NS, LEAST_HEIGHT_M = 200_000_000, 2.0
 """Lower, what the rotors blow is reflected by the ground, and presses on a barometer."""
 RANGE_EVERY_NS = 100_000_000
+LATE_NS = 150_000_000
+"""Heights and ranges aid that long after their own time. In flight they are newer than the frame
+that comes with them, and navigation knows no time before its last measurement: neither a pose of
+that frame nor, half a frame earlier, the velocity that its flow is held against."""
 MAP_AIDED_NS = 500_000_000
 """A map that has placed the body lately makes flow needless."""
 
@@ -56,6 +60,8 @@ class GroundAiding:
         """Judge of flow at the last lift-off: only flow that has shown it aids."""
         self._held: deque[AidedPlace | AidedHeight] = deque()
         """Of the latest frames while the vehicle stands; empty when it does not."""
+        self._late: deque[AidedHeight | AidedRange] = deque()
+        """In flight, until a frame is newer by LATE_NS."""
         self._takes_ranges = self._takes_heights = False
         """True in flight where no map aids; for a barometer, high enough, too."""
         self._stood_down_m, self._upright = 0.0, 1.0
@@ -82,13 +88,13 @@ class GroundAiding:
         if self.stood is not None:
             self._held.append(AidedHeight(t_ns, height_m))
         elif self._takes_heights:
-            self._body.aid(AidedHeight(t_ns, height_m))
+            self._late.append(AidedHeight(t_ns, height_m))
 
     def take_range(self, t_ns: int, distance_m: float) -> None:
         """Take the distance to the ground along the body's down axis."""
         if self._takes_ranges and t_ns - self._range_ns >= RANGE_EVERY_NS:
             self._range_ns = t_ns
-            self._body.aid(AidedRange(t_ns, distance_m * self._upright))
+            self._late.append(AidedRange(t_ns, distance_m * self._upright))
 
     def stand(self, t_ns: int, place_m: Array) -> None:
         """Take a frame of a vehicle that stands: at `place_m` (3,), unless it stood before."""
@@ -96,12 +102,13 @@ class GroundAiding:
         turn = self._body.world_from_attitude
         self.stood = AidedPlace(t_ns, held_m, turn, SIGMA_STANDING_M)
         self._takes_ranges = False
+        self._late.clear()
         self._held.append(self.stood)
         while self._held[0].t_ns < t_ns - STANDING_LAG_NS:
             self._body.aid(self._held.popleft())
 
-    def fly(self, down_m: float, wants: bool, upright: float) -> None:
-        """Take a frame of a vehicle that does not stand, at a down coordinate.
+    def fly(self, t_ns: int, down_m: float, wants: bool, upright: float) -> None:
+        """Take a frame of a vehicle that does not stand, by autopilot stamps, at a down coordinate.
 
         `wants` where it is aided from here; `upright` is the cosine of its tilt.
         """
@@ -111,6 +118,8 @@ class GroundAiding:
             self.lift_off_flow = LiftOffFlow()
         self.stood = None
         self._held.clear()
+        while self._late and self._late[0].t_ns <= t_ns - LATE_NS:
+            self._body.aid(self._late.popleft())
         self._takes_ranges, self._upright = wants, max(upright, 0.0)
         self._takes_heights = wants and self._stood_down_m - down_m > LEAST_HEIGHT_M
 

@@ -214,6 +214,7 @@ class SmoothOdometry:
             if self.ground.stood is not None:
                 self._heading.lift_off(t_ns, self.reset_counter, self.ground.stood.place_m)
             self.ground.fly(
+                t_ns if attitude is None else attitude.t_ns,
                 float(self._place_now()[2]), self.ground.wants_flow(t_ns),
                 1.0 if attitude is None else float(attitude.ned_from_body[2, 2]),
             )  # fmt: skip
