@@ -162,7 +162,7 @@ async def _flown(through_router: bool, folder: Path) -> None:
 
         running.append(asyncio.ensure_future(beat()))
         if through_router:
-            for _ in range(100):
+            for _ in range(1200):  # a minute
                 with contextlib.suppress(ConnectionError):
                     reader, writer = await asyncio.open_connection(HOST, client_port)
                     break
