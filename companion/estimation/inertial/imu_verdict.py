@@ -32,7 +32,7 @@ CHECK_NS, CHECK_OLD_NS = 500_000_000, 1_000_000_000
 N_AGREEING = 2
 """Successive checks with the same fault that are required."""
 N_UNEXPLAINED = 12
-"""The same where nothing explains the rates: a jump of the attitude's heading looks so for 4 s."""
+"""The same where nothing explains the rates: a jump of the attitude's tilt looks so for 4 s."""
 MAX_SILENT_S = 1.0
 MAX_DELAY_S = 0.055
 """Of the stamps; logs of real autopilots show 0 to 0.03 s."""
@@ -43,6 +43,9 @@ BY_CHANCE = 10.0
 """Others were better by 8 at most in those logs."""
 EXPLAINED, UNEXPLAINED = 0.5, 0.7
 """Shares of the body's turning that are left by what explains it, and by what does not."""
+WHOLLY = 0.1
+"""Part of what the axes as they are leave that others leave where they are the reason: a fiftieth.
+Where they fit a heading that swings by chance it is a sixth."""
 EXCITED_RAD_S = 0.05
 """Change of rates with which a comparison must succeed."""
 QUIET_CHECKS = 16
@@ -55,7 +58,7 @@ ALWAYS_NS = -(2**62)
 
 NOT_USED = "the autopilot's IMU is not used: no scale and no dead reckoning by it"
 USED_AGAIN = "the autopilot's IMU is used again"
-SILENT, DELAY = "silent", "delay"
+SILENT, DELAY, RATES, AXES_TURNED = "silent", "delay", "rates", "axes"
 FORWARD_LEFT_UP = "its axes are forward, left and up, not forward, right and down"
 
 
@@ -178,14 +181,13 @@ class ImuVerdict:
             compared, found = wide, _turned_or_late(wide)
         else:
             found = _turned_or_late(compared)
-        if found is not None and found.kind == DELAY and not _late_in_tilt(window):
-            found = None
-        if found is None:
-            found = _gravity(force_by_way(window))
         if found is None and excited and compared.identity_unexplained > UNEXPLAINED:
             words = "its rates of turn are not those of the attitude"
-            found = _Fault("rates", words, True, N_UNEXPLAINED)
-        return found, compared
+            found = _Fault(RATES, words, True, N_UNEXPLAINED)
+        wholly = compared.unexplained < WHOLLY * compared.identity_unexplained
+        if found is not None and not (found.kind == AXES_TURNED and wholly):
+            found = found if _seen_in_tilt(found.kind, window) else None
+        return found or _gravity(force_by_way(window)), compared
 
     def _confirm(self, compared: Agreement) -> None:
         """Exclude other axes and delays."""
@@ -211,9 +213,9 @@ def _turned_or_late(compared: Agreement) -> _Fault | None:
     if way != IDENTITY:
         rest = np.delete(chi_square, way, axis=0)
         if rest.min() > least + SURE:
-            return _Fault("axes", f"{turned_in_words(BODY_FROM_IMU[way])}", True)
+            return _Fault(AXES_TURNED, f"{turned_in_words(BODY_FROM_IMU[way])}", True)
         if chi_square[IDENTITY].min() > least + SURE:
-            return _Fault("axes", "its axes are not those of the body", True)
+            return _Fault(AXES_TURNED, "its axes are not those of the body", True)
         return None
     in_time = np.abs(compared.delays_s) <= MAX_DELAY_S
     if chi_square[IDENTITY, in_time].min() > least + SURE:
@@ -222,15 +224,19 @@ def _turned_or_late(compared: Agreement) -> _Fault | None:
     return None
 
 
-def _late_in_tilt(window: ImuWindow) -> bool:
-    """True if turns about level axes show it, too.
+def _seen_in_tilt(kind: str, window: ImuWindow) -> bool:
+    """True if turns about level axes show a fault, too.
 
     ArduPilot aligns its heading anew as it climbs, by some degrees within a second or two: about
-    the vertical that looks like gyroscopes that are early or late.
+    the vertical that looks like gyroscopes that are early or late. PX4's heading swings for seconds
+    on the ground and after a take-off: like gyroscopes with other axes, or that turn otherwise.
     """
     compared = agreement(window, WIDE_S, without_heading=True)
     if compared is None:
         return False
+    if kind != DELAY:
+        unexplained = compared.identity_unexplained > EXPLAINED
+        return unexplained and compared.rate_rad_s > EXCITED_RAD_S
     chi_square = compared.chi_square[IDENTITY]
     in_time = np.abs(compared.delays_s) <= MAX_DELAY_S
     return bool(chi_square[in_time].min() > chi_square.min() + SURE)

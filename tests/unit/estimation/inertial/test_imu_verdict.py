@@ -305,6 +305,19 @@ def test_a_heading_that_is_aligned_anew_is_no_delay(late_s: float) -> None:
     assert bool(changes) == (late_s > 0.0)
 
 
+@pytest.mark.parametrize("period_s", [1.5, 4.0, 9.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_heading_that_swings_on_the_ground_is_not_the_imu(period_s: float, seed: int) -> None:
+    """PX4 finds its heading by a compass that is disturbed, and swings by 14 degrees for seconds."""
+
+    def error_rad(t_s: float) -> float:
+        swing_rad = np.radians(14.0) * np.exp(-max(t_s - 10.0, 0.0) / 3.0)
+        return float(swing_rad * np.sin(2.0 * np.pi * t_s / period_s))
+
+    given = misheaded(made_up(lifting_off, seed=seed, seconds=25.0), error_rad)
+    assert judged(given)[1] == []
+
+
 def integrated(wrong: Wrong) -> tuple[AccelerationIntegral, list[int], list[Warned]]:
     integral, withdrawn = AccelerationIntegral(), list[int]()
     acceleration = JudgedAcceleration(integral, withdrawn.append)
