@@ -308,7 +308,7 @@ def test_a_heading_that_is_aligned_anew_is_no_delay(late_s: float) -> None:
 @pytest.mark.parametrize("period_s", [1.5, 4.0, 9.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_heading_that_swings_on_the_ground_is_not_the_imu(period_s: float, seed: int) -> None:
-    """PX4 finds its heading by a compass that is disturbed, and swings by 14 degrees for seconds."""
+    """PX4 finds its heading by a disturbed compass, and swings by 14 degrees for seconds."""
 
     def error_rad(t_s: float) -> float:
         swing_rad = np.radians(14.0) * np.exp(-max(t_s - 10.0, 0.0) / 3.0)
