@@ -184,8 +184,9 @@ FEATURES: dict[str, tuple[Callable[[Trial, Figures], None], Conditions]] = {
     )),
     "earth_position": (earth_position, Conditions(
         has_gps=True, pose_mode="off",
-        parameters={**OWN_SOURCES, "EK3_SRC2_POSXY": 0, "EK3_SRC2_VELXY": 5, "EK3_SRC2_VELZ": 0,
-                    "FLOW_TYPE": 5, "EK3_FLOW_DELAY": 60},
+        # no driver of poses, of which it would hear none: it could not be armed
+        parameters={**OWN_SOURCES, "VISO_TYPE": 0, "EK3_SRC2_POSXY": 0, "EK3_SRC2_VELXY": 5,
+                    "EK3_SRC2_VELZ": 0, "FLOW_TYPE": 5, "EK3_FLOW_DELAY": 60},
         settings=("feedback.global_position=estimate", "feedback.flow=optical_flow"),
     )),
     "earth_position_px4": (earth_position, Conditions(
