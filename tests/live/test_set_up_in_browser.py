@@ -200,10 +200,6 @@ def test_the_viewer_is_opened_through_the_page(page: Any, paged: Paged, browser:
         viewer.click()
     assert stream.value.status == 200 and RERUN in page.url
     page.goto("about:blank")
-    # the viewer's program warns of itself, and would ask its makers, which the page refuses: what
-    # is said of the refusal, and of the request that failed by it, is all that may be said
-    errors = [each for each in browser.complaints if not each.startswith("warning")]
-    refused = [each for each in errors if "Content Security Policy" in each]
-    assert refused or not errors
-    assert [each for each in errors if each not in refused and "Failed to fetch" not in each] == []
+    # the viewer's program warns of itself; what it asks of its makers is answered in the browser
+    assert [each for each in browser.complaints if not each.startswith("warning")] == []
     browser.complaints.clear()

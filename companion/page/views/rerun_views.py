@@ -2,7 +2,8 @@
 
 Its files and its stream come from the viewer on board (`daemon.viewer = "web"`), which listens on
 loopback: those who may look on need no other port. Its page asks for the stream at the root of
-whoever served it, by the name of a gRPC service.
+whoever served it, by the name of a gRPC service. What it would ask of its makers over the internet
+is answered in the browser (`AT_HOME`).
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ CONTENT = {
 """Its page has scripts and styles in it, and compiles its program."""
 FOREIGN = re.compile(rb"<link[^>]*https://[^>]*>")
 """Fonts from elsewhere: nothing here comes from the internet."""
+HEAD = b"<head>"
+AT_HOME = b'<script src="/static/viewer_at_home.js"></script>'
+"""Before all scripts of the viewer."""
 KEPT = "private, max-age=604800"
 """The program is 43 MB; its address names its version."""
 PASSED_ON = ("content-type", "grpc-timeout", "x-grpc-web", "x-user-agent", "accept")
@@ -64,17 +68,26 @@ class RerunViews:
         file = quote(request.path_params["file"])
         answer = await self._asked("GET", WEB_PORT, f"/{file}")
         if answer is None:
-            return PlainTextResponse(NO_VIEWER, 503)
+            return await self._not_there(request)
         headers = _back(answer) | CONTENT
         if "html" not in headers.get("content-type", "") and answer.is_success:
             headers["Cache-Control"] = KEPT
             return _passed(answer, headers)
         try:
             body = FOREIGN.sub(b"", (await answer.aread())[:SHORT])
+            body = body.replace(HEAD, HEAD + AT_HOME, 1)
         finally:
             await answer.aclose()
         headers.pop("content-length", None)
         return Response(body, answer.status_code, headers)
+
+    async def _not_there(self, request: Request) -> Response:
+        """A page that waits for the viewer, which starts some seconds after the daemon."""
+        if not request.headers.get("accept", "").startswith("text/html"):
+            return PlainTextResponse(NO_VIEWER, 503)
+        if self._site.facts.config.daemon.viewer != "web":
+            return await self._site.refused(request, NO_VIEWER, 503)
+        return await self._site.render(request, "viewer_waits.html.j2", 202)
 
     async def _stream(self, request: Request) -> Response:
         """Messages of the flight, as its gRPC service sends them."""

@@ -50,9 +50,20 @@ def test_without_a_code_nobody_sees_it(served: ServedPage) -> None:
     assert served.ask("POST", READ, peer=ELSEWHERE, headers={"accept": "*/*"}).status == 401
 
 
-def test_a_viewer_that_does_not_run_is_said(served: ServedPage) -> None:
-    answer = served.ask("GET", rerun_views.viewer_path(), headers={"host": "localhost"})
+def test_a_viewer_that_does_not_run_yet_is_waited_for(served: ServedPage) -> None:
+    headers = {"host": "localhost"}
+    answer = served.ask("GET", rerun_views.viewer_path(), headers=headers)
+    assert answer.status == 202 and 'http-equiv="refresh"' in answer.text
+    script = rerun_views.viewer_path() + "re_viewer.js"
+    answer = served.ask("GET", script, headers={**headers, "accept": "*/*"})
     assert answer.status == 503 and "daemon.viewer" in answer.text
+
+
+def test_a_viewer_that_is_not_to_run_is_said(tmp_path: Path) -> None:
+    with ServedPage(tmp_path, "") as served:
+        answer = served.ask("GET", rerun_views.viewer_path(), headers={"host": "localhost"})
+    assert answer.status == 503 and "daemon.viewer" in answer.text
+    assert "refresh" not in answer.text
 
 
 def test_its_page_has_nothing_from_elsewhere(
@@ -62,6 +73,8 @@ def test_its_page_has_nothing_from_elsewhere(
     answer = served.ask("GET", rerun_views.viewer_path(), headers=headers)
     assert answer.status == 200 and "the_canvas_id" in answer.text
     assert "fonts." not in answer.text
+    first = answer.text[answer.text.index("<script") :]
+    assert first.startswith(rerun_views.AT_HOME.decode())
     assert "default-src 'self'" in answer.headers["content-security-policy"]
     script = served.ask("GET", rerun_views.viewer_path() + "re_viewer.js", headers=headers)
     assert len(script.body) > 100_000
