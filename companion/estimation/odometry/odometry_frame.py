@@ -115,7 +115,7 @@ class OdometryFrame:
 
 
 def drift_m(residual_m: float, span_s: float) -> float:
-    """What satellites are off by over minutes, by what they scatter by over a time.
+    """Error of satellites over minutes, by what they scatter by over a time.
 
     Of an error that lasts for `DRIFT_TAU_S` little shows in a few seconds: their mean is off by it.
     """
