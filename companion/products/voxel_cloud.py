@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array
-from companion.geometry.voxel import voxel_downsample
+from companion.geometry.voxel import distinct_cells, voxel_downsample
 from companion.messages import Floats
 from companion.products.cloud import Cloud, joined, no_cloud
 
@@ -25,8 +25,8 @@ def tiles_of(points: Floats, low: Array, voxel: float) -> tuple[list[Tile], NDAr
     """Tiles that points (N, 3) lie in, sorted, and the index of each point's tile (N,)."""
     side = voxel * TILE_VOXELS
     tiles = np.floor((points[:, :2].astype(np.float64) - low[:2]) / side).astype(np.int64)
-    found, which = np.unique(tiles, axis=0, return_inverse=True)
-    return [(int(i), int(j)) for i, j in found], which.ravel()
+    found, which = distinct_cells(tiles)
+    return [(int(i), int(j)) for i, j in found], which
 
 
 class VoxelCloud:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.transforms import Array
+from companion.geometry.voxel import distinct_cells
 from companion.messages import Bytes
 from companion.products.cloud import Cloud
 
@@ -175,7 +176,7 @@ def _frame(
 
 def _splat_px(pixels: Array) -> int:
     """Side of squares that just close the gaps between points, by their density."""
-    cells = np.unique(np.floor(pixels / 16).astype(np.int64), axis=0)
+    cells, _ = distinct_cells(np.floor(pixels / 16).astype(np.int64))
     per_cell = len(pixels) / len(cells)
     return int(np.clip(np.ceil(1.6 * 16 / np.sqrt(per_cell)), 1, MAX_SPLAT_PX))
 

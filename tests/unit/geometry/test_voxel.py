@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from companion.geometry.voxel import voxel_downsample
+from companion.geometry.voxel import distinct_cells, voxel_downsample
 
 
 def test_most_confident_point_per_voxel() -> None:
@@ -37,3 +38,13 @@ def test_voxel_size_limits() -> None:
     assert len(voxel_downsample(points, np.ones(200), 1e-4)) == 200
     assert len(voxel_downsample(points, np.ones(200), 100.0)) == 1
     assert len(voxel_downsample(points[:0], np.ones(0), 1.0)) == 0
+
+
+@pytest.mark.parametrize("apart", [1, 2**40])
+def test_distinct_cells_are_those_of_unique_rows(apart: int) -> None:
+    """Far apart their numbers in the grid do not fit into an integer."""
+    cells = np.random.default_rng(3).integers(-9, 10, (2000, 2)) * apart
+    found, which = distinct_cells(cells)
+    expected, index = np.unique(cells, axis=0, return_inverse=True)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(which, index.ravel())
