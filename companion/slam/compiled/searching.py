@@ -140,6 +140,40 @@ def search(
     return taken_by[found], found
 
 
+@compiled(words, words, number, number)
+def search_mutual(
+    words_a: Words, words_b: Words, max_distance: float, ratio: float
+) -> tuple[Ints, Ints]:
+    """Mutually best features of two images by descriptor alone, ordered by the first; ties: first.
+
+    The best of a row passes `max_distance` and, by `ratio`, the second best of that row.
+    """
+    n_b, far = len(words_b), 1000
+    best_of_a = np.full(len(words_a), -1, np.int64)
+    bits_of_a, second_of_a = np.full(len(words_a), far), np.full(len(words_a), far)
+    best_of_b, bits_of_b = np.full(n_b, -1, np.int64), np.full(n_b, far)
+    bits = np.empty(n_b, np.int64)
+    for a in range(len(words_a)):
+        for b in range(n_b):
+            bits[b] = _differing_bits(words_a[a], words_b[b])
+        best, first, second = -1, far, far
+        for b in range(n_b):
+            if bits[b] < second:
+                if bits[b] < first:
+                    best, first, second = b, bits[b], first
+                else:
+                    second = bits[b]
+            if bits[b] < bits_of_b[b]:
+                best_of_b[b], bits_of_b[b] = a, bits[b]
+        best_of_a[a], bits_of_a[a], second_of_a[a] = best, first, second
+    good = np.zeros(len(words_a), np.bool_)
+    for a in range(len(words_a)):
+        if best_of_a[a] >= 0 and best_of_b[best_of_a[a]] == a and bits_of_a[a] <= max_distance:
+            good[a] = np.float32(bits_of_a[a]) < np.float32(ratio) * np.float32(second_of_a[a])
+    found = np.flatnonzero(good)
+    return found, best_of_a[found]
+
+
 @compiled(
     single_pairs, single_pairs, numbers, words, words, integers, integers, integer, integer, number
 )  # fmt: skip

@@ -9,43 +9,30 @@ from __future__ import annotations
 import numpy as np
 
 from companion.geometry.transforms import Pose, skew
-from companion.messages import Bytes, Floats
-from companion.slam.compiled.searching import search_along
+from companion.messages import Bytes
+from companion.slam.compiled.searching import search_along, search_mutual
 from companion.slam.features.orb_features import Features, Ints
 
 MAX_DISTANCE_STRICT = 50
 """Largest distance, bits, between views of the same corner."""
 MAX_OCTAVE_GAP = 4
-FAR = np.float32(1000.0)
 
 
-def hamming_matrix(descriptors_a: Bytes, descriptors_b: Bytes) -> Floats:
-    """Distances (Na, Nb) in bits, as float32; by one matrix product of signs."""
-    signs_a = np.unpackbits(descriptors_a, axis=1).astype(np.float32) * 2 - 1
-    signs_b = np.unpackbits(descriptors_b, axis=1).astype(np.float32) * 2 - 1
-    return np.asarray(np.float32(128.0) - np.float32(0.5) * (signs_a @ signs_b.T), np.float32)
-
-
-def mutual_matches(distances: Floats, max_distance: float, ratio: float) -> tuple[Ints, Ints]:
-    """Index pairs that are mutually best; ties resolve to the first."""
-    none = np.zeros(0, np.int64)
-    if distances.shape[0] == 0 or distances.shape[1] < 2:
-        return none, none
-    rows = np.arange(distances.shape[0])
-    best = distances.argmin(1)
-    value = distances[rows, best]
-    good = distances.argmin(0)[best] == rows
-    second_best = distances.copy()
-    second_best[rows, best] = FAR
-    good &= (value <= max_distance) & (value < ratio * second_best.min(1))
-    return rows[good], best[good]
+def mutual_matches(
+    descriptors_a: Bytes, descriptors_b: Bytes, max_distance: float, ratio: float
+) -> tuple[Ints, Ints]:
+    """Index pairs that are mutually best, by descriptors alone; ties resolve to the first."""
+    if len(descriptors_a) == 0 or len(descriptors_b) < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    words_a, words_b = (
+        np.ascontiguousarray(each).view(np.uint64) for each in (descriptors_a, descriptors_b)
+    )
+    return search_mutual(words_a, words_b, max_distance, ratio)
 
 
 def match_descriptors(a: Features, b: Features) -> tuple[Ints, Ints]:
     """Match two images by descriptors only."""
-    if len(a) == 0 or len(b) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return mutual_matches(hamming_matrix(a.descriptors, b.descriptors), MAX_DISTANCE_STRICT, 0.8)
+    return mutual_matches(a.descriptors, b.descriptors, MAX_DISTANCE_STRICT, 0.8)
 
 
 def match_epipolar(

@@ -15,7 +15,6 @@ from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose
 from companion.slam.features.matching import (
     MAX_DISTANCE_STRICT,
-    hamming_matrix,
     match_descriptors,
     mutual_matches,
 )
@@ -157,8 +156,9 @@ def _candidate_matches(
     """Descriptor matches: points and features, of a keyframe or also its covisible ones."""
     if with_covisible:
         ids = covisible_points(slam_map, keyframe)
-        distances = hamming_matrix(slam_map.descriptors[ids], features.descriptors)
-        nearest, found = mutual_matches(distances, MAX_DISTANCE_STRICT, 0.8)
+        nearest, found = mutual_matches(
+            slam_map.descriptors[ids], features.descriptors, MAX_DISTANCE_STRICT, 0.8
+        )
         return ids[nearest], found
     seen, ids = slam_map.observations_of(keyframe)
     ia, ib = match_descriptors(keyframe.features, features)

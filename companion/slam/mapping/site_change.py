@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from companion.geometry.transforms import Array, Similarity
 from companion.messages import Bytes
-from companion.slam.features.matching import hamming_matrix, mutual_matches
+from companion.slam.features.matching import mutual_matches
 from companion.slam.features.orb_features import Bools, Ints
 from companion.slam.map.free_space import MAX_EDGE_RAD, SIGMAS, looked_through
 from companion.slam.map.site_flights import SiteFlight, disagreement_m
@@ -169,8 +169,7 @@ def _with_moved(
 def _shift(both: SiteMap, a: _Thing, b: _Thing, off_m: float) -> Array | None:
     """The shift (3,) that takes the corners of one thing to those of the other; None without."""
     descriptors: Bytes = both.points.descriptors
-    distances = hamming_matrix(descriptors[a.ids], descriptors[b.ids])
-    ia, ib = mutual_matches(distances, MAX_BITS, RATIO)
+    ia, ib = mutual_matches(descriptors[a.ids], descriptors[b.ids], MAX_BITS, RATIO)
     if len(ia) < MIN_MOVED:
         return None
     shifts = both.points.positions[b.ids[ib]] - both.points.positions[a.ids[ia]]

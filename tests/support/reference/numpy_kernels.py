@@ -151,6 +151,21 @@ def warps(
     return np.asarray(np.matmul(jacobian, projected), np.float64)
 
 
+def mutual_matches(
+    descriptors_a: Bytes, descriptors_b: Bytes, max_distance: float, ratio: float
+) -> tuple[Ints, Ints]:
+    """As `companion.slam.features.matching.mutual_matches`."""
+    words_a, words_b = descriptors_a.view(np.uint64), descriptors_b.view(np.uint64)
+    distance = np.bitwise_count(words_a[:, None] ^ words_b[None]).sum(2).astype(np.float32)
+    rows = np.arange(len(distance))
+    best = distance.argmin(1)
+    value = distance[rows, best]
+    good = distance.argmin(0)[best] == rows
+    distance[rows, best] = np.float32(1000.0)
+    good &= (value <= max_distance) & (value < ratio * distance.min(1))
+    return rows[good], best[good]
+
+
 def match_epipolar(
     a: Features, b: Features, index_a: Ints, index_b: Ints, b_from_a: Pose, max_error: float = 2.0
 ) -> tuple[Ints, Ints]:

@@ -14,7 +14,7 @@ from companion.geometry.transforms import (
     yaw_rotation,
 )
 from companion.slam.compiled.searching import find_both
-from companion.slam.features.matching import match_epipolar
+from companion.slam.features.matching import match_epipolar, mutual_matches
 from companion.slam.features.orb_features import Features
 from companion.slam.map.local_map import Projector, Visible
 from companion.slam.map.patch_refinement import _warps
@@ -172,3 +172,23 @@ def test_two_ids_are_found_in_one_pass() -> None:
     assert find_both(ids, 4, 9) == (0, 2, True)
     assert find_both(ids, 7, 5) == (2, 1, False)
     assert find_both(ids[:0], 7, 5) == (-1, 0, False)
+
+
+@pytest.mark.parametrize("n_bytes", [32, 2])
+def test_matches_by_descriptor_match_numpy(n_bytes: int) -> None:
+    """Few bytes give many ties, of which the first counts."""
+    rng = np.random.default_rng(n_bytes)
+    a, b = np.zeros((300, 32), np.uint8), np.zeros((200, 32), np.uint8)
+    a[:, :n_bytes] = rng.integers(0, 256, (300, n_bytes))
+    b[:150] = a[rng.permutation(300)[:150]]
+    b[:, 0] ^= rng.integers(0, 8, 200).astype(np.uint8)
+    expected = numpy_kernels.mutual_matches(a, b, 50, 0.8)
+    assert len(expected[0]) > 5
+    for found, due in zip(mutual_matches(a, b, 50, 0.8), expected, strict=True):
+        np.testing.assert_array_equal(found, due)
+
+
+def test_one_descriptor_has_no_second_best_and_no_match() -> None:
+    same = np.zeros((1, 32), np.uint8)
+    assert len(mutual_matches(same, same, 50, 0.8)[0]) == 0
+    assert len(mutual_matches(same, same[:0], 50, 0.8)[0]) == 0
