@@ -70,6 +70,9 @@ COLOUR_PATH = [255, 176, 32]
 COLOUR_AUTOPILOT = [120, 150, 255]
 COLOUR_FOUND = [80, 230, 120]
 EARTH_EVERY_NS = 500_000_000
+EARTH_MOVED_M = 0.2
+"""A piece of the path on the earth is drawn again where its keyframe has moved by more: most
+keyframes move by millimetres with each adjustment, and a satellite picture is no better."""
 NOWHERE = Similarity(1e-6, np.eye(3), np.zeros(3))
 
 
@@ -91,6 +94,8 @@ class Drawing:
         self._width = 0
         """Width of the pictures drawn; 0 before the first."""
         self._earth_ns = -(2**63)
+        self._earth_m: dict[int, Array] = {}
+        """Places (3,) of keyframes in the world whose paths are drawn on the earth."""
         self.go_on_in(recording)
 
     def go_on_in(self, recording: rr.RecordingStream) -> None:
@@ -214,7 +219,7 @@ class Drawing:
                 self._places[keyframe_id] = place
             entity = f"world/map/keyframes/{keyframe_id}"
             self._rec.log(entity, _transform(place or NOWHERE), static=self._live)
-            if keyframe_id in self._strips:
+            if keyframe_id in self._strips and self._moved_on_earth(keyframe_id):
                 self._path_on_earth(keyframe_id)
 
     def _points(self, item: PointsItem) -> None:
@@ -249,12 +254,21 @@ class Drawing:
         self._rec.log(entity, _strips([item.strip], COLOUR_PATH), static=self._live)
         self._path_on_earth(item.keyframe_id)
 
+    def _moved_on_earth(self, keyframe_id: int) -> bool:
+        """True if a keyframe's path is not where it is drawn on the earth."""
+        drawn_m, place = self._earth_m.get(keyframe_id), self._places.get(keyframe_id)
+        if drawn_m is None or place is None or self._world is None:
+            return True
+        moved_m = self._world.apply(place.translation) - drawn_m
+        return float(np.linalg.norm(moved_m)) > EARTH_MOVED_M
+
     def _path_on_earth(self, keyframe_id: int) -> None:
         origin = self._flight.origin if self._flight is not None else None
         place = self._places.get(keyframe_id)
         if origin is None or place is None or self._world is None:
             return
         world = self._world @ place
+        self._earth_m[keyframe_id] = world.translation
         lines = [
             geodetic_from_ned(world.apply(strip.astype(np.float64)), origin)[:, :2]
             for strip in self._strips[keyframe_id].values()
