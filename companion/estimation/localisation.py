@@ -36,6 +36,7 @@ from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Array, Pose
 from companion.messages import (
+    Bytes,
     Frame,
     FrameOverdue,
     FrameTracked,
@@ -199,6 +200,10 @@ class LocalisationStage:
             return self._gimbal.take(sample, self._attitude.correction[1])
         # a rangefinder looks down from the body
         return () if isinstance(sample, RangeSample) else (sample,)
+
+    def look_ahead(self, grey: Bytes) -> None:
+        """Begin with the image (H, W) of a frame to come, in order: the very array of its step."""
+        self._tracker.look_ahead(grey)
 
     def set_effort(self, share: float) -> None:
         """Extract this ratio of the features from now on, under load."""

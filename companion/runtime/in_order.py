@@ -1,15 +1,17 @@
 """Stages of one flight in one process: each message goes through all of them before the next.
 
 Nothing is lost, and results do not depend on anybody's speed. Localisation works in the caller's
-thread. Depth, to which no stage above it listens, has a thread of its own, fed in order through a
-bounded queue that makes the caller wait. A depth stage that fails is left out from there on:
-trajectory, map and the cloud so far stay.
+thread; where frames to come are known (`looked_ahead`), their features are extracted beside. Depth,
+to which no stage above it listens, has a thread of its own, fed in order through a bounded queue
+that makes the caller wait. A depth stage that fails is left out from there on: trajectory, map and
+the cloud so far stay.
 """
 
 from __future__ import annotations
 
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -24,6 +26,8 @@ DEPTH_QUEUE, DEPTH_QUEUE_BYTES = 64, 128 << 20
 """Capacity of the queue to depth, in messages and bytes."""
 DEPTH_FAILED = "the dense map ends here: the depth stage has failed"
 APART = "depth"
+FRAMES_AHEAD = 4
+"""A keyframe takes as long as the features of some frames."""
 
 
 class InOrder:
@@ -57,6 +61,27 @@ class InOrder:
         """Times of all stages, by name of the work."""
         times = {k: v for work in self.works.values() for k, v in work.times.summary().items()}
         return dict(sorted(times.items()))
+
+    def looked_ahead(self, messages: Iterable[Message]) -> Iterator[Message]:
+        """The same messages; stages see each frame when it is `FRAMES_AHEAD` frames ahead."""
+        waiting: deque[Message] = deque()
+        n_frames = 0
+        try:
+            for message in messages:
+                waiting.append(message)
+                if not isinstance(message, Frame):
+                    continue
+                n_frames += 1
+                for stage in self._stages:
+                    if isinstance(message, stage.listens) and stage.name != APART:
+                        self.works[stage.name].look_ahead(message)
+                while n_frames > FRAMES_AHEAD:
+                    n_frames -= isinstance(waiting[0], Frame)
+                    yield waiting.popleft()
+        except Exception:  # what came before it is still worked on
+            yield from waiting
+            raise
+        yield from waiting
 
     def feed(self, message: Message) -> None:
         """Pass one message, and all that comes of it, through the stages that listen."""

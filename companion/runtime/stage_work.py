@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
-from companion.messages import Message
+from companion.messages import Frame, Message
 from companion.runtime.stage_protocol import Finish, ResultsWritten, Setup, Snapshot
 from companion.timing.clock import StageTimes
 
@@ -33,6 +33,9 @@ class Work(ABC):
 
     def begin(self, tell: Callable[[Any], None]) -> None:  # noqa: B027 - most have nothing to do
         """Called before the first message; `tell` sends a message to the daemon at once."""
+
+    def look_ahead(self, frame: Frame) -> None:  # noqa: B027 - most have nothing to do
+        """A frame that will come by `step` later, in order; work on it may begin beside."""
 
     @abstractmethod
     def step(self, message: Any) -> Iterable[Message | Snapshot | ResultsWritten]:

@@ -13,7 +13,7 @@ import numpy as np
 from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.site.site_use import SiteUse
-from companion.messages import Frame, Georeferenced, MapUpdate, Message, SiteMapUsed, Warned
+from companion.messages import Bytes, Frame, Georeferenced, MapUpdate, Message, SiteMapUsed, Warned
 from companion.products.site_map_file import (
     SITE_MAP,
     SiteMapError,
@@ -61,6 +61,8 @@ class _Localisation(Work):
         self._to_take_up: Kept | None = None
         self._reported_fault = ""
         self._kept_ns = 0
+        self._ahead: dict[int, Bytes] = {}
+        """Images of frames to come that are begun with, by their number."""
 
     def _site(self, setup: Setup) -> SiteUse | None:
         """The site map to be used; SiteMapError of a replay, while a flight goes on without."""
@@ -99,7 +101,14 @@ class _Localisation(Work):
         if not isinstance(message, Frame):
             return self._stage.step(message)
         # the map keeps grey images for long, but nothing of the memory that a frame came in
-        return self._frame(replace(message, grey=message.grey.copy(), rgb=NO_COLOUR))
+        grey = self._ahead.pop(message.seq, None)
+        if grey is None:
+            grey = message.grey.copy()
+        return self._frame(replace(message, grey=grey, rgb=NO_COLOUR))
+
+    def look_ahead(self, frame: Frame) -> None:
+        self._ahead[frame.seq] = grey = frame.grey.copy()
+        self._stage.look_ahead(grey)
 
     def finish(self, finish: Finish) -> Iterable[Message]:
         if self._keeper is not None:

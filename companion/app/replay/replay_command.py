@@ -159,7 +159,7 @@ def replay(
                     notify(f"viewer: open {live.page}")
             progress.start(given.n_frames)
             n_done = 0
-            for message in given.messages():
+            for message in stages.looked_ahead(given.messages()):
                 stages.feed(message)
                 if isinstance(message, Frame):
                     n_done += 1

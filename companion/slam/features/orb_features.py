@@ -89,6 +89,15 @@ class FeatureExtractor:
         self.feature_ratio = 1.0
         """Ratio of the configured number of features to extract."""
 
+    @property
+    def state(self) -> tuple[int, float]:
+        """All that features depend on beside the image: threshold, and ratio of features."""
+        return self._threshold, self.feature_ratio
+
+    @state.setter
+    def state(self, state: tuple[int, float]) -> None:
+        self._threshold, self.feature_ratio = state
+
     def extract(self, grey: Bytes) -> Features:
         """Features of an image (H, W); possibly none."""
         shrunk = self._pyramid(grey)

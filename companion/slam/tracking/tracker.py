@@ -14,7 +14,8 @@ import numpy as np
 from companion.config import Config
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, angle_between
-from companion.messages import Frame, KeyframeAdded, LoopClosed, Track, TrackState
+from companion.messages import Bytes, Frame, KeyframeAdded, LoopClosed, Track, TrackState
+from companion.slam.features.features_ahead import FeaturesAhead
 from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.features.view import View
 from companion.slam.initialisation.bootstrap import Bootstrap, TwoViewReconstruction
@@ -77,6 +78,7 @@ class Tracker:
         self._camera = camera
         self._times = times
         self._extractor = FeatureExtractor(config.features, camera)
+        self._ahead = FeaturesAhead(config.features, camera, self._extractor)
         self.n_features = 0
         """Features seen in the last frame."""
         self._is_live = background
@@ -122,9 +124,15 @@ class Tracker:
     def step(self, frame: Frame, prior: Prior) -> list[TrackerOutput]:
         """Process one frame, with the map lock held; frames come in order of time."""
         with self._times("features"):
-            features = self._extractor.extract(frame.grey)
+            features = self._ahead.take(frame.grey)
+            if features is None:
+                features = self._extractor.extract(frame.grey)
         self.n_features = len(features)
         return self._track_frame(frame, features, prior) + self._worker.done()
+
+    def look_ahead(self, grey: Bytes) -> None:
+        """Extract the features of the image (H, W) of a frame to come in another thread."""
+        self._ahead.begin(grey)
 
     def resume(self, kept: SlamMap, next_keyframe_id: int, until_ns: int) -> None:
         """Start lost in a stored map; before the first frame.
@@ -179,6 +187,7 @@ class Tracker:
 
     def close(self) -> Done:
         """Finish pending mapping; its results."""
+        self._ahead.close()
         self.map_lock.end_order()
         self._worker.close()
         return self._worker.done()

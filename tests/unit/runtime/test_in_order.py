@@ -13,7 +13,13 @@ from companion.config import Config
 from companion.geometry.transforms import Pose
 from companion.messages import Frame, KeyframeAdded, Message, PointChunk, Track, TrackState, Warned
 from companion.runtime import in_order
-from companion.runtime.in_order import DEPTH_FAILED, DEPTH_QUEUE_BYTES, InOrder, in_order_of_time
+from companion.runtime.in_order import (
+    DEPTH_FAILED,
+    DEPTH_QUEUE_BYTES,
+    FRAMES_AHEAD,
+    InOrder,
+    in_order_of_time,
+)
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.runtime.stage_work import Work
 from companion.runtime.stages import stage_named
@@ -194,3 +200,26 @@ def test_whoever_feeds_waits_for_depth_and_nothing_is_lost(monkeypatch: pytest.M
     feeder.join(30)
     made.finish(finish)
     assert got.count("depth Frame") == 20
+
+
+def test_frames_are_seen_ahead_and_pass_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording that breaks off gives all that came before."""
+    made, _, _ = stages(monkeypatch)
+    seen: list[int] = []
+    monkeypatch.setattr(made.works["localisation"], "look_ahead", lambda f: seen.append(f.seq))
+
+    def recorded() -> Iterable[Message]:
+        for seq in range(8):
+            yield RangeSample(seq * MS, 1.0)
+            yield frame(seq, seq * MS)
+        raise OSError("the disk is gone")
+
+    passed: list[Message] = []
+    with pytest.raises(OSError, match="gone"):
+        for message in made.looked_ahead(recorded()):
+            passed.append(message)
+            if isinstance(message, Frame):
+                assert seen[-1] == min(message.seq + FRAMES_AHEAD, 7)
+    assert [m.t_ns for m in passed] == [seq * MS for seq in range(8) for _ in range(2)]
+    assert all(isinstance(m, Frame) == bool(n % 2) for n, m in enumerate(passed))
+    made.finish(lambda stage: Finish(hurry=False))
