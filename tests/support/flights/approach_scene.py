@@ -13,6 +13,9 @@ from companion.messages import Bytes, Floats
 from tests.support.flights.scene import leaves
 
 NOTHING = np.float32(1e4)
+SKY = 200
+SAMPLES = 2
+"""Rays along each side of a pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,50 +39,66 @@ class Rod:
 
 
 class ApproachScene:
-    """Things before a camera; a pixel that meets none is sky."""
+    """Things before a camera; a pixel that meets none is sky.
+
+    Drawn without aliasing: each pixel is the mean of `SAMPLES` x `SAMPLES` rays, and each ray takes
+    its grey from the texture as coarse as what it covers of it.
+    """
 
     def __init__(self, things: list[Sheet | Rod], metres_per_texel: float = 0.02) -> None:
         self.things = things
         self._metres_per_texel = metres_per_texel
         looks = {each.look for each in things}
-        self._patterns = {look: leaves(np.random.default_rng(look), 512) for look in looks}
-        self._rays: dict[int, Floats] = {}
+        self._patterns = {
+            look: _coarser(leaves(np.random.default_rng(look), 512)) for look in looks
+        }
+        self._rays: dict[tuple[int, int], Floats] = {}
 
     def picture(self, camera: Camera, ned_from_camera: Pose) -> Bytes:
         """Grey image (H, W)."""
-        return self.render(camera, ned_from_camera)[0]
+        rays = self._rays_of(camera, SAMPLES) @ ned_from_camera.rotation.T.astype(np.float32)
+        nearest, a, b, width_m = self._met(rays, ned_from_camera.translation)
+        width_m *= 1.0 / (SAMPLES * camera.fx)
+        image = np.full(len(rays), SKY, np.float32)
+        for n, thing in enumerate(self.things):
+            hit = np.flatnonzero(nearest == n)
+            at = [(v[hit] / self._metres_per_texel).astype(np.float32) for v in (a, b)]
+            texels = width_m[hit] / self._metres_per_texel
+            image[hit] = _drawn(self._patterns[thing.look], at[0], at[1], texels)
+        shape = camera.height, SAMPLES, camera.width, SAMPLES
+        return np.asarray(np.rint(image.reshape(shape).mean((1, 3))), np.uint8)
 
-    def render(self, camera: Camera, ned_from_camera: Pose) -> tuple[Bytes, Floats]:
-        """Grey image and z-depth (H, W), 0 where sky."""
-        if id(camera) not in self._rays:
-            u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-            flat = camera.normalise(np.stack([u, v], -1).reshape(-1, 2))
-            self._rays[id(camera)] = np.c_[flat, np.ones(len(flat))].astype(np.float32)
-        rays = self._rays[id(camera)] @ ned_from_camera.rotation.T.astype(np.float32)
+    def depth(self, camera: Camera, ned_from_camera: Pose) -> Floats:
+        """True z-depth (H, W) at the centres of pixels, 0 where sky."""
+        rays = self._rays_of(camera, 1) @ ned_from_camera.rotation.T.astype(np.float32)
+        depth = np.zeros(len(rays), np.float32)
         eye = ned_from_camera.translation
-        depth = np.full(len(rays), NOTHING)
-        image = np.full(len(rays), 200, np.uint8)
-        for thing in self.things:
-            away, a, b = _met(thing, rays, eye)
+        away = np.min([_met(thing, rays, eye)[0] for thing in self.things], axis=0)
+        depth[away < NOTHING] = away[away < NOTHING]
+        return depth.reshape(camera.height, camera.width)
+
+    def _met(self, rays: Floats, eye: Array) -> tuple[Array, Floats, Floats, Floats]:
+        """Of rays (N, 3): index of what each meets, -1 for none, the place on it, metres, and how
+        wide a ray of one radian's width is there."""
+        depth, nearest = np.full(len(rays), NOTHING), np.full(len(rays), -1)
+        a, b, width_m = (np.zeros(len(rays), np.float32) for _ in range(3))
+        for n, thing in enumerate(self.things):
+            away, a_here, b_here, cosine = _met(thing, rays, eye)
             hit = (away > 0.1) & (away < depth)
-            if not hit.any():
-                continue
-            pattern = self._patterns[thing.look]
-            column, row = (
-                np.mod(v[hit] / self._metres_per_texel, len(pattern)).astype(np.float32)
-                for v in (a, b)
+            depth[hit], nearest[hit], a[hit], b[hit] = away[hit], n, a_here[hit], b_here[hit]
+            width_m[hit] = away[hit] / np.maximum(cosine[hit], 1e-3)
+        return nearest, a, b, width_m
+
+    def _rays_of(self, camera: Camera, samples: int) -> Floats:
+        key = id(camera), samples
+        if key not in self._rays:
+            u, v = (
+                (np.arange(samples * n) + 0.5) / samples - 0.5
+                for n in (camera.width, camera.height)
             )
-            drawn = (
-                cv2.remap(
-                    pattern, column[None], row[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
-                )
-                if hit.sum() < 32000
-                else _in_parts(pattern, column, row)
-            )
-            image[hit], depth[hit] = drawn.ravel(), away[hit]
-        depth[depth >= NOTHING] = 0
-        shape = camera.height, camera.width
-        return image.reshape(shape), depth.reshape(shape)
+            flat = camera.normalise(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2))
+            self._rays[key] = np.c_[flat, np.ones(len(flat))].astype(np.float32)
+        return self._rays[key]
 
     def nearest_m(self, place: Array, bearings_rad: Array, above_m: float, below_m: float) -> Array:
         """True horizontal distance (N,) of what stands in a band of heights about a place."""
@@ -93,19 +112,42 @@ class ApproachScene:
         return out
 
 
-def _in_parts(pattern: Bytes, column: Floats, row: Floats) -> Bytes:
-    """`cv2.remap` takes no row of more than 32767 pixels."""
-    return np.concatenate([
-        cv2.remap(
-            pattern, column[None, at : at + 30000], row[None, at : at + 30000], cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_WRAP,
-        ).ravel()
-        for at in range(0, len(column), 30000)
-    ])  # fmt: skip
+def _coarser(pattern: Bytes) -> list[Bytes]:
+    """A pattern that repeats, and the same at half the resolution, again and again."""
+    levels = [pattern]
+    while len(levels[-1]) > 1:
+        half = len(levels[-1]) // 2
+        smaller = cv2.resize(levels[-1], (half, half), interpolation=cv2.INTER_AREA)
+        levels.append(np.asarray(smaller, np.uint8))
+    return levels
 
 
-def _met(thing: Sheet | Rod, rays: Floats, eye: Array) -> tuple[Floats, Floats, Floats]:
-    """Lengths of rays (N, 3) up to it, `NOTHING` without, and places on it, metres."""
+def _drawn(levels: list[Bytes], column: Floats, row: Floats, texels: Floats) -> Floats:
+    """Grey (N,) of a pattern at places (N,), where each ray covers so many texels (N,)."""
+    fine = np.clip(np.log2(np.maximum(texels, 1e-6)), 0.0, len(levels) - 1.0)
+    grey = np.zeros(len(column), np.float32)
+    for k, pattern in enumerate(levels):
+        weight = 1.0 - np.abs(fine - k)
+        here = np.flatnonzero(weight > 0)
+        for at in np.array_split(here, -(-len(here) // 30000) or 1):  # remap takes no longer rows
+            if len(at) == 0:
+                continue
+            u, v = (
+                np.mod((x[at] + 0.5) / 2**k - 0.5, len(pattern)).astype(np.float32)
+                for x in (column, row)
+            )
+            grey[at] += (
+                weight[at]
+                * cv2.remap(
+                    pattern, u[None], v[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+                ).ravel()
+            )
+    return grey
+
+
+def _met(thing: Sheet | Rod, rays: Floats, eye: Array) -> tuple[Floats, Floats, Floats, Floats]:
+    """Lengths of rays (N, 3) up to it, `NOTHING` without, places on it, metres, and the cosines of
+    the angles at which they meet it, of unit rays."""
     with np.errstate(divide="ignore", invalid="ignore"):
         if isinstance(thing, Sheet):
             normal = np.cross(thing.side_a, thing.side_b)
@@ -115,6 +157,7 @@ def _met(thing: Sheet | Rod, rays: Floats, eye: Array) -> tuple[Floats, Floats, 
             a, b = (
                 at @ (s / n) for s, n in zip((thing.side_a, thing.side_b), lengths, strict=True)
             )
+            cosine = np.abs(rays @ (normal / np.linalg.norm(normal)).astype(np.float32))
             met = (a >= 0) & (a <= lengths[0]) & (b >= 0) & (b <= lengths[1]) & (away > 0)
         else:
             length = float(np.linalg.norm(thing.end - thing.begin))
@@ -130,8 +173,10 @@ def _met(thing: Sheet | Rod, rays: Floats, eye: Array) -> tuple[Floats, Floats, 
             first = np.cross(axis, [0.3, 0.5, 0.81])
             first /= np.linalg.norm(first)
             a = thing.radius_m * np.arctan2(side @ np.cross(axis, first), side @ first)
+            cosine = np.abs((side * rays).sum(1)) / thing.radius_m
             met = (root > 0) & (b >= 0) & (b <= length) & (away > 0)
     return (
         np.where(met, away, NOTHING).astype(np.float32),
         np.where(met, a, 0).astype(np.float32), np.where(met, b, 0).astype(np.float32),
+        np.where(met, cosine / np.linalg.norm(rays, axis=1), 1).astype(np.float32),
     )  # fmt: skip
