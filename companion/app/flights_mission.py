@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from companion.errors import FlightError, InputError
+from companion.geometry.thinned_path import thinned
 from companion.products.atomic_file import write_atomically
-from companion.products.mission_file import mission_plan, mission_waypoints, thinned
+from companion.products.mission_file import mission_plan, mission_waypoints
 from companion.products.run_folder import read_path
 
 WRITERS = {".plan": mission_plan, ".waypoints": mission_waypoints}

@@ -298,11 +298,15 @@ class Daemon:
     def _on_odometry(self, odometry: Odometry) -> None:
         if odometry.seq < NO_PICTURE:
             self._watch.take_odometry(odometry)
+            if self._ground is not None:
+                self._ground.way_back.take_odometry(odometry)
         if self._senders is not None:
             self._senders.take_odometry(odometry)
 
     def _on_georeferenced(self, told: Georeferenced) -> None:
         self._watch.take_georeference(told)
+        if self._ground is not None:
+            self._ground.way_back.take_georeference(told)
         if self._senders is not None:
             self._senders.take_georeference(told)
 

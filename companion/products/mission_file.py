@@ -8,8 +8,6 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import numpy as np
-
 from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned
 from companion.geometry.transforms import Array
 
@@ -21,34 +19,6 @@ QUADROTOR, ANY_AUTOPILOT = 2, 0
 """MAV_TYPE_QUADROTOR, MAV_AUTOPILOT_GENERIC."""
 SPEED_M_S = 5.0
 """Of QGroundControl's estimate of the time; the autopilot flies at its own."""
-
-
-def thinned(path_ned_m: Array, within_m: float) -> Array:
-    """Corners (M, 3) of a polyline that stays within a distance of a path (N, 3).
-
-    Ramer 1972, Douglas and Peucker 1973; first and last place are kept.
-    """
-    kept = np.zeros(len(path_ned_m), bool)
-    kept[[0, -1]] = True
-    spans = [(0, len(path_ned_m) - 1)]
-    while spans:
-        first, last = spans.pop()
-        if last - first < 2:
-            continue
-        away_m = _from_segment(path_ned_m[first + 1 : last], path_ned_m[first], path_ned_m[last])
-        furthest = int(away_m.argmax())
-        if away_m[furthest] > within_m:
-            middle = first + 1 + furthest
-            kept[middle] = True
-            spans += [(first, middle), (middle, last)]
-    return np.asarray(path_ned_m[kept])
-
-
-def _from_segment(places: Array, a: Array, b: Array) -> Array:
-    """Distances (N,) of places from the segment between two."""
-    along = b - a
-    share = np.clip((places - a) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(places - a - share[:, None] * along, axis=1))
 
 
 def mission_plan(places_ned_m: Array, origin: GeoOrigin) -> bytes:

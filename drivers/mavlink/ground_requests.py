@@ -15,12 +15,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
 from drivers.mavlink.command_server import CommandServer
+from drivers.mavlink.mission_server import MISSIONS, MissionServer
 from drivers.mavlink.parameter_server import ParameterServer
 from drivers.mavlink.request_limit import RequestLimit
 from drivers.mavlink.wire.message_port import MavlinkPort
 
 TICK_S = 0.025
-"""Interval of parameter messages: 1.5 kB/s."""
+"""Interval of parameters and waypoints: 1.5 to 2 kB/s."""
 WARN_EVERY_NS = 10_000_000_000
 TOO_MANY = "more is asked of the companion over MAVLink than it answers"
 COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
@@ -29,7 +30,7 @@ PARAMETERS = (
     mavlink.MAVLINK_MSG_ID_PARAM_SET,
 )  # fmt: skip
 PING: int = mavlink.MAVLINK_MSG_ID_PING
-KINDS = frozenset({*COMMANDS, *PARAMETERS, PING})
+KINDS = frozenset({*COMMANDS, *PARAMETERS, *MISSIONS, PING})
 EVERYBODY = (0, 0)
 
 
@@ -42,10 +43,11 @@ class GroundRequests:
         clock: FlightClock,
         commands: CommandServer,
         parameters: ParameterServer,
+        missions: MissionServer,
         warn: Callable[[Warned], None],
     ) -> None:
         self._port, self._clock, self._warn = port, clock, warn
-        self._commands, self._parameters = commands, parameters
+        self._commands, self._parameters, self._missions = commands, parameters, missions
         self._limit = RequestLimit()
         self._warned_ns: int | None = None
 
@@ -73,6 +75,9 @@ class GroundRequests:
         if kind in PARAMETERS:
             self._parameters.take(message, to_all)
             return
+        if kind in MISSIONS:
+            self._missions.take(message, to_all)
+            return
         for answer in self._commands.take(message, to_all, now_ns):
             self._port.send(answer)
 
@@ -82,6 +87,6 @@ class GroundRequests:
             await asyncio.sleep(TICK_S)
             for answer in self._commands.step(self._clock.now_ns()):
                 self._port.send(answer)
-            value = self._parameters.next_message()
-            if value is not None:
-                self._port.send(value)
+            waiting = self._missions.next_message() or self._parameters.next_message()
+            if waiting is not None:
+                self._port.send(waiting)

@@ -22,6 +22,7 @@ from companion.daemon.control.flight_parameters import (
     value_of,
 )
 from companion.daemon.control.tightening import may_change
+from companion.daemon.control.way_back import WayBack
 from companion.daemon.flights.flights import Flights
 from companion.daemon.flights.live_flight import depth_elsewhere
 from companion.daemon.flights.new_map import NewMap
@@ -48,6 +49,7 @@ from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.command_server import ACCEPTED, BUSY, DENIED, Command, CommandServer, Done, Job
 from drivers.mavlink.ground_requests import GroundRequests
+from drivers.mavlink.mission_server import MissionServer
 from drivers.mavlink.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, ParameterServer
 from drivers.mavlink.wire.send_queue import RateLimit
 from drivers.system.journal import INFO, WARNING, Journal
@@ -110,6 +112,7 @@ class GroundControl:
         self._kept: NewestFile | None = None
         self._new_map = NewMap(flights, daemon.prepare, daemon.begin_flight)
         self._snapshots = Snapshots(flights, self._tell)
+        self.way_back = WayBack(link, clock, lambda: daemon.armed, self._tell)
         commands = {
             MAPPING: Command(self._switch_mapping),
             NEW_MAP: Command(self._begin_new_map),
@@ -118,7 +121,12 @@ class GroundControl:
             **questions,
         }
         self._requests = GroundRequests(
-            link.port, clock, CommandServer(commands), ParameterServer(self), warn
+            link.port,
+            clock,
+            CommandServer(commands),
+            ParameterServer(self),
+            MissionServer(self.way_back.waypoints),
+            warn,
         )
         link.on_request = self._requests.take
 

@@ -11,12 +11,11 @@ from pymavlink import mavwp
 
 from companion.app.cli import main
 from companion.geometry.geodesy import ned_from_geodetic
-from companion.geometry.transforms import Array
 from companion.products.flight_result import FlightResult
-from companion.products.mission_file import thinned
 from companion.products.report.write_results import write_results
 from companion.products.run_folder import read_path
 from tests.support.flights.flown import facts, messages
+from tests.unit.geometry.test_thinned_path import away_m
 
 
 @pytest.fixture(scope="module")
@@ -27,25 +26,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flights") / "square"
     write_results(folder, result, facts(), 0.1, page=False)
     return folder
-
-
-def away_m(places: Array, path: Array) -> float:
-    """Largest distance of a path from the polyline through places."""
-    a, along = places[:-1, None], np.diff(places, axis=0)[:, None]
-    share = ((path[None] - a) * along).sum(2) / (along**2).sum(2)
-    on = a + np.clip(share, 0, 1)[..., None] * along
-    return float(np.linalg.norm(path[None] - on, axis=2).min(0).max())
-
-
-def test_a_thinned_path_stays_near_the_path() -> None:
-    angle = np.linspace(0, 3 * np.pi, 2000)
-    path = np.c_[20 * np.cos(angle), 20 * np.sin(angle), -0.5 * angle]
-    for within_m in (0.1, 1.0):
-        places = thinned(path, within_m)
-        assert away_m(places, path) <= within_m
-        assert 5 < len(places) < 20 / np.sqrt(within_m) + 60
-        assert (places[0] == path[0]).all() and (places[-1] == path[-1]).all()
-    assert len(thinned(np.zeros((50, 3)), 0.5)) == 2
 
 
 @pytest.mark.parametrize("suffix", [".plan", ".waypoints"])

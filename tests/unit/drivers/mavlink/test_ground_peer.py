@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -20,8 +21,9 @@ from companion.messages import Warned
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.command_server import CommandServer
-from drivers.mavlink.ground_requests import GroundRequests
+from drivers.mavlink.ground_requests import TOO_MANY, GroundRequests
 from drivers.mavlink.message_requests import MessageRequests
+from drivers.mavlink.mission_server import MissionServer
 from drivers.mavlink.parameter_server import OUT_OF_RANGE, SET, ParameterServer
 from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 from tests.support.autopilot.fake_wire import free_port
@@ -57,6 +59,7 @@ class Component:
 
     def __init__(self, port: int) -> None:
         self.table, self.warned = Numbers(), list[Warned]()
+        self.waypoints = np.array([[47.3977, 8.5456 + 1e-4 * n, 488.0 + n] for n in range(150)])
         self.faults: list[BaseException] = []
         self._url = f"udpin:127.0.0.1:{port}"
         self._loop = asyncio.new_event_loop()
@@ -75,7 +78,7 @@ class Component:
         )
         requests = GroundRequests(
             port, clock, CommandServer(questions.commands), ParameterServer(self.table),
-            self.warned.append,
+            MissionServer(lambda: self.waypoints), self.warned.append,
         )  # fmt: skip
         link.on_request = requests.take
         self._tasks = [asyncio.ensure_future(each) for each in (link.run(), requests.run())]
@@ -183,6 +186,52 @@ def test_parameters(component: tuple[Component, Peer]) -> None:
     assert ours.table.now["TWO"] == 4.5
 
 
+def test_a_mission_is_fetched_over_a_link_that_loses_a_third(
+    component: tuple[Component, Peer],
+) -> None:
+    """With the times and retries that the protocol asks of a client, and it changes meanwhile."""
+    ours, peer = component
+    rng, given = random.Random(4), ours.waypoints
+
+    def ask(request: Any, kind: str, wait_s: float, seq: int | None = None) -> Any:
+        for _ in range(10):
+            if rng.random() > 0.17:
+                peer.mav.send(request)
+            got = peer.next(kind, wait_s)
+            if got is not None and getattr(got, "seq", None) == seq and rng.random() > 0.17:
+                return got
+        raise AssertionError(f"no {kind}")
+
+    count = ask(mavlink.MAVLink_mission_request_list_message(*OURS), "MISSION_COUNT", 1.5)
+    assert (count.target_system, count.target_component) == GROUND
+    assert count.count == len(given)
+    ours.waypoints = np.zeros((5, 3))
+    for n, (latitude, longitude, height) in enumerate(given[:40]):
+        request = mavlink.MAVLink_mission_request_int_message(*OURS, n)
+        if n % 2:  # of old ground stations
+            request = mavlink.MAVLink_mission_request_message(*OURS, n)
+        item = ask(request, "MISSION_ITEM_INT", 0.25, n)
+        assert (item.x * 1e-7, item.y * 1e-7) == pytest.approx((latitude, longitude), abs=6e-8)
+        assert item.z == pytest.approx(height)
+        assert (item.frame, item.command) == (mavlink.MAV_FRAME_GLOBAL_INT, 16)
+    peer.mav.mission_ack_send(*OURS, mavlink.MAV_MISSION_ACCEPTED)
+    while peer.next(["MISSION_ITEM_INT", "MISSION_ACK"], NOTHING_S) is not None:
+        pass
+    peer.mav.mission_request_list_send(1, 0)  # it is the autopilot's to answer
+    assert peer.next("MISSION_COUNT", NOTHING_S) is None
+
+
+def test_a_long_mission_comes_as_fast_as_it_is_taken(component: tuple[Component, Peer]) -> None:
+    ours, peer = component
+    peer.mav.mission_request_list_send(*OURS, 0)
+    n = peer.next("MISSION_COUNT").count
+    for seq in range(n):
+        peer.mav.mission_request_int_send(*OURS, seq, 0)
+        assert peer.next("MISSION_ITEM_INT").seq == seq
+    assert n == 150
+    assert TOO_MANY not in [warning.what for warning in ours.warned]
+
+
 def test_a_ping_is_answered_and_an_answer_is_not(component: tuple[Component, Peer]) -> None:
     peer = component[1]
     peer.mav.ping_send(123_456_789, 41, 0, 0)
@@ -231,6 +280,9 @@ def test_nothing_hostile_keeps_it_from_answering(component: tuple[Component, Pee
         mavlink.MAVLink_command_long_message(*OURS, 512, 255, *[float("nan")] * 7),
         mavlink.MAVLink_ping_message(2**64 - 1, 2**32 - 1, 0, 0),
         mavlink.MAVLink_timesync_message(-(2**63), 2**63 - 1),
+        mavlink.MAVLink_mission_request_list_message(*OURS, 255),
+        mavlink.MAVLink_mission_request_int_message(*OURS, 65535),
+        mavlink.MAVLink_mission_count_message(*OURS, 65535),
     ]
     for n in range(600):
         packet = bytearray(rng.choice(seeds).pack(speaker, force_mavlink1=rng.random() < 0.3))

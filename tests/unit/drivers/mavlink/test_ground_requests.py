@@ -6,6 +6,7 @@ import asyncio
 import random
 from typing import Any
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import LinkConfig
@@ -21,6 +22,7 @@ from drivers.mavlink.component_messages import (
     protocol_version,
 )
 from drivers.mavlink.ground_requests import KINDS, TOO_MANY, GroundRequests
+from drivers.mavlink.mission_server import MissionServer
 from drivers.mavlink.parameter_server import SET, ParameterServer
 from drivers.mavlink.request_limit import EACH_BURST, MOST_ASKERS, RequestLimit
 from drivers.mavlink.status_text import TEXTS_AT_ONCE, WARNINGS_ONLY, TextLimit
@@ -58,7 +60,8 @@ class Asked:
         self.table, self.n_done = One(), 0
         self.requests = GroundRequests(
             self.port, FlightClock(), CommandServer({NUMBER: Command(self._do)}),
-            ParameterServer(self.table), self.warned.append,
+            ParameterServer(self.table), MissionServer(lambda: np.zeros((3, 3))),
+            self.warned.append,
         )  # fmt: skip
 
     def _do(self, _parameters: object) -> Done:
@@ -138,8 +141,9 @@ def test_the_link_hands_on_what_others_than_the_autopilot_ask() -> None:
         link = AutopilotLink(LinkConfig(), port, clock, lambda _: None, lambda _: None)
         table = One()
         requests = GroundRequests(
-            port, clock, CommandServer({}), ParameterServer(table), lambda _: None
-        )
+            port, clock, CommandServer({}), ParameterServer(table),
+            MissionServer(lambda: np.zeros((3, 3))), lambda _: None,
+        )  # fmt: skip
         link.on_request = requests.take
         tasks = [asyncio.ensure_future(each) for each in (link.run(), requests.run())]
         await asyncio.sleep(0.05)

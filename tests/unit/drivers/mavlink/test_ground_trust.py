@@ -7,11 +7,13 @@ import socket
 import time
 from pathlib import Path
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.timing.clock import FlightClock
 from drivers.mavlink.command_server import ACCEPTED, Command, CommandServer, Done
 from drivers.mavlink.ground_requests import GroundRequests
+from drivers.mavlink.mission_server import MissionServer
 from drivers.mavlink.parameter_server import ParameterServer
 from tests.support.autopilot.fake_wire import free_port
 from tests.support.autopilot.mavlink_link import Speaker, port_at, running
@@ -43,7 +45,7 @@ async def n_done(packets: list[bytes], key_file: str = "") -> int:
 
     requests = GroundRequests(
         port, FlightClock(), CommandServer({NUMBER: Command(carry_out)}),
-        ParameterServer(Nothing()), lambda _: None,
+        ParameterServer(Nothing()), MissionServer(lambda: np.empty((0, 3))), lambda _: None,
     )  # fmt: skip
     async with running(port.run(requests.take)):
         await asyncio.sleep(0.05)
