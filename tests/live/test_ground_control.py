@@ -11,15 +11,18 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.daemon.control.flight_parameters import PARAMETERS
 from companion.daemon.control.ground_control import BUDGET, MAPPING, NEW_MAP, SNAPSHOT
+from companion.geometry.geodesy import ned_from_geodetic
 from tests.support.autopilot.fake_wire import free_port
 from tests.support.autopilot.ground_station import OURS, GroundStation
+from tests.support.cameras.http_camera import world_from_body
 from tests.support.processes.daemon_process import UNGOVERNED
-from tests.support.processes.flying import Flying
+from tests.support.processes.flying import MOST_AWAY_M, Flying
 from tests.support.reference.scoring import read_ply
 
 ACCEPTED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
@@ -161,6 +164,24 @@ def test_while_armed_the_pose_cannot_be_made_easier(flying: Flying, ground: Grou
     flying.assert_went_on(began_ns)  # a stricter limit takes no pose away that keeps it
 
 
+def test_the_way_back_is_fetched(flying: Flying, ground: GroundStation) -> None:
+    flying.take_off()
+    until_s = time.monotonic() + MAP_S
+    while len(found := ground.mission()) < 4:
+        assert time.monotonic() < until_s
+        time.sleep(1.0)
+    now_ns, origin = time.monotonic_ns(), flying.autopilot.flight.origin
+    way_m = np.stack([ned_from_geodetic(*place, origin) for place in found])
+    flown_m = np.stack(
+        [world_from_body(now_ns - n * 50_000_000).translation for n in range(int(MAP_S * 20))]
+    )
+    off_m = np.linalg.norm(way_m[:, None] - flown_m, axis=2)
+    assert off_m.min(1).max() < MOST_AWAY_M
+    assert off_m[1, : 20 * 5].min() < MOST_AWAY_M  # the first lies where it is
+    np.testing.assert_array_equal(way_m[0], way_m[-1])  # ArduPilot's home
+    flying.daemon.line("ground: way back: ")
+
+
 def test_a_storm_of_requests_delays_no_pose(flying: Flying, port: int) -> None:
     """All kinds, for us, from one and from many; and what is no request at all."""
     flying.take_off()
@@ -170,6 +191,8 @@ def test_a_storm_of_requests_delays_no_pose(flying: Flying, port: int) -> None:
         mavlink.MAVLink_param_request_read_message(*OURS, b"FB_MODE", -1),
         mavlink.MAVLink_param_set_message(*OURS, b"FB_RATE_HZ", 1e9, 9),
         mavlink.MAVLink_command_long_message(*OURS, 512, 0, 148, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_mission_request_list_message(*OURS),
+        mavlink.MAVLink_mission_count_message(*OURS, 60_000),
         mavlink.MAVLink_command_long_message(*OURS, 7777, 0, 1, 0, 0, 0, 0, 0, 0),
     ]
     with GroundStation(port) as ground:

@@ -88,6 +88,17 @@ class GroundStation:
         said = self.heard("PARAM_VALUE", lambda got: got.param_id == name)
         return float(said.param_value)
 
+    def mission(self) -> list[tuple[float, float, float]]:
+        """All of it: latitude, longitude in degrees, and height in metres."""
+        self.send(mavlink.MAVLink_mission_request_list_message(*OURS))
+        items = []
+        for seq in range(self.heard("MISSION_COUNT").count):
+            self.send(mavlink.MAVLink_mission_request_int_message(*OURS, seq))
+            items.append(self.heard("MISSION_ITEM_INT"))
+            assert items[-1].seq == seq
+        self.send(mavlink.MAVLink_mission_ack_message(*OURS, mavlink.MAV_MISSION_ACCEPTED))
+        return [(item.x * 1e-7, item.y * 1e-7, item.z) for item in items]
+
     def _read(self, timeout_s: float) -> list[Any]:
         if not self._pending:
             self._socket.settimeout(timeout_s)
