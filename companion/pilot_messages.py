@@ -66,6 +66,12 @@ MAP_TILTED = PilotMessage(WARNING, "map tilted: restarting")
 MAP_RESUMED = PilotMessage(NOTICE, "map resumed after restart")
 MAP_NOT_RESUMED = PilotMessage(NOTICE, "old map not recognised: new map")
 MAP_NOT_SAVED = PilotMessage(NOTICE, "map not saved for a restart")
+SITE_LOCATED = PilotMessage(INFO, "located in the saved map")
+SITE_REFUSED = PilotMessage(WARNING, "saved map contradicted: not used")
+SITE_MISPLACED = PilotMessage(WARNING, "saved map contradicted: place not used")
+SITE_OTHER_CAMERA = PilotMessage(NOTICE, "saved map is of another camera")
+SITE_UNREADABLE = PilotMessage(WARNING, "saved map cannot be read: not used")
+SITE_DAMAGED = PilotMessage(NOTICE, "saved map damaged: used in part")
 MOUNT_CORRECTED = PilotMessage(NOTICE, "camera mount angle corrected")
 IMU_NOT_USED = PilotMessage(NOTICE, "autopilot IMU data not used")
 IMU_USED = PilotMessage(INFO, "autopilot IMU data used again")
@@ -202,6 +208,12 @@ PARTS: Mapping[str, str] = {
 }  # fmt: skip
 
 OF_WARNING: Mapping[str, PilotMessage] = {
+    "located in the map of an earlier flight": SITE_LOCATED,
+    "the map of an earlier flight is not used": SITE_REFUSED,
+    "the map of an earlier flight is not where satellites are": SITE_MISPLACED,
+    "the map of an earlier flight was made with another camera": SITE_OTHER_CAMERA,
+    "the map of an earlier flight cannot be read": SITE_UNREADABLE,
+    "the map of an earlier flight is damaged": SITE_DAMAGED,
     "localisation has died: the flight ends, and another begins": TRACKING_FAILED,
     "the autopilot's attitude is not the camera's and is not used": ATTITUDE_MISMATCH,
     "camera does not turn with the body: attitude not used, no vision position": ATTITUDE_MISMATCH,

@@ -30,7 +30,7 @@ from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_in_flight import SiteInFlight
-from companion.estimation.site.site_use import SiteUse
+from companion.estimation.site.site_use import DOUBTED, SiteUse
 from companion.estimation.tracking_margin import TrackingMargin
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
@@ -333,6 +333,7 @@ class LocalisationStage:
             self._reset_motion()
         # another map must be georeferenced before its first pose is published
         update = self._map_update() if other_map and self._segments() else None
+        seen: Pose | None = None
         for message in tracked:
             if isinstance(message, Track) and message.map_from_camera is not None:
                 measured = self._attitude.at(message.t_ns)
@@ -344,6 +345,7 @@ class LocalisationStage:
                 mount = self._attitude.correction[0]
                 self._georeferences.take(message, None if measured is None else measured @ mount.T)
                 if message.seq == frame.seq:
+                    seen = message.map_from_camera
                     self._motion.last = message
                     self._satellites.take_pose(
                         message.t_ns, self._tracker.map.first_keyframe_id, message.map_from_camera,
@@ -375,7 +377,10 @@ class LocalisationStage:
             yield resumed
             if resumed.what == MAP_RESUMED:
                 yield self._map_update()
-        yield from self._site.frame(frame.t_ns, added)
+        for warned in self._site.frame(frame.t_ns, seen):
+            yield warned
+            if warned.what == DOUBTED:
+                yield self._map_update()
         yield from self._imu.warnings()
         yield from self._georeferencer.warnings()
         yield from self._satellites.warnings()

@@ -96,6 +96,13 @@ class SegmentGeoreferences:
             if key in self._known:
                 self._known[key] = self._held[key]
 
+    def give_up_place(self) -> None:
+        """Maps of an earlier flight have no place on the globe: satellites contradict it."""
+        for key, kept in self._held.items():
+            self._held[key] = replace(kept, has_origin=False)
+            if key in self._known:
+                self._known[key] = self._held[key]
+
     def _more_certain(self, segment: SlamMap, found: Georeference) -> Georeference:
         """The found or the stored georeference of a segment, whichever is more certain.
 

@@ -10,12 +10,15 @@ from companion.estimation.site.site_of_flight import site_of_flight
 from companion.estimation.site.site_use import SiteUse
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
-from companion.geometry.transforms import Similarity
+from companion.geometry.transforms import Array, Pose, Similarity
 from companion.messages import Warned
 from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import SlamMap
 from companion.slam.tracking.tracker import Tracker
+
+COMPARE_EVERY_NS = 1_000_000_000
+"""Longer than positions come late."""
 
 
 class SiteInFlight:
@@ -27,6 +30,8 @@ class SiteInFlight:
     ) -> None:  # fmt: skip
         self._use, self._tracker = use, tracker
         self._georeferencer, self._georeferences = georeferencer, georeferences
+        self._place: tuple[int, Array] | None = None
+        """Place of the camera, NED metres, that is to be compared."""
         if use is not None:
             tracker.use_site(use.slam_map)
             tracker.atlas.on_merge = self._merged
@@ -54,12 +59,12 @@ class SiteInFlight:
             self._georeferencer.place_at(found.keyframe.t_ns),
         )  # fmt: skip
 
-    def frame(self, t_ns: int, added: bool) -> Iterator[Warned]:
-        """Warnings after a frame; `added` where it brought a keyframe."""
+    def frame(self, t_ns: int, map_from_camera: Pose | None) -> Iterator[Warned]:
+        """Warnings after a frame, with its pose in the newest map, None while lost."""
         if self._use is None:
             return
-        if added and self._use.located:
-            self._compare(self._use)
+        if self._use.located:
+            self._compare(self._use, t_ns, map_from_camera)
         yield from self._use.warnings(t_ns)
 
     def site_map(
@@ -71,14 +76,19 @@ class SiteInFlight:
         used = None if self._use is None else self._use.site
         return site_of_flight(metric, camera, flight, origin, used)
 
-    def _compare(self, use: SiteUse) -> None:
-        """Compare the place of the last keyframe but one with what the autopilot measured then."""
-        placed, keyframes = self._georeferences.of(self._tracker.map), self._tracker.map.keyframes
-        if placed is None or len(keyframes) < 2:
-            return
-        keyframe = keyframes[sorted(keyframes)[-2]]
-        place_m = placed.world_from_map.apply(keyframe.centre)
-        use.compare(place_m, self._georeferencer.place_at(keyframe.t_ns))
+    def _compare(self, use: SiteUse, t_ns: int, map_from_camera: Pose | None) -> None:
+        """Compare a place with what the autopilot measured then, which is known somewhat later.
+
+        Not of keyframes: a flight in a known map makes none.
+        """
+        if self._place is not None and t_ns - self._place[0] >= COMPARE_EVERY_NS:
+            at_ns, place_m = self._place
+            self._place = None
+            if use.compare(place_m, self._georeferencer.place_at(at_ns)):
+                self._georeferences.give_up_place()
+        placed = self._georeferences.of(self._tracker.map)
+        if self._place is None and placed is not None and map_from_camera is not None:
+            self._place = t_ns, placed.world_from_map.apply(map_from_camera.translation)
 
     def _merged(self, here: SlamMap, there: SlamMap, here_from_there: Similarity) -> None:
         self._georeferences.merged(here, there, here_from_there)

@@ -18,9 +18,11 @@ MIN_SCALE_OFF, SIGMAS_OFF = 0.1, 4.0
 """Relative difference of scales that contradict, at least, and in standard deviations."""
 MAX_FOCAL_OFF = 0.01
 """Relative difference of focal lengths of the same camera, calibrated twice."""
+TIMES_OFF = 3
+"""Comparisons in a row that contradict the map before it counts: a filter may leap once."""
 LOCATED = "located in the map of an earlier flight"
 CONTRADICTED = "the map of an earlier flight is not used"
-DOUBTED = "the map of an earlier flight is contradicted, and still flown on"
+DOUBTED = "the map of an earlier flight is not where satellites are"
 OTHER_CAMERA = "the map of an earlier flight was made with another camera"
 
 
@@ -36,17 +38,18 @@ class SiteUse:
     ) -> None:
         self.site = site
         self.slam_map: SlamMap = slam_map_of(site, camera)
-        self.located = False
+        self.located = self.misplaced = False
+        self._n_off = 0
         self._origin, self._is_live = origin, is_live
         self._world_from_site = world_from_site(site.georeference.origin, origin)
         self._to_say: list[tuple[str, str]] = []
         self._said: set[str] = set()
-        theirs = site.parts[-1].camera
-        if abs(np.log(theirs.focal_px / camera.focal_px)) > MAX_FOCAL_OFF:
+        others = [part for part in site.parts if _is_other(part.camera, camera)]
+        if others:
             self._say(
                 OTHER_CAMERA,
-                f"its focal length was {theirs.focal_px:.0f} pixels, and is {camera.focal_px:.0f}; "
-                "directions are compared, not pixels",
+                f"of {others[-1].flight} it was {_in_words(others[-1].camera)}, and is "
+                f"{_in_words(camera)}; directions are compared, not pixels",
             )
 
     @property
@@ -56,8 +59,9 @@ class SiteUse:
         return Georeference(
             self._world_from_site, found.sigma_scale, found.sigma_yaw_rad,
             f"the map of {self.site.parts[0].flight} ({found.method})", len(self.site.keyframes),
-            found.sigma_m, has_origin=self._has_both
-            or (found.origin is not None and not self._is_live),
+            found.sigma_m, has_origin=not self.misplaced and (
+                self._has_both or (found.origin is not None and not self._is_live)
+            ),
         )  # fmt: skip
 
     @property
@@ -107,17 +111,21 @@ class SiteUse:
                 return False
         return True
 
-    def compare(self, place_m: Array, measured_m: Array | None) -> None:
-        """Say it where satellites contradict the map after the flight was located in it.
+    def compare(self, place_m: Array, measured_m: Array | None) -> bool:
+        """True once satellites contradict the map after the flight was located in it; it is said.
 
         `place_m` (3,) is the place of the camera by the map, `measured_m` (3,) the autopilot's,
-        None where unknown. The flight goes on in the map: which of them is wrong is not known.
+        None where unknown. Which of them is wrong is not known: the map still gives scale and
+        heading, and no place any more.
         """
-        if measured_m is None or not self._has_both:
-            return
+        if measured_m is None or not self._has_both or self.misplaced:
+            return False
         off_m = float(np.linalg.norm(place_m - measured_m))
-        if off_m > MAX_OFF_M:
+        self._n_off = self._n_off + 1 if off_m > MAX_OFF_M else 0
+        self.misplaced = self._n_off >= TIMES_OFF
+        if self.misplaced:
             self._say(DOUBTED, f"its place is {off_m:.0f} m from that by the autopilot")
+        return self.misplaced
 
     def locate(self) -> None:
         """Note that the flight was found in the map."""
@@ -129,6 +137,20 @@ class SiteUse:
         if what not in self._said:
             self._said.add(what)
             self._to_say.append((what, detail))
+
+
+def _is_other(theirs: Camera, ours: Camera) -> bool:
+    """True of another camera, or of another lens or size of picture."""
+    return (theirs.width, theirs.height, theirs.distortion) != (
+        ours.width, ours.height, ours.distortion,
+    ) or abs(float(np.log(theirs.focal_px / ours.focal_px))) > MAX_FOCAL_OFF  # fmt: skip
+
+
+def _in_words(camera: Camera) -> str:
+    return (
+        f"{camera.width}x{camera.height} pixels with {camera.focal_px:.0f} of focal length, "
+        f"distortion {camera.distortion.value}"
+    )
 
 
 def world_from_site(site: GeoOrigin | None, world: GeoOrigin | None) -> Similarity:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from companion.estimation.site.site_use import (
     SiteUse,
     world_from_site,
 )
+from companion.geometry.camera import Distortion
 from companion.geometry.geodesy import GeoOrigin, geodetic_from_ned, ned_from_geodetic
 from companion.geometry.transforms import Similarity, yaw_rotation
 from companion.messages import Georeference
@@ -133,11 +135,15 @@ def test_in_the_air_a_map_has_a_place_once_the_origin_is_known(
 
 def test_satellites_that_contradict_later_are_said(site: SiteMap) -> None:
     use = SiteUse(site, CAMERA, ORIGIN)
-    for off_m in (0.0, 19.0, 21.0, 30.0):
-        use.compare(np.zeros(3), np.array([off_m, 0.0, 0.0]))
-    use.compare(np.zeros(3), None)
+    offs_m = (0.0, 21.0, 30.0, 19.0, 21.0, 22.0)  # one leap of a filter is none
+    assert not any(use.compare(np.zeros(3), np.array([off_m, 0.0, 0.0])) for off_m in offs_m)
+    assert not use.compare(np.zeros(3), None)
+    assert not use.warnings(5) and use.georeference.has_origin
+    assert use.compare(np.zeros(3), np.array([0.0, 0.0, 23.0]))
     (warning,) = use.warnings(5)
-    assert warning.what == DOUBTED and "21 m" in warning.detail
+    assert warning.what == DOUBTED and "23 m" in warning.detail
+    assert not use.georeference.has_origin
+    assert not use.compare(np.zeros(3), np.array([0.0, 0.0, 24.0]))  # once
 
 
 def test_another_camera_is_said(site: SiteMap) -> None:
@@ -146,6 +152,21 @@ def test_another_camera_is_said(site: SiteMap) -> None:
     assert warning.what == OTHER_CAMERA and "500" in warning.detail and "600" in warning.detail
     longer = use.slam_map.base_distance[: use.slam_map.n_points]
     np.testing.assert_allclose(longer, 1.2 * site.points.base_distance)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"width": CAMERA.width + 160},
+        {"distortion": Distortion.EQUIDISTANT, "coefficients": (0.1, 0.0, 0.0, 0.0)},
+    ],
+)
+def test_another_picture_or_lens_of_the_same_focal_length_is_said(
+    site: SiteMap, changed: dict[str, Any]
+) -> None:
+    (warning,) = SiteUse(site, replace(CAMERA, **changed), ORIGIN).warnings(7)
+    assert warning.what == OTHER_CAMERA and "morning" in warning.detail
+    assert not SiteUse(site, replace(CAMERA, fx=502.0, readout_ms=5.0), ORIGIN).warnings(7)
 
 
 def test_being_located_is_good_news(site: SiteMap) -> None:
