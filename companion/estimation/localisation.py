@@ -179,7 +179,7 @@ class LocalisationStage:
                     sample.t_ns, sample.height_m, self._standing.armed
                 )
             if isinstance(sample, RangeSample):
-                self._odometry.ground.take_range(sample.t_ns, sample.distance_m)
+                self._take_range(sample)
             if isinstance(sample, AttitudeSample | ImuSample):
                 self._imu.take(sample)
             if isinstance(sample, AttitudeSample):
@@ -191,6 +191,15 @@ class LocalisationStage:
                     self._georeferencer.take(each)
         self._n_samples += len(self._samples)
         self._samples.clear()
+
+    def _take_range(self, sample: RangeSample) -> None:
+        """A range is along the body's axis, also where the frames' attitude is a gimbal head's."""
+        upright = None
+        if self._gimbal is not None:
+            upright = self._gimbal.body_upright(sample.t_ns)
+            if upright is None:
+                return
+        self._odometry.ground.take_range(sample.t_ns, sample.distance_m, upright)
 
     def _of_head(self, sample: Telemetry) -> Iterable[Telemetry]:
         """A sample as it is of what the camera is fixed to: the body, or a gimbal's head."""

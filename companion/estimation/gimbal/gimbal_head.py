@@ -113,6 +113,11 @@ class GimbalHead:
             rates = vector_from_rotation(last[1].T @ ned_from_head) / ((t_ns - last[0]) * 1e-9)
         return AttitudeSample(t_ns, quaternion_from_rotation(ned_from_head), rates)
 
+    def body_upright(self, t_ns: int) -> float | None:
+        """Cosine of the tilt of the body, which the head has not; None where it is not known."""
+        vehicle = self._vehicle.at(t_ns)
+        return None if vehicle is None else max(float(vehicle[2, 2]), 0.0)
+
     def of_head(self, sample: PositionSample) -> PositionSample:
         """A position as it is for the head; as it was where the body's attitude is not known."""
         vehicle = self._vehicle.at(sample.t_ns)

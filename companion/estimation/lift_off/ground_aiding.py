@@ -90,11 +90,15 @@ class GroundAiding:
         elif self._takes_heights:
             self._late.append(AidedHeight(t_ns, height_m))
 
-    def take_range(self, t_ns: int, distance_m: float) -> None:
-        """Take the distance to the ground along the body's down axis."""
+    def take_range(self, t_ns: int, distance_m: float, upright: float | None = None) -> None:
+        """Take the distance to the ground along the body's down axis.
+
+        `upright` is the cosine of the body's tilt where the frames' attitude is not the body's.
+        """
         if self._takes_ranges and t_ns - self._range_ns >= RANGE_EVERY_NS:
             self._range_ns = t_ns
-            self._late.append(AidedRange(t_ns, distance_m * self._upright))
+            upright = self._upright if upright is None else upright
+            self._late.append(AidedRange(t_ns, distance_m * upright))
 
     def stand(self, t_ns: int, place_m: Array) -> None:
         """Take a frame of a vehicle that stands: at `place_m` (3,), unless it stood before."""
