@@ -56,6 +56,7 @@ from companion.timing.clock import FlightClock
 from companion.timing.overdue_frames import OVERDUE_NS, OverdueFrames
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_registry import camera_source
+from drivers.camera.live_calibration import is_on_gimbal
 from drivers.mavlink.autopilot_date import AutopilotDate
 from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.origin_keeper import OriginKeeper
@@ -109,7 +110,7 @@ class Daemon:
             link_watch = LinkWatch(port, self._on_warned)
             self._link = AutopilotLink(
                 config.link, port, clock, self._on_telemetry, self._on_warned,
-                config.mount.type == "gimbal",
+                is_on_gimbal(config.camera, config.mount),
             )  # fmt: skip
             self._senders = Senders(
                 config, self._link, clock, self._on_warned, lambda step: self._flights.take(step)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import CameraConfig, MountConfig
-from companion.errors import ConfigError
+from companion.errors import ConfigError, FlightError
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Pose
 from drivers.camera.pattern_camera import pattern_optics
@@ -16,6 +16,7 @@ from drivers.images.calibration_file import (
     assumed_camera,
     configured_rotation,
     read_calibration,
+    states_gimbal,
     with_mount,
     with_readout,
 )
@@ -60,6 +61,17 @@ def live_camera(
             "be used; set [mount]"
         )
     return with_readout(camera, config.readout_ms), warnings
+
+
+def is_on_gimbal(config: CameraConfig, mount: MountConfig) -> bool:
+    """True where settings or calibration say so; what `live_camera` cannot read says nothing."""
+    file = _calibration_file(config)
+    if mount.type == "gimbal" or file is None:
+        return mount.type == "gimbal"
+    try:
+        return states_gimbal(file)
+    except FlightError:
+        return False
 
 
 def body_from_camera(mount: MountConfig) -> Pose:

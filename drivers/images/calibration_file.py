@@ -72,6 +72,11 @@ def read_calibration(path: Path, width: int, height: int) -> Camera:
     )  # fmt: skip
 
 
+def states_gimbal(path: Path) -> bool:
+    """True where a calibration says that the camera is on a gimbal; FlightError if unreadable."""
+    return _content(path).get("gimbal") is not None
+
+
 def with_mount(camera: Camera, mount: MountConfig) -> Camera:
     """The camera on the gimbal that is configured, if any.
 

@@ -11,7 +11,7 @@ from companion.config import CameraConfig, MountConfig
 from companion.errors import ConfigError, FlightError
 from companion.geometry.camera import Distortion
 from companion.geometry.gimbal import Gimbal
-from drivers.camera.live_calibration import body_from_camera, live_camera
+from drivers.camera.live_calibration import body_from_camera, is_on_gimbal, live_camera
 from drivers.images.calibration_file import (
     FORWARD_UPRIGHT,
     assumed_camera,
@@ -238,6 +238,16 @@ def test_a_gimbal_is_read_and_recorded(tmp_path: Path) -> None:
     assert camera_of(camera_document(stated)).gimbal == stated.gimbal
     config = CameraConfig(calibration=str(tmp_path / "camera.json"))
     assert live_camera(config, MountConfig(), 64, 48)[0].gimbal == stated.gimbal
+
+
+def test_a_gimbal_is_known_before_the_first_frame(tmp_path: Path) -> None:
+    config, mount = CameraConfig(calibration=str(tmp_path / "camera.json")), MountConfig()
+    assert not is_on_gimbal(config, mount)  # there is no file: the first frame says so
+    assert is_on_gimbal(config, MountConfig(type="gimbal"))
+    write(tmp_path, body_from_camera=TURNED)
+    assert not is_on_gimbal(config, mount)
+    write(tmp_path, body_from_camera=TURNED, gimbal={})
+    assert is_on_gimbal(config, mount)
 
 
 @pytest.mark.parametrize(
