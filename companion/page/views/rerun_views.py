@@ -9,11 +9,10 @@ is answered in the browser (`AT_HOME`).
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncIterator
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-import httpx
 from starlette.background import BackgroundTask
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
@@ -21,7 +20,11 @@ from starlette.routing import Route
 
 from companion.page.views.site import Site
 
-LOOPBACK = "127.0.0.1"
+if TYPE_CHECKING:
+    import httpx
+
+    from companion.page.viewer_on_board import ViewerOnBoard
+
 WEB_PORT, GRPC_PORT = 9090, 9876
 """Of the viewer on board."""
 SERVICE = re.compile(r"rerun\.[\w.]+")
@@ -41,7 +44,6 @@ KEPT = "private, max-age=604800"
 """The program is 43 MB; its address names its version."""
 PASSED_ON = ("content-type", "grpc-timeout", "x-grpc-web", "x-user-agent", "accept")
 PASSED_BACK = ("content-type", "content-length", "rerun-final-length", "grpc-status")
-CONNECT_S = 3.0
 SHORT = 1 << 20
 NO_VIEWER = "the Rerun viewer does not run here: daemon.viewer = web"
 
@@ -51,9 +53,8 @@ class RerunViews:
 
     def __init__(self, site: Site) -> None:
         self._site = site
-        timeout = httpx.Timeout(None, connect=CONNECT_S)  # a stream may be silent
-        once = httpx.Limits(max_keepalive_connections=0)
-        self._client = httpx.AsyncClient(timeout=timeout, limits=once, trust_env=False)
+        self._viewer: ViewerOnBoard | None = None
+        """Client of the viewer, from the first that looks on: it is 6 MB of memory."""
 
     def routes(self) -> list[Route]:
         """Routes of this view."""
@@ -107,13 +108,11 @@ class RerunViews:
         body: bytes = b"",
     ) -> httpx.Response | None:  # fmt: skip
         """Begin of an answer; None where nobody answers."""
-        request = self._client.build_request(
-            method, f"http://{LOOPBACK}:{port}{path}", headers=headers, content=body
-        )
-        try:
-            return await self._client.send(request, stream=True)
-        except httpx.HTTPError:
-            return None
+        if self._viewer is None:
+            from companion.page.viewer_on_board import ViewerOnBoard
+
+            self._viewer = ViewerOnBoard()
+        return await self._viewer.asked(method, port, path, headers, body)
 
 
 def viewer_path() -> str:
@@ -135,17 +134,8 @@ def _back(answer: httpx.Response) -> dict[str, str]:
 
 
 def _passed(answer: httpx.Response, headers: dict[str, str]) -> StreamingResponse:
+    from companion.page.viewer_on_board import bytes_of
+
     return StreamingResponse(
-        _bytes(answer), answer.status_code, headers, background=BackgroundTask(answer.aclose)
+        bytes_of(answer), answer.status_code, headers, background=BackgroundTask(answer.aclose)
     )
-
-
-async def _bytes(answer: httpx.Response) -> AsyncIterator[bytes]:
-    """Bytes as they come, no faster than the browser takes them."""
-    try:
-        async for data in answer.aiter_raw():
-            yield data
-    except httpx.HTTPError:
-        pass  # the viewer has ended, and with it the stream
-    finally:
-        await answer.aclose()

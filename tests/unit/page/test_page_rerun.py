@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,3 +90,9 @@ def test_its_stream_comes_through_the_page(
         assert answer.status_code == 200
         assert answer.headers["content-type"] == GRPC["content-type"]
     assert httpx.post(f"http://127.0.0.1:{served.port}/etc/passwd").status_code == 404
+
+
+def test_its_client_is_loaded_by_nobody_before_someone_looks() -> None:
+    command = "import sys, companion.page.page_process; print('httpx' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
+    assert (found.stdout, found.stderr) == ("False\n", "")
