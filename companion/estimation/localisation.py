@@ -100,7 +100,9 @@ class LocalisationStage:
             camera.body_from_camera,
             sensors_only=config.feedback.gives_position,
         )
-        self._acceleration = AccelerationIntegral(turns_with_camera=camera.gimbal is None)
+        self._acceleration = AccelerationIntegral(
+            None if camera.gimbal is None else np.array(camera.gimbal.place_body_m)
+        )
         self._body = BodyFilter(self._acceleration)
         self._standing = Standing()
         self._odometry = SmoothOdometry(

@@ -42,10 +42,14 @@ class Change(NamedTuple):
 
 
 class AccelerationIntegral:
-    """Integrates what arrives; attitude and IMU may come in any order up to a few samples."""
+    """Integrates what arrives; attitude and IMU may come in any order up to a few samples.
 
-    def __init__(self, turns_with_camera: bool = True) -> None:
-        self._turns_with_camera = turns_with_camera
+    The integrals are those of a place `lever_body_m` (3,) from the IMU, in the body: a gimbal's
+    head, which does not turn with the body.
+    """
+
+    def __init__(self, lever_body_m: Array | None = None) -> None:
+        self._lever_body_m = lever_body_m
         self.believed = True
         """False while nobody knows yet whether the samples are right."""
         self.turns = TurnIntegral()
@@ -56,7 +60,9 @@ class AccelerationIntegral:
         self._last: tuple[int, Array, Array] | None = None
         """Time, acceleration (3,) and rotation (3, 3) of the last sample."""
         self._sums = np.zeros((9, 3))
-        """Rows: velocity, displacement, their derivatives by bias, and the number of gaps."""
+        """Of the IMU. Rows: velocity, displacement, their derivatives by bias, number of gaps."""
+        self._lever_sums = np.zeros((9, 3))
+        """Difference of the place to the IMU, by the last sample: it is not integrated."""
         self._raw: deque[Array] = deque(maxlen=3)
         self._noise_variance = self._newest_variance = 0.0
         self._n = 0
@@ -66,7 +72,7 @@ class AccelerationIntegral:
         """Add a sample; samples of a kind come in order of time."""
         if isinstance(sample, ImuSample):
             self._see_noise(sample)
-            if self._turns_with_camera:
+            if self._lever_body_m is None:
                 self.turns.take(sample)
             self._waiting.append(sample)
         elif not self._attitudes or sample.t_ns > self._attitudes[-1].t_ns:
@@ -125,7 +131,7 @@ class AccelerationIntegral:
         if newest is not None:  # the series is sparse
             for n in np.flatnonzero((t_ns > newest[0]) & (t_ns <= self.newest_ns)):
                 share = (t_ns[n] - newest[0]) / (self.newest_ns - newest[0])
-                sums[n], known[n] = newest[1] + share * (self._sums - newest[1]), True
+                sums[n], known[n] = newest[1] + share * (self._newest_sums() - newest[1]), True
         return sums, known
 
     def _see_noise(self, sample: ImuSample) -> None:
@@ -156,6 +162,9 @@ class AccelerationIntegral:
                 continue
             share = (sample.t_ns - before.t_ns) / span_ns
             rotation = rotation_from_quaternion(first + share * (second - first))
+            if self._lever_body_m is not None:
+                self._lever_sums[0] = rotation @ np.cross(sample.gyro_rad_s, self._lever_body_m)
+                self._lever_sums[1] = rotation @ self._lever_body_m
             self._add(sample.t_ns, rotation @ sample.accel_m_s2 + GRAVITY_NED_M_S2, rotation)
 
     def _add(self, t_ns: int, acceleration_m_s2: Array, rotation: Array) -> None:
@@ -173,4 +182,7 @@ class AccelerationIntegral:
             changed = (was + now) * (dt_s / 2.0)
             self._sums[[0, 2, 3, 4]] += changed
             self._sums[[1, 5, 6, 7]] += moved
-        self._series.add(t_ns, self._sums.copy())
+        self._series.add(t_ns, self._newest_sums())
+
+    def _newest_sums(self) -> Array:
+        return np.asarray(self._sums + self._lever_sums)

@@ -15,6 +15,7 @@ from companion.geometry.transforms import (
     Array,
     quaternion_from_rotation,
     rotation_from_vector,
+    vector_from_rotation,
 )
 from companion.telemetry import AttitudeSample, ImuSample
 
@@ -35,11 +36,20 @@ def acceleration(t_s: float) -> Array:
     return np.array([1.5 * np.cos(t_s), -0.7 * np.sin(2 * t_s), 0.4])
 
 
+def rates(t_s: float) -> Array:
+    """Of that body, rad/s."""
+    turn = turning(t_s - 1e-4).T @ turning(t_s + 1e-4)
+    return np.asarray(vector_from_rotation(turn) / 2e-4)
+
+
 def flown(
-    seconds: float, bias: Array | None = None, without: tuple[float, float] = (0.0, 0.0)
+    seconds: float,
+    bias: Array | None = None,
+    without: tuple[float, float] = (0.0, 0.0),
+    lever_m: Array | None = None,
 ) -> AccelerationIntegral:
     """What an accelerometer makes of that flight; without samples in a span of time."""
-    integral = AccelerationIntegral()
+    integral = AccelerationIntegral(lever_m)
     for i in range(int(seconds * RATE_HZ) + 1):
         t_s = i / RATE_HZ
         t_ns = round(t_s * 1e9)
@@ -47,7 +57,7 @@ def flown(
             integral.take(AttitudeSample(t_ns, quaternion_from_rotation(turning(t_s))))
         force = turning(t_s).T @ (acceleration(t_s) - GRAVITY_NED_M_S2)
         if not without[0] <= t_s < without[1]:
-            integral.take(ImuSample(t_ns, np.zeros(3), force + (0.0 if bias is None else bias)))
+            integral.take(ImuSample(t_ns, rates(t_s), force + (0.0 if bias is None else bias)))
     return integral
 
 
@@ -62,6 +72,19 @@ def test_it_gives_velocity_and_displacement() -> None:
     assert change.dt_s == pytest.approx(4.0)
     assert change.velocity_m_s == pytest.approx(velocity[-1], abs=2e-3)
     assert change.displacement_m == pytest.approx(displacement, abs=5e-3)
+
+
+def test_a_place_beside_moves_by_the_turns_of_the_body_too() -> None:
+    """A gimbal's head, from the newest samples, too, which are not kept."""
+    lever_m, span = np.array([0.3, -0.1, 0.2]), (round(1e9), round(5e9))
+    alone, beside = flown(5.0).between(*span), flown(5.0, lever_m=lever_m).between(*span)
+    assert alone is not None and beside is not None
+    velocity_m_s = [turning(t_s) @ np.cross(rates(t_s), lever_m) for t_s in (1.0, 5.0)]
+    moved_m = (turning(5.0) - turning(1.0)) @ lever_m - 4.0 * velocity_m_s[0]
+    assert np.linalg.norm(velocity_m_s[1] - velocity_m_s[0]) > 0.1
+    gained_m_s = beside.velocity_m_s - alone.velocity_m_s
+    assert gained_m_s == pytest.approx(velocity_m_s[1] - velocity_m_s[0], abs=5e-3)
+    assert beside.displacement_m - alone.displacement_m == pytest.approx(moved_m, abs=5e-3)
 
 
 def test_a_bias_changes_them_as_its_derivatives_say() -> None:
