@@ -21,6 +21,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import msgspec
 
 from companion.config import EXPERT, Config
+from companion.config.computer_settings import NO_PROFILE, profile_text
 from companion.errors import ConfigError
 
 if sys.version_info >= (3, 11):
@@ -62,18 +63,32 @@ Warn = Callable[[str], None]
 def load_config(
     path: Path | None, overrides: Sequence[str] = (), warn: Warn = warn_on_stderr
 ) -> Config:
-    """The defaults, changed by a TOML file if any, then by overrides `KEY=VALUE` in order.
+    """The defaults, changed by a profile, by a TOML file, then by overrides `KEY=VALUE` in order.
 
-    An override's value is TOML; text that is not is taken as a string, so that quotes may be left
-    out. `warn` takes a line for each key of the version before.
+    File or overrides name the profile, if any. An override's value is TOML; text that is not is
+    taken as a string, so that quotes may be left out. `warn` takes a line for each key of the
+    version before.
     """
-    config = Config() if path is None else changed_by(Config(), path, warn)
+    config = _changed(Config(), path, overrides, warn)
+    if config.computer.profile != NO_PROFILE:
+        config = _changed(of_profile(config.computer.profile), path, overrides, lambda line: None)
+    return with_fixed_camera_only(config)
+
+
+def of_profile(name: str) -> Config:
+    """The defaults, changed by a profile."""
+    return config_of_text(profile_text(name), f"profile {name}")
+
+
+def _changed(config: Config, path: Path | None, overrides: Sequence[str], warn: Warn) -> Config:
+    if path is not None:
+        config = changed_by(config, path, warn)
     for override in overrides:
         name, text = _split(override)
         for current in _current({name: text}, f"--set {override}", warn):
             value = _parse(text, current)
             config = with_value(config, current, value, f"--set {override}")
-    return with_fixed_camera_only(config)
+    return config
 
 
 def with_fixed_camera_only(config: Config) -> Config:

@@ -84,6 +84,7 @@ def _pairs(document: Mapping[str, Any]) -> list[str]:
         ("reduced", document.get("degraded") or "nothing"),
         ("set", _settings(document.get("set_by_ground") or {})),
         ("computer", ", ".join(computer)),
+        *_profile(document.get("profile", "none")),
         ("event loop", f"{_number(document.get('loop_delay_p99_ms'), ' ms', 1)} late (p99)"),
         ("running for", _number(document.get("uptime_s"), " s")),
     ]
@@ -95,6 +96,11 @@ def _belief(believed: Sequence[Any]) -> list[tuple[str, str]]:
     if set(believed) >= set(MEASUREMENTS):
         return []
     return [("believed", f"{', '.join(map(str, believed)) or 'nothing'} (telemetry.use)")]
+
+
+def _profile(name: Any) -> list[tuple[str, str]]:
+    """Row of the profile, unless there is none."""
+    return [] if name == "none" else [("profile", str(name))]
 
 
 def _settings(settings: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ from companion.config.autopilot_settings import (
     TelemetryConfig,
 )
 from companion.config.camera_settings import CameraConfig, MountConfig
+from companion.config.computer_settings import ComputerConfig
 from companion.config.flight_settings import DaemonConfig, ExportConfig, MapConfig, RecorderConfig
 from companion.config.mapping_settings import (
     CloudConfig,
@@ -39,8 +40,8 @@ from companion.config.network_settings import (
 from companion.config.setting_kinds import EXPERT, MEASUREMENTS, Expert, Measurement
 
 __all__ = [
-    "EXPERT", "MEASUREMENTS", "CameraConfig", "CloudConfig", "Config", "ControlConfig",
-    "DaemonConfig", "DepthConfig", "DistributedConfig", "Expert", "ExportConfig",
+    "EXPERT", "MEASUREMENTS", "CameraConfig", "CloudConfig", "ComputerConfig", "Config",
+    "ControlConfig", "DaemonConfig", "DepthConfig", "DistributedConfig", "Expert", "ExportConfig",
     "FeaturesConfig", "FeedbackConfig", "GeoreferenceConfig", "GpsConfig", "LandingConfig",
     "LinkConfig", "MapConfig", "Measurement", "MountConfig", "OpenclConfig", "PageConfig",
     "RecorderConfig", "RouterConfig", "StreamConfig", "TelemetryConfig", "TrackingConfig",
@@ -52,6 +53,7 @@ __all__ = [
 class Config:
     """All sections."""
 
+    computer: ComputerConfig = field(default_factory=ComputerConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     mount: MountConfig = field(default_factory=MountConfig)
     link: LinkConfig = field(default_factory=LinkConfig)

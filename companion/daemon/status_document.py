@@ -35,6 +35,7 @@ class StatusDocument:
         camera, origin = self._starts.camera, self._link.origin if self._link is not None else None
         return {
             **self._watch.document(),
+            "profile": config.computer.profile,
             "armed": self._settings.armed,
             "page": config.page.listen,
             "kept": flight is not None and flight.kept,

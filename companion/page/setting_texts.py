@@ -15,6 +15,7 @@ from companion.config import EXPERT, Config
 from companion.config_file import toml_value
 
 PURPOSES = {
+    "Computer": ("computer",),
     "Camera": ("camera", "mount"),
     "Autopilot": ("link", "router", "telemetry", "feedback", "landing", "gps", "control"),
     "Flights, and what is kept of them": ("daemon", "recorder", "map", "export"),

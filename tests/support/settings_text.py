@@ -21,7 +21,8 @@ PAGE_HEAD = """\
 
 A TOML file (`companion run --config FILE`) changes the keys that it names; `--set KEY=VALUE` goes
 over it. `config/companion.toml` is one to start from. An unknown key, a wrong type or a value out
-of range is refused, with the nearest key that exists.
+of range is refused, with the nearest key that exists. `--profile NAME` puts settings that fit a
+computer below those of the file: [computers and their profiles](budget.md).
 
     companion check-config --config FILE              # the whole of what would be used
     companion check-config --config FILE --migrate    # writes a file of the version before anew

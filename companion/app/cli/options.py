@@ -9,14 +9,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from companion.app.stopping import StopSignals
+from companion.config_file import words_of
 from companion.errors import InputError
 
+PROFILE = "computer.profile"
 Command = Callable[[argparse.Namespace, StopSignals], int]
 """Implementation of a command: arguments in, exit status out."""
 
 
 def configuration() -> argparse.ArgumentParser:
-    """--config and --set, for `parents`."""
+    """--config, --set and --profile, for `parents`."""
     options = argparse.ArgumentParser(add_help=False)
     options.add_argument(
         "--config", type=Path, metavar="FILE", help="TOML file; see docs/settings.md"
@@ -25,7 +27,20 @@ def configuration() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE",
         help="set one key, over the file; can be given again",
     )  # fmt: skip
+    options.add_argument(
+        "--profile", dest="set", action="append", type=profile, metavar="NAME",
+        help=f"settings that fit a computer, below the file: {', '.join(words_of(PROFILE))}",
+    )  # fmt: skip
     return options
+
+
+def profile(name: str) -> str:
+    """`--set` that takes a profile."""
+    if name not in words_of(PROFILE):
+        raise argparse.ArgumentTypeError(
+            f"wanted one of {', '.join(words_of(PROFILE))}, given is {name}"
+        )
+    return f"{PROFILE}={name}"
 
 
 def json_option() -> argparse.ArgumentParser:
