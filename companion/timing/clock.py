@@ -132,6 +132,11 @@ def wait_s(stop: threading.Event, seconds: float) -> None:
         stop.wait(seconds)
 
 
+def thread_s() -> float:
+    """CPU seconds used by this thread."""
+    return time.thread_time()
+
+
 def cpu_s() -> float:
     """CPU seconds used by this process."""
     return time.process_time()

@@ -27,6 +27,11 @@ RUNNING_NICE = 15
 def _devices(arguments: argparse.Namespace, signals: StopSignals) -> int:
     from companion.app.devices_command import devices, opencl_devices
 
+    if arguments.bench:
+        from companion.app.computer_speed import computer_speed
+
+        print(computer_speed(arguments.json))
+        return 0
     if not arguments.opencl:
         print(devices(arguments.json, arguments.verbose))
         return 0
@@ -133,6 +138,10 @@ def add_parsers(commands: Any) -> None:
     devices.add_argument(
         "--opencl", action="store_true",
         help="only OpenCL devices; exit status 1 where none of them works",
+    )  # fmt: skip
+    devices.add_argument(
+        "--bench", action="store_true",
+        help="only measure how fast this computer is, what it can carry, and which profile fits",
     )  # fmt: skip
     devices.add_argument(
         "--verbose", action="store_true", help="with what drivers and their compilers say"
