@@ -10,7 +10,7 @@ OUT ?= out/demo
 # With it each process of the tests, seven a flight, compiles the whole program anew: a second each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint opencl clean reference regression settings deb system-test trials docs
+.PHONY: demo test lint opencl clean reference regression settings deb system-test trials docs bench
 
 demo: opencl
 	$(BIN)/companion replay $(FLIGHT) --out $(OUT)
@@ -64,6 +64,11 @@ docs: $(VENV)/.installed-docs
 
 deb:
 	sh packaging/build_deb.sh
+
+# How fast this version is beside what is kept of this machine; a slower one is a warning. Some
+# minutes; BENCH=--short takes less than one, BENCH=--keep keeps this version's figures instead.
+bench: opencl $(VENV)/.installed-dev
+	$(BIN)/python -m tests.bench.kept_figures $(BENCH)
 
 # The package on a booted Debian, and the firmwares in their simulators; tests/system and
 # tests/firmware say what they need.

@@ -75,7 +75,7 @@ def computer_speed(as_json: bool) -> str:
 
 def measured_speed(devices: list[MeasuredDevice]) -> Speed:
     """Speed of localisation, measured now, and of the best of the devices."""
-    frames_ms, keyframes_ms, seconds = _localised()
+    frames_ms, keyframes_ms, seconds = localised()
     best = next(iter(in_order(devices)), None)
     return Speed(
         n_cores=len(os.sched_getaffinity(0)),
@@ -87,7 +87,7 @@ def measured_speed(devices: list[MeasuredDevice]) -> Speed:
     )  # fmt: skip
 
 
-def _localised() -> tuple[list[float], list[float], float]:
+def localised() -> tuple[list[float], list[float], float]:
     """Milliseconds of each frame and of each keyframe, and for how long they were flown, s."""
     config = Config()
     flight = open_flight(sample_flight(), config.camera, config.telemetry)
