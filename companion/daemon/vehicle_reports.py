@@ -14,16 +14,20 @@ from companion.config import Config, FeedbackConfig
 from companion.daemon.flights.flights import Flights
 from companion.daemon.health_watch import HealthWatch
 from companion.dense.fresh_sight import points_found, sectors_seen
+from companion.dense.newest_sight import NewestSight, Seen, things_in
 from companion.dense.obstacles import (
+    MIN_POINTS,
     N_SECTORS,
     Obstacles,
     RecentCloud,
     known_in,
     obstacles_around,
+    sector_of,
     unknown,
 )
+from companion.dense.sight_tracks import WINDOW_PX
 from companion.geometry.camera import Camera
-from companion.messages import DepthMap, Frame, MapUpdate, PointChunk, Track, TrackState
+from companion.messages import Bytes, DepthMap, Frame, MapUpdate, PointChunk, Track, TrackState
 from companion.pilot_messages import RECORDING_NO_FLIGHT, RECORDING_SET_OFF, PilotText
 from companion.timing.clock import FlightClock
 from drivers.images.still_pictures import StillPictures
@@ -95,6 +99,10 @@ class VehicleReports:
         self._seen = RecentCloud(), waiting
         """The cloud, which is the thread's of a round alone, and what the next round adds to it."""
         self._known_ns: int | None = None
+        self._sight = NewestSight(self._camera) if self._camera is not None else None
+        self._greys: deque[tuple[int, Bytes]] = deque(maxlen=MOST_TRACKS)
+        """The newest images by their numbers: of one its track comes some images later."""
+        self._sighted = -1
 
     def take(self, message: Track | MapUpdate | DepthMap | PointChunk) -> None:
         """Take a track, a map update, a depth map or points."""
@@ -109,6 +117,8 @@ class VehicleReports:
 
     def frame(self, frame: Frame) -> None:
         """Take a frame, in the camera's thread: an image of it may be wanted."""
+        if self._obstacles:
+            self._greys.append((frame.seq, frame.grey))
         if self._stills is not None:
             self._stills.frame(frame)
 
@@ -235,7 +245,26 @@ class VehicleReports:
                 points = np.concatenate([points, world_from_map.apply(found)])
                 eyes = np.concatenate([eyes, np.tile(camera_in_world.translation, (len(found), 1))])
                 ages = np.r_[ages, np.full(len(found), np.inf)]  # of no free space do they tell
+        newest = self._newest_sight(track, update)
+        if newest is not None and now_ns - newest.t_ns <= MAX_AGE_NS:
+            things = things_in(newest, 0.5 * WINDOW_PX / self._camera.fx)
+            points = np.concatenate([points, things])
+            eyes = np.concatenate([eyes, np.tile(newest.eye_world_m, (len(things), 1))])
+            ages = np.r_[ages, np.full(len(things), np.inf)]
+            around = sector_of(things - world_from_body.translation, world_from_body)
+            is_seen |= np.bincount(around, minlength=N_SECTORS) >= MIN_POINTS
         return known_in(obstacles_around(track.t_ns, world_from_body, points, eyes, ages), is_seen)
+
+    def _newest_sight(self, track: Track, update: MapUpdate) -> Seen | None:
+        """Points of the newest image whose track has come."""
+        sight = self._sight
+        grey = next((grey for seq, grey in list(self._greys) if seq == track.seq), None)
+        if sight is None or track.seq == self._sighted:
+            return None if sight is None else sight.newest
+        if grey is not None:
+            self._sighted = track.seq
+            sight.add(track, grey, update)
+        return sight.newest
 
 
 def flight_recording(config: Config, flights: Flights) -> FlightRecording:

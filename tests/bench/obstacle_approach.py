@@ -111,7 +111,9 @@ class Approach:
     def _frame(self, n: int) -> Frame:
         grey = self._scene.picture(CAMERA, place(n / RATE_HZ) @ FORWARD)
         t_ns = START_NS + round(n / RATE_HZ * 1e9)
-        return Frame(n, t_ns, grey, np.repeat(grey[..., None], 3, 2))
+        frame = Frame(n, t_ns, grey, np.repeat(grey[..., None], 3, 2))
+        self._reports.frame(frame)
+        return frame
 
     def _watch(self, message: Message) -> None:
         if isinstance(message, Track | MapUpdate | DepthMap | PointChunk):
