@@ -300,6 +300,8 @@ JOURNAL_ONLY = frozenset({
     "rolling shutter is undone by the rotation between images alone",
     "looks like a rolling shutter: set camera.readout_ms",
     "the rolling shutter looks slower or faster than camera.readout_ms",
+    "measured depths contradict the other scales: check baseline and calibration",
+    "measured depths agree with the other scales again",
 })  # fmt: skip
 """Kinds of `Warned` that do not concern a pilot."""
 

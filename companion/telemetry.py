@@ -132,9 +132,27 @@ class GimbalSample:
     yaw_from_north: bool = False
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthSample:
+    """Depth along the camera's axis of what one pixel sees in the image of the same `t_ns`.
+
+    By a second camera or a depth camera; the pixel is of the image as it came, with its distortion.
+    """
+
+    schema: ClassVar[Schema] = Schema(
+        "depth", "Depth along the camera's axis of what a pixel sees in the image of that time"
+    )
+    t_ns: int
+    u_px: float
+    v_px: float
+    depth_m: float
+    sigma_m: float
+    """Standard deviation of this one depth; errors of the calibration are in all alike."""
+
+
 Telemetry = (
     AttitudeSample | ImuSample | PositionSample | RangeSample | HeightSample | ArmedSample
-    | AirspeedSample | LandedSample | GimbalSample
+    | AirspeedSample | LandedSample | GimbalSample | DepthSample
 )  # fmt: skip
 TELEMETRY: tuple[type[Telemetry], ...] = get_args(Telemetry)
 """In order of their channels in a recording."""
@@ -143,6 +161,7 @@ FIELDS = {kind: fields_of(kind) for kind in TELEMETRY}
 MEASURED: Mapping[type[Telemetry] | PositionSource, Measurement | None] = {
     AttitudeSample: "attitude", ImuSample: "imu", RangeSample: "range", HeightSample: "height",
     AirspeedSample: "airspeed", ArmedSample: None, LandedSample: None, GimbalSample: "attitude",
+    DepthSample: "depth",
     PositionSource.LOCAL: "position", PositionSource.GLOBAL: "position",
     PositionSource.GPS: "satellites",
 }  # fmt: skip

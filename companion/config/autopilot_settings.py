@@ -54,7 +54,7 @@ class RouterConfig:
 
 @dataclass(frozen=True, slots=True)
 class TelemetryConfig:
-    """Telemetry of the autopilot: what is believed of it, and the time alignment of its log.
+    """Telemetry of the autopilot and beside it: what is believed, and the time alignment of a log.
 
     What is not believed decides nothing about the pose, and is recorded as it comes.
     """
@@ -62,7 +62,7 @@ class TelemetryConfig:
     use: tuple[Measurement, ...] = MEASUREMENTS
     """Kinds of measurement that are believed, each at most once. imu: accelerations and rates of
     turn; position: the autopilot's own estimate; satellites: GPS; range: rangefinder; height:
-    barometer. Without attitude no pose is sent."""
+    barometer; depth: by a second camera or a depth camera. Without attitude no pose is sent."""
     log: Expert[str] = ""
     """The log to read; "" takes the one beside the images."""
     align: Expert[Literal["auto", "never"]] = "auto"

@@ -8,6 +8,8 @@ T = TypeVar("T")
 EXPERT = "expert"
 Expert = Annotated[T, EXPERT]
 """A key that few drones need: its default was found by tests, or fits nearly all."""
-Measurement = Literal["attitude", "imu", "position", "satellites", "range", "height", "airspeed"]
+Measurement = Literal[
+    "attitude", "imu", "position", "satellites", "range", "height", "airspeed", "depth"
+]
 """A kind of measurement, as `telemetry.use` names it."""
 MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)

@@ -54,6 +54,7 @@ from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
 from companion.telemetry import (
     AttitudeSample,
+    DepthSample,
     GimbalSample,
     HeightSample,
     ImuSample,
@@ -189,6 +190,8 @@ class LocalisationStage:
             for each in self._of_head(sample):
                 if isinstance(each, AttitudeSample):
                     self._attitude.add(each)
+                elif isinstance(each, DepthSample):
+                    self._georeferences.depths.take(each)
                 else:
                     self._georeferencer.take(each)
         self._n_samples += len(self._samples)
@@ -355,6 +358,9 @@ class LocalisationStage:
                 self._attitude.compare(message, message.map_from_camera.rotation, corrected_rad)
                 mount = self._attitude.correction[0]
                 self._georeferences.take(message, None if measured is None else measured @ mount.T)
+                view = self._tracker.view_of(message.seq)
+                if view is not None and message.keyframe_id is not None:
+                    self._georeferences.depths.compare(view, self._tracker.map, message.keyframe_id)
                 if message.seq == frame.seq:
                     seen = message.map_from_camera
                     self._motion.last = message

@@ -42,6 +42,9 @@ OF_WARNING: Mapping[str, str] = {
     "the autopilot's velocity contradicts its positions and is not used":
         "Check compass, and mount and lens of a flow sensor.",
     "the autopilot's velocity agrees with its positions again": NOTHING,
+    "measured depths contradict the other scales: check baseline and calibration":
+        "Calibrate both cameras anew, or the scale of the depth camera's depths.",
+    "measured depths agree with the other scales again": NOTHING,
     "the ground passes too fast for the camera: tracking may fail":
         "Climb or slow down; a higher camera.rate_hz helps.",
     "too little contrast: tracking may fail":

@@ -7,7 +7,8 @@ right and down, and nothing here turns them. What the sequence was measured with
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,22 @@ from companion.errors import FlightError
 from companion.estimation.attitude.attitude_by_imu import attitudes_by_imu
 from companion.geometry.camera import Camera, Distortion
 from companion.geometry.transforms import Pose
+from companion.messages import Warned
 from companion.telemetry import AttitudeSample, ImuSample
 from drivers.datasets.flight_folder import camera_of
 from drivers.flight import Flight, TruePose
 from drivers.images.calibration_file import MODELS, body_from_camera_of
 from drivers.images.listed_images import listed_images
+from drivers.images.picture_file import read_grey
+from drivers.images.stereo_pair import Depths, StereoPair
 from drivers.images.text_table import ns_of_whole, numbers_of, pose_of, read_rows
+from drivers.telemetry.measured_depths import with_depths
 from drivers.telemetry.telemetry_folder import aligned, unchanged
 from drivers.telemetry.telemetry_log import LogContent, Pictures, TelemetryCollector, TelemetryLog
 
 MAX_YAML_BYTES = 100_000
+SAME_EXPOSURE_NS = 1_000_000
+"""Between stamps of two cameras of one exposure."""
 
 
 def is_euroc(path: Path) -> bool:
@@ -38,7 +45,10 @@ def is_euroc(path: Path) -> bool:
 
 
 def open_euroc(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """Camera cam0 and IMU imu0 of a sequence; FlightError where it is incomplete."""
+    """Camera cam0 and IMU imu0 of a sequence, depths where there is a cam1.
+
+    FlightError where it is incomplete.
+    """
     mav = _mav(path)
     listing = mav / "cam0" / "data.csv"
     rows = read_rows(listing, 2)
@@ -52,20 +62,51 @@ def open_euroc(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> 
         warnings += assumed
 
     def read_log(pictures: Pictures) -> TelemetryLog:
-        return aligned(_imu(mav), pictures, telemetry)
+        log = aligned(_imu(mav), pictures, telemetry)
+        if not (mav / "cam1" / "data.csv").is_file() or "depth" not in telemetry.use:
+            return log
+        return _with_second(mav, log, camera, stamped)
 
     return Flight(
         path, camera, source, numbers, times_ns, warnings, read_log, lambda: _truth(mav, camera)
     )
 
 
+def _with_second(
+    mav: Path, log: TelemetryLog, camera: Camera, stamped: Sequence[tuple[int, Path]]
+) -> TelemetryLog:
+    """The log with depths by the second camera of a stereo pair."""
+    listing = mav / "cam1" / "data.csv"
+    second = [
+        (ns_of_whole(listing, t), mav / "cam1" / "data" / name)
+        for t, name, *_ in read_rows(listing, 2)
+    ]
+    sensor = mav / "cam1" / "sensor.yaml"
+    other = _camera(sensor, *_size_of(sensor))
+    try:
+        pair = StereoPair(camera, other)
+    except FlightError as error:
+        why_not = Warned(stamped[0][0], "cam1 is not used", str(error))
+        return replace(log, warnings=(*log.warnings, why_not))
+
+    def measure(here: Path, there: Path) -> Depths | None:
+        first = read_grey(here, camera.width, camera.height)
+        grey = read_grey(there, other.width, other.height)
+        return None if first is None or grey is None else pair.depths(first, grey)
+
+    return with_depths(log, stamped, second, SAME_EXPOSURE_NS, "cam1", measure)
+
+
 def _mav(path: Path) -> Path:
     return path / "mav0" if (path / "mav0").is_dir() else path
 
 
+def _size_of(sensor: Path) -> list[int]:
+    return [int(n) for n in _list(sensor, _yaml(sensor), "resolution", 2)]
+
+
 def _camera(sensor: Path, width: int, height: int) -> Camera:
-    said = _yaml(sensor)
-    size = [int(n) for n in _list(sensor, said, "resolution", 2)]
+    said, size = _yaml(sensor), _size_of(sensor)
     if size != [width, height]:
         raise FlightError(
             f"{sensor}: it is for pictures of {size[0]} x {size[1]}, those that are there are "

@@ -18,6 +18,7 @@ import numpy as np
 
 from companion.errors import FlightError
 from companion.messages import Bytes
+from drivers.images.picture_file import read_picture
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm"})
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
@@ -207,12 +208,5 @@ class ImageFolder:
 
 
 def _load(path: Path) -> Bytes | None:
-    # OpenCV turns pictures by EXIF unless told not to; calibrations are of the sensor as it is
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError:  # a file that a list names need not be there: its number stays a hole
-        return None
-    if not data.size:
-        return None
-    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    bgr = read_picture(path, cv2.IMREAD_COLOR)
     return None if bgr is None else np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

@@ -14,6 +14,7 @@ from companion.telemetry import (
     TELEMETRY,
     ArmedSample,
     AttitudeSample,
+    DepthSample,
     HeightSample,
     ImuSample,
     LandedSample,
@@ -61,6 +62,11 @@ WRITTEN: list[tuple[Telemetry, str, str]] = [
     (RangeSample(5, 7.5), '{"distance_m":7.5}', "5,range,7.5"),
     (HeightSample(5, -3.25), '{"height_m":-3.25}', "5,height,-3.25"),
     (ArmedSample(5, True), '{"armed":true}', "5,armed,1.0"),
+    (
+        DepthSample(5, 7.5, 2.0, 4.25, 0.5),
+        '{"u_px":7.5,"v_px":2.0,"depth_m":4.25,"sigma_m":0.5}',
+        "5,depth,7.5,2.0,4.25,0.5",
+    ),
     (LandedSample(5, True), '{"landed":true}', "5,landed,1.0"),
 ]
 NUMBERS = '{"type": "array", "items": {"type": ["number", "null"]}}'

@@ -10,6 +10,7 @@ import pytest
 
 from companion.config import MEASUREMENTS, Config, Measurement, TelemetryConfig
 from companion.estimation.attitude.camera_attitude import CameraAttitude
+from companion.estimation.georeference.depth_scales import DepthScales
 from companion.estimation.georeference.georeferencer import Georeferencer
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
 from companion.estimation.localisation import LocalisationStage
@@ -21,6 +22,7 @@ from companion.telemetry import (
     AirspeedSample,
     ArmedSample,
     AttitudeSample,
+    DepthSample,
     GimbalSample,
     HeightSample,
     ImuSample,
@@ -43,6 +45,7 @@ SAMPLES: list[tuple[Telemetry, Measurement | None]] = [
     (RangeSample(1, 5.0), "range"),
     (HeightSample(1, 5.0), "height"),
     (AirspeedSample(1, 5.0), "airspeed"),
+    (DepthSample(1, 5.0, 6.0, 7.0, 0.1), "depth"),
     (ArmedSample(1, True), None),
     (LandedSample(1, True), None),
     (GimbalSample(1, LEVEL), "attitude"),
@@ -91,6 +94,7 @@ def test_localisation_takes_what_is_believed_and_counts_everything(
     taken: set[int] = set()
     for kind, method in (
         (Georeferencer, "take"), (AccelerationIntegral, "take"), (CameraAttitude, "add"),
+        (DepthScales, "take"),
     ):  # fmt: skip
         monkeypatch.setattr(kind, method, lambda _self, sample: taken.add(id(sample)))
     stage = LocalisationStage(

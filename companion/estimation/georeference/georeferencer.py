@@ -14,6 +14,7 @@ import numpy as np
 
 from companion.config import GeoreferenceConfig
 from companion.estimation.georeference.alignment_sample import AlignmentSample, mean_rotation
+from companion.estimation.georeference.depth_verdict import DepthVerdict
 from companion.estimation.georeference.height_scales import HeightScales
 from companion.estimation.georeference.trajectory_alignment import (
     SIGMA_TILT_RAD,
@@ -62,6 +63,7 @@ class Georeferencer:
         self._velocity_integral = {source: SampleSeries() for source in PositionSource}
         self._velocity = {source: VelocityVerdict() for source in PositionSource}
         self._warnings: list[Warned] = []
+        self._depths = DepthVerdict()
         self._heights = HeightScales(config.min_travel_m, body_from_camera)
 
     def take(self, sample: Telemetry) -> None:
@@ -77,7 +79,7 @@ class Georeferencer:
             self._heights.take(sample)
 
     def warnings(self) -> list[Warned]:
-        """Changes of the verdict on a velocity since the last call."""
+        """Changes of the verdicts on velocity and depths since the last call."""
         out, self._warnings = self._warnings, []
         return out
 
@@ -179,11 +181,13 @@ class Georeferencer:
         return None
 
     def solve(
-        self, samples: list[AlignmentSample], inertial: Scale | None = None
-    ) -> Georeference | None:
+        self, samples: list[AlignmentSample], inertial: Scale | None = None,
+        depths: Scale | None = None,
+    ) -> Georeference | None:  # fmt: skip
         """Georeference of the map; None until certain enough. Samples may be unordered.
 
-        `inertial` is the scale by accelerometers, where there are any.
+        `inertial` is the scale by accelerometers, `depths` that by measured depths, where there are
+        any.
         """
         samples = sorted(
             samples, key=lambda sample: sample.t_ns
@@ -192,22 +196,27 @@ class Georeferencer:
             chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_SAMPLES).astype(int))
             samples = [samples[int(i)] for i in chosen]
         level = levelled(mean_rotation(samples), inertial)
+        known = self._heights.of(samples, None if level is None else level.world_from_map)
+        others = reduce(reconciled, [*known, *([] if inertial is None else [inertial])], None)
+        prior = others if depths is None else reconciled(others, depths)
+        placed = self._by_positions(samples, level, prior)
+        if depths is not None:
+            by_others = others if placed is None else scale_of(placed)
+            self._warnings += self._depths.compare(samples[-1].t_ns, depths, by_others)
+        if placed is not None or level is None:
+            return placed
+        return self._from_scale(samples, level.world_from_map, prior)
+
+    def _by_positions(
+        self, samples: list[AlignmentSample], level: Level | None, prior: Scale | None
+    ) -> Georeference | None:
+        """Georeference by the first source of positions that gives one."""
         for source in self._sources:
             if len(self._positions[source]) >= 4:
-                found = self._from_positions(samples, level, source, inertial)
+                found = self._from_positions(samples, level, source, prior)
                 if found is not None:
                     return found
-        if level is None:
-            return None
-        known = self._scale(samples, level.world_from_map, inertial)
-        return self._from_scale(samples, level.world_from_map, known)
-
-    def _scale(
-        self, samples: list[AlignmentSample], level: Array | None, inertial: Scale | None
-    ) -> Scale | None:
-        """Scale by all that is not positions."""
-        known = self._heights.of(samples, level)
-        return reduce(reconciled, known if inertial is None else [*known, inertial], None)
+        return None
 
     def travelled(self, samples: list[AlignmentSample]) -> tuple[Array, float, str] | None:
         """Displacement (3,) by velocity from the first to the last sample, NED metres.
@@ -228,7 +237,7 @@ class Georeferencer:
 
     def _from_positions(
         self, samples: list[AlignmentSample], level: Level | None, source: PositionSource,
-        inertial: Scale | None,
+        prior: Scale | None,
     ) -> Georeference | None:  # fmt: skip
         t_ns = np.array([p.t_ns for p in samples])
         measured, ok = self._positions[source].at(t_ns)
@@ -245,7 +254,6 @@ class Georeferencer:
         extent = target - target.mean(0)
         if float(np.linalg.norm(extent, axis=1).max()) < 0.5 * self._config.min_travel_m:
             return None
-        prior = self._scale(samples, None if level is None else level.world_from_map, inertial)
         solution = fit_map(t_ns[ok] * 1e-9, mapped, target, travelled_m[ok], level, prior)
         if solution is None:
             return None
@@ -295,6 +303,11 @@ class Georeferencer:
         return Georeference(
             similarity, sigma, float(SIGMA_YAW_RAD), method, n, 0.0, has_origin=False
         )
+
+
+def scale_of(placed: Georeference) -> Scale:
+    """The scale of a georeference."""
+    return Scale(placed.world_from_map.scale, placed.sigma_scale, placed.method, placed.n_positions)
 
 
 def levelled(level: Array | None, inertial: Scale | None) -> Level | None:

@@ -10,6 +10,7 @@ import numpy as np
 from companion.estimation.attitude.camera_attitude import CameraAttitude
 from companion.estimation.body.reckoned_path import BodyPlace
 from companion.estimation.georeference.alignment_sample import AlignmentSample
+from companion.estimation.georeference.depth_scales import DepthScales
 from companion.estimation.georeference.displacement_by_velocity import displacement_factor
 from companion.estimation.georeference.georeferencer import Georeferencer, place_new_map
 from companion.estimation.georeference.height_above_ground import HeightAboveGround
@@ -61,6 +62,7 @@ class SegmentGeoreferences:
         self._inertial: dict[int, InertialScale] = {}
         """By first keyframe of a segment."""
         self._places = TrackedPlaces()
+        self.depths = DepthScales()
         self.reckoned_at: Callable[[int], BodyPlace | None] = lambda _t_ns: None
         """Place of the body by inertial navigation at a recent frame."""
         self._reckoned: dict[int, tuple[BodyPlace, Georeference | None]] = {}
@@ -138,6 +140,7 @@ class SegmentGeoreferences:
                 found = self._georeferencer.solve(
                     self._samples(segment, _subsample(segment, final)),
                     self._inertial_scale(segment, final),
+                    self.depths.of(segment),
                 )
                 if found is not None:
                     self._by_acceleration.note(t_ns, segment.first_keyframe_id, self._known, found)

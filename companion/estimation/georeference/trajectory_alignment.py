@@ -57,15 +57,20 @@ class Level(NamedTuple):
     sigma_tilt_rad: float
 
 
+def apart(first: Scale, second: Scale) -> float:
+    """Logarithm of the ratio of two scales."""
+    return float(np.log(first.scale / second.scale))
+
+
 def reconciled(first: Scale | None, second: Scale) -> Scale:
     """The more certain of two scales; where they contradict, sigma is their difference."""
     if first is None:
         return second
     best = min(first, second, key=lambda scale: scale.sigma)
-    apart = abs(float(np.log(first.scale / second.scale)))
-    if apart < DISAGREE * float(np.hypot(first.sigma, second.sigma)):
+    off = abs(apart(first, second))
+    if off < DISAGREE * float(np.hypot(first.sigma, second.sigma)):
         return best
-    return best._replace(sigma=apart)
+    return best._replace(sigma=off)
 
 
 class _Equations:

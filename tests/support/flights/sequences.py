@@ -87,25 +87,18 @@ def write_flight_folder(folder: Path, flown: Piece, grey: bool = False) -> None:
     (folder / "camera.json").write_text(json.dumps(said))
 
 
-def write_euroc(folder: Path, flown: Piece, measured: Sequence[ImuSample] = ()) -> None:
-    """ASL layout: cam0, imu0 and the true states, which are the body's.
-
-    Without an IMU that `measured` anything there are made-up numbers.
-    """
-    mav = folder / "mav0"
-    (mav / "cam0" / "data").mkdir(parents=True)
-    (mav / "imu0").mkdir()
-    (mav / "state_groundtruth_estimate0").mkdir()
+def write_euroc_camera(place: Path, frames: Sequence[Frame], c: Camera) -> None:
+    """A camera of the ASL layout: its images, their times and its calibration."""
+    (place / "data").mkdir(parents=True)
     lines = ["#timestamp [ns],filename"]
-    for frame in flown.frames:
+    for frame in frames:
         lines.append(f"{frame.t_ns},{frame.t_ns}.png")
-        _write(mav / "cam0" / "data" / f"{frame.t_ns}.png", frame, grey=True)
-    (mav / "cam0" / "data.csv").write_text("\r\n".join(lines) + "\r\n")
-    c = flown.camera
+        _write(place / "data" / f"{frame.t_ns}.png", frame, grey=True)
+    (place / "data.csv").write_text("\r\n".join(lines) + "\r\n")
     assert c.body_from_camera is not None
     assert c.distortion is Distortion.RADTAN
     data = ", ".join(repr(float(v)) for v in c.body_from_camera.matrix().ravel())
-    (mav / "cam0" / "sensor.yaml").write_text(
+    (place / "sensor.yaml").write_text(
         "# comment\nsensor_type: camera\ncomment: test\n"
         f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\n"
         f"rate_hz: 20\nresolution: [{c.width}, {c.height}]\ncamera_model: pinhole\n"
@@ -113,6 +106,18 @@ def write_euroc(folder: Path, flown: Piece, measured: Sequence[ImuSample] = ()) 
         "distortion_model: radial-tangential\n"
         f"distortion_coefficients: [{', '.join(map(repr, c.coefficients[:4]))}]\n"
     )
+
+
+def write_euroc(folder: Path, flown: Piece, measured: Sequence[ImuSample] = ()) -> None:
+    """ASL layout: cam0, imu0 and the true states, which are the body's.
+
+    Without an IMU that `measured` anything there are made-up numbers.
+    """
+    mav, c = folder / "mav0", flown.camera
+    assert c.body_from_camera is not None
+    write_euroc_camera(mav / "cam0", flown.frames, c)
+    (mav / "imu0").mkdir()
+    (mav / "state_groundtruth_estimate0").mkdir()
     imu = ["#timestamp [ns],w_RS_S_x [rad s^-1],w y,w z,a_RS_S_x [m s^-2],a y,a z"]
     for each in measured:
         numbers = ",".join(f"{v:.9f}" for v in (*each.gyro_rad_s, *each.accel_m_s2))
