@@ -38,7 +38,7 @@ class Depths(NamedTuple):
     depth_m: Array
     sigma_m: Array
     off_line_px: float
-    """How far matches lie from their epipolar lines, in the median; nan of few."""
+    """Median of distances from matches to their epipolar lines; nan of few."""
 
 
 class StereoPair:
