@@ -163,7 +163,7 @@ def test_key_outside_a_section(tmp_path: Path) -> None:
         ("feedback.mode=on", "off, odometry, vision_position", "'on'"),
         ("router.clients=[1]", "text in the list", "[1]"),
         ("telemetry.use=attitude", "a list of attitude, imu, position", "'attitude'"),
-        ('telemetry.use=["compass"]', "airspeed, each at most once", "['compass']"),
+        ('telemetry.use=["compass"]', "depth, each at most once", "['compass']"),
         ("telemetry.use=[true]", "a list of attitude", "[True]"),
         ('telemetry.use=["imu", "range", "imu"]', "once", "['imu', 'range', 'imu']"),
     ],
