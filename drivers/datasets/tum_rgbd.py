@@ -1,11 +1,15 @@
 """TUM RGB-D sequences and others of that layout: images in `rgb.txt`.
 
-Only the colour images are read.
+Depth images (`depth.txt`) are registered to them, 5000 units a metre.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from companion.config import CameraConfig, TelemetryConfig
 from companion.geometry.camera import Camera, Distortion
@@ -13,9 +17,17 @@ from companion.messages import Warned
 from drivers.datasets.posed_layouts import TUM_CAMERA, TUM_CAMERAS
 from drivers.flight import Flight, TruePose
 from drivers.images.calibration_file import read_calibration
+from drivers.images.depth_picture import depths_at_corners
 from drivers.images.listed_images import listed_images
+from drivers.images.picture_file import read_grey, read_picture
+from drivers.images.stereo_pair import Depths
 from drivers.images.text_table import ns_of_seconds, numbers_of, pose_of, read_rows
-from drivers.telemetry.telemetry_log import no_telemetry
+from drivers.telemetry.measured_depths import with_depths
+from drivers.telemetry.telemetry_log import Pictures, TelemetryLog, no_telemetry
+
+UNITS_PER_M = np.float32(5000.0)
+SAME_PICTURE_NS = 20_000_000
+"""Between stamps of colour and depth, as in the benchmark's own tools."""
 
 
 def is_tum_rgbd(path: Path) -> bool:
@@ -24,7 +36,10 @@ def is_tum_rgbd(path: Path) -> bool:
 
 
 def open_tum_rgbd(path: Path, config: CameraConfig, telemetry: TelemetryConfig) -> Flight:
-    """Colour images of a sequence; FlightError where it is incomplete."""
+    """Colour images of a sequence, and depths where it has depth images.
+
+    FlightError where it is incomplete.
+    """
     listing = path / "rgb.txt"
     stamped = [(ns_of_seconds(listing, t), path / name) for t, name, *_ in read_rows(listing, 2)]
     source, numbers, times_ns, warnings = listed_images(listing, stamped)
@@ -34,9 +49,30 @@ def open_tum_rgbd(path: Path, config: CameraConfig, telemetry: TelemetryConfig) 
     else:
         camera, of = _usual_camera(path, source.width, source.height)
         warnings.append(Warned(times_ns[0], "no camera.json: the benchmark's camera is taken", of))
-    return Flight(
-        path, camera, source, numbers, times_ns, warnings, no_telemetry, lambda: _truth(path)
-    )
+
+    def read_log(pictures: Pictures) -> TelemetryLog:
+        if not (path / "depth.txt").is_file() or "depth" not in telemetry.use:
+            return no_telemetry(pictures)
+        return _depths(path, stamped, camera)
+
+    return Flight(path, camera, source, numbers, times_ns, warnings, read_log, lambda: _truth(path))
+
+
+def _depths(path: Path, stamped: Sequence[tuple[int, Path]], camera: Camera) -> TelemetryLog:
+    """Depths by the depth camera: all the telemetry that there is."""
+    listing = path / "depth.txt"
+    depth = [(ns_of_seconds(listing, t), path / name) for t, name, *_ in read_rows(listing, 2)]
+
+    def measure(here: Path, there: Path) -> Depths | None:
+        grey = read_grey(here, camera.width, camera.height)
+        units = read_picture(there, cv2.IMREAD_UNCHANGED)
+        if grey is None or units is None or units.shape != grey.shape:
+            return None
+        return depths_at_corners(grey, units.astype(np.float32) / UNITS_PER_M)
+
+    level = Warned(stamped[0][0], "no attitude", "the world is level as the first picture is")
+    log = TelemetryLog(listing.name, (), warnings=(level,))
+    return with_depths(log, stamped, depth, SAME_PICTURE_NS, "the depth camera", measure)
 
 
 def _usual_camera(path: Path, width: int, height: int) -> tuple[Camera, str]:

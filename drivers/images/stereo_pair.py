@@ -97,9 +97,7 @@ class StereoPair:
             np.asarray(cv2.remap(grey, *each, cv2.INTER_LINEAR), np.uint8)
             for grey, each in zip((first, second), self._maps, strict=True)
         )
-        corners = cv2.goodFeaturesToTrack(a, N_CORNERS, CORNER_QUALITY, CORNER_SPACING_PX)
-        at = np.asarray([] if corners is None else corners, np.float32).reshape(-1, 2)
-        guessed = [(p, x) for p in at if (x := self._along_row(a, b, p)) is not None]
+        guessed = [(p, x) for p in corners_of(a) if (x := self._along_row(a, b, p)) is not None]
         if not guessed:
             return Depths(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.nan)
         here = np.array([p for p, _ in guessed], np.float32)
@@ -139,6 +137,12 @@ class StereoPair:
         if score[best] < LEAST_CORRELATION or score[best] - rest.max(initial=-1.0) < UNIQUE_BY:
             return None
         return float(first + best + h + corner[0] - u)
+
+
+def corners_of(grey: Bytes) -> Floats:
+    """The best corners (N, 2) of a picture (H, W), spread over it."""
+    found = cv2.goodFeaturesToTrack(grey, N_CORNERS, CORNER_QUALITY, CORNER_SPACING_PX)
+    return np.asarray([] if found is None else found, np.float32).reshape(-1, 2)
 
 
 def _refined(a: Bytes, b: Bytes, here: Floats, guess: Floats) -> tuple[Floats, Floats, Bools]:

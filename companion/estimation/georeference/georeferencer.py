@@ -38,6 +38,8 @@ MAX_SIGMA_ROTATION_RAD = np.radians(8.0)
 MAX_SAMPLES = 400
 SIGMA_BEND_RAD = np.radians(0.1)
 """Of the level of one part of a map against another."""
+LOOKS_NORTH = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""`ned_from_camera` of a camera that looks north, level."""
 DOWN = np.array([0.0, 0.0, 1.0])
 MAX_SIGMA_SCALE_NEW_MAP = 0.5
 """Largest relative scale error at which a new map is placed."""
@@ -203,9 +205,19 @@ class Georeferencer:
         if depths is not None:
             by_others = others if placed is None else scale_of(placed)
             self._warnings += self._depths.compare(samples[-1].t_ns, depths, by_others)
-        if placed is not None or level is None:
+        if placed is not None:
             return placed
+        if level is None:
+            return None if depths is None else self._as_it_began(samples, depths)
         return self._from_scale(samples, level.world_from_map, prior)
+
+    def _as_it_began(self, samples: list[AlignmentSample], depths: Scale) -> Georeference | None:
+        """Georeference of a map whose attitude nobody measures: level as its first image is."""
+        mount = self._body_from_camera
+        forward = LOOKS_NORTH if mount is None else mount.rotation
+        level = forward @ samples[0].map_from_camera.rotation.T
+        found = self._from_scale(samples, level, depths)
+        return None if found is None else replace(found, sigma_yaw_rad=float(np.pi))
 
     def _by_positions(
         self, samples: list[AlignmentSample], level: Level | None, prior: Scale | None

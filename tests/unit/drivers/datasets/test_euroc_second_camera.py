@@ -16,26 +16,40 @@ from companion.telemetry import DepthSample
 from drivers.datasets.euroc import open_euroc
 from drivers.telemetry.measured_depths import OFF_LINE
 from drivers.telemetry.telemetry_log import TelemetryLog
+from tests.support.flights.rendered_flight import CAMERA_DOWN
 from tests.support.flights.sequences import Piece, write_euroc, write_euroc_camera
-from tests.support.flights.stereo_flight import FIRST, SECOND, ground, pictures_of, with_baseline
+from tests.support.flights.stereo_flight import (
+    FIRST,
+    SECOND,
+    ground,
+    ned_from_body,
+    pictures_of,
+    with_baseline,
+)
+from tests.support.processes.program import replay_here
+from tests.support.reference.scoring import read_tum, score
 
-SECONDS, RATE_HZ = 1.0, 10.0
+RATE_HZ = 10.0
+
+
+def write_pair(folder: Path, seconds: float) -> None:
+    frames, poses = [], []
+    for seq, (t_ns, pose, grey) in enumerate(pictures_of(FIRST, ground(), seconds, RATE_HZ, 0)):
+        frames.append(Frame(seq, t_ns, grey, np.repeat(grey[..., None], 3, 2)))
+        poses.append(pose)
+    write_euroc(folder, Piece(frames, poses, FIRST, []))
+    write_second(folder, SECOND, seconds)
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, terrain = tmp_path_factory.mktemp("euroc"), ground()
-    frames, poses = [], []
-    for seq, (t_ns, pose, grey) in enumerate(pictures_of(FIRST, terrain, SECONDS, RATE_HZ, 0)):
-        frames.append(Frame(seq, t_ns, grey, np.repeat(grey[..., None], 3, 2)))
-        poses.append(pose)
-    write_euroc(folder, Piece(frames, poses, FIRST, []))
-    write_second(folder, SECOND)
+    folder = tmp_path_factory.mktemp("euroc")
+    write_pair(folder, seconds=1.0)
     return folder
 
 
-def write_second(folder: Path, stated: Camera, late_ns: int = 0) -> None:
-    found = pictures_of(SECOND, ground(), SECONDS, RATE_HZ, 1)
+def write_second(folder: Path, stated: Camera, seconds: float = 1.0, late_ns: int = 0) -> None:
+    found = pictures_of(SECOND, ground(), seconds, RATE_HZ, 1)
     frames = [
         Frame(seq, t_ns + late_ns, grey, np.repeat(grey[..., None], 3, 2))
         for seq, (t_ns, _, grey) in enumerate(found)
@@ -106,3 +120,24 @@ def test_damaged_pictures_are_told(copied: Path) -> None:
     log = read(copied)
     assert not depths_in(log)
     assert whats(log)[0] == "pictures of cam1 could not be read"
+
+
+def test_a_replay_of_two_cameras_alone_is_metric(tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    write_pair(folder, seconds=8.0)
+    shutil.rmtree(folder / "mav0" / "imu0")
+    run = replay_here(folder, tmp_path / "out", "--set", "depth.enabled=false")
+    assert run.status == 0, run.stderr
+    assert run.report["unit"] == "m"
+    assert run.report["scale"]["method"] == "measured depths"
+    states = np.loadtxt(folder / "mav0" / "state_groundtruth_estimate0" / "data.csv", delimiter=",")
+    found = read_tum(run.out / "trajectory.tum")
+    poses = [ned_from_body((t - states[0, 0]) * 1e-9) @ CAMERA_DOWN for t in states[:, 0]]
+    truth = type(found)(
+        states[:, 0] * 1e-9, np.stack([p.translation for p in poses]),
+        np.stack([p.rotation for p in poses]),
+    )  # fmt: skip
+    scored = score(found, truth)
+    print(f"{100 * scored.scale_error:.2f} % off")
+    assert scored.tracked_share > 0.9
+    assert scored.scale_error < 0.01
