@@ -164,19 +164,28 @@ class SatelliteResiduals:
         residual = residual - lag_s * own_speeds
         white, rates = self._white(residual), self._rates
         now = times >= times[-1] - NOW_S
+        n_now, now_s = int(np.count_nonzero(now)), times[now].mean()
+        residual_now, world_now = residual[now].mean(0), world[now].mean(0)
+        own_speed_now = own_speeds[now].mean(0)
+        steps_m = np.linalg.norm(np.diff(world, axis=0), axis=1)
+        stands = bool(
+            np.ptp(gps[-N_STAND:, :2], axis=0).max() <= STANDS_M
+            and np.ptp(world[-N_STAND:, :2], axis=0).max() > MOVES_M
+        )
         out = []
         for window_s in WINDOWS_S:
             base = (times <= times[-1] - window_s) & (times >= times[-1] - window_s - BASE_S)
-            n_base, n_now = int(np.count_nonzero(base)), int(np.count_nonzero(now))
+            n_base = int(np.count_nonzero(base))
             if not n_base:
                 continue
             inside = times >= times[-1] - window_s
-            change = residual[now].mean(0) - residual[base].mean(0)
-            flown = world[now].mean(0) - world[base].mean(0)
-            span_s = float(times[now].mean() - times[base].mean())
+            residual_base = residual[base].mean(0)
+            change = residual_now - residual_base
+            flown = world_now - world[base].mean(0)
+            span_s = float(now_s - times[base].mean())
             level_m = float(np.hypot(*flown[:2]))
-            way_m = float(np.linalg.norm(np.diff(world[inside], axis=0), axis=1).sum())
-            faster = float(np.linalg.norm(own_speeds[now].mean(0) - own_speeds[base].mean(0)))
+            way_m = float(steps_m[inside[:-1]].sum())
+            faster = float(np.linalg.norm(own_speed_now - own_speeds[base].mean(0)))
             shared = np.sqrt(1.0 / n_base + 1.0 / n_now)
             placed = self._placed
             of_vision = np.array([
@@ -193,11 +202,7 @@ class SatelliteResiduals:
             out.append(
                 Change(
                     window_s, change[:2], float(horizontal), float(change[2]), float(vertical),
-                    speed, float(sigma_speed), flown, residual[base].mean(0),
-                    bool(
-                        np.ptp(gps[-N_STAND:, :2], axis=0).max() <= STANDS_M
-                        and np.ptp(world[-N_STAND:, :2], axis=0).max() > MOVES_M
-                    ),
+                    speed, float(sigma_speed), flown, residual_base, stands,
                 )
             )  # fmt: skip
         return out

@@ -101,6 +101,7 @@ class Drawing:
     def go_on_in(self, recording: rr.RecordingStream) -> None:
         """Draw in another recording from now on; repeats the places that later entities need."""
         self._rec = recording
+        self._earth_m.clear()
         recording.log("world", rr.ViewCoordinates.FRD, static=True)
         for plot, name in SERIES.items():
             recording.log(f"plots/{plot}", rr.SeriesLines(names=name), static=True)
