@@ -1,0 +1,86 @@
+"""A site map that cannot be used: a replay ends, a flight says so and goes on without it."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.config import Config, MapConfig
+from companion.estimation.site.site_of_flight import site_of_flight
+from companion.geometry.geodesy import GeoOrigin
+from companion.geometry.transforms import Similarity
+from companion.messages import Frame, Georeference, Warned
+from companion.pilot_messages import OTHER, of_warning
+from companion.products.site_map_file import SiteMapError, write_site_map
+from companion.runtime.stage_protocol import Finish, Setup
+from companion.stages.localisation_work import MAP_DAMAGED, MAP_NOT_USED, work
+from tests.support.reference.synthetic_map import CAMERA, Ground, flown, mapped
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A map made with the features of `Config()`."""
+    world = Similarity(2.5, np.eye(3), np.zeros(3))
+    there = [flown(p) for p in np.linspace((-6, 0), (6, 0), 10)]
+    slam_map = mapped(Ground(np.random.default_rng(5)), there, Similarity.identity())
+    placed = Georeference(world, 0.01, 0.02, "gps", 9, 0.5)
+    site = site_of_flight(
+        [(slam_map, placed)], CAMERA, "morning", GeoOrigin(47.1, 8.5, 400.0), None
+    )
+    assert site is not None
+    features = Config().features
+    made = replace(site, scale_factor=features.scale_factor, n_levels=features.n_levels)
+    write_site_map(tmp_path / "site.map", made)
+    return tmp_path / "site.map"
+
+
+def said(path: Path, is_live: bool) -> list[Warned]:
+    """Warnings with the first frame."""
+    stage = work(Setup(Config(map=MapConfig(use=str(path))), CAMERA, is_live=is_live))
+    grey = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    frame = Frame(0, 1_000_000_000, grey, np.repeat(grey[..., None], 3, 2))
+    out = [each for each in stage.step(frame) if isinstance(each, Warned)]
+    list(stage.finish(Finish(hurry=True)))
+    return out
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+def newer(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("PRAGMA user_version = 99")
+
+
+def letter(path: Path) -> None:
+    path.write_bytes(b"Dear all,\n" * 500)
+
+
+@pytest.mark.parametrize("spoil", [cut, newer, letter, Path.unlink])
+def test_a_flight_goes_on_without_it_and_a_replay_ends(
+    path: Path, spoil: Callable[[Path], None]
+) -> None:
+    assert not said(path, True)
+    spoil(path)
+    (warning,) = said(path, True)
+    assert warning.what == MAP_NOT_USED and str(path) in warning.detail
+    assert of_warning(warning.what) not in (None, OTHER())
+    with pytest.raises(SiteMapError):
+        said(path, False)
+
+
+def test_a_damaged_one_is_used_in_part(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("UPDATE keyframe SET features = zeroblob(length(features)) WHERE id = 3")
+        file.commit()
+    for is_live in (True, False):
+        (warning,) = said(path, is_live)
+        assert warning.what == MAP_DAMAGED and "1 parts" in warning.detail
+        assert of_warning(warning.what) not in (None, OTHER())
