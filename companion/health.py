@@ -30,6 +30,9 @@ class SourceHealth:
     n_reopened: int = 0
     age_s: float | None = None
     detail: str = ""
+    exposure_us: int | None = None
+    """Of a camera whose exposure we choose; likewise `gain`, in its own steps."""
+    gain: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

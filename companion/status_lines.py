@@ -119,6 +119,9 @@ def _source(source: SourceHealth) -> str:
     text = f"{source.name} "
     if source.state == "running":
         text += f"{source.rate_hz:.0f}/s"
+        if source.exposure_us is not None:
+            text += f", exposed {1e-3 * source.exposure_us:.1f} ms"
+            text += "" if source.gain is None else f", gain {source.gain}"
     elif source.state == "silent" and source.age_s is not None:
         text += f"silent for {source.age_s:.0f} s"
     else:

@@ -259,6 +259,7 @@ class Daemon:
     def _on_telemetry(self, sample: Telemetry) -> None:
         """Take a sample; in the event loop."""
         self._flights.take(sample)
+        self._feed.exposure.take_telemetry(sample)
         if self._senders is not None:
             self._senders.take_sample(sample)
         if isinstance(sample, ArmedSample):

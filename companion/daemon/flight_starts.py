@@ -102,6 +102,7 @@ class FlightStarts:
         except CompanionError as error:
             self._stop.fail(str(error), BAD_INPUT)
             return
+        self._feed.exposure.focal_px = self.camera.focal_px
         for remark in remarks:
             self._journal.say(remark, WARNING)
         self._begin_if_due()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from companion.messages import Frame, Warned
 from companion.meters import SourceMeter
 from companion.timing.clock import FlightClock
 from drivers.camera.camera_source import CameraSource, EndOfPictures, Picture
+from drivers.camera.live_exposure import LiveExposure
 from drivers.system.fault_trace import FaultTraces
 
 MISSING = "the camera is not there"
@@ -81,6 +82,7 @@ class CameraFeed:
         """Reason why the configured camera can never be opened; the thread has then ended."""
         self.size: tuple[int, int] | None = None
         """Width and height of the first image, which all others must have."""
+        self.exposure = LiveExposure(source, config)
         self._source = source
         self._clock = clock
         self._rate_hz = config.rate_hz
@@ -102,7 +104,10 @@ class CameraFeed:
     @property
     def health(self) -> SourceHealth:
         """Health now; from any thread."""
-        return self._meter.health(self._clock.now_ns())
+        health, exposure = self._meter.health(self._clock.now_ns()), self.exposure.now
+        if exposure is None:
+            return health
+        return replace(health, exposure_us=exposure.exposure_us, gain=exposure.gain)
 
     def start(self) -> None:
         """Start the thread, which opens the camera."""
@@ -116,6 +121,8 @@ class CameraFeed:
 
     def _run(self) -> None:
         n_opened = 0
+        if self.exposure.remark:
+            self._warn(Warned(self._clock.now_ns(), NOT_AS_ASKED, self.exposure.remark))
         while not self._stop.is_set():
             try:
                 if self._open(n_opened > 0):
@@ -143,6 +150,7 @@ class CameraFeed:
         except EXPECTED as error:
             self._set("missing", MISSING, self._in_words(error))
             return False
+        self.exposure.begin()
         if self._meter.state == "opening":  # else the fault may persist
             self._meter.detail = self._source.name
         return True
@@ -213,6 +221,7 @@ class CameraFeed:
         t_ns = self._clock.from_monotonic_ns(picture.monotonic_ns + self._offset_ns)
         self._meter.came(self._clock.from_monotonic_ns(now_ns))
         self._deliver(Frame(self._seq, t_ns, picture.grey, picture.rgb))
+        self.exposure.take(t_ns, picture.grey)
         self._seq += 1
         return ""
 

@@ -14,8 +14,9 @@ from companion.errors import ConfigError, SourceError
 from drivers.camera import v4l2_ioctl as v4l2
 from drivers.camera.camera_devices import find_camera, sizes_of, stable_path
 from drivers.camera.camera_source import Picture
+from drivers.camera.exposure_choice import Exposure, ExposureRange
 from drivers.camera.pixel_formats import CODES, to_grey_and_rgb
-from drivers.camera.v4l2_controls import apply_controls
+from drivers.camera.v4l2_controls import ManualExposure, apply_controls
 from drivers.camera.v4l2_node import CaptureNode, FilledBuffer, PictureFormat
 
 N_BUFFERS = 4
@@ -32,6 +33,8 @@ class _Stream:
     format: PictureFormat
     buffers: list[mmap.mmap]
     exposure_ns: int
+    manual: ManualExposure | None = None
+    """Exposure chosen in flight."""
     sequence: int | None = None
     """Sequence number of the last image."""
     stamped_by_us: bool = False
@@ -93,11 +96,38 @@ class V4l2Camera:
             if left_s <= 0:
                 return None
 
+    @property
+    def exposure_range(self) -> tuple[ExposureRange, Exposure] | None:
+        """Limits of what can be set, and the setting; None where the camera chooses for itself."""
+        manual = self._stream.manual if self._stream is not None else None
+        return None if manual is None else (manual.range, manual.now)
+
+    def set_exposure(self, wanted: Exposure) -> Exposure | None:
+        """Set exposure and gain; what the camera took.
+
+        None where it refuses: it is left to its own automatic exposure from then on.
+        """
+        stream = self._stream
+        if stream is None or stream.manual is None:
+            return None
+        try:
+            taken = stream.manual.put(wanted)
+        except OSError as error:
+            stream.manual.give_back()
+            stream.manual, stream.exposure_ns = None, 0
+            if error.errno != errno.ENODEV:  # else it has gone, as the next read will say
+                self.remarks.append(_left_to_itself(self.name, f"refused: {error.strerror}"))
+            return None
+        stream.exposure_ns = taken.exposure_us * 1_000
+        return taken
+
     def close(self) -> None:
         """Stop and release the device, so that it can come back under its own name."""
         stream, self._stream = self._stream, None
         if stream is None:
             return
+        if stream.manual is not None:
+            stream.manual.give_back()
         for buffer in stream.buffers:
             buffer.close()
         try:
@@ -123,7 +153,17 @@ class V4l2Camera:
             for buffer in buffers:  # a mapping keeps the device busy
                 buffer.close()
             raise
-        return _Stream(fd, node, form, buffers, exposure_ns)
+        stream = _Stream(fd, node, form, buffers, exposure_ns)
+        if self._config.exposure == "tracking":
+            self._take_over_exposure(path, stream)
+        return stream
+
+    def _take_over_exposure(self, path: str, stream: _Stream) -> None:
+        try:
+            stream.manual = ManualExposure(stream.node)
+            stream.exposure_ns = stream.manual.now.exposure_us * 1_000
+        except SourceError as error:
+            self.remarks.append(_left_to_itself(path, str(error)))
 
     def _set_format(self, path: str, node: CaptureNode) -> PictureFormat:
         config = self._config
@@ -231,6 +271,10 @@ def _by_preference(node: CaptureNode, offered: list[str], config: CameraConfig) 
         return max(rates, default=0.0) < MAX_RATE_SHORTFALL * config.rate_hz
 
     return sorted(known, key=too_slow)
+
+
+def _left_to_itself(name: str, why: str) -> str:
+    return f'{name}: camera.exposure = "tracking": {why}; it is left to its own exposure'
 
 
 def _cannot_open(error: OSError) -> str:

@@ -79,6 +79,8 @@ class FakeV4l2:
                 [b"Focus, Automatic Continuous", v4l2.CTRL_TYPE_BOOLEAN, 0, 1, 1, 1],
         }  # fmt: skip
         self.values = {number: each[5] for number, each in self.controls.items()}
+        self.fixed: set[int] = set()
+        """Controls that refuse to be set."""
         self.control_after_last: Callable[[int], int] | None = None
         """Of a driver whose list does not end: the number that it names after this one."""
         self.n_requests = 0
@@ -210,6 +212,8 @@ class FakeV4l2:
         about.value = self.values[about.id]
 
     def _s_ctrl(self, _: int, about: Any) -> None:
+        if about.id in self.fixed:
+            raise _refusal(errno.EACCES)
         step = self.controls[about.id][4]
         self.values[about.id] = about.value // step * step
 

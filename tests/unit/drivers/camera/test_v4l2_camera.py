@@ -18,6 +18,7 @@ from drivers.camera import v4l2_ioctl as v4l2
 from drivers.camera.camera_devices import cameras
 from drivers.camera.camera_feed import CameraFeed
 from drivers.camera.camera_source import Picture
+from drivers.camera.exposure_choice import Exposure, ExposureRange
 from drivers.camera.v4l2_camera import V4l2Camera
 from tests.support.cameras.fake_v4l2 import MONOTONIC_EOF, N_BUFFERS, FakeV4l2, install
 from tests.support.processes.strain import Strain
@@ -116,6 +117,64 @@ def test_controls_are_set_and_automatics_put_off(webcam: FakeV4l2, camera: V4l2C
     assert camera.remarks == [
         f"{webcam.stable_path}: expert.camera.focus is 20 in its steps, 23 was asked"
     ]
+
+
+@pytest.mark.parametrize("camera", [{"exposure": "tracking"}], indirect=True)
+def test_exposure_for_tracking_is_set_and_moves_the_stamps(
+    webcam: FakeV4l2, camera: V4l2Camera
+) -> None:
+    camera.open()
+    known = camera.exposure_range
+    assert known == (ExposureRange((300, 204_700), (0, 255)), Exposure(25_000, 64))
+    assert webcam.values[v4l2.CID_EXPOSURE_AUTO] == v4l2.EXPOSURE_MANUAL
+    assert camera.set_exposure(Exposure(4_050, 99)) == Exposure(4_000, 99)
+    assert webcam.values[v4l2.CID_EXPOSURE_ABSOLUTE] == 40
+    moved_ns = first(camera).monotonic_ns - webcam.last_stamp_ns
+    assert moved_ns == pytest.approx(2_000_000, abs=1_000)
+    assert camera.remarks == []
+    camera.close()
+    assert webcam.values[v4l2.CID_EXPOSURE_AUTO] == 3
+
+
+@pytest.mark.parametrize("camera", [{"exposure": "tracking"}], indirect=True)
+@pytest.mark.parametrize("when", ["no such control", "at the start", "in flight"])
+def test_a_camera_that_refuses_is_left_to_its_own_exposure(
+    webcam: FakeV4l2, camera: V4l2Camera, when: str
+) -> None:
+    if when == "no such control":
+        del webcam.controls[v4l2.CID_EXPOSURE_ABSOLUTE]
+    webcam.fixed = {v4l2.CID_EXPOSURE_ABSOLUTE} if when == "at the start" else set()
+    camera.open()
+    if when == "in flight":
+        webcam.fixed = {v4l2.CID_EXPOSURE_ABSOLUTE}
+        assert camera.set_exposure(Exposure(4_000, 99)) is None
+    assert camera.exposure_range is None
+    assert webcam.values[v4l2.CID_EXPOSURE_AUTO] == 3
+    assert len(camera.remarks) == 1
+    assert "it is left to its own exposure" in camera.remarks[0]
+    assert first(camera).grey.shape == (480, 640)
+
+
+@pytest.mark.parametrize("camera", [{"exposure": "tracking", "gain": 3}], indirect=True)
+def test_a_fixed_gain_and_one_that_is_chosen_exclude_each_other(
+    webcam: FakeV4l2, camera: V4l2Camera
+) -> None:
+    with pytest.raises(ConfigError, match="chooses exposure and gain"):
+        camera.open()
+
+
+def test_the_feed_sets_the_exposure_and_tells_it(webcam: FakeV4l2) -> None:
+    config = CameraConfig(exposure="tracking")
+    warned: list[Warned] = []
+    feed = CameraFeed(V4l2Camera(config), FlightClock(), config, lambda _: None, warned.append)
+    feed.start()
+    try:
+        # nothing is heard of the vehicle: half a radian per second, of a lens of 417 pixels
+        until(lambda: feed.health.exposure_us is not None and feed.health.exposure_us < 7_300)
+        assert webcam.values[v4l2.CID_EXPOSURE_ABSOLUTE] <= 72
+    finally:
+        feed.stop()
+    assert warned == []
 
 
 def test_what_is_left_to_the_camera_is_not_touched(webcam: FakeV4l2, camera: V4l2Camera) -> None:
