@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from companion.config import FeaturesConfig
 from companion.geometry.camera import Camera
 from companion.messages import Bytes
+from companion.slam.features.faint_pictures import strengthened
 from companion.slam.features.orb_features import FeatureExtractor, Features
 
 
@@ -55,7 +56,7 @@ class FeaturesAhead:
 
     def _extracted(self, grey: Bytes) -> _Extracted:
         before = self._own.state
-        features = self._own.extract(grey)
+        features = self._own.extract(strengthened(grey))
         return before, features, self._own.state
 
 

@@ -15,6 +15,7 @@ from companion.config import Config
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, angle_between
 from companion.messages import Bytes, Frame, KeyframeAdded, LoopClosed, Track, TrackState
+from companion.slam.features.faint_pictures import strengthened
 from companion.slam.features.features_ahead import FeaturesAhead
 from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.features.view import View
@@ -125,6 +126,7 @@ class Tracker:
         """Process one frame, with the map lock held; frames come in order of time."""
         with self._times("features"):
             features = self._ahead.take(frame.grey)
+            frame = replace(frame, grey=strengthened(frame.grey))
             if features is None:
                 features = self._extractor.extract(frame.grey)
         self.n_features = len(features)

@@ -1,0 +1,70 @@
+"""Faint pictures are strengthened so that corners are found again; others stay as they are."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from companion.config import FeaturesConfig
+from companion.geometry.camera import Camera
+from companion.messages import Bytes, Floats
+from companion.slam.features.faint_pictures import FAINT_SPREAD, SPREAD, strengthened
+from companion.slam.features.matching import match_descriptors
+from companion.slam.features.orb_features import FeatureExtractor
+
+SHIFT = 37
+"""Pixels by which the second picture is taken to the right of the first."""
+CAMERA = Camera(400, 300, 350.0, 350.0, 200.0, 150.0)
+
+
+def ground() -> Floats:
+    """Blots of all sizes over more than one picture, with the contrast of daylight."""
+    rng = np.random.default_rng(5)
+    total = np.zeros((300, 400 + SHIFT), np.float32)
+    for sigma in (1.0, 3.0, 9.0):
+        noise = rng.normal(size=total.shape).astype(np.float32)
+        total += cv2.GaussianBlur(noise, (0, 0), sigma) * sigma
+    return np.asarray(25.0 * total / total.std(), np.float32)
+
+
+def taken(scene: Floats, contrast: float, noise: float, seed: int) -> Bytes:
+    rng = np.random.default_rng(seed)
+    grey = 90.0 + contrast * scene + rng.normal(scale=max(noise, 1e-9), size=scene.shape)
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def n_true_matches(first: Bytes, second: Bytes) -> int:
+    a, b = (FeatureExtractor(FeaturesConfig(), CAMERA).extract(each) for each in (first, second))
+    ia, ib = match_descriptors(a, b)
+    off = a.pixels[ia] - b.pixels[ib] - np.array([SHIFT, 0.0], np.float32)
+    return int(np.count_nonzero(np.linalg.norm(off, axis=1) < 3.0))
+
+
+@pytest.mark.parametrize(("contrast", "noise"), [(0.15, 1.5), (0.1, 1.0)])
+def test_more_corners_of_a_faint_ground_are_found_again(contrast: float, noise: float) -> None:
+    scene = ground()
+    first = taken(scene[:, :400], contrast, noise, 1)
+    second = taken(scene[:, SHIFT:], contrast, noise, 2)
+    before = n_true_matches(first, second)
+    after = n_true_matches(strengthened(first), strengthened(second))
+    assert after > max(1.5 * before, 100)
+
+
+def test_a_faint_picture_gets_the_contrast_of_daylight() -> None:
+    out = strengthened(taken(ground()[:, :400], 0.15, 1.5, 1))
+    assert out.dtype == np.uint8
+    assert out.std() == pytest.approx(SPREAD, abs=1.0)
+    assert out.mean() == pytest.approx(128.0, abs=2.0)
+
+
+def test_a_picture_in_daylight_is_not_touched() -> None:
+    picture = taken(ground()[:, :400], 0.5, 2.0, 1)
+    assert picture.std() > FAINT_SPREAD
+    assert strengthened(picture) is picture
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_of_noise_alone_no_contrast_is_made(noise: float) -> None:
+    picture = taken(np.zeros((300, 400), np.float32), 0.0, noise, 1)
+    assert strengthened(picture).std() < 0.3 * SPREAD
