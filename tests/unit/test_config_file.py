@@ -25,8 +25,8 @@ from tests.support.settings_text import described_toml, settings_page
 ROOT = Path(__file__).parents[2]
 DESCRIBED, PAGE = ROOT / "config/companion.toml", ROOT / "docs/settings.md"
 BEFORE = ROOT / "tests/support/reference/companion_0_1_0.toml"
-SINCE = {"computer.profile",
-    "distributed.ros_domain",
+SINCE = {
+    "camera.exposure", "computer.profile", "distributed.ros_domain",
     "camera.readout_ms", "expert.export.mesh_m", "expert.link.gimbal_hz", "mount.gimbal_delay_ms",
     "mount.gimbal_sigma_deg", "mount.type", "feedback.flow", "feedback.global_position",
     "gps.satellites_set", "gps.switch_source", "gps.vision_set",
