@@ -7,6 +7,7 @@ import pytest
 
 from companion.config import FeaturesConfig
 from companion.messages import Bytes
+from companion.slam.features.faint_pictures import strengthened
 from companion.slam.features.features_ahead import FeaturesAhead
 from companion.slam.features.orb_features import FeatureExtractor, Features
 from tests.unit.slam.test_orb_features import LENS, textured
@@ -35,7 +36,7 @@ def test_features_and_thresholds_are_those_of_one_after_the_other(images: list[B
     for grey in images:
         found = ahead.take(grey)
         assert found is not None
-        same(found, direct.extract(grey))
+        same(found, direct.extract(strengthened(grey)))
         assert extractor.state == direct.state
         states.add(direct.state)
     assert len(states) > 1
