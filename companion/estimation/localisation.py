@@ -31,6 +31,7 @@ from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
 from companion.estimation.site.site_in_flight import SiteInFlight
 from companion.estimation.site.site_use import DOUBTED, SiteUse
+from companion.estimation.telemetry_intake import TelemetryIntake
 from companion.estimation.tracking_margin import TrackingMargin
 from companion.geometry.camera import Camera
 from companion.geometry.geodesy import GeoOrigin
@@ -52,17 +53,7 @@ from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.site_map import SiteMap
 from companion.slam.map.sparse_map import Keyframe, SlamMap
 from companion.slam.tracking.tracker import Prior, Tracker
-from companion.telemetry import (
-    AttitudeSample,
-    DepthSample,
-    GimbalSample,
-    HeightSample,
-    ImuSample,
-    PositionSample,
-    RangeSample,
-    Telemetry,
-    is_believed,
-)
+from companion.telemetry import Telemetry
 from companion.timing.clock import Timer
 
 FINAL_ITERATIONS = 8
@@ -120,9 +111,11 @@ class LocalisationStage:
         self._shutter = None if camera.readout_ms == 0 else ShutterOfFrames(camera)
         self._margin = TrackingMargin(camera, config.features.n_features)
         self._t_ns = 0
-        self._samples: list[Telemetry] = []
-        """Telemetry since the last frame: taken with the next, while nothing is mapped."""
-        self._n_samples = 0
+        self._telemetry = TelemetryIntake(
+            config.telemetry.use, self._gimbal, self._standing, self._flow, self._odometry.ground,
+            self._imu, self._satellites, self._attitude, self._georeferencer,
+            self._georeferences.depths,
+        )  # fmt: skip
         self._origin: GeoOrigin | None = None
         """The origin of local NED, where it was told since the last frame."""
         self._pruned_ns: int | None = None
@@ -162,58 +155,13 @@ class LocalisationStage:
         if isinstance(message, GeoOrigin):
             self._origin = message
         elif isinstance(message, Telemetry):
-            self._samples.append(message)
+            self._telemetry.add(message)
         return []
 
     def _take_samples(self) -> None:
         if self._origin is not None:
             self._site.take_origin(self._origin)
-        for sample in self._samples:
-            if not is_believed(sample, self._config.telemetry.use):
-                continue
-            if isinstance(sample, PositionSample) and self._gimbal is not None:
-                sample = self._gimbal.of_head(sample)
-            if isinstance(sample, PositionSample) and not self._satellites.may_use(sample):
-                continue
-            self._standing.take(sample)
-            self._flow.take(sample)
-            if isinstance(sample, HeightSample):
-                self._odometry.ground.take_height(
-                    sample.t_ns, sample.height_m, self._standing.armed
-                )
-            if isinstance(sample, RangeSample):
-                self._take_range(sample)
-            if isinstance(sample, AttitudeSample | ImuSample):
-                self._imu.take(sample)
-            if isinstance(sample, AttitudeSample):
-                self._satellites.take_time(sample.t_ns)
-            for each in self._of_head(sample):
-                if isinstance(each, AttitudeSample):
-                    self._attitude.add(each)
-                elif isinstance(each, DepthSample):
-                    self._georeferences.depths.take(each)
-                else:
-                    self._georeferencer.take(each)
-        self._n_samples += len(self._samples)
-        self._samples.clear()
-
-    def _take_range(self, sample: RangeSample) -> None:
-        """A range is along the body's axis, also where the frames' attitude is a gimbal head's."""
-        upright = None
-        if self._gimbal is not None:
-            upright = self._gimbal.body_upright(sample.t_ns)
-            if upright is None:
-                return
-        self._odometry.ground.take_range(sample.t_ns, sample.distance_m, upright)
-
-    def _of_head(self, sample: Telemetry) -> Iterable[Telemetry]:
-        """A sample as it is of what the camera is fixed to: the body, or a gimbal's head."""
-        if self._gimbal is None:
-            return (sample,)
-        if isinstance(sample, AttitudeSample | GimbalSample):
-            return self._gimbal.take(sample, self._attitude.correction[1])
-        # a rangefinder looks down from the body
-        return () if isinstance(sample, RangeSample) else (sample,)
+        self._telemetry.pass_on()
 
     def look_ahead(self, grey: Bytes) -> None:
         """Begin with the image (H, W) of a frame to come, in order: the very array of its step."""
@@ -299,8 +247,9 @@ class LocalisationStage:
     def _frame_tracked(self, t_ns: int, seq: int, has_picture: bool) -> FrameTracked:
         origin, self._origin = self._origin, None
         return FrameTracked(
-            t_ns, seq, self._n_samples, self._tracker.map_lock.point, self._tracker.feature_ratio,
-            has_picture, None if origin is None or not self._site.in_use else astuple(origin),
+            t_ns, seq, self._telemetry.n_samples, self._tracker.map_lock.point,
+            self._tracker.feature_ratio, has_picture,
+            None if origin is None or not self._site.in_use else astuple(origin),
         )  # fmt: skip
 
     def _flow_of(self, frame: Frame) -> Iterator[Message]:
