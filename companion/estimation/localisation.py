@@ -355,6 +355,7 @@ class LocalisationStage:
             yield from self._margin.take(
                 next(m for m in tracked if isinstance(m, Track) and m.seq == frame.seq),
                 tracker.view_of(frame.seq), tracker.map, tracker.n_features, tracker.feature_ratio,
+                tracker.drowned,
             )  # fmt: skip
         yield from self._check_attitude(frame.t_ns)
         if self._gimbal is not None and self._attitude.used:

@@ -51,13 +51,17 @@ class TrackingMargin:
         self._near_ns = 0
 
     def take(
-        self, track: Track, view: View | None, slam_map: SlamMap, n_seen: int, ratio: float
-    ) -> list[Warned]:
+        self, track: Track, view: View | None, slam_map: SlamMap, n_seen: int, ratio: float,
+        drowned: bool = False,
+    ) -> list[Warned]:  # fmt: skip
         """Add a frame: its track, its view where it is tracked, and the features seen in it.
 
-        `ratio` is that of the features asked for that load leaves.
+        `ratio` is that of the features asked for that load leaves. In a picture that is `drowned`
+        features are many and matched, until they are lost all at once.
         """
         t_ns, limit = track.t_ns, self._limit(track, view, slam_map, n_seen, ratio)
+        if drowned:
+            limit = TOO_FAINT
         if limit is not None:
             self._recent.append((t_ns, limit))
         while self._recent and t_ns - self._recent[0][0] > WINDOW_NS:

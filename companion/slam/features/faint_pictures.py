@@ -30,6 +30,10 @@ MAX_GAIN = 30.0
 levels leave 0.2) is a third; from there on down what comes out fades as the picture does. A sudden
 end would leave the map without its corners from one frame to the next."""
 
+DROWNED_SPREAD = 0.75 * SPREAD
+"""Standard deviation of what comes out where the detail is half a grey level: with the noise of a
+camera, near half of it."""
+
 
 def strengthened(grey: Bytes) -> Bytes:
     """Picture (H, W) with the contrast of daylight where it is faint; else `grey` itself."""
@@ -44,3 +48,8 @@ def strengthened(grey: Bytes) -> Bytes:
     detail = fine - cv2.resize(broad, (width, height), interpolation=cv2.INTER_LINEAR)
     gain = min(SPREAD / max(float(detail.std()), 1e-6), MAX_GAIN)
     return np.asarray(np.clip(np.rint(gain * detail + 128.0), 0, 255), np.uint8)
+
+
+def is_drowned(strong: Bytes) -> bool:
+    """Whether a strengthened picture (H, W) has so little detail that near half of it is noise."""
+    return float(cv2.meanStdDev(strong)[1][0, 0]) < DROWNED_SPREAD

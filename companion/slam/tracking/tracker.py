@@ -15,7 +15,7 @@ from companion.config import Config
 from companion.geometry.camera import Camera
 from companion.geometry.transforms import Array, Pose, angle_between
 from companion.messages import Bytes, Frame, KeyframeAdded, LoopClosed, Track, TrackState
-from companion.slam.features.faint_pictures import strengthened
+from companion.slam.features.faint_pictures import is_drowned, strengthened
 from companion.slam.features.features_ahead import FeaturesAhead
 from companion.slam.features.orb_features import FeatureExtractor, Features
 from companion.slam.features.view import View
@@ -81,7 +81,9 @@ class Tracker:
         self._extractor = FeatureExtractor(config.features, camera)
         self._ahead = FeaturesAhead(config.features, camera, self._extractor)
         self.n_features = 0
-        """Features seen in the last frame."""
+        """Features seen in the last frame,"""
+        self.drowned = False
+        """which may be of noise."""
         self._is_live = background
         self._next_keyframe_id = 0
         self.map_lock = MapLock(order)
@@ -126,7 +128,9 @@ class Tracker:
         """Process one frame, with the map lock held; frames come in order of time."""
         with self._times("features"):
             features = self._ahead.take(frame.grey)
-            frame = replace(frame, grey=strengthened(frame.grey))
+            strong = strengthened(frame.grey)
+            self.drowned = strong is not frame.grey and is_drowned(strong)
+            frame = replace(frame, grey=strong)
             if features is None:
                 features = self._extractor.extract(frame.grey)
         self.n_features = len(features)

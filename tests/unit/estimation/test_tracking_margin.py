@@ -36,7 +36,7 @@ class Flight:
 
     def fly(
         self, seconds: float, heights_s: float = 0.5, n_matches: int = 300, n_seen: int = 1200,
-        ratio: float = 1.0,
+        ratio: float = 1.0, drowned: bool = False,
     ) -> list[Warned]:  # fmt: skip
         """Frames that are tracked, or with no match lost; what is said."""
         said: list[Warned] = []
@@ -48,7 +48,7 @@ class Flight:
             t_ns = round(self._seq * 1e9 / RATE_HZ)
             track = Track(self._seq, t_ns, state, n_inliers=n_matches, n_matches=n_matches)
             view = self._view(t_ns, n_matches) if tracked else None
-            said += self.margin.take(track, view, self.map, n_seen, ratio)
+            said += self.margin.take(track, view, self.map, n_seen, ratio, drowned)
         return said
 
     def _view(self, t_ns: int, n: int) -> View:
@@ -102,3 +102,10 @@ def test_a_loss_over_rich_ground_is_no_limit() -> None:
     flight = Flight()
     assert flight.fly(3.0) == []
     assert flight.fly(3.0, n_matches=0) == []
+
+
+def test_a_picture_drowned_in_noise_is_told_with_all_its_matches() -> None:
+    flight = Flight()
+    assert flight.fly(2.0) == []
+    (said,) = flight.fly(1.0, drowned=True)
+    assert said.what == TOO_FAINT

@@ -9,7 +9,7 @@ import pytest
 from companion.config import FeaturesConfig
 from companion.geometry.camera import Camera
 from companion.messages import Bytes, Floats
-from companion.slam.features.faint_pictures import FAINT_SPREAD, SPREAD, strengthened
+from companion.slam.features.faint_pictures import FAINT_SPREAD, SPREAD, is_drowned, strengthened
 from companion.slam.features.matching import match_descriptors
 from companion.slam.features.orb_features import FeatureExtractor
 
@@ -56,6 +56,7 @@ def test_a_faint_picture_gets_the_contrast_of_daylight() -> None:
     assert out.dtype == np.uint8
     assert out.std() == pytest.approx(SPREAD, abs=1.0)
     assert out.mean() == pytest.approx(128.0, abs=2.0)
+    assert not is_drowned(out)
 
 
 def test_a_picture_in_daylight_is_not_touched() -> None:
@@ -68,3 +69,4 @@ def test_a_picture_in_daylight_is_not_touched() -> None:
 def test_of_noise_alone_no_contrast_is_made(noise: float) -> None:
     picture = taken(np.zeros((300, 400), np.float32), 0.0, noise, 1)
     assert strengthened(picture).std() < 0.3 * SPREAD
+    assert is_drowned(strengthened(picture))
