@@ -6,7 +6,6 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from companion.dense.sight_depth import sight_depth
 from companion.dense.sight_tracks import MOST_IMAGES, SightTracks
@@ -87,6 +86,8 @@ def things_in(seen: Seen, half_width_rad: float) -> Array:
 
     A corner is in the middle of the window by which it was followed, that wide to either side.
     """
+    from scipy.spatial import cKDTree  # 15 MB of the daemon, where obstacles are told alone
+
     rays = seen.points_world_m - seen.eye_world_m
     distance_m = np.linalg.norm(rays, axis=1)
     if len(rays) == 0:

@@ -32,6 +32,17 @@ OF_WARNING: Mapping[str, str] = {
     "map tilted against the autopilot's attitude: begun anew":
         "Once after take-off: nothing to do. Again and again: the mount is stated wrong.",
     "map resumed after restart": NOTHING,
+    "located in the map of an earlier flight": NOTHING,
+    "the map of an earlier flight is not used":
+        "The flight goes on in its own map. See what is said of it; set or clear [map] use.",
+    "the map of an earlier flight is not where satellites are":
+        "Either it or the satellites are wrong: fly to no place on earth before that is clear.",
+    "the map of an earlier flight was made with another camera":
+        "Places are less exact in it. Make a map with this camera.",
+    "the map of an earlier flight cannot be read":
+        "companion map verify says what is wrong; set [map] use to another, or clear it.",
+    "the map of an earlier flight is damaged":
+        "What is whole is used. companion map verify says what is lost.",
     "old map not recognised: new map": "Climb or fly some metres, so that it gets its scale.",
     "the map cannot be kept for a restart in flight": "Make room on the disk.",
     "camera and autopilot were found to disagree, corrected":
