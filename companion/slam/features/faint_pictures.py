@@ -51,5 +51,5 @@ def strengthened(grey: Bytes) -> Bytes:
 
 
 def is_drowned(strong: Bytes) -> bool:
-    """Whether a strengthened picture (H, W) has so little detail that near half of it is noise."""
+    """Verdict on a strengthened picture (H, W): of so little detail that near half is noise."""
     return float(cv2.meanStdDev(strong)[1][0, 0]) < DROWNED_SPREAD
