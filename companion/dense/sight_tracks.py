@@ -22,7 +22,7 @@ MAX_ELEVATION_RAD = np.radians(20.0)
 WINDOW_PX, LEVELS = 9, 2
 """A larger window sees more of what is behind a thin thing than of the thing."""
 MAX_RETURN_PX = 0.5
-"""From where a corner that is followed back comes out."""
+"""Distance from a corner to where it comes out when it is followed there and back."""
 LEAST_CORNER = 1e-4
 """Smaller eigenvalue of the gradients about it, greys from 0 to 1: noise of 2 greys stays below."""
 MARGIN_PX = 6

@@ -17,7 +17,7 @@ from companion.messages import Warned
 from drivers.datasets.posed_layouts import TUM_CAMERA, TUM_CAMERAS
 from drivers.flight import Flight, TruePose
 from drivers.images.calibration_file import read_calibration
-from drivers.images.depth_picture import depths_at_corners
+from drivers.images.depth_camera import depths_at_corners
 from drivers.images.listed_images import listed_images
 from drivers.images.picture_file import read_grey, read_picture
 from drivers.images.stereo_pair import Depths
