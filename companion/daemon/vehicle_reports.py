@@ -35,8 +35,8 @@ from drivers.mavlink.autopilot_link import AutopilotLink
 from drivers.mavlink.camera_captures import NOTHING_RECORDED, FlightRecording
 from drivers.mavlink.camera_component import CameraComponent
 from drivers.mavlink.camera_messages import CameraStream
-from drivers.mavlink.command_server import Command
 from drivers.mavlink.computer_status import computer_status
+from drivers.mavlink.ground.command_server import Command
 from drivers.mavlink.measurements.obstacle_distance import obstacle_distance
 from drivers.mavlink.message_requests import (
     COMPUTER_STATUS,

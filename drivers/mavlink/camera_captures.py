@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.pilot_messages import RECORDING_GOES_ON, RECORDING_NO_FLIGHT, PilotText
 from drivers.images.still_pictures import Still
 from drivers.mavlink.camera_messages import CAPTURE_STATUS, SETTINGS, STORAGE
-from drivers.mavlink.command_server import ACCEPTED, BUSY, DENIED, FAILED, Command, Done, Job
+from drivers.mavlink.ground.command_server import ACCEPTED, BUSY, DENIED, FAILED, Command, Done, Job
 from drivers.mavlink.status_text import status_text
 
 CAPABILITIES: int = (

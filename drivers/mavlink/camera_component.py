@@ -31,10 +31,10 @@ from drivers.mavlink.camera_messages import (
     stream_information,
     stream_status,
 )
-from drivers.mavlink.command_server import CommandServer
-from drivers.mavlink.ground_requests import COMMANDS
+from drivers.mavlink.ground.command_server import CommandServer
+from drivers.mavlink.ground.ground_requests import COMMANDS
+from drivers.mavlink.ground.request_limit import RequestLimit
 from drivers.mavlink.message_requests import HEARTBEAT, MessageRequests
-from drivers.mavlink.request_limit import RequestLimit
 
 CAMERA: int = mavlink.MAV_COMP_ID_CAMERA
 HEARTBEAT_S = 1.0

@@ -9,7 +9,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drivers.mavlink.command_server import ACCEPTED, DENIED, Command, Done
+from drivers.mavlink.ground.command_server import ACCEPTED, DENIED, Command, Done
 
 INFORMATION: int = mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION
 STREAM: int = mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION

@@ -12,7 +12,6 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drivers.mavlink.command_server import ACCEPTED, DENIED, UNSUPPORTED, Command, Done
 from drivers.mavlink.component_messages import (
     COMPONENT_INFORMATION_BASIC,
     PROTOCOL_VERSION,
@@ -21,6 +20,7 @@ from drivers.mavlink.component_messages import (
     message_interval,
     protocol_version,
 )
+from drivers.mavlink.ground.command_server import ACCEPTED, DENIED, UNSUPPORTED, Command, Done
 
 LAST_MESSAGE = 2**24 - 1
 DEFAULT_RATE = 0

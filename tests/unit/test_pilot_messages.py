@@ -36,7 +36,7 @@ from companion.pilot_messages import (
 from companion.products import flight_result
 from companion.stages import localisation_work, topics_work
 from drivers.camera import camera_feed
-from drivers.mavlink import ground_requests
+from drivers.mavlink.ground import ground_requests
 from drivers.recording import disk_writer
 from drivers.telemetry import live_samples
 

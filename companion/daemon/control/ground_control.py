@@ -47,10 +47,18 @@ from companion.products.newest_file import NewestFile
 from companion.runtime.stage_protocol import Snapshot
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.command_server import ACCEPTED, BUSY, DENIED, Command, CommandServer, Done, Job
-from drivers.mavlink.ground_requests import GroundRequests
-from drivers.mavlink.mission_server import MissionServer
-from drivers.mavlink.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, ParameterServer
+from drivers.mavlink.ground.command_server import (
+    ACCEPTED,
+    BUSY,
+    DENIED,
+    Command,
+    CommandServer,
+    Done,
+    Job,
+)
+from drivers.mavlink.ground.ground_requests import GroundRequests
+from drivers.mavlink.ground.mission_server import MissionServer
+from drivers.mavlink.ground.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, ParameterServer
 from drivers.mavlink.wire.send_queue import RateLimit
 from drivers.system.journal import INFO, WARNING, Journal
 
@@ -146,7 +154,7 @@ class GroundControl:
         """Take the progress of a snapshot from the results stage."""
         self._snapshots.take(snapshot)
 
-    # -- parameters, as drivers.mavlink.parameter_server wants them ------------------------------
+    # -- parameters, as drivers.mavlink.ground.parameter_server wants them ------
 
     @property
     def names(self) -> Sequence[str]:

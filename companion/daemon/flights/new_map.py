@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from companion.daemon.flights.flights import Flights
 from companion.timing.clock import monotonic_s
-from drivers.mavlink.command_server import ACCEPTED, FAILED, Job
+from drivers.mavlink.ground.command_server import ACCEPTED, FAILED, Job
 
 USUAL_S, MOST_S = 5.0, 30.0
 READY_PERCENT = 90

@@ -10,7 +10,7 @@ from companion.daemon.flights.live_flight import LiveFlight
 from companion.geometry.geodesy import GeoOrigin
 from companion.pilot_messages import CLOUD_NOT_SAVED, CLOUD_SAVED, PilotText
 from companion.runtime.stage_protocol import Snapshot
-from drivers.mavlink.command_server import ACCEPTED, FAILED, Job
+from drivers.mavlink.ground.command_server import ACCEPTED, FAILED, Job
 
 RESULTS_GONE = "the results stage has died"
 

@@ -32,8 +32,8 @@ from companion.health import Health, SourceHealth, StageHealth
 from companion.pilot_messages import position_lost
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.command_server import BUSY
-from drivers.mavlink.parameter_server import LONGEST_NAME, NOT_NOW, OUT_OF_RANGE, SET
+from drivers.mavlink.ground.command_server import BUSY
+from drivers.mavlink.ground.parameter_server import LONGEST_NAME, NOT_NOW, OUT_OF_RANGE, SET
 from drivers.system.journal import Journal
 from tests.support.autopilot.memory_port import MemoryPort
 

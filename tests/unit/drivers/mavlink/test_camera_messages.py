@@ -17,7 +17,7 @@ from drivers.mavlink.camera_messages import (
     stream_information,
     stream_status,
 )
-from drivers.mavlink.command_server import ACCEPTED, DENIED, Done
+from drivers.mavlink.ground.command_server import ACCEPTED, DENIED, Done
 
 URI = "rtsp://10.0.0.5:8554/camera"
 MADE = CameraStream(URI, 640, 480, 30.0, 2000, 75.4, True)

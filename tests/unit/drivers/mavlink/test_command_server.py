@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drivers.mavlink.command_server import (
+from drivers.mavlink.ground.command_server import (
     ACCEPTED,
     BUSY,
     DENIED,

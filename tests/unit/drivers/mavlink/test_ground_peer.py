@@ -20,11 +20,11 @@ from companion.config import LinkConfig, RouterConfig
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.command_server import CommandServer
-from drivers.mavlink.ground_requests import TOO_MANY, GroundRequests
+from drivers.mavlink.ground.command_server import CommandServer
+from drivers.mavlink.ground.ground_requests import TOO_MANY, GroundRequests
+from drivers.mavlink.ground.mission_server import MissionServer
+from drivers.mavlink.ground.parameter_server import OUT_OF_RANGE, SET, ParameterServer
 from drivers.mavlink.message_requests import MessageRequests
-from drivers.mavlink.mission_server import MissionServer
-from drivers.mavlink.parameter_server import OUT_OF_RANGE, SET, ParameterServer
 from drivers.mavlink.wire.pymavlink_port import PymavlinkPort
 from tests.support.autopilot.fake_wire import free_port
 from tests.support.autopilot.ground_station import OURS

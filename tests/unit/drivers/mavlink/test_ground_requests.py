@@ -14,17 +14,17 @@ from companion.messages import Warned
 from companion.pilot_messages import PilotText
 from companion.timing.clock import FlightClock
 from drivers.mavlink.autopilot_link import AutopilotLink
-from drivers.mavlink.command_server import ACCEPTED, Command, CommandServer, Done
 from drivers.mavlink.component_messages import (
     autopilot_version,
     component_information,
     message_interval,
     protocol_version,
 )
-from drivers.mavlink.ground_requests import KINDS, TOO_MANY, GroundRequests
-from drivers.mavlink.mission_server import MissionServer
-from drivers.mavlink.parameter_server import SET, ParameterServer
-from drivers.mavlink.request_limit import EACH_BURST, MOST_ASKERS, RequestLimit
+from drivers.mavlink.ground.command_server import ACCEPTED, Command, CommandServer, Done
+from drivers.mavlink.ground.ground_requests import KINDS, TOO_MANY, GroundRequests
+from drivers.mavlink.ground.mission_server import MissionServer
+from drivers.mavlink.ground.parameter_server import SET, ParameterServer
+from drivers.mavlink.ground.request_limit import EACH_BURST, MOST_ASKERS, RequestLimit
 from drivers.mavlink.status_text import TEXTS_AT_ONCE, WARNINGS_ONLY, TextLimit
 from drivers.mavlink.wire.packet_stream import MavlinkStream, decode
 from tests.support.autopilot.ground_station import asked

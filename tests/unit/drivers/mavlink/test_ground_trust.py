@@ -11,10 +11,10 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.timing.clock import FlightClock
-from drivers.mavlink.command_server import ACCEPTED, Command, CommandServer, Done
-from drivers.mavlink.ground_requests import GroundRequests
-from drivers.mavlink.mission_server import MissionServer
-from drivers.mavlink.parameter_server import ParameterServer
+from drivers.mavlink.ground.command_server import ACCEPTED, Command, CommandServer, Done
+from drivers.mavlink.ground.ground_requests import GroundRequests
+from drivers.mavlink.ground.mission_server import MissionServer
+from drivers.mavlink.ground.parameter_server import ParameterServer
 from tests.support.autopilot.fake_wire import free_port
 from tests.support.autopilot.mavlink_link import Speaker, port_at, running
 from tests.support.waiting_in_loop import until

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drivers.mavlink.command_server import ACCEPTED, DENIED, UNSUPPORTED, Done
+from drivers.mavlink.ground.command_server import ACCEPTED, DENIED, UNSUPPORTED, Done
 from drivers.mavlink.message_requests import COMPUTER_STATUS, HEARTBEAT, MessageRequests
 
 CAMERA_INFORMATION = 259

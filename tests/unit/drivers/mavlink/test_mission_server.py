@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.geometry.transforms import Array
-from drivers.mavlink.mission_server import MOST_ASKERS, MOST_WAITING, MissionServer
+from drivers.mavlink.ground.mission_server import MOST_ASKERS, MOST_WAITING, MissionServer
 from tests.support.autopilot.ground_station import asked
 
 OURS = (1, 197)

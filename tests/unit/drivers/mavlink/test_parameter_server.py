@@ -8,7 +8,13 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drivers.mavlink.parameter_server import NOT_NOW, OUT_OF_RANGE, SET, UNKNOWN, ParameterServer
+from drivers.mavlink.ground.parameter_server import (
+    NOT_NOW,
+    OUT_OF_RANGE,
+    SET,
+    UNKNOWN,
+    ParameterServer,
+)
 from tests.support.autopilot.ground_station import asked
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32

@@ -14,10 +14,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.messages import Warned
 from companion.timing.clock import FlightClock
-from drivers.mavlink.command_server import CommandServer
-from drivers.mavlink.mission_server import MISSIONS, MissionServer
-from drivers.mavlink.parameter_server import ParameterServer
-from drivers.mavlink.request_limit import RequestLimit
+from drivers.mavlink.ground.command_server import CommandServer
+from drivers.mavlink.ground.mission_server import MISSIONS, MissionServer
+from drivers.mavlink.ground.parameter_server import ParameterServer
+from drivers.mavlink.ground.request_limit import RequestLimit
 from drivers.mavlink.wire.message_port import MavlinkPort
 
 TICK_S = 0.025

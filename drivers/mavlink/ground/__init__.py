@@ -1,0 +1,1 @@
+"""Answers to ground stations: commands, parameters, missions, and how many are taken."""
