@@ -153,7 +153,8 @@ class CameraMotion:
 
         Constant velocity between frames. Over longer spans the filter of the body, whose place (3,)
         of the camera in the map `reckoned` gives for its rotation (3, 3) there, else the way (3,)
-        by the velocity of the autopilot between two times, `moved_m`, None where that is unknown.
+        by the velocity of the autopilot between two times, `moved_m`, None where that is unknown
+        (an axis that is nan is taken as none: this says where to look for known points).
         """
         predicted, last = self.carried_on(t_ns, attitude), self.last
         if predicted is None or last is None or last.map_from_camera is None or placed is None:
@@ -167,7 +168,7 @@ class CameraMotion:
         if way_m is None:
             return predicted
         to_map = placed.world_from_map.inverse()
-        moved = to_map.scale * to_map.rotation @ way_m
+        moved = to_map.scale * to_map.rotation @ np.nan_to_num(way_m)
         return Pose(predicted.rotation, last.map_from_camera.translation + moved)
 
     def dead_reckoned(

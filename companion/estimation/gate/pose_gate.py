@@ -276,6 +276,7 @@ class PoseGate:
         if (
             not all(np.isfinite(part).all() for part in parts)
             or np.abs(pose.translation).max() > MAX_EXTENT_M
+            or not np.isfinite(odometry.sigma_velocity_m_s)  # the velocity is an old one
         ):
             return UNCERTAIN
         hysteresis = 1.0 if self.sending else HYSTERESIS

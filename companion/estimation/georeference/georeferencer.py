@@ -166,6 +166,7 @@ class Georeferencer:
     def displacement_by_velocity(self, from_ns: int, to_ns: int) -> Array | None:
         """Displacement (3,) by velocity, NED metres; None where unknown.
 
+        Its down axis is nan where velocities are level ones, as some satellite receivers tell them.
         Beyond the newest sample the last velocity is held for a while.
         """
         for source in self._sources:
@@ -179,7 +180,7 @@ class Georeferencer:
             (start, end), ok = series.at(np.array([from_ns, end_ns]))
             if ok.all():
                 travelled_m = end[1] - start[1] + end[0] * ((to_ns - end_ns) * 1e-9)
-                return np.asarray(np.nan_to_num(travelled_m), np.float64)
+                return np.asarray(travelled_m, np.float64)
         return None
 
     def solve(
@@ -350,13 +351,15 @@ def place_new_map(
 ) -> Georeference | None:  # fmt: skip
     """Georeference of a new map whose first keyframe is at `start_ned_m` (3,).
 
-    Its scale is roughly that of a displacement (3,) from the first to the last sample, NED metres;
-    None where that is too uncertain.
+    Its scale is roughly that of a displacement (3,) from the first to the last sample, NED metres,
+    of its axes that are known (others are nan); None where that is too uncertain.
     """
     first, last, level = samples[0], samples[-1], mean_rotation(samples)
     if level is None:
         return None
     mapped = level @ (last.map_from_camera.translation - first.map_from_camera.translation)
+    known = np.isfinite(displacement_m)
+    mapped, displacement_m = mapped[known], displacement_m[known]
     scale = float(mapped @ displacement_m) / max(float(mapped @ mapped), 1e-12)
     sigma = sigma_m / max(float(np.linalg.norm(displacement_m)), 1e-9)
     if scale <= 0 or sigma > MAX_SIGMA_SCALE_NEW_MAP:

@@ -275,7 +275,8 @@ class SegmentGeoreferences:
         displacement_m = self._georeferencer.displacement_by_velocity(since_ns, first.t_ns)
         if displacement_m is None:
             return None
-        start_ned_m = from_ned_m + displacement_m
+        # an unknown climb is taken as none: it is where the map lies, not how large it is
+        start_ned_m = from_ned_m + np.nan_to_num(displacement_m)
         if own is None:
             samples = self._samples(segment, list(segment.keyframes.values()))
             travelled = self._georeferencer.travelled(samples)

@@ -116,7 +116,7 @@ class GimbalHead:
     def body_upright(self, t_ns: int) -> float | None:
         """Cosine of the tilt of the body, which the head has not; None where it is not known."""
         vehicle = self._vehicle.at(t_ns)
-        return None if vehicle is None else max(float(vehicle[2, 2]), 0.0)
+        return None if vehicle is None else float(vehicle[2, 2])
 
     def of_head(self, sample: PositionSample) -> PositionSample:
         """A position as it is for the head; as it was where the body's attitude is not known."""

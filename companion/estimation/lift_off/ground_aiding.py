@@ -41,6 +41,12 @@ whose map is lost there, goes on sinking (see `SHOCK_NS`)."""
 HEIGHT_EVERY_NS, LEAST_HEIGHT_M = 200_000_000, 2.0
 """Lower, what the rotors blow is reflected by the ground, and presses on a barometer."""
 RANGE_EVERY_NS = 100_000_000
+LEAST_UPRIGHT = 0.5
+"""Cosine of the body's tilt; beyond, a rangefinder looks elsewhere than down."""
+UPRIGHT_NS = 500_000_000
+"""The tilt of a frame says nothing of a range that much later."""
+MOST_LATE = 64
+"""Three wait at a time; more only where frames have ceased, and then they are of no use."""
 LATE_NS = 150_000_000
 """Heights and ranges aid that long after their own time. In flight they are newer than the frame
 that comes with them, and navigation knows no time before its last measurement: neither a pose of
@@ -60,11 +66,13 @@ class GroundAiding:
         """Judge of flow at the last lift-off: only flow that has shown it aids."""
         self._held: deque[AidedPlace | AidedHeight] = deque()
         """Of the latest frames while the vehicle stands; empty when it does not."""
-        self._late: deque[AidedHeight | AidedRange] = deque()
+        self._late: deque[AidedHeight | AidedRange] = deque(maxlen=MOST_LATE)
         """In flight, until a frame is newer by LATE_NS."""
         self._takes_ranges = self._takes_heights = False
         """True in flight where no map aids; for a barometer, high enough, too."""
-        self._stood_down_m, self._upright = 0.0, 1.0
+        self._stood_down_m = 0.0
+        self._upright: tuple[int, float] | None = None
+        """Time of the last frame and the cosine of its tilt; None where its attitude is unknown."""
         self._height_ns = self._range_ns = self._flow_ns = 0
         self._map_aided_ns: int | None = None
 
@@ -93,11 +101,16 @@ class GroundAiding:
     def take_range(self, t_ns: int, distance_m: float, upright: float | None = None) -> None:
         """Take the distance to the ground along the body's down axis.
 
-        `upright` is the cosine of the body's tilt where the frames' attitude is not the body's.
+        `upright` is the cosine of the body's tilt where the frames' attitude is not the body's. A
+        range of a body whose tilt is unknown, or that lies on its side, says no height.
         """
-        if self._takes_ranges and t_ns - self._range_ns >= RANGE_EVERY_NS:
+        if not self._takes_ranges or t_ns - self._range_ns < RANGE_EVERY_NS:
+            return
+        if upright is None and self._upright is not None:
+            seen_ns, of_frame = self._upright
+            upright = of_frame if t_ns - seen_ns <= UPRIGHT_NS else None
+        if upright is not None and upright >= LEAST_UPRIGHT:
             self._range_ns = t_ns
-            upright = self._upright if upright is None else upright
             self._late.append(AidedRange(t_ns, distance_m * upright))
 
     def stand(self, t_ns: int, place_m: Array) -> None:
@@ -111,10 +124,10 @@ class GroundAiding:
         while self._held[0].t_ns < t_ns - STANDING_LAG_NS:
             self._body.aid(self._held.popleft())
 
-    def fly(self, t_ns: int, down_m: float, wants: bool, upright: float) -> None:
+    def fly(self, t_ns: int, down_m: float, wants: bool, upright: float | None) -> None:
         """Take a frame of a vehicle that does not stand, by autopilot stamps, at a down coordinate.
 
-        `wants` where it is aided from here; `upright` is the cosine of its tilt.
+        `wants` where it is aided from here; `upright` is the cosine of its tilt, None if unknown.
         """
         if self.stood is not None:
             self._stood_down_m = float(self.stood.place_m[2])
@@ -124,7 +137,8 @@ class GroundAiding:
         self._held.clear()
         while self._late and self._late[0].t_ns <= t_ns - LATE_NS:
             self._body.aid(self._late.popleft())
-        self._takes_ranges, self._upright = wants, max(upright, 0.0)
+        self._takes_ranges = wants
+        self._upright = None if upright is None else (t_ns, upright)
         self._takes_heights = wants and self._stood_down_m - down_m > LEAST_HEIGHT_M
 
     def take_flow(self, measured: GroundVelocity, delay_ns: int) -> bool:

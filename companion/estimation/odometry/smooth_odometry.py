@@ -216,7 +216,7 @@ class SmoothOdometry:
             self.ground.fly(
                 t_ns if attitude is None else attitude.t_ns,
                 float(self._place_now()[2]), self.ground.wants_flow(t_ns),
-                1.0 if attitude is None else float(attitude.ned_from_body[2, 2]),
+                None if attitude is None else float(attitude.ned_from_body[2, 2]),
             )  # fmt: skip
         self.reckoning.begin(t_ns, attitude, self._flown.frame.from_world)
         return self.reckoning.reckoned

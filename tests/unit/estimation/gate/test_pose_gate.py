@@ -478,6 +478,14 @@ def test_a_bridge_goes_on_after_frames_that_came_too_late(late_s: float, resumes
     assert flight.state() is (Sending.BRIDGING if resumes else Sending.OFF)
 
 
+def test_a_pose_with_an_old_velocity_is_not_sent() -> None:
+    """One of unknown certainty is not known: an autopilot would take it all the same."""
+    flight = Flight()
+    flight.run(2)
+    assert not [p for p in flight.run(1, sigma_velocity_m_s=float("inf")) if not p.predicted]
+    assert flight.state() is Sending.OFF
+
+
 def test_none_is_predicted_beyond_the_limit() -> None:
     """Which is of the place apart from the scale."""
     flight = Flight(max_sigma_m=1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -179,6 +181,21 @@ def test_new_map_is_placed_by_velocity() -> None:
     off_m = found.world_from_map.apply(kept[2].map_from_camera.translation) - ned[2]
     assert np.linalg.norm(off_m) < 0.15 * np.linalg.norm(ned[2] - ned[0])
     assert found.sigma_scale > 0.02, "two keyframes are no measure"
+
+
+def test_a_climb_that_no_velocity_tells_does_not_make_a_new_map_small() -> None:
+    """Receivers that tell speed and course only say nothing of the vertical: it is not zero."""
+    kept, ned = places(4)
+    climbed_m = ned[2] - ned[0] - [0.0, 0.0, 5.0]
+    up = TRUTH.inverse().apply(ned[2] - [0.0, 0.0, 5.0])
+    kept[2] = replace(kept[2], map_from_camera=Pose(kept[2].map_from_camera.rotation, up))
+    found = place_new_map(kept[:3], ned[0], np.r_[climbed_m[:2], np.nan], 0.1, "velocity")
+    assert found is not None
+    np.testing.assert_allclose(found.world_from_map.scale, TRUTH.scale, rtol=0.02)
+    level = reference(ned, np.zeros_like(ned), np.tile([0.0, 0.0, np.nan], (2, 1)))
+    travelled = level.travelled(kept[:3])
+    assert travelled is not None
+    assert np.isfinite(travelled[0]).tolist() == [True, True, False]
 
 
 def test_new_map_is_not_placed_without_velocity() -> None:

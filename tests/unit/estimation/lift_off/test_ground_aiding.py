@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from companion.estimation.body.body_filter import BodyFilter
 from companion.estimation.inertial.acceleration_integral import AccelerationIntegral
@@ -31,12 +32,12 @@ class Vehicle:
 
     def go_on(
         self, seconds: float, accelerates_m_s2: Array, tilted_rad: float, flow_hz: Array | None,
-        range_m: float | None = None,
+        range_m: float | None = None, upright: float | None = 1.0,
     ) -> None:  # fmt: skip
         """By its own measurements; its autopilot's pitch is wrong by `tilted_rad`."""
         for _ in range(round(seconds * 1e9 / STEP_NS)):
             self._measure(accelerates_m_s2, tilted_rad)
-            self.ground.fly(self.t_ns, float(self.place_m[2]), True, 1.0)
+            self.ground.fly(self.t_ns, float(self.place_m[2]), True, upright)
             if range_m is not None:
                 self.ground.take_range(self.t_ns, range_m)
             if flow_hz is not None:
@@ -142,3 +143,30 @@ def test_heights_and_ranges_newer_than_a_frame_take_its_pose_from_it_at_no_time(
         assert vehicle.navigation.at(vehicle.t_ns - exposed_ns) is not None
         assert vehicle.navigation.at(vehicle.t_ns - exposed_ns - STEP_NS // 2) is not None
     assert vehicle.navigation.over_ground()[1] < 0.15  # they did aid
+
+
+@pytest.mark.parametrize("upright", [None, -1.0, 0.3])
+def test_a_range_of_a_body_whose_tilt_is_unknown_or_that_lies_on_its_side_says_no_height(
+    upright: float | None,
+) -> None:
+    """Taken as upright, or as none at all, it would move the body: it sees 1 m more, or 0 m."""
+    unaided, aided = Vehicle(), Vehicle()
+    for _ in range(40):
+        climbs_m_s2 = np.array([0.0, 0.0, -1.0])
+        height_m = STOOD_M[2] + LEGS_M - float(aided.place_m[2])
+        unaided.go_on(STEP_NS * 1e-9, climbs_m_s2, 0.0, None)
+        aided.go_on(STEP_NS * 1e-9, climbs_m_s2, 0.0, None, height_m + 0.2, upright)
+    assert np.array_equal(aided.place_m, unaided.place_m)
+    aided.go_on(STEP_NS * 1e-9, climbs_m_s2, 0.0, None, height_m + 0.2)
+    aided.go_on(0.5, climbs_m_s2, 0.0, None, height_m + 0.2)
+    unaided.go_on(0.5 + STEP_NS * 1e-9, climbs_m_s2, 0.0, None)
+    assert not np.array_equal(aided.place_m, unaided.place_m)
+
+
+def test_ranges_after_the_last_frame_are_of_no_use_nor_kept() -> None:
+    vehicle = Vehicle()
+    vehicle.go_on(1.0, np.array([0.0, 0.0, -1.0]), 0.0, None)
+    for k in range(1000):
+        vehicle.ground.take_range(vehicle.t_ns + k * 100_000_000, 0.7)
+        vehicle.ground.take_height(vehicle.t_ns + k * 200_000_000, 0.7, True)
+    assert len(vehicle.ground._late) <= 6
