@@ -11,12 +11,13 @@ from dataclasses import astuple, replace
 import numpy as np
 
 from companion.config import Config
-from companion.estimation.attitude.camera_attitude import AttitudeCheck, CameraAttitude
-from companion.estimation.attitude.keyframe_attitudes import clear_since, correct_mount
-from companion.estimation.body.body_filter import BodyFilter, Reckoned
-from companion.estimation.body.reckoning import BodyAttitude
+from companion.estimation.attitude.camera_attitude import CameraAttitude
+from companion.estimation.attitude_checks import AttitudeChecks
+from companion.estimation.body.body_filter import BodyFilter
+from companion.estimation.body_odometry import BodyOdometry
 from companion.estimation.camera_motion import CameraMotion
 from companion.estimation.checkpoint import Checkpoint
+from companion.estimation.flow_of_frames import FlowOfFrames
 from companion.estimation.georeference.georeferencer import Georeferencer
 from companion.estimation.georeference.segment_georeference import SegmentGeoreferences
 from companion.estimation.gimbal.gimbal_head import GimbalHead
@@ -25,7 +26,6 @@ from companion.estimation.inertial.judged_acceleration import JudgedAcceleration
 from companion.estimation.lift_off.optical_flow import FlowMeter
 from companion.estimation.lift_off.standing import Standing
 from companion.estimation.map_resumption import MAP_RESUMED, MapResumption
-from companion.estimation.odometry.odometry_frame import MapView
 from companion.estimation.odometry.smooth_odometry import SmoothOdometry
 from companion.estimation.satellites.satellite_watch import SatelliteWatch
 from companion.estimation.shutter.shutter_of_frames import ShutterOfFrames
@@ -44,10 +44,8 @@ from companion.messages import (
     KeyframeAdded,
     MapUpdate,
     Message,
-    Odometry,
     Track,
     TrackState,
-    Warned,
 )
 from companion.slam.loop.loop_closure import LoopClosure
 from companion.slam.map.site_map import SiteMap
@@ -64,7 +62,6 @@ MAX_HEAD_TURN_RAD = np.radians(10.0)
 """Of a gimbal's head from where images have it to where it says it is: at 15 frames/s one that
 begins to turn by 90 degrees a second is 6 degrees off."""
 PRUNE_PERIOD_NS = 60_000_000_000
-NO_CLIMB = "at lift-off it sees another motion than the accelerometers measure; check mount.*"
 
 
 class LocalisationStage:
@@ -95,16 +92,27 @@ class LocalisationStage:
         self._acceleration = AccelerationIntegral(
             None if camera.gimbal is None else np.array(camera.gimbal.place_body_m)
         )
-        self._body = BodyFilter(self._acceleration)
         self._standing = Standing()
-        self._odometry = SmoothOdometry(
-            camera, config.feedback.max_jump_m, self._body, config.feedback.min_quality
+        body = BodyFilter(self._acceleration)
+        self._smooth = SmoothOdometry(
+            camera, config.feedback.max_jump_m, body, config.feedback.min_quality
         )
         self._georeferences = SegmentGeoreferences(
             self._georeferencer, self._attitude, self._acceleration, camera.body_from_camera
         )
+        self._odometry = BodyOdometry(
+            self._tracker, self._attitude, self._gimbal, self._motion, self._georeferencer,
+            self._georeferences, body, self._smooth,
+        )  # fmt: skip
+        self._checks = AttitudeChecks(
+            self._attitude, self._tracker, self._motion, self._georeferences, self._smooth
+        )
         self._imu = JudgedAcceleration(self._acceleration, self._withdraw_accelerations)
-        self._flow = FlowMeter(camera)
+        flow = FlowMeter(camera)
+        self._flow = FlowOfFrames(
+            config.feedback.flow != "off" and self._gimbal is None, flow, self._smooth.ground,
+            self._attitude, self._checks, times,
+        )  # fmt: skip
         self._satellites = SatelliteWatch(
             camera.camera_from_body, camera.body_from_camera is not None and not camera.assumed
         )
@@ -112,7 +120,7 @@ class LocalisationStage:
         self._margin = TrackingMargin(camera, config.features.n_features)
         self._t_ns = 0
         self._telemetry = TelemetryIntake(
-            config.telemetry.use, self._gimbal, self._standing, self._flow, self._odometry.ground,
+            config.telemetry.use, self._gimbal, self._standing, flow, self._smooth.ground,
             self._imu, self._satellites, self._attitude, self._georeferencer,
             self._georeferences.depths,
         )  # fmt: skip
@@ -121,10 +129,10 @@ class LocalisationStage:
         self._pruned_ns: int | None = None
         self._resumption = MapResumption(
             camera, config.features, self._tracker, self._attitude, self._motion,
-            self._georeferences, self._odometry,
+            self._georeferences, self._smooth,
         )  # fmt: skip
         self._tracker.atlas.loop_allowed = self._loop_allowed
-        self._georeferences.reckoned_at = self._odometry.reckoning.path.at
+        self._georeferences.reckoned_at = self._smooth.reckoning.path.at
         self._tracker.atlas.displacements_of = self._georeferences.displacements_of
         self._site = SiteInFlight(site, self._tracker, self._georeferencer, self._georeferences)
 
@@ -228,7 +236,7 @@ class LocalisationStage:
                     said = shutter.end(self._tracker.view_of(frame.seq), self._tracker.map)
                 yield from said
             yield self._frame_tracked(frame.t_ns, frame.seq, has_picture=True)
-        yield from self._flow_of(frame)
+        yield from self._flow.of(frame)
 
     def _without_frame(self, overdue: FrameOverdue) -> Iterator[Message]:
         """The pose by inertial navigation alone, where that is known."""
@@ -237,10 +245,10 @@ class LocalisationStage:
             return
         with self._tracker.map_lock.tracking():
             self._take_samples()
-            self._apply_map_correction()
-            found = self._odometry.without_frame(overdue.seq, t_ns, self._body_attitude(t_ns))
+            self._odometry.apply_map_correction()
+            found = self._odometry.without_frame(overdue.seq, t_ns)
             if found is not None:
-                yield self._given(found)
+                yield found
             self._prune(t_ns)
             yield self._frame_tracked(t_ns, overdue.seq, has_picture=False)
 
@@ -252,27 +260,9 @@ class LocalisationStage:
             None if origin is None or not self._site.in_use else astuple(origin),
         )  # fmt: skip
 
-    def _flow_of(self, frame: Frame) -> Iterator[Message]:
-        """Optical flow for the autopilot, and for the way from a lift-off to a metric map."""
-        asked, wanted = (
-            self._config.feedback.flow != "off" and self._gimbal is None,
-            self._odometry.ground.wants_flow(frame.t_ns),
-        )
-        if not asked and not wanted:
-            return
-        with self._times("optical flow"):
-            flow = self._flow.step(frame, self._attitude)
-        if wanted and self._flow.over_ground is not None:
-            delay_ns = self._attitude.imu_delay_ns
-            if self._odometry.ground.take_flow(self._flow.over_ground, delay_ns):
-                checked = self._attitude.contradicted(frame.t_ns, NO_CLIMB)
-                yield from self._apply_check(checked, self._tracker.map)
-        if asked:
-            yield flow
-
     def _tracked(self, frame: Frame) -> Iterator[Message]:
         attitude = self._attitude.at(frame.t_ns)
-        self._apply_map_correction()
+        self._odometry.apply_map_correction()
         if (
             self._gimbal is not None
             and attitude is not None
@@ -282,18 +272,16 @@ class LocalisationStage:
         stands = self._standing.at(frame.t_ns, frame.grey)
         if stands and self.state is TrackState.INITIALISING:
             self._tracker.stand()
-        stands_at = self._georeferencer.newest_place if stands else None
-        reckoned = self._odometry.begin(
-            frame.t_ns, self._body_attitude(frame.t_ns), stands, stands_at
-        )
-        predicted = self._predicted(frame.t_ns, attitude, reckoned)
+        reckoned = self._odometry.begin(frame.t_ns, stands)
+        predicted = self._odometry.predicted(frame.t_ns, attitude, reckoned)
         before = self._tracker.map
         aligned = predicted is not None and attitude is not None and self._motion.aligned
         rotation_in_map = predicted.rotation if predicted is not None and aligned else None
         tracked = self._tracker.step(frame, Prior(predicted, attitude, rotation_in_map))
         other_map = self._tracker.map is not before
         if other_map or self.state is TrackState.INITIALISING:
-            self._reset_motion()
+            self._motion.reset()
+            self._attitude.reset()
         # another map must be georeferenced before its first pose is published
         update = self._map_update() if other_map and self._segments() else None
         seen: Pose | None = None
@@ -317,7 +305,7 @@ class LocalisationStage:
                         message.t_ns, self._tracker.map.first_keyframe_id, message.map_from_camera,
                         self._georeferences.of(self._tracker.map),
                     )  # fmt: skip
-                    yield self._odometry_of(message)
+                    yield self._odometry.of_track(message)
                 placed = self._georeferences.main_from_newest.apply_to_pose(message.map_from_camera)
                 yield replace(message, map_from_camera=placed)
             elif isinstance(message, Track):
@@ -325,7 +313,7 @@ class LocalisationStage:
                     message, predicted, self._georeferences.of(self._tracker.map),
                     self._attitude.at(message.t_ns) is not None,
                 )  # fmt: skip
-                yield self._odometry_of(dead_reckoned or message)
+                yield self._odometry.of_track(dead_reckoned or message)
                 yield (
                     message
                     if dead_reckoned is None
@@ -357,7 +345,7 @@ class LocalisationStage:
                 tracker.view_of(frame.seq), tracker.map, tracker.n_features, tracker.feature_ratio,
                 tracker.drowned,
             )  # fmt: skip
-        yield from self._check_attitude(frame.t_ns)
+        yield from self._checks.check(frame.t_ns)
         if self._gimbal is not None and self._attitude.used:
             yield from self._gimbal.warnings(frame.t_ns, attitude is not None)
         self._prune(frame.t_ns)
@@ -373,98 +361,13 @@ class LocalisationStage:
         self._georeferencer.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
         self._acceleration.prune(t_ns - TELEMETRY_KEPT_NS, when_ns)
 
-    def _reset_motion(self) -> None:
-        """Clear motion state after another map became active."""
-        self._motion.reset()
-        self._attitude.reset()
-
     def _map_update(self) -> MapUpdate:
         with self._times("georeference"):
             return self._georeferences.update(self._segments(), self._t_ns, final=False)
 
-    def _apply_map_correction(self) -> None:
-        """Move the motion state with corrections of the map."""
-        segment = self._tracker.map
-        moved = self._motion.follow(segment)
-        if moved is not None:
-            self._odometry.correct_map(segment.first_keyframe_id, *moved)
-
-    def _predicted(
-        self, t_ns: int, attitude: Array | None, reckoned: Reckoned | None
-    ) -> Pose | None:
-        """Predicted pose in the active segment; None when unknown."""
-
-        def place_of(rotation: Array) -> Array | None:
-            assert reckoned is not None
-            return self._odometry.place_in_map(reckoned.place_m, rotation)
-
-        return self._motion.predicted(
-            t_ns, attitude, self._georeferences.of(self._tracker.map),
-            None if reckoned is None else place_of, self._georeferencer.displacement_by_velocity,
-        )  # fmt: skip
-
-    def _odometry_of(self, track: Track) -> Odometry:
-        """Odometry of a track of the active segment, in its own frame."""
-        segment = self._tracker.map
-        first = segment.keyframes.get(segment.first_keyframe_id)
-        odometry = self._odometry.step(
-            track, segment.first_keyframe_id, self._georeferences.of(segment),
-            self._motion.velocity,
-            None if first is None else MapView(first.t_ns, first.camera_from_map.inverse()),
-        )  # fmt: skip
-        return self._given(odometry)
-
-    def _given(self, odometry: Odometry) -> Odometry:
-        """Odometry as it is given out: of the body."""
-        odometry = replace(odometry, refused=self._body.n_refused)
-        if self._gimbal is None:
-            return odometry
-        attitude = None if self._attitude.doubted else self._body_attitude(odometry.t_ns)
-        return self._gimbal.body_of(odometry, None if attitude is None else attitude.ned_from_body)
-
-    def _body_attitude(self, t_ns: int) -> BodyAttitude | None:
-        """Attitude of the body at a frame, where the autopilot's is that of the camera.
-
-        With a gimbal it is that of its head.
-        """
-        ned_from_camera = self._attitude.at(t_ns)
-        if ned_from_camera is None:
-            return None
-        mount = self._attitude.correction[0]
-        return BodyAttitude(t_ns + self._attitude.imu_delay_ns, ned_from_camera @ mount.T)
-
-    def _check_attitude(self, t_ns: int) -> list[Warned]:
-        if not self._attitude.due(t_ns):
-            return []
-        segment = self._tracker.map
-        placed = self._georeferences.of(segment)
-
-        def rotation_of(keyframe_id: int) -> Array | None:
-            pose = segment.pose_of(keyframe_id)
-            return None if pose is None else pose.rotation.T
-
-        checked = self._attitude.check(
-            t_ns, rotation_of, None if placed is None else placed.world_from_map.rotation
-        )
-        return self._apply_check(checked, segment)
-
-    def _apply_check(self, checked: AttitudeCheck, segment: SlamMap) -> list[Warned]:
-        if checked.now_from_before is not None:
-            correct_mount(self._tracker.segments, checked.now_from_before)
-        if checked.before_from_now_ned is not None:
-            self._motion.correct_attitude(checked.before_from_now_ned)
-        if checked.invalid_since_ns is not None:
-            self._motion.discard_alignment()
-            clear_since(self._tracker.segments, checked.invalid_since_ns)
-        if checked.reinitialise:
-            self._tracker.reinitialise(checked.n_reinitialised, keep=not checked.young)
-            self._reset_motion()
-            self._odometry.discard_map(segment.first_keyframe_id, checked.tilt_rad)
-        return checked.warnings
-
     def _withdraw_accelerations(self, since_ns: int) -> None:
         """Forget what accelerations since a time gave: they were wrong."""
-        self._odometry.forget_reckoned()
+        self._smooth.forget_reckoned()
         self._georeferences.withdraw_accelerations(since_ns)
 
     def _loop_allowed(self, keyframe: Keyframe, other: Keyframe, found: LoopClosure) -> bool:

@@ -84,14 +84,14 @@ class Truth:
 
 def watch_innovations(stage: LocalisationStage, found: Squares) -> None:
     """Keep squared innovations of a stage's filter of the body as they come."""
-    corrected = stage._body._corrected
+    corrected = stage._smooth._course.body._corrected
 
     def watched(state: BodyState, model: Model) -> tuple[BodyState | None, float]:
         after, squared = corrected(state, model)
         found[f"NIS {model.kind.value}"].append(squared)
         return after, squared
 
-    stage._body._corrected = watched  # type: ignore[method-assign]
+    stage._smooth._course.body._corrected = watched  # type: ignore[method-assign]
 
 
 def fly(path: Path, denied: bool, seed: int, settings: list[str]) -> Squares:

@@ -43,10 +43,10 @@ OF_FRAME = {
     "  local map": SLAM + "tracking.frame_tracker:FrameTracker.update_local_map",
     "keyframe decision": SLAM + "tracking.tracker:Tracker._needs_keyframe",
     "telemetry": ESTIMATION + "localisation:LocalisationStage._take_samples",
-    "attitude, checked": ESTIMATION + "localisation:LocalisationStage._check_attitude",
-    "odometry": ESTIMATION + "localisation:LocalisationStage._odometry_of",
+    "attitude, checked": ESTIMATION + "attitude_checks:AttitudeChecks.check",
+    "odometry": ESTIMATION + "body_odometry:BodyOdometry.of_track",
     "motion filter": ESTIMATION + "motion_filter:MotionFilter.correct",
-    "corrections of the map": ESTIMATION + "localisation:LocalisationStage._apply_map_correction",
+    "corrections of the map": ESTIMATION + "body_odometry:BodyOdometry.apply_map_correction",
     "shutter": ESTIMATION + "shutter.shutter_of_frames:ShutterOfFrames.end",
     "site map": ESTIMATION + "site.site_in_flight:SiteInFlight.frame",
 }

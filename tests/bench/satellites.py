@@ -39,19 +39,22 @@ class Seen(NamedTuple):
     placed: Georeference | None
 
 
-class _Seeing(LocalisationStage):
-    """Keeps what the watch gets of each frame."""
+def _watch(stage: LocalisationStage) -> list[Seen]:
+    """What the watch gets of each frame, kept as it comes."""
+    seen: list[Seen] = []
+    of_track = stage._odometry.of_track
 
-    seen: list[Seen]
-
-    def _odometry_of(self, track: Track) -> Odometry:
+    def seeing(track: Track) -> Odometry:
         if track.map_from_camera is not None:
-            segment = self._tracker.map
-            self.seen.append(
+            segment = stage._tracker.map
+            seen.append(
                 Seen(track.t_ns, segment.first_keyframe_id, track.map_from_camera,
-                     self._georeferences.of(segment))
+                     stage._georeferences.of(segment))
             )  # fmt: skip
-        return super()._odometry_of(track)
+        return of_track(track)
+
+    stage._odometry.of_track = seeing  # type: ignore[method-assign]
+    return seen
 
 
 def _silent(samples: Samples, span: Span) -> Samples:
@@ -124,13 +127,13 @@ def main() -> None:
     for path in arguments.flights:
         flight = open_flight(path, config.camera, config.telemetry)
         samples = list(flight.telemetry().samples)
-        stage = _Seeing(config, flight.camera, StageTimes())
-        stage.seen = []
+        stage = LocalisationStage(config, flight.camera, StageTimes())
+        seen = _watch(stage)
         frames = flight.frames(flight.start_ns, flight.stop_ns)
         for message in in_order_of_time(samples, frames):
             for _ in stage.step(message):
                 pass
-        placed = [each.t_ns for each in stage.seen if each.placed is not None]
+        placed = [each.t_ns for each in seen if each.placed is not None]
         if not placed:
             print(f"| {path.name} | no metric map |")
             continue
@@ -139,7 +142,7 @@ def main() -> None:
         span = Span(placed[0], placed[-1])
         for fault in TRIED:
             said, nearest = watched(
-                stage.seen, fault.telemetry(samples, span), camera.camera_from_body, calibrated
+                seen, fault.telemetry(samples, span), camera.camera_from_body, calibrated
             )
             words = "; ".join(
                 f"{1e-9 * (each.t_ns - span.fault_ns):.1f} s {each.what} ({each.detail})"

@@ -1,0 +1,99 @@
+"""Starts of the smooth odometry in a map: a new one, a stored one, one that is seen again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.estimation.odometry.odometry_course import OdometryCourse
+from companion.estimation.odometry.odometry_frame import MapView, OdometryState
+from companion.estimation.odometry.placed_map import PlacedMap, frame_of
+from companion.estimation.odometry.stand import Stand
+from companion.geometry.transforms import Pose
+from companion.messages import Georeference, Track
+
+YOUNG_NS = 2_000_000_000
+"""A map of a take-off grows by ten keyframes a second, and their adjustment lags behind: until then
+it bends. Flown on at once in the firmwares' simulators, poses were off by 0.7 m after four metres
+of climb in one take-off of three, with 0.1 m stated."""
+CONTRADICTS_SIGMAS = 4.0
+"""Beyond, a new map that is off from inertial navigation is wrong, not navigation; what that was
+off by without aid in the firmwares' simulators was 2.5 of them at most."""
+MAX_SIGMA_SCALE_AIDING = 0.05
+"""Of a map that aids inertial navigation: with a worse scale it would give a wrong velocity."""
+
+
+class MapStarts:
+    """Goes on in another map than that of the pose before."""
+
+    def __init__(self, course: OdometryCourse, stand: Stand) -> None:
+        self._course, self._stand = course, stand
+
+    def start(
+        self, segment: int, georeference: Georeference, track: Track, pose: Pose,
+        first: MapView | None,
+    ) -> bool:  # fmt: skip
+        """Start in another map, or the first one, where that is good enough yet: see `frame_of`.
+
+        False also where it contradicts inertial navigation, which is certain enough to know better:
+        by a wrong mount, say. Flown on in the firmwares' simulators, such maps took the vehicle
+        away.
+        """
+        course = self._course
+        reckoned, last = course.reckoning.reckoned, course.flown.last
+        goes_on = reckoned is not None or course.given
+        if goes_on and georeference.sigma_scale > MAX_SIGMA_SCALE_AIDING:
+            return False  # it would also be slower and faster than the body
+        if first is not None and track.t_ns - first.t_ns < YOUNG_NS and course.reckoning.is_good:
+            return False
+        placed = PlacedMap(segment, georeference, course.flown.camera_from_body)
+        frame, goes_on, off_m = frame_of(
+            placed, pose, first, course.flown.frame,
+            None if first is None else course.reckoning.path.at(first.t_ns),
+            None if reckoned is None else reckoned.place_m,
+            None if last is None else last.place_m, course.gate.max_jump_m,
+        )  # fmt: skip
+        if (
+            not goes_on and off_m is not None and not georeference.has_origin
+            and reckoned is not None and off_m > CONTRADICTS_SIGMAS * reckoned.sigma_place_m
+        ):  # fmt: skip
+            return False
+        self._stand.in_world |= georeference.has_origin
+        if not goes_on:
+            course.reset_counter += course.given
+            course.drift.clear()
+            if last is not None and georeference.has_origin:
+                course.body.reset()
+        course.reckoning.path.clear()
+        course.flown.begin(placed, frame, pose)
+        course.dead_reckoning = False
+        course.gate.clear()
+        return True
+
+    def resume(self, segment: int, georeference: Georeference, state: OdometryState) -> None:
+        """Continue in a stored frame; `segment` and `georeference` are of the map stored with it.
+
+        The next pose is taken as is, since the motion meanwhile is unknown.
+        """
+        course = self._course
+        placed = PlacedMap(segment, georeference, course.flown.camera_from_body)
+        course.flown.resume(placed, state.odometry_from_world, state.anchored)
+        course.dead_reckoning = False
+        course.gate.clear()
+        course.drift.clear()
+        course.body.reset()
+
+    def reacquire(self, raw: Pose, t_ns: int) -> None:
+        """Reacquisition after dead reckoning: continue from its pose, if close enough.
+
+        What the pose, the body's in the world, is then off by is slewed away.
+        """
+        course, last = self._course, self._course.flown.last
+        course.dead_reckoning = False
+        if last is None:
+            return
+        expected = last.place_m + course.velocity * ((t_ns - last.t_ns) * 1e-9)
+        if course.reckoning.reckoned is not None:
+            expected = course.reckoning.reckoned.place_m
+        correction = expected - (course.flown.frame.from_world @ raw).translation
+        if float(np.linalg.norm(correction)) < course.gate.max_jump_m:
+            course.flown.frame = course.flown.frame.shifted(correction)
