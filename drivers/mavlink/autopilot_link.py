@@ -15,7 +15,6 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.advice.imu_room import imu_room
 from companion.config import LinkConfig
 from companion.geometry.geodesy import GeoOrigin
 from companion.health import SourceHealth
@@ -28,23 +27,22 @@ from companion.timing.link_clock import ClockFilter
 from drivers.mavlink.clock_exchange import ClockExchange
 from drivers.mavlink.commands import (
     AUTOPILOT,
-    NO_ANSWER,
+    REFUSALS,
     TRIES,
     Commands,
     command_at,
     command_long,
 )
-from drivers.mavlink.imu_rate import ImuNews, ImuRate
-from drivers.mavlink.message_rates import MessageRates
 from drivers.mavlink.other_companion import OtherCompanion
+from drivers.mavlink.rate_requests import RateRequests
 from drivers.mavlink.status_text import TextLimit, status_text
-from drivers.mavlink.vehicle import Vehicle, is_autopilot, vehicle_of
+from drivers.mavlink.vehicle import Firmware, Vehicle, is_autopilot, vehicle_of
 from drivers.mavlink.wire.message_port import MavlinkPort
 from drivers.mavlink.wire.wire import run_together
 from drivers.system.within import within
 from drivers.telemetry.gimbal_messages import GIMBAL_IDS
 from drivers.telemetry.live_samples import LiveSamples
-from drivers.telemetry.mavlink_samples import READERS, landed, wanted
+from drivers.telemetry.mavlink_samples import READERS, landed
 
 FIRST_SYSTEM = 1
 """System id that we use until the vehicle is heard: on UDP it may send only then."""
@@ -53,9 +51,6 @@ WATCH_S, ORIGIN_S = 0.1, 5.0
 ANSWER_S, REQUEST_S = 1.0, 0.4
 TIMESYNC_S = 0.1
 """Interval of requests, as PX4's own."""
-REFUSALS = (
-    mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
-)  # fmt: skip
 COUNTED = {
     *READERS,
     *GIMBAL_IDS,
@@ -89,8 +84,7 @@ class AutopilotLink:
         self.samples = LiveSamples(self.clock_filter, deliver, warn)
         self._meter = SourceMeter("autopilot")
         self._rates: defaultdict[str, RateMeter] = defaultdict(RateMeter)
-        self._wanted = MessageRates(wanted(config, on_gimbal))
-        self._imu = ImuRate() if config.imu_hz == "auto" else None
+        self._requests = RateRequests(config, port, clock, warn, self._request_rate, on_gimbal)
         self._commands = Commands(self.send)
         self._text_limit = TextLimit()
         self.system_status: int = mavlink.MAV_STATE_BOOT
@@ -107,8 +101,6 @@ class AutopilotLink:
         self._armed: bool | None = None
         self._n_reboots = 0
         self._strangers: set[int] = set()
-        self._missing: set[int] = set()
-        self._said_of_imu = ""
         port.identity = (config.system_id or FIRST_SYSTEM, config.component_id)
         self._on: dict[int, Take] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._take_heartbeat,
@@ -124,7 +116,7 @@ class AutopilotLink:
             self._say_heartbeats(),
             self._compare_clocks(),
             self._watch(),
-            self._ask_for_messages(),
+            self._requests.run(self._firmware),
             self._ask_for_origin(),
         )
 
@@ -248,11 +240,9 @@ class AutopilotLink:
                 self.samples.take_gimbal(message, receive_ns)
             return
         self._heard(receive_ns)
-        if self._imu is not None:
-            self._imu.heard(kind)
+        self._requests.came(kind, kind in COUNTED)
         if kind in COUNTED:
             self._rates[message.get_type()].add(receive_ns)
-            self._wanted.came(kind)
         own = self._on.get(kind)
         if own is not None:
             own(message, receive_ns)
@@ -284,7 +274,7 @@ class AutopilotLink:
             detail = f"after {silent_s:.1f} s"
             self._warn(Warned(now_ns, "autopilot heard again", detail, good=True))
             self._meter.n_reopened += 1
-            self._restart_rates(rebooted=False)
+            self._requests.restart(rebooted=False)
         self.alive = True
         self._heard_ns = max(self._heard_ns, now_ns)
         self._meter.came(now_ns)
@@ -304,13 +294,8 @@ class AutopilotLink:
     def _rebooted(self, now_ns: int) -> None:
         self._n_reboots = self.clock_filter.n_reboots
         self._clocks.restart()
-        self._restart_rates(rebooted=True)
+        self._requests.restart(rebooted=True)
         self._warn(Warned(now_ns, "autopilot rebooted", "its boot time went back"))
-
-    def _restart_rates(self, rebooted: bool) -> None:
-        self._wanted.restart()
-        if self._imu is not None:
-            self._imu.restart(rebooted)
 
     # -- what is done in turn --------------------------------------------------------------------
 
@@ -344,46 +329,15 @@ class AutopilotLink:
                 detail = f"nothing for {silent_s:.1f} s{where}"
                 self._warn(Warned(now_ns, "autopilot silent", detail))
 
-    async def _ask_for_messages(self) -> None:
-        while True:
-            now_ns = self._clock.now_ns()
-            if not self.alive:
-                self._wanted.skip(now_ns)
-            elif (due := self._wanted.due(now_ns)) is not None:
-                await self._ask_for(*due)
-                continue
-            elif self._imu is not None and self.vehicle is not None:
-                capacity, firmware = self.port.capacity_bytes_per_s, self.vehicle.firmware
-                news = self._imu.step(self._wanted, imu_room(self._config, capacity, firmware))
-                self._tell_of_imu(news, now_ns)
-            await asyncio.sleep(WATCH_S)
-
-    def _tell_of_imu(self, news: ImuNews | None, now_ns: int) -> None:
-        if news is not None and news.detail != self._said_of_imu:
-            self._said_of_imu = news.detail
-            self._warn(Warned(now_ns, news.what, news.detail))
-
-    async def _ask_for(self, message_id: int, rate_hz: float) -> None:
-        """Request a message at a rate; at 0, what the autopilot sends by itself."""
-        interval_us = 1e6 / rate_hz if rate_hz else 0.0
-        result = await self.command(
+    async def _request_rate(self, message_id: int, interval_us: float) -> int:
+        return await self.command(
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us,
             timeout_s=REQUEST_S, tries=2,
         )  # fmt: skip
-        if result == NO_ANSWER and not rate_hz:
-            await asyncio.sleep(WATCH_S)
-            return
-        now_ns = self._clock.now_ns()
-        refused = result in REFUSALS
-        self._wanted.asked(message_id, refused, now_ns)
-        if refused and self._imu is not None and message_id in self._imu.ids:
-            self._tell_of_imu(self._imu.refused(message_id), now_ns)
-        elif refused and message_id not in self._missing:
-            self._missing.add(message_id)
-            name = mavlink.mavlink_map[message_id].msgname
-            self._warn(Warned(now_ns, "autopilot does not send a message", name))
-        if result == NO_ANSWER:
-            await asyncio.sleep(WATCH_S)
+
+    def _firmware(self) -> Firmware | None:
+        """That of the autopilot; None while it is not heard."""
+        return self.vehicle.firmware if self.alive and self.vehicle else None
 
     async def _ask_for_origin(self) -> None:
         """Request the origin: it is sent once, possibly before we listened."""
@@ -402,5 +356,5 @@ class AutopilotLink:
             return ""
         report = self.clock_filter.report()
         clock = "clock not known" if report is None else f"clock ±{report.sigma_ms:.1f} ms"
-        parts = [str(self.vehicle), clock, str(self._imu or "")]
+        parts = [str(self.vehicle), clock, str(self._requests)]
         return ", ".join(part for part in parts if part)

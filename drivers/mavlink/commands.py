@@ -13,6 +13,9 @@ from drivers.system.within import within
 
 NO_ANSWER = -1
 """Result of a command that was never acknowledged."""
+REFUSALS = (
+    mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED,
+)  # fmt: skip
 TRIES = 3
 MOST_PATIENCE_S = 30.0
 """Longest wait after an acknowledgement "in progress"."""
