@@ -20,12 +20,14 @@ demo: opencl
 # more, one after the other: a machine that others use too may be too busy for one, and in some files
 # one flight goes through all tests.
 test: lint opencl
-	$(BIN)/pytest -m "not real_time" $(THREE)
-	$(BIN)/pytest -m "real_time and not alone" $(THREE) || $(ONCE_MORE)
+	$(BIN)/pytest -m "not real_time" --ignore tests/live --ignore tests/system $(THREE)
+	$(BIN)/pytest -m "real_time and not alone" tests/live $(REAL_TIME) $(THREE) || $(ONCE_MORE)
 	$(BIN)/pytest tests/system tests/firmware || $(ONCE_MORE)
 
 # In the order in which they are found, which is that of tests/conftest.py: the longest files first.
 THREE = -n 3 --dist loadfile --no-loadscope-reorder
+# Files that are not asked for are not imported: that takes each worker six seconds and more.
+REAL_TIME = $(shell grep -rl --include='test_*.py' real_time tests/unit tests/replay)
 ONCE_MORE = { [ $$? -eq 1 ] && $(BIN)/pytest -m real_time $$($(FAILED_FILES)); }
 FAILED_FILES := $(BIN)/python -c "import json; \
   failed = json.load(open('.pytest_cache/v/cache/lastfailed')); \

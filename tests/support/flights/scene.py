@@ -58,29 +58,32 @@ class PlaneWorld:
             size = rng.uniform(4, 8)
             rectangle = np.array([north, east, north + size, east + size])
             self._planes.append((-1.5 - 0.5 * k, rectangle, texture(rng)))
+        self._rays: dict[Camera, Array] = {}
+
+    def rays_of(self, camera: Camera) -> Array:
+        """Rays (H * W, 3) of its pixels, z 1; kept of each camera."""
+        if camera not in self._rays:
+            u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+            flat = camera.normalise(np.stack([u.ravel(), v.ravel()], 1).astype(float))
+            self._rays[camera] = np.c_[flat, np.ones(len(flat))]
+        return self._rays[camera]
 
     def render(self, camera: Camera, world_from_camera: Pose) -> tuple[Bytes, Floats]:
         """Grey image and z-depth (0: nothing) of an undistorted or distorted camera."""
-        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        n = camera.normalise(np.stack([u.ravel(), v.ravel()], 1).astype(float))
-        rays = np.c_[n, np.ones(len(n))] @ world_from_camera.rotation.T
+        rays = self.rays_of(camera) @ world_from_camera.rotation.T
+        to_north, to_east, to_down = np.ascontiguousarray(rays.T)
         centre = world_from_camera.translation
-        image = np.full(len(n), 128.0)
-        depth = np.full(len(n), np.inf)
+        image = np.full(len(rays), 128.0)
+        depth = np.full(len(rays), np.inf)
         for height, (n0, e0, n1, e1), pattern in self._planes:
             with np.errstate(divide="ignore", invalid="ignore"):
-                z = (height - centre[2]) / rays[:, 2]
-                hit = centre + z[:, None] * rays
-            ok = (
-                (z > 0.1)
-                & (z < depth)
-                & (hit[:, 0] > n0)
-                & (hit[:, 0] < n1)
-                & (hit[:, 1] > e0)
-                & (hit[:, 1] < e1)
-            )
-            texel = np.mod(hit[ok, :2] / self._metres_per_texel, len(pattern) - 2)
-            image[ok] = _sample(pattern, texel)
+                z = (height - centre[2]) / to_down
+                north, east = centre[0] + z * to_north, centre[1] + z * to_east
+            ok = (z > 0.1) & (z < depth) & (north > n0) & (north < n1) & (east > e0) & (east < e1)
+            if not ok.any():
+                continue
+            hit = np.stack([north[ok], east[ok]], 1)
+            image[ok] = _sample(pattern, np.mod(hit / self._metres_per_texel, len(pattern) - 2))
             depth[ok] = z[ok]
         depth[~np.isfinite(depth)] = 0
         shape = (camera.height, camera.width)
@@ -90,13 +93,12 @@ class PlaneWorld:
 def _sample(pattern: Bytes, texel: Array) -> Array:
     i = np.floor(texel).astype(int)
     f = texel - i
-    p = pattern.astype(np.float64)
     i1 = i + 1
     out: Array = (
-        p[i[:, 0], i[:, 1]] * (1 - f[:, 0]) * (1 - f[:, 1])
-        + p[i1[:, 0], i[:, 1]] * f[:, 0] * (1 - f[:, 1])
-        + p[i[:, 0], i1[:, 1]] * (1 - f[:, 0]) * f[:, 1]
-        + p[i1[:, 0], i1[:, 1]] * f[:, 0] * f[:, 1]
+        pattern[i[:, 0], i[:, 1]] * (1 - f[:, 0]) * (1 - f[:, 1])
+        + pattern[i1[:, 0], i[:, 1]] * f[:, 0] * (1 - f[:, 1])
+        + pattern[i[:, 0], i1[:, 1]] * (1 - f[:, 0]) * f[:, 1]
+        + pattern[i1[:, 0], i1[:, 1]] * f[:, 0] * f[:, 1]
     )
     return out
 

@@ -69,13 +69,20 @@ class Ground:
     def __init__(self, rng: np.random.Generator) -> None:
         self._world, self._grass = PlaneWorld(rng), texture(rng)
         self._rng = rng
+        self._newest: tuple[Pose, Array] | None = None
+        """What was seen last, from where: the same while the vehicle stands."""
 
     def picture(self, camera: Camera, world_from_camera: Pose) -> Bytes:
         """As a camera takes it whose focus is at infinity."""
+        if self._newest is None or not _same(self._newest[0], world_from_camera):
+            self._newest = world_from_camera, self._without_noise(camera, world_from_camera)
+        seen = self._newest[1]
+        noisy = seen + self._rng.normal(scale=2.0, size=seen.shape)
+        return np.asarray(np.clip(noisy, 0, 255), np.uint8)
+
+    def _without_noise(self, camera: Camera, world_from_camera: Pose) -> Array:
         grey, depth = self._world.render(camera, world_from_camera)
-        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        rays = camera.normalise(np.stack([u.ravel(), v.ravel()], 1).astype(float))
-        rays = np.c_[rays, np.ones(len(rays))] @ world_from_camera.rotation.T
+        rays = self._world.rays_of(camera) @ world_from_camera.rotation.T
         on = world_from_camera.translation + depth.reshape(-1, 1) * rays
         at = np.mod(on[:, :2] / 0.007, len(self._grass) - 2).astype(np.float32)
         size = (camera.height, camera.width)
@@ -88,8 +95,11 @@ class Ground:
         blur_px = 1.0 / near_m  # 5 pixels where it stands
         if blur_px > 0.3:
             mixed = cv2.GaussianBlur(mixed, (0, 0), blur_px)
-        noisy = mixed + self._rng.normal(scale=2.0, size=size)
-        return np.asarray(np.clip(noisy, 0, 255), np.uint8)
+        return np.asarray(mixed)
+
+
+def _same(a: Pose, b: Pose) -> bool:
+    return np.array_equal(a.rotation, b.rotation) and np.array_equal(a.translation, b.translation)
 
 
 class Times(NamedTuple):
