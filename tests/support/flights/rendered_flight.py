@@ -48,11 +48,45 @@ METRES_PER_TEXEL = 0.05
 IMU_S, IMU_STEP_S = 0.01, 1e-3
 """Interval of an IMU, and the step of the differences that it is drawn from."""
 GRAVITY_NED = np.array([0.0, 0.0, 9.80665])
+TILE_PX = 16
 N_EXPOSED = 6
 """Pictures in one exposure."""
 
 PathOf = Callable[[float], Pose]
 """`ned_from_body` by seconds since the start."""
+
+
+class Reach:
+    """Where in a picture a level may show, by tiles of it: most of it meets no roof.
+
+    `rays` (3, H, W) are in NED.
+    """
+
+    def __init__(self, rays: np.ndarray) -> None:
+        height, width = rays.shape[1:]
+        self._tops, self._lefts = np.arange(0, height, TILE_PX), np.arange(0, width, TILE_PX)
+        slopes = rays[:2] / rays[2]
+        least, most = (
+            each.reduceat(each.reduceat(slopes, self._tops, 1), self._lefts, 2)
+            for each in (np.minimum, np.maximum)
+        )
+        self._ranges = least, most
+
+    def part(
+        self, centre: np.ndarray, height: float, place: tuple[float, float, float, float]
+    ) -> tuple[slice, slice] | None:
+        """Rows and columns from the first to the last that may show a level; None without any."""
+        least, most = self._ranges
+        down = height - float(centre[2])
+        corners = np.array(place).reshape(2, 2, 1, 1) - centre[:2].reshape(2, 1, 1)
+        low, high = np.sort(corners / down, 0) + np.array([-1e-3, 1e-3]).reshape(2, 1, 1, 1)
+        tiles = ~((most < low) | (least > high)).any(0)  # nan, at the horizon, is no reason
+        rows, columns = tiles.any(1).nonzero()[0], tiles.any(0).nonzero()[0]
+        if not len(rows):
+            return None
+        top, left = self._tops[rows[0]], self._lefts[columns[0]]
+        below, right = self._tops[rows[-1]] + TILE_PX, self._lefts[columns[-1]] + TILE_PX
+        return slice(top, below), slice(left, right)
 
 
 class Terrain:
@@ -88,18 +122,23 @@ class Terrain:
 
     def picture(self, camera: Camera, ned_from_camera: Pose) -> Bytes:
         """What the camera sees (H, W); mid grey where a pixel has no ray or meets nothing."""
-        rays = self._rays_of(camera) @ ned_from_camera.rotation.T.astype(np.float32)
-        north, east, down = np.moveaxis(rays, -1, 0)
+        turned = self._rays_of(camera) @ ned_from_camera.rotation.T.astype(np.float32)
+        rays = np.ascontiguousarray(np.moveaxis(turned, -1, 0))
         centre = ned_from_camera.translation.astype(np.float32)
-        seen = np.full(north.shape, 128, np.uint8)
+        whole = np.full(rays[0].shape, 128, np.uint8)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            reach = Reach(rays)
             for height, (n0, e0, n1, e1), pattern in self._levels:
+                part = reach.part(centre, height, (n0, e0, n1, e1))
+                if part is None:
+                    continue
+                north, east, down = rays[:, part[0], part[1]]
                 away = np.float32(height - centre[2]) / down
                 n, e = centre[0] + away * north, centre[1] + away * east
                 hit = (away > 0.1) & (away < 1e3) & (n > n0) & (n < n1) & (e > e0) & (e < e1)
                 if not hit.any():
                     continue
-                size = len(pattern)
+                seen, size = whole[part], len(pattern)
                 column, row = (
                     np.where(hit, np.mod(v / self._metres_per_texel, size), -1.0).astype(np.float32)
                     for v in (e, n)
@@ -108,7 +147,7 @@ class Terrain:
                     pattern, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
                 )
                 seen[hit] = drawn[hit]
-        return seen
+        return whole
 
     def _rays_of(self, camera: Camera) -> np.ndarray:
         if id(camera) not in self._rays:
