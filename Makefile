@@ -25,7 +25,8 @@ test: lint opencl
 	$(BIN)/pytest tests/system tests/firmware || $(ONCE_MORE)
 
 # In the order in which they are found, which is that of tests/conftest.py: the longest files first.
-THREE = -n 3 --dist loadfile --no-loadscope-reorder
+# The slowest tests are named at the end.
+THREE = -n 3 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 2
 # Files that are not asked for are not imported: that takes each worker six seconds and more.
 REAL_TIME = $(shell grep -rl --include='test_*.py' real_time tests/unit tests/replay)
 ONCE_MORE = { [ $$? -eq 1 ] && $(BIN)/pytest -m real_time $$($(FAILED_FILES)); }
