@@ -336,7 +336,7 @@ class AutopilotLink:
         )  # fmt: skip
 
     def _firmware(self) -> Firmware | None:
-        """That of the autopilot; None while it is not heard."""
+        """Firmware of the autopilot; None while it is not heard."""
         return self.vehicle.firmware if self.alive and self.vehicle else None
 
     async def _ask_for_origin(self) -> None:

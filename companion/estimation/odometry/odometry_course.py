@@ -20,7 +20,7 @@ SIGMA_ATTITUDE_RAD = float(np.radians(1.0))
 
 
 class OdometryCourse:
-    """What the next pose goes on from, and odometry where the map gives none."""
+    """State that the next pose goes on from, and odometry where the map gives none."""
 
     def __init__(self, camera_from_body: Pose, max_jump_m: float, body: BodyFilter) -> None:
         self.flown = FlownMap(camera_from_body)
