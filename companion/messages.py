@@ -193,6 +193,18 @@ class SiteMapUsed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MapTakenUp:
+    """The map of a process before, looked for from the frame at `t_ns` on.
+
+    `data` (N,) are the bytes of its checkpoint, whose last frame was `absent_ns` ago.
+    """
+
+    t_ns: int
+    absent_ns: int
+    data: Bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class KeyframeAdded:
     """A new keyframe: its frame, and the map points that it sees.
 
@@ -398,5 +410,5 @@ class ClockReport:
 Message = (
     Frame | Telemetry | Track | Odometry | KeyframeAdded | LoopClosed | MapUpdate | DepthMap
     | PointChunk | Warned | Georeferenced | FrameTracked | FrameOverdue | OpticalFlow
-    | LandingTarget | SiteMapUsed
+    | LandingTarget | SiteMapUsed | MapTakenUp
 )  # fmt: skip

@@ -13,7 +13,16 @@ import numpy as np
 from companion.estimation.checkpoint import CheckpointError
 from companion.estimation.localisation import LocalisationStage
 from companion.estimation.site.site_use import SiteUse
-from companion.messages import Bytes, Frame, Georeferenced, MapUpdate, Message, SiteMapUsed, Warned
+from companion.messages import (
+    Bytes,
+    Frame,
+    Georeferenced,
+    MapTakenUp,
+    MapUpdate,
+    Message,
+    SiteMapUsed,
+    Warned,
+)
 from companion.products.site_map_file import (
     SITE_MAP,
     SiteMapError,
@@ -138,9 +147,12 @@ class _Localisation(Work):
 
     def _frame(self, frame: Frame) -> Iterator[Message]:
         if self._to_take_up is not None:
-            kept, tracked_ns = self._to_take_up
+            kept, tracked_ns, data = self._to_take_up
             self._to_take_up = None
-            self._stage.resume(kept, frame.t_ns, since_boot_ns() - tracked_ns)
+            absent_ns = since_boot_ns() - tracked_ns
+            self._stage.resume(kept, frame.t_ns, absent_ns)
+            if self._setup.config.recorder.enabled:
+                yield MapTakenUp(frame.t_ns, absent_ns, np.frombuffer(data, np.uint8))
         for what, detail in self._said:
             yield Warned(frame.t_ns, what, detail)
         self._said.clear()

@@ -33,10 +33,11 @@ MOST_READ_BYTES = 64_000_000
 
 
 class Kept(NamedTuple):
-    """A checkpoint, and the time of its last frame by `since_boot_ns`."""
+    """A checkpoint, the time of its last frame by `since_boot_ns`, and the bytes of its file."""
 
     checkpoint: Checkpoint
     tracked_ns: int
+    data: bytes
 
 
 class MapKeeper:
@@ -100,7 +101,7 @@ class MapKeeper:
             raise CheckpointError(f"it is {age_ns * 1e-9:.0f} s old")
         features = self._setup.config.features
         checkpoint = decode(arrays, self._setup.camera, features.scale_factor)
-        return Kept(checkpoint, said["tracked_ns"])
+        return Kept(checkpoint, said["tracked_ns"], data)
 
     def close(self, forget: bool) -> None:
         """End writing; with `forget` remove the file."""

@@ -17,10 +17,25 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.config import Config
 from companion.config_file import config_of_text
 from companion.errors import FlightError
-from companion.estimation.gate.gate_journal import GLOBAL, LANDING, POSE, SOURCES
+from companion.estimation.gate.gate_journal import (
+    FLOW,
+    GLOBAL,
+    LANDING,
+    OBSTACLES,
+    POSE,
+    SOURCES,
+)
 from companion.flight_notes import GateStep
 from companion.geometry.transforms import Pose
-from companion.messages import FrameTracked, LandingTarget, Odometry, SiteMapUsed, TrackState
+from companion.messages import (
+    FrameTracked,
+    LandingTarget,
+    MapTakenUp,
+    Odometry,
+    OpticalFlow,
+    SiteMapUsed,
+    TrackState,
+)
 from companion.telemetry import Telemetry
 from drivers.mavlink.measurements.pose_messages import FRAMES
 from drivers.mavlink.vehicle import Firmware
@@ -31,12 +46,15 @@ from drivers.recording.recording import Recording
 from drivers.recording.recording_topics import (
     EVENTS,
     GATES,
+    MAP_TAKEN_UP,
     ODOMETRY,
     SENT,
     SITE_MAP,
     TRACKING,
+    MapOfBefore,
     MavlinkBytes,
 )
+from drivers.recording.recording_topics import FLOW as FLOWS
 from drivers.recording.recording_topics import LANDING as LANDING_TARGETS
 
 GATE_OF = {
@@ -46,6 +64,9 @@ GATE_OF = {
     mavlink.MAVLINK_MSG_ID_LANDING_TARGET: LANDING,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_SENSOR: GLOBAL,
     mavlink.MAVLINK_MSG_ID_GPS_INPUT: GLOBAL,
+    mavlink.MAVLINK_MSG_ID_OPTICAL_FLOW: FLOW,
+    mavlink.MAVLINK_MSG_ID_OPTICAL_FLOW_RAD: FLOW,
+    mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: OBSTACLES,
 }
 """Gate that let a message of ours through, by its id."""
 GATE_OF_COMMAND = {
@@ -72,7 +93,11 @@ class Decisions:
     """Odometry by the number of the frame."""
     targets: dict[int, LandingTarget] = field(default_factory=dict)
     """Landing targets by the number of the frame."""
+    flows: dict[int, OpticalFlow] = field(default_factory=dict)
+    """Optical flow by the number of the frame."""
     site_map: SiteMapUsed | None = None
+    map_taken_up: MapTakenUp | None = None
+    """Map of a process before; None without one."""
     events: list[str] = field(default_factory=list)
     """Warnings and good news, in words."""
     sent: dict[str, list[tuple[int, bytes]]] = field(default_factory=lambda: defaultdict(list))
@@ -114,6 +139,14 @@ def decisions_of(recording: Recording) -> Decisions:
             elif topic == LANDING_TARGETS:
                 target = _target(message.t_ns, data)
                 found.targets[target.seq] = target
+            elif topic == FLOWS:
+                flow = _flow(message.t_ns, data)
+                found.flows[flow.seq] = flow
+            elif topic == MAP_TAKEN_UP:
+                taken = MapOfBefore.FromString(data)
+                found.map_taken_up = MapTakenUp(
+                    message.t_ns, taken.absent_ns, np.frombuffer(taken.data, np.uint8)
+                )
             elif topic == SITE_MAP:
                 found.site_map = _of(SiteMapUsed, message.t_ns, data)
             elif topic == SENT:
@@ -176,6 +209,16 @@ def _target(t_ns: int, data: bytes) -> LandingTarget:
     return dataclasses.replace(
         target, position_body_m=position, sigma_body_m=sigma, normals_body=normals
     )
+
+
+def _flow(t_ns: int, data: bytes) -> OpticalFlow:
+    flow: OpticalFlow = _of(OpticalFlow, t_ns, data)
+    seen, turn = (
+        None if given is None else np.array(given, float)
+        for given in (flow.flow_rad_s, flow.turn_rad)
+    )
+    sigma_rad_s = np.inf if flow.sigma_rad_s is None else flow.sigma_rad_s
+    return dataclasses.replace(flow, flow_rad_s=seen, turn_rad=turn, sigma_rad_s=sigma_rad_s)
 
 
 def _odometry(t_ns: int, given: Mapping[str, Any]) -> Odometry:

@@ -23,14 +23,16 @@ from companion.geometry.transforms import Similarity, quaternion_from_rotation
 from companion.messages import (
     FrameTracked,
     LandingTarget,
+    MapTakenUp,
     Odometry,
+    OpticalFlow,
     PointChunk,
     SiteMapUsed,
     Warned,
 )
 from companion.telemetry import FIELDS, TELEMETRY, Telemetry
 from companion.telemetry_schema import Field
-from drivers.recording.recording_topics import MavlinkBytes, telemetry_topic
+from drivers.recording.recording_topics import MapOfBefore, MavlinkBytes, telemetry_topic
 
 WORLD, MAP = "local_ned", "map"
 """Coordinate frames for Foxglove."""
@@ -52,8 +54,10 @@ def sample_bytes(sample: Telemetry) -> bytes:
     return json_bytes({f.name: getattr(sample, f.name) for f in FIELDS[type(sample)]})
 
 
-def decision_bytes(decision: FrameTracked | GateStep | SiteMapUsed | LandingTarget) -> bytes:
-    """A decision, or a landing target, without its time."""
+def decision_bytes(
+    decision: FrameTracked | GateStep | SiteMapUsed | LandingTarget | OpticalFlow,
+) -> bytes:
+    """A decision, a landing target or an optical flow, without its time."""
     names = [each.name for each in dataclasses.fields(decision) if each.name != "t_ns"]
     return json_bytes({name: getattr(decision, name) for name in names})
 
@@ -78,6 +82,11 @@ def link_bytes(taken: LinkBytes) -> bytes:
         monotonic_ns=taken.monotonic_ns, epoch_ns=taken.t_ns, data=taken.data
     )  # fmt: skip
     return serialised(message)
+
+
+def map_of_before_bytes(taken: MapTakenUp) -> bytes:
+    """A map that was taken up, without its time."""
+    return serialised(MapOfBefore(absent_ns=taken.absent_ns, data=taken.data.tobytes()))
 
 
 def odometry_bytes(odometry: Odometry) -> bytes:

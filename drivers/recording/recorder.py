@@ -18,9 +18,11 @@ from companion.messages import (
     Frame,
     FrameTracked,
     LandingTarget,
+    MapTakenUp,
     MapUpdate,
     Message,
     Odometry,
+    OpticalFlow,
     PointChunk,
     SiteMapUsed,
     Warned,
@@ -39,6 +41,7 @@ from drivers.recording.recorded_content import (
     event_bytes,
     json_bytes,
     link_bytes,
+    map_of_before_bytes,
     odometry_bytes,
     pose_bytes,
     sample_bytes,
@@ -48,9 +51,11 @@ from drivers.recording.recording_topics import (
     CALIBRATION,
     CLOUD,
     EVENTS,
+    FLOW,
     GATES,
     HEALTH,
     LANDING,
+    MAP_TAKEN_UP,
     ODOMETRY,
     POSE,
     PROFILE,
@@ -135,8 +140,11 @@ class Recorder:
                 self._put(POSE, message.t_ns, pose, message.seq)
         elif isinstance(message, FrameTracked | GateStep | SiteMapUsed):
             self._put(_DECISIONS[type(message)], message.t_ns, decision_bytes(message))
-        elif isinstance(message, LandingTarget):
-            self._put(LANDING, message.t_ns, decision_bytes(message), message.seq)
+        elif isinstance(message, LandingTarget | OpticalFlow):
+            topic = LANDING if isinstance(message, LandingTarget) else FLOW
+            self._put(topic, message.t_ns, decision_bytes(message), message.seq)
+        elif isinstance(message, MapTakenUp):
+            self._put(MAP_TAKEN_UP, message.t_ns, map_of_before_bytes(message))
         elif isinstance(message, Warned):
             self._put(EVENTS, message.t_ns, event_bytes(message))
         elif isinstance(message, HealthNote):

@@ -35,10 +35,13 @@ POSE, ODOMETRY, CLOUD = "/pose", "/odometry", "/cloud"
 EVENTS, HEALTH = "/events", "/health"
 TRACKING, GATES = "/decisions/tracking", "/decisions/gates"
 SITE_MAP = "/decisions/site_map"
-LANDING = "/landing_target"
+LANDING, FLOW = "/landing_target", "/optical_flow"
+MAP_TAKEN_UP = "/decisions/map_taken_up"
 PICTURES = frozenset({IMAGE, VIDEO, RAW})
 """Topics of images, of which a flight has one."""
-FROM_PICTURES = frozenset({GREY, POSE, ODOMETRY, CLOUD, TRACKING, GATES, SITE_MAP, LANDING})
+FROM_PICTURES = frozenset(
+    {GREY, POSE, ODOMETRY, CLOUD, TRACKING, GATES, SITE_MAP, LANDING, FLOW, MAP_TAKEN_UP}
+)
 """Topics of what was made of images."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
@@ -53,28 +56,29 @@ LASTING = frozenset({CALIBRATION, HEALTH, telemetry_topic(ArmedSample)})
 """Topics whose messages hold until the next one, which may never come."""
 
 
-def _own_messages() -> descriptor_pb2.FileDescriptorProto:
-    """MavlinkBytes, as a .proto file would define it."""
+def _own_message(name: str, fields: Mapping[str, int]) -> Any:
+    """Class of a message of our own, as a .proto file would define it."""
     file = descriptor_pb2.FileDescriptorProto(
-        name="companion/MavlinkBytes.proto", package="companion", syntax="proto3"
+        name=f"companion/{name}.proto", package="companion", syntax="proto3"
     )
-    message = file.message_type.add(name="MavlinkBytes")
-    for number, (name, kind) in enumerate(
-        [
-            ("monotonic_ns", _FIELD.TYPE_FIXED64),
-            ("epoch_ns", _FIELD.TYPE_FIXED64),
-            ("data", _FIELD.TYPE_BYTES),
-        ],
-        1,
-    ):
-        message.field.add(name=name, number=number, type=kind, label=_FIELD.LABEL_OPTIONAL)
-    return file
+    message = file.message_type.add(name=name)
+    for number, (field, kind) in enumerate(fields.items(), 1):
+        message.field.add(name=field, number=number, type=kind, label=_FIELD.LABEL_OPTIONAL)
+    _pool.Add(file)
+    return message_factory.GetMessageClass(_pool.FindMessageTypeByName(f"companion.{name}"))
 
 
 _pool = descriptor_pool.DescriptorPool()
-_pool.Add(_own_messages())
-MavlinkBytes: Any = message_factory.GetMessageClass(
-    _pool.FindMessageTypeByName("companion.MavlinkBytes")
+MavlinkBytes: Any = _own_message(
+    "MavlinkBytes",
+    {
+        "monotonic_ns": _FIELD.TYPE_FIXED64,
+        "epoch_ns": _FIELD.TYPE_FIXED64,
+        "data": _FIELD.TYPE_BYTES,
+    },
+)
+MapOfBefore: Any = _own_message(
+    "MapTakenUp", {"absent_ns": _FIELD.TYPE_FIXED64, "data": _FIELD.TYPE_BYTES}
 )
 
 
@@ -163,6 +167,16 @@ TOPICS: dict[str, Any] = {
             "normals_body": {"type": ["array", "null"]}, "size_px": NUMBER, "why_not": TEXT,
         },
     ),
+    FLOW: _Json(
+        "companion.OpticalFlow",
+        "Flow of the ground since the frame before, about the body's forward and right axes, "
+        "without its rotation; null where it was not measured",
+        {
+            "seq": INTEGER, "dt_s": NUMBER, "flow_rad_s": NUMBERS, "turn_rad": NUMBERS,
+            "sigma_rad_s": NUMBER, "quality": INTEGER, "distance_m": NUMBER, "why_not": TEXT,
+        },
+    ),
+    MAP_TAKEN_UP: MapOfBefore,
     CLOUD: PointCloud,
     EVENTS: Log,
     HEALTH: _Json(

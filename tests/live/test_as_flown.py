@@ -16,10 +16,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CameraConfig, TelemetryConfig
 from companion.estimation.gate.global_gate import IN_USE
+from companion.estimation.map_resumption import MAP_RESUMED
 from companion.estimation.site.site_use import LOCATED
 from companion.telemetry import MEASURED, PositionSample
 from drivers.recording.decisions import decisions_of
 from drivers.recording.recorded_flight import open_recording
+from tests.support.flights.halting import Halting
 from tests.support.processes.flying import Flying
 from tests.support.processes.program import Run, replay
 
@@ -27,6 +29,8 @@ LOADED_S = 4.0
 MARKERS_M = 2.0
 ENOUGH = 150
 """Messages with poses, however long they take on a busy machine."""
+KEPT_S = 2.5
+"""So long after the first pose the map is kept with its scale."""
 BUSY = "while True: pass"
 
 
@@ -48,6 +52,7 @@ def flown(folder: Path) -> Path:
     with Flying(
         folder, "recorder.codec=png", f"telemetry.use={list(use)}", "gps.switch_source=true",
         "landing.marker=apriltag_36h11", "landing.id=0", f"landing.size_m={MARKERS_M}",
+        "feedback.flow=optical_flow",
         has_imu=True,
     ) as flying:  # fmt: skip
         flying.camera.markers_m = MARKERS_M
@@ -108,6 +113,7 @@ def test_images_recorded_as_they_were_give_all_of_it_again(tmp_path: Path) -> No
     assert found["targets_same"] == found["targets"] > 100
     sent = {gate: each["sent"] for gate, each in found["by_gate"].items()}
     assert sent["pose"] > 100 and sent["landing"] >= 20 and sent["sources"] >= 2
+    assert sent["flow"] > 100 and any(flow.quality for flow in told.flows.values())
     assert "the same to the byte" in done.stdout
 
 
@@ -144,7 +150,7 @@ def test_a_flight_in_the_map_of_an_earlier_one_is_flown_again_in_that_map(tmp_pa
 
 
 def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path) -> None:
-    with Flying(tmp_path, "recorder.codec=mjpeg") as flying:
+    with Flying(tmp_path, "recorder.codec=mjpeg", "feedback.flow=optical_flow_rad") as flying:
         flying.take_off()
         flying.autopilot.wait_for("ODOMETRY", ENOUGH, 120)
         flying.autopilot.disarm()
@@ -153,7 +159,37 @@ def test_compressed_images_give_the_decisions_of_the_gates_again(tmp_path: Path)
         flying.daemon.stop()
     _, found = again(path, tmp_path / "again")
     assert not found["tracked_again"]
-    assert found["by_gate"]["pose"]["sent"] > 100
+    assert found["by_gate"]["pose"]["sent"] > 100 and found["by_gate"]["flow"]["sent"] > 100
+
+
+def test_a_flight_that_went_on_with_the_map_of_a_process_before_is_flown_again(
+    tmp_path: Path,
+) -> None:
+    way = Halting()
+    with Flying(tmp_path, "recorder.codec=png", path=way) as flying:
+        flying.take_off()
+        time.sleep(KEPT_S)
+        way.hover()
+        time.sleep(KEPT_S)
+        flying.start_again(signal.SIGKILL)
+        flying.until_sending()
+        flying.autopilot.wait_for("ODOMETRY", ENOUGH, 60)
+        time.sleep(KEPT_S)
+        lost_ns = flying.daemon.signal_stage("localisation", signal.SIGKILL)
+        flying.daemon.line(MAP_RESUMED, after_ns=lost_ns)
+        flying.until_sending()
+        flying.autopilot.disarm()
+        flying.daemon.line("results so far")
+        _, by_daemon, by_localisation = flying.daemon.flown()
+        flying.daemon.stop()
+    for path in by_daemon, by_localisation:
+        recorded = open_recording(path / "flight.mcap", CameraConfig(), TelemetryConfig())
+        with closing(recorded.recording):
+            told = decisions_of(recorded.recording)
+        assert any(event.startswith(MAP_RESUMED) for event in told.events)
+        _, found = again(path, tmp_path / f"again-{path.name}")
+        assert found["tracked_again"] and found["frames_same"] == found["frames"] > 30
+        assert found["by_gate"]["pose"]["sent"] > 10
 
 
 def test_global_positions_are_made_again_where_poses_are_not_sent(tmp_path: Path) -> None:

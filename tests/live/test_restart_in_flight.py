@@ -6,23 +6,18 @@ map its scale. What the killed one kept is taken up.
 
 from __future__ import annotations
 
-import math
 import signal
 import time
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 
-from companion.geometry.transforms import Pose
 from tests.support.autopilot.received_poses import Poses
-from tests.support.cameras.http_camera import world_from_body
+from tests.support.flights.halting import Halting
 from tests.support.processes.flying import MOST_AWAY_M, MOST_TURNED_DEG, PROOF_S, Flying
 
 pytestmark = pytest.mark.continues
 
-SWAY_M, SWAY_S = 0.1, 5.0
-"""As a hovering vehicle sways: too little for GPS or barometer to tell a scale by."""
 STARTED_S = 15.0
 """A daemon comes up, its camera and its link are open, and its stages have begun, in this time;"""
 STAGE_S = 8.0
@@ -30,25 +25,6 @@ STAGE_S = 8.0
 RECOGNISED_S = 2.0
 KEPT_S = 2.5
 """So long after the last pose was told everything there is to know is kept."""
-
-
-class Halting:
-    """A circle, on which the vehicle stays where it is told to hover."""
-
-    def __init__(self) -> None:
-        self._since_ns: int | None = None
-
-    def hover(self) -> None:
-        self._since_ns = time.monotonic_ns()
-
-    def __call__(self, monotonic_ns: int) -> Pose:
-        since_ns = self._since_ns
-        if since_ns is None or monotonic_ns < since_ns:
-            return world_from_body(monotonic_ns)
-        pose, after_s = world_from_body(since_ns), (monotonic_ns - since_ns) * 1e-9
-        turn = 2 * math.pi * after_s / SWAY_S
-        sway = np.array([math.sin(turn), math.sin(1.3 * turn), 0.0]) * SWAY_M
-        return Pose(pose.rotation, pose.translation + sway)
 
 
 @pytest.fixture(scope="module")

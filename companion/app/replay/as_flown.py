@@ -2,7 +2,7 @@
 
 Of images recorded without loss all stages up to the gates are replayed: telemetry, frames and
 mapping in their recorded order, at the recorded load levels. Else other pixels would give other
-poses: then only the gates are replayed, on the recorded odometry and landing targets.
+poses: then only the gates are replayed, on the recorded odometry, landing targets and optical flow.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from companion.app.progress import Progress
 from companion.app.replay.sent_again import SentAgain, steps_as_tracked
 from companion.config import Config
 from companion.errors import FlightError, StageError
+from companion.estimation.checkpoint import CheckpointError, decode, read_arrays
+from companion.estimation.gate.gate_journal import OBSTACLES
 from companion.estimation.gate.gates_again import placed_values
 from companion.estimation.landing.marker_detector import MarkerDetector
 from companion.estimation.localisation import LocalisationStage
@@ -31,6 +33,7 @@ from companion.messages import (
     MapUpdate,
     Message,
     Odometry,
+    OpticalFlow,
     Warned,
 )
 from companion.products.atomic_file import write_atomically
@@ -56,12 +59,7 @@ def replay_as_flown(
     flight = open_recording(path, config.camera, config.telemetry)
     try:
         told = decisions_of(flight.recording)
-        if any(event.startswith((MAP_RESUMED, MAP_NOT_RECOGNISED)) for event in told.events):
-            raise FlightError(
-                f"{path}: this flight began with the map of a process before it, which is not in "
-                "the recording"
-            )
-        tracked = Tracked(told.odometry, told.targets)
+        tracked = Tracked(told.odometry, told.targets, told.flows)
         steps = told.gates
         if told.lossless:
             site = _site_of(told, config, flight.camera)
@@ -72,16 +70,17 @@ def replay_as_flown(
             steps = list(steps_as_tracked(steps, tracked.places, tracked.verdicts))
         else:
             notify(
-                "images were compressed with losses: the recorded odometry and landing targets go "
-                "to the gates"
+                "images were compressed with losses: the recorded odometry, landing targets and "
+                "optical flow go to the gates"
             )
-        made = SentAgain(told, tracked.odometry, tracked.targets).payloads(steps)
+        made = SentAgain(told, tracked.odometry, tracked.targets, tracked.flows).payloads(steps)
     finally:
         flight.recording.close()
     by_gate = {
         gate: _compared(made.get(gate, []), told.sent.get(gate, []))
-        for gate in sorted({*made, *told.sent})
+        for gate in sorted({*made, *told.sent} & {step.gate for step in told.gates})
     }
+    not_made = {gate: len(sent) for gate, sent in told.sent.items() if gate not in by_gate}
     n_tracked = sum(_same(tracked.odometry.get(n), each) for n, each in told.odometry.items())
     n_seen = sum(_same_target(tracked.targets.get(n), each) for n, each in told.targets.items())
     out.mkdir(parents=True, exist_ok=True)
@@ -90,7 +89,7 @@ def replay_as_flown(
         for name in ("sent", "made_again", "same")
     }
     found = {
-        **totals, "by_gate": by_gate,
+        **totals, "by_gate": by_gate, "not_made_again": not_made,
         "frames": len(told.odometry), "frames_same": n_tracked,
         "targets": len(told.targets), "targets_same": n_seen, "tracked_again": told.lossless,
     }  # fmt: skip
@@ -106,6 +105,13 @@ def replay_as_flown(
                 f"{each['made_again']} are made again; number {each['same'] + 1} is the first that "
                 "differs"
             )
+    for gate, n in not_made.items():
+        why = (
+            "they hang on the dense map, whose depth is not computed again"
+            if gate == OBSTACLES
+            else "the recording is of a version that kept no journal of them"
+        )
+        notify(f"{n} messages of `{gate}` were sent and are not made again: {why}")
     parts = ", ".join(f"{gate} {each['same']}" for gate, each in by_gate.items())
     notify(
         f"{totals['same']} messages were sent ({parts}); made again, each is the same to the byte"
@@ -118,6 +124,7 @@ class Tracked:
 
     odometry: dict[int, Odometry] = field(default_factory=dict)
     targets: dict[int, LandingTarget] = field(default_factory=dict)
+    flows: dict[int, OpticalFlow] = field(default_factory=dict)
     places: list[Mapping[str, object]] = field(default_factory=list)
     """Of each update of the map its place, see `placed_values`."""
     verdicts: list[bool] = field(default_factory=list)
@@ -127,6 +134,8 @@ class Tracked:
         """Take an output of localisation."""
         if isinstance(message, Odometry):
             self.odometry[message.seq] = message
+        elif isinstance(message, OpticalFlow):
+            self.flows[message.seq] = message
         elif isinstance(message, MapUpdate):
             self.places.append(placed_values(message.georeference))
         elif isinstance(message, Warned):
@@ -164,6 +173,7 @@ def _tracked_again(
         told.config, camera, StageTimes(), background=True,
         order=[step.mapping_point for step in told.frames], site=site,
     )  # fmt: skip
+    _take_up(stage, told, camera)
     found = Tracked()
     pictures = _looked_at(frames, camera, told, found)
     n_taken = 0
@@ -193,6 +203,24 @@ def _tracked_again(
     finally:
         stage.finish(adjust=False)
     return found
+
+
+def _take_up(stage: LocalisationStage, told: Decisions, camera: Camera) -> None:
+    """Begin with the map of a process before, where the flight did."""
+    taken = told.map_taken_up
+    if taken is None:
+        if any(event.startswith((MAP_RESUMED, MAP_NOT_RECOGNISED)) for event in told.events):
+            raise FlightError(
+                "this flight began with the map of a process before it, which is not in the "
+                "recording: it is of an older version"
+            )
+        return
+    try:
+        _, arrays = read_arrays(taken.data.tobytes())
+        kept = decode(arrays, camera, told.config.features.scale_factor)
+    except CheckpointError as error:
+        raise FlightError(f"the map of the process before it, in the recording: {error}") from error
+    stage.resume(kept, taken.t_ns, taken.absent_ns)
 
 
 def _looked_at(

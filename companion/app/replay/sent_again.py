@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from companion.errors import FlightError
+from companion.estimation.gate.flow_gate import FlowToSend
 from companion.estimation.gate.gate_journal import (
+    FLOW,
     GLOBAL,
     LANDING,
     POSE,
@@ -21,6 +23,7 @@ from companion.estimation.gate.gate_journal import (
 from companion.estimation.gate.gates_again import (
     DOUBT,
     PLACED,
+    FlowGateAgain,
     GlobalGateAgain,
     LandingGateAgain,
     SourceChoiceAgain,
@@ -31,8 +34,9 @@ from companion.estimation.gate.pose_gate import PoseToSend
 from companion.estimation.gate.pose_journal import PoseGateAgain
 from companion.estimation.landing.landing_gate import TargetToSend
 from companion.flight_notes import GateStep
-from companion.messages import LandingTarget, Odometry
+from companion.messages import LandingTarget, Odometry, OpticalFlow
 from drivers.mavlink.commands import source_set_command
+from drivers.mavlink.measurements.flow_messages import flow_message
 from drivers.mavlink.measurements.global_messages import global_message
 from drivers.mavlink.measurements.landing_messages import landing_target_message
 from drivers.mavlink.measurements.pose_messages import pose_messages
@@ -42,11 +46,11 @@ Payloads = dict[str, list[tuple[int, bytes]]]
 
 
 class SentAgain:
-    """Gates of a flight, asked again: of these odometries and landing targets, by their frames."""
+    """Gates of a flight, asked again: of these odometries, targets and flows, by their frames."""
 
     def __init__(
         self, told: Decisions, odometry: Mapping[int, Odometry],
-        targets: Mapping[int, LandingTarget],
+        targets: Mapping[int, LandingTarget], flows: Mapping[int, OpticalFlow],
     ) -> None:  # fmt: skip
         config, use = told.config, told.config.telemetry.use
         self._told = told
@@ -58,6 +62,7 @@ class SentAgain:
             LANDING: LandingGateAgain(use, _found_in(targets, "landing target")),
             GLOBAL: self._places,
             SOURCES: SourceChoiceAgain(config.gps),
+            FLOW: FlowGateAgain(config.feedback, _found_in(flows, "optical flow")),
         }
 
     def payloads(self, steps: Sequence[GateStep]) -> Payloads:
@@ -77,6 +82,8 @@ class SentAgain:
             own = values["own_ned_m"]
             own_ned_m = None if own is None else np.array(own, float)
             return (landing_target_message(given, size_rad, own_ned_m),)
+        if isinstance(given, FlowToSend):
+            return (flow_message(given.flow, given.rates_body_rad_s),)
         if isinstance(given, GlobalToSend):
             kind = self._places.config.global_position
             return (global_message(given, kind, values["system"], step.t_ns),)

@@ -46,7 +46,7 @@ class Senders:
         self._poses = PoseSender(
             config.feedback, link, clock, counter_path(config.daemon.flights), warn, journal
         )
-        self._flow = FlowSender(config.feedback, link, clock)
+        self._flow = FlowSender(config.feedback, link, clock, journal)
         self._landing: LandingSender | None = None
         self._places: GlobalSender | None = None
         self._switch: SourceSwitch | None = None
@@ -71,6 +71,7 @@ class Senders:
     def begin_flight(self, use: Collection[Measurement]) -> None:
         """A flight has begun, and its recording; of telemetry it believes what is in `use`."""
         self._poses.begin_flight(use)
+        self._flow.begin_flight()
         if self._landing is not None:
             self._landing.begin_flight(use)
         if self._places is not None:

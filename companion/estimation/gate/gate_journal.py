@@ -14,8 +14,10 @@ from typing import Protocol
 from companion.flight_notes import GateStep
 from companion.telemetry import Telemetry
 
-POSE, LANDING, GLOBAL, SOURCES = "pose", "landing", "global", "sources"
-"""Gates: poses, landing targets, global positions, source sets of the EKF."""
+POSE, LANDING, GLOBAL, SOURCES, FLOW = "pose", "landing", "global", "sources", "flow"
+"""Gates: poses, landing targets, global positions, source sets of the EKF, optical flow."""
+OBSTACLES = "obstacles"
+"""Without a journal: OBSTACLE_DISTANCE hangs on the dense map, which is not computed again."""
 BEGIN = "begin"
 
 

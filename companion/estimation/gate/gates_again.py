@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.config import FeedbackConfig, GpsConfig, Measurement
+from companion.estimation.gate.flow_gate import FlowGate, FlowToSend
 from companion.estimation.gate.gate_journal import BEGIN
 from companion.estimation.gate.global_gate import GlobalGate, GlobalToSend
 from companion.estimation.gate.pose_gate import PoseGate
@@ -16,7 +17,7 @@ from companion.estimation.satellites.source_choice import SourceChoice
 from companion.flight_notes import GateStep
 from companion.geometry.geodesy import GeoOrigin
 from companion.geometry.transforms import Similarity
-from companion.messages import Georeference, LandingTarget, Odometry
+from companion.messages import Georeference, LandingTarget, Odometry, OpticalFlow
 from companion.telemetry import AttitudeSample, PositionSample, Telemetry
 
 FRAME, LIMITS = "frame", "limits"
@@ -45,6 +46,31 @@ class LandingGateAgain:
         if step.what != FRAME:
             return None
         return self._gate.take(self._target_of(step.values["seq"]), step.t_ns)
+
+
+class FlowGateAgain:
+    """The gate of optical flow; `flow_of` gives that of a frame, and raises without one."""
+
+    takes: tuple[type, ...] = (AttitudeSample,)
+
+    def __init__(self, config: FeedbackConfig, flow_of: Callable[[int], OpticalFlow]) -> None:
+        self._gate, self._flow_of = FlowGate(config), flow_of
+
+    def take_sample(self, sample: Telemetry) -> None:
+        """Take an attitude of the autopilot."""
+        if isinstance(sample, AttitudeSample):
+            self._gate.take_attitude(sample)
+
+    def ask(self, step: GateStep) -> FlowToSend | None:
+        """Repeat a call; the flow that it gives, if any."""
+        if step.what == LIMITS:
+            self._gate.reconfigure(FeedbackConfig(**step.values["limits"]))
+        if step.what != FRAME:
+            return None
+        given = self._gate.take(self._flow_of(step.values["seq"]), step.t_ns)
+        if step.sent:
+            self._gate.sent(step.t_ns)
+        return given
 
 
 class GlobalGateAgain:

@@ -35,6 +35,13 @@ UNKNOWN_DISTANCE = -1.0
 MAX_INT16 = 32767
 
 
+def flow_message(flow: OpticalFlow, rates_body_rad_s: Array | None) -> Any:
+    """OPTICAL_FLOW with the body's turn rates (3,), OPTICAL_FLOW_RAD without."""
+    if rates_body_rad_s is None:
+        return optical_flow_rad_message(flow)
+    return optical_flow_message(flow, rates_body_rad_s)
+
+
 def optical_flow_message(flow: OpticalFlow, rates_body_rad_s: Array) -> Any:
     """OPTICAL_FLOW for ArduPilot; rates (3,) of the body since the message before.
 

@@ -10,13 +10,19 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.config import FeedbackConfig
-from companion.daemon.pose.flow_sender import NO_RATES, TOO_OLD, UNHEARD, FlowSender
+from companion.app.replay.sent_again import SentAgain
+from companion.config import Config, FeedbackConfig
+from companion.daemon.pose.flow_sender import UNHEARD, FlowSender
+from companion.estimation.gate.flow_gate import NO_RATES, TOO_OLD
+from companion.estimation.gate.gate_journal import FLOW as FLOW_GATE
 from companion.estimation.lift_off.optical_flow import NO_ATTITUDE
+from companion.flight_notes import GateStep
 from companion.messages import OpticalFlow
 from companion.telemetry import AttitudeSample, Telemetry
+from drivers.recording.decisions import Decisions, payloads_of
 from tests.support.autopilot.memory_link import SetClock, listen, memory_link
 from tests.support.autopilot.memory_port import MemoryPort
+from tests.support.flights.recorded_steps import recorded
 
 MS = 1_000_000
 FLOW, DT_S = np.array([0.2, 0.5]), 0.05
@@ -28,9 +34,14 @@ class Vehicle:
 
     def __init__(self, message: Literal["optical_flow", "optical_flow_rad"]) -> None:
         self.clock, self.port = SetClock(), MemoryPort()
+        self.steps: list[GateStep] = []
         self.began_ns = self.clock.t_ns
         self.link = memory_link(self.port, self.clock, self._deliver)
-        self.sender = FlowSender(FeedbackConfig(flow=message), self.link, self.clock)
+        self.sender = FlowSender(
+            FeedbackConfig(flow=message), self.link, self.clock, self.steps.append
+        )
+        self.attitudes: list[AttitudeSample] = []
+        self.flows: dict[int, OpticalFlow] = {}
         self.rates_told = True
 
     async def begin(self) -> None:
@@ -38,6 +49,7 @@ class Vehicle:
 
     def _deliver(self, sample: Telemetry) -> None:
         if isinstance(sample, AttitudeSample):
+            self.attitudes.append(sample)
             self.sender.take_attitude(sample)
 
     def pitch_rate(self, t_ns: int) -> float:
@@ -54,9 +66,11 @@ class Vehicle:
                 if self.rates_told:
                     rates = np.array([0.0, self.pitch_rate(now_ns), 0.0])
                     level = np.array([1.0, 0.0, 0.0, 0.0])
-                    self.sender.take_attitude(AttitudeSample(now_ns, level, rates))
+                    self._deliver(AttitudeSample(now_ns, level, rates))
             if now_ns % (50 * MS) == 0:
-                self.sender.take(self.flow(flow))
+                seen = replace(self.flow(flow), seq=len(self.flows))
+                self.flows[seen.seq] = seen
+                self.sender.take(seen)
         return self.sent[n_before:]
 
     def flow(self, like: OpticalFlow | None) -> OpticalFlow:
@@ -161,3 +175,34 @@ def test_switched_off_it_is_silent() -> None:
     vehicle.sender.reconfigure(FeedbackConfig())
     assert vehicle.run(0.5) == []
     assert vehicle.sender.health().message == "off"
+
+
+@pytest.mark.parametrize("message", ["optical_flow", "optical_flow_rad"])
+def test_its_journal_gives_the_messages_again(
+    message: Literal["optical_flow", "optical_flow_rad"],
+) -> None:
+    vehicle = vehicle_of(message)
+    vehicle.run(0.3)
+    vehicle.attitudes.clear()
+    n_before = len(vehicle.sent)
+    vehicle.sender.begin_flight()
+    vehicle.run(0.5)
+    vehicle.rates_told = False
+    vehicle.run(0.6)
+    vehicle.rates_told = True
+    vehicle.run(0.3)
+    vehicle.link.alive = False
+    vehicle.run(0.5, alive=False)
+    vehicle.run(0.3, OpticalFlow(1, 0, DT_S, why_not="too little to track"))
+    vehicle.sender.reconfigure(FeedbackConfig())
+    vehicle.run(0.2)
+    vehicle.sender.reconfigure(FeedbackConfig(flow=message))
+    vehicle.run(0.3)
+    feedback = FeedbackConfig(flow=message)
+    told = Decisions(replace(Config(), feedback=feedback), lossless=True)
+    told.samples.extend(vehicle.attitudes)
+    steps = [recorded(step) for step in vehicle.steps]
+    steps = steps[[step.what for step in steps].index("begin") :]
+    made = SentAgain(told, {}, {}, vehicle.flows).payloads(steps)
+    assert len(vehicle.sent) > n_before + 15
+    assert made == {FLOW_GATE: payloads_of(vehicle.sent[n_before:])}

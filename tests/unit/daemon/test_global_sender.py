@@ -201,6 +201,6 @@ def test_its_journal_gives_the_messages_again(message: Message) -> None:
     )
     told.samples.extend(vehicle.samples)
     steps = [recorded(step) for step in vehicle.steps]
-    made = SentAgain(told, vehicle.odometry, {}).payloads(steps)
+    made = SentAgain(told, vehicle.odometry, {}, {}).payloads(steps)
     assert len(vehicle.sent) >= n_before + 4
     assert made == {GLOBAL: payloads_of(vehicle.sent[n_before:])}

@@ -175,6 +175,6 @@ def test_its_journal_gives_the_messages_again(vehicle: Vehicle) -> None:
     told.samples.extend(vehicle.attitudes)
     steps = [recorded(step) for step in vehicle.steps]
     steps = steps[[step.what for step in steps].index("begin") :]
-    made = SentAgain(told, {}, vehicle.targets).payloads(steps)
+    made = SentAgain(told, {}, vehicle.targets, {}).payloads(steps)
     assert len(vehicle.sent) > n_before + 15
     assert made == {LANDING: payloads_of(vehicle.sent[n_before:])}

@@ -187,7 +187,7 @@ def test_another_flight_asks_again_what_its_journal_has() -> None:
         vehicle.clock.t_ns += AGAIN_NS
         await vehicle.step()
         told = Decisions(replace(Config(), gps=GPS), lossless=True)
-        made = SentAgain(told, {}, {}).payloads([recorded(step) for step in vehicle.steps])
+        made = SentAgain(told, {}, {}, {}).payloads([recorded(step) for step in vehicle.steps])
         assert vehicle.sets[n_before:] == [1, 3, 3]
         assert made == {SOURCES: payloads_of(vehicle.commands[n_before:])}
 
