@@ -16,6 +16,8 @@ MAX_VISO_DELAY_MS = 250.0
 LEAST_LAG_S, MOST_LAG_S = 0.02, 0.25
 """Range of PLND_LAG."""
 SOURCE_SETS = 1, 2, 3
+VELOCITY = "velocity"
+"""Mode that sends no position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +34,10 @@ class Context:
     def vision_set(self) -> int:
         """Source set of ArduPilot's EKF that takes our pose."""
         return self.gps.vision_set if self.gps.switch_source else 1
+
+    def takes_position(self, number: int) -> bool:
+        """True if the source set of that number takes our position."""
+        return self.vision_set == number and self.mode != VELOCITY
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +80,26 @@ def _proximity(context: Context, values: Values) -> Wanted | None:
 
 
 def _from_pose(number: int, wanted: Wanted) -> Callable[[Context, Values], Wanted | None]:
-    """The condition where the source set of that number takes our pose."""
-    return lambda context, values: wanted if context.vision_set == number else None
+    """The condition where the source set of that number takes our pose, position and all."""
+    return lambda context, values: wanted if context.takes_position(number) else None
+
+
+def _velocity(number: int) -> Callable[[Context, Values], Wanted | None]:
+    """Our velocity, which alone must be taken where nothing else is sent."""
+
+    def wanted(context: Context, values: Values) -> Wanted | None:
+        if context.vision_set != number:
+            return None
+        return OneOf((6,)) if context.mode == VELOCITY else OneOf((6, 0))
+
+    return wanted
 
 
 def _position(number: int) -> Callable[[Context, Values], Wanted | None]:
     """Our position, or that of satellites in the set that the EKF is switched back to."""
 
     def wanted(context: Context, values: Values) -> Wanted | None:
-        if context.vision_set == number:
+        if context.takes_position(number):
             return OneOf((6,))
         back = context.gps.switch_source and context.gps.satellites_set == number
         return OneOf((3,)) if back else None
@@ -120,12 +137,24 @@ def _place_delay(context: Context, values: Values) -> Wanted | None:
 
 def fused(context: Context, values: Values) -> Wanted:
     """Pose components that EKF2 is to fuse."""
+    if context.mode == VELOCITY:
+        return Bits(0b100, "2 (velocity)")
     if context.mode == "odometry":
         return Bits(0b111, "0, 1 and 2 (horizontal position, vertical position, velocity)")
     return Bits(0b011, "0 and 1 (horizontal and vertical position)")
 
 
+def _height(context: Context, values: Values) -> Wanted | None:
+    return OneOf((3, 0, 2)) if context.mode != VELOCITY else None
+
+
+def _without_gps(context: Context, values: Values) -> Wanted | None:
+    return OneOf((1, 2)) if context.mode != VELOCITY else None
+
+
 def _fused_before_1_14(context: Context, values: Values) -> Wanted:
+    if context.mode == VELOCITY:
+        return Bits(256, "8 (vision velocity)")
     if context.mode == "odometry":
         return Bits(8 | 256, "3 and 8 (vision position and velocity)")
     return Bits(8, "3 (vision position)")
@@ -153,7 +182,7 @@ def _source_set(number: int) -> tuple[Rule, ...]:
              "from satellites, which gps.switch_source goes back to",
              lacking="ArduPilot before 4.1; it cannot be told to use vision beside a GPS"
              if number == 1 else ""),
-        Rule(name + "VELXY", _from_pose(number, OneOf((6, 0))), "6 takes the velocity that we "
+        Rule(name + "VELXY", _velocity(number), "6 takes the velocity that we "
              "send; 3 waits for a GPS"),
         Rule(name + "POSZ", _from_pose(number, OneOf((1, 6))), "1 is the barometer, 6 our height; "
              "3 waits for a GPS"),
@@ -215,9 +244,9 @@ PX4_RULES = (
          "off, since our heading comes from the autopilot's own"),
     Rule("EKF2_AID_MASK", _fused_before_1_14, "what is not enabled here is not fused (PX4 before "
          "1.14)", reboot=True),
-    Rule("EKF2_HGT_REF", _always(OneOf((3, 0, 2))), "3 is vision, 0 the barometer; 1 waits for a "
+    Rule("EKF2_HGT_REF", _height, "3 is vision, 0 the barometer; 1 waits for a "
          "GPS", reboot=True),
-    Rule("EKF2_HGT_MODE", _always(OneOf((3, 0, 2))), "3 is vision, 0 the barometer; 1 waits for a "
+    Rule("EKF2_HGT_MODE", _height, "3 is vision, 0 the barometer; 1 waits for a "
          "GPS (PX4 before 1.14)", reboot=True),
     Rule("EKF2_EV_DELAY", _always(Near(0, 20)), "our stamps are those of the exposure, in "
          "PX4's own clock: nothing is left to take off", reboot=True),
@@ -239,7 +268,7 @@ PX4_RULES = (
          "the place on earth that we send is not fused"),
     Rule("EKF2_AGP0_DELAY", _place_delay, "the time from exposure to sending, as measured; PX4 "
          "stamps a place on earth when it comes", reboot=True),
-    Rule("COM_ARM_WO_GPS", _always(OneOf((1, 2))), "0 refuses to arm without a GPS fix"),
+    Rule("COM_ARM_WO_GPS", _without_gps, "0 refuses to arm without a GPS fix"),
 )  # fmt: skip
 
 RULES = {ARDUPILOT: ARDUPILOT_RULES, PX4: PX4_RULES}

@@ -13,7 +13,7 @@ from companion.advice.imu_room import (
 from companion.advice.wanted import ARDUPILOT, PX4, Finding, Values
 from companion.config import FeedbackConfig, LinkConfig
 
-POSE_BYTES = {"odometry": 245, "vision_position": 129 + 69}
+POSE_BYTES = {"odometry": 245, "vision_position": 129 + 69, "velocity": 245}
 OTHER_BYTES_PER_S = 700.0
 """Our heartbeat, time synchronisation and status."""
 LINE_PARAMETERS = {

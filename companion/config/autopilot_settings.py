@@ -77,10 +77,11 @@ class TelemetryConfig:
 class FeedbackConfig:
     """Poses sent to the autopilot; while armed limits only tighten, see docs/control.md."""
 
-    mode: Literal["off", "odometry", "vision_position"] = "off"
-    """ODOMETRY, or for older firmware VISION_POSITION_ESTIMATE."""
+    mode: Literal["off", "odometry", "vision_position", "velocity"] = "off"
+    """ODOMETRY, or for older firmware VISION_POSITION_ESTIMATE; velocity is the pose's velocity
+    alone, beside satellites or a global position."""
     global_position: Literal["off", "sensor", "estimate", "gps_input"] = "off"
-    """Send latitude and longitude while satellites are not in use, and mode is off: sensor is
+    """Send latitude and longitude while satellites are not in use, and no pose is sent: sensor is
     GLOBAL_POSITION_SENSOR for PX4, estimate MAV_CMD_EXTERNAL_POSITION_ESTIMATE for ArduPilot,
     gps_input GPS_INPUT for others; see docs/global_position.md."""
     rate_hz: Annotated[float, Meta(ge=4, le=100)] = 30.0
@@ -109,6 +110,11 @@ class FeedbackConfig:
     for ArduPilot, OPTICAL_FLOW_RAD for PX4."""
     obstacle_distance: bool = False
     """Send OBSTACLE_DISTANCE from the newest part of the cloud."""
+
+    @property
+    def sends_position(self) -> bool:
+        """True if what is sent as a pose has a position."""
+        return self.mode not in ("off", "velocity")
 
     @property
     def gives_position(self) -> bool:

@@ -43,7 +43,7 @@ def fly(
             version = f"{trial.firmware.name} {trial.firmware.version()}"
     add_poses(figures, folder / "cable.tlog", trial.ground.true)
     told = {"folder": folder.name, "version": version, "seed": conditions.seed,
-            "wind_m_s": conditions.wind_m_s, "look": conditions.look,
+            "wind_m_s": conditions.wind_m_s, "look": conditions.look, "perfect": conditions.perfect,
             "parameters": dict(conditions.parameters)}  # fmt: skip
     append_to(out / "runs.json", experiment, firmware, told, figures.rows)
     write_page(out)
@@ -59,6 +59,8 @@ def main() -> int:
     parser.add_argument("--wind", type=float, metavar="M_S", dest="wind_m_s")
     parser.add_argument("--pitch", type=float, metavar="DEG", dest="pitch_deg")
     parser.add_argument("--look")
+    parser.add_argument("--perfect", action="store_true", default=None,
+                        help="the truth is sent instead of the companion's poses")  # fmt: skip
     parser.add_argument("--backend")
     parser.add_argument("--parameter", action="append", default=[], metavar="NAME=VALUE")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")

@@ -6,6 +6,7 @@ import socket
 import threading
 import time
 from types import TracebackType
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -34,6 +35,7 @@ class PerfectPose:
         self._socket.settimeout(0.05)
         self._codec = mavlink.MAVLink(None, *COMPANION)
         self._over = threading.Event()
+        self._silent_until_s = 0.0
         self._thread = threading.Thread(target=self._run, name="perfect pose", daemon=True)
 
     def __enter__(self) -> PerfectPose:
@@ -48,6 +50,10 @@ class PerfectPose:
         self._thread.join()
         self._socket.close()
 
+    def be_silent(self, seconds: float) -> None:
+        """Send no pose for so long, as a companion that sees nothing and reckons nothing."""
+        self._silent_until_s = time.time() + seconds
+
     def _run(self) -> None:
         cable: tuple[str, int] | None = None
         began_s, said_s, asked_s = time.time(), 0.0, 0.0
@@ -61,7 +67,9 @@ class PerfectPose:
             if cable is None:
                 continue
             now_s = time.time()
-            messages = [odometry_message(self._true_pose(), self._firmware)]
+            messages: list[Any] = []
+            if now_s >= self._silent_until_s:
+                messages.append(odometry_message(self._true_pose(), self._firmware))
             if now_s - said_s > 1.0:
                 said_s = now_s
                 messages.append(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))

@@ -110,6 +110,7 @@ class Trial:
         self.ground = Ground(ground, kind.home, self.folder / "ground.tlog")
         self.pilot: Pilot = PILOTS[kind.name](self.ground, self.firmware)
         self.daemon: Daemon | None = None
+        self._perfect: PerfectPose | None = None
         self.status: dict[str, Any] = {}
         self.events: list[tuple[float, str]] = []
         self.began_s = time.time()
@@ -171,7 +172,7 @@ class Trial:
     def start_daemon(self) -> None:
         """As its service does."""
         if self.conditions.perfect:
-            self._open.enter_context(PerfectPose(
+            self._perfect = self._open.enter_context(PerfectPose(
                 self.ground, self._companion_port, self.firmware.home, CAMERA_HZ,
                 "px4" if isinstance(self.firmware, Px4) else "ardupilot",
             ))  # fmt: skip
@@ -236,7 +237,9 @@ class Trial:
         return done
 
     def tell_camera(self, order: str) -> None:
-        """See `drawn_camera`."""
+        """See `drawn_camera`; the truth, where that is sent, ceases for as long."""
+        if self._perfect is not None:
+            self._perfect.be_silent(float(order.split()[-1]))
         self._tell(self._camera, order)
 
     def tell_cable(self, order: str) -> None:

@@ -160,7 +160,7 @@ def test_key_outside_a_section(tmp_path: Path) -> None:
         ("cloud.voxel_m=-1", ">= 0.001", "-1"),
         ("depth.stride=9", "<= 8", "9"),
         ("depth.stride=0", ">= 1", "0"),
-        ("feedback.mode=on", "off, odometry, vision_position", "'on'"),
+        ("feedback.mode=on", "off, odometry, vision_position, velocity", "'on'"),
         ("router.clients=[1]", "text in the list", "[1]"),
         ("telemetry.use=attitude", "a list of attitude, imu, position", "'attitude'"),
         ('telemetry.use=["compass"]', "depth, each at most once", "['compass']"),

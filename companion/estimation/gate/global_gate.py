@@ -12,7 +12,8 @@ a spoofed receiver's by our word. So the rule is:
 - GPS_INPUT comes back as the autopilot's GPS. It is given out only where satellites are left out of
   `telemetry.use`, so that nothing that comes back ever places the map.
 - The autopilot's own estimates place no map while this is on (`FeedbackConfig.gives_position`).
-- Where poses are sent (`feedback.mode`), no global position is: the same error, twice.
+- Where poses are sent (`feedback.mode`), no global position is: the same error, twice. Beside
+  their velocity alone it is: that knows nothing of where the map lies.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ class GlobalGate:
         )  # fmt: skip
 
     def _refusal(self, origin: GeoOrigin | None, now_ns: int) -> str:
-        if self._config.mode != "off":
+        if self._config.sends_position:
             return OTHER_SOURCE
         if self._config.global_position == "gps_input" and "satellites" in self._use:
             return ECHO

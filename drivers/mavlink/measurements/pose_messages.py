@@ -34,7 +34,20 @@ UNKNOWN = [math.nan] * N_COVARIANCE
 
 def pose_messages(pose: PoseToSend, mode: str, firmware: Firmware) -> tuple[Any, ...]:
     """Messages of a pose, as `feedback.mode` and the autopilot want them."""
+    if mode == "velocity":
+        return (velocity_message(pose, firmware),)
     return (odometry_message(pose, firmware),) if mode == "odometry" else vision_messages(pose)
+
+
+def velocity_message(pose: PoseToSend, firmware: Firmware) -> Any:
+    """The velocity of a pose alone: ODOMETRY whose pose is nan for PX4, else a speed estimate."""
+    if firmware != "px4":
+        return vision_messages(pose)[1]
+    message = odometry_message(pose, firmware)
+    message.x = message.y = message.z = math.nan
+    message.q = [math.nan] * 4
+    message.pose_covariance = list(UNKNOWN)
+    return message
 
 
 def odometry_message(pose: PoseToSend, firmware: Firmware) -> Any:

@@ -41,7 +41,7 @@ def test_all_rules_apply_to_a_new_autopilot(firmware: str) -> None:
 
 
 @pytest.mark.parametrize("firmware", FIRMWARES)
-@pytest.mark.parametrize("mode", ["odometry", "vision_position"])
+@pytest.mark.parametrize("mode", ["odometry", "vision_position", "velocity"])
 def test_following_the_advice_leaves_none(firmware: str, mode: str) -> None:
     values = dict.fromkeys(names_to_read(firmware), 77.0)
     for _ in range(2):  # a compass is asked for once the heading comes from it
@@ -97,6 +97,15 @@ def test_values_of_px4(name: str, good: list[float], bad: list[float]) -> None:
 def test_bits_are_added_and_others_kept() -> None:
     assert blocking("px4", {"EKF2_EV_CTRL": 8})["EKF2_EV_CTRL"].set_to == 15
     assert blocking("px4", {"EKF2_EV_CTRL": 3}, mode="vision_position") == {}
+
+
+def test_of_the_velocity_alone_nothing_else_is_asked_to_be_fused() -> None:
+    px4 = {"EKF2_EV_CTRL": 4, "EKF2_HGT_REF": 1, "COM_ARM_WO_GPS": 0}
+    assert blocking("px4", px4, mode="velocity") == {}
+    assert blocking("px4", {**px4, "EKF2_EV_CTRL": 0}, "velocity")["EKF2_EV_CTRL"].set_to == 4
+    ardupilot = {"EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 6, "EK3_SRC1_POSZ": 1}
+    assert blocking("ardupilot", ardupilot, mode="velocity") == {}
+    assert "EK3_SRC1_VELXY" in blocking("ardupilot", {"EK3_SRC1_VELXY": 0}, mode="velocity")
 
 
 def test_sensor_offset_may_be_that_of_the_imu() -> None:

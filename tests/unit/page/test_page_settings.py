@@ -77,7 +77,7 @@ def test_a_key_that_counts_after_a_restart_says_so(served: ServedPage) -> None:
 @pytest.mark.parametrize("name, text, wanted", [
     ("feedback.max_sigma_m", "0", "0.01"),
     ("feedback.min_quality", "many", "int"),
-    ("feedback.mode", "on", "wanted one of off, odometry, vision_position"),
+    ("feedback.mode", "on", "wanted one of off, odometry, vision_position, velocity"),
     ("telemetry.use", '["attitude", "attitude"]', "at most once"),
     ("telemetry.use", '["smell"]', "smell"),
 ])  # fmt: skip

@@ -20,7 +20,7 @@ POSE = PoseToSend(
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4", "other"])
-@pytest.mark.parametrize("mode", ["odometry", "vision_position"])
+@pytest.mark.parametrize("mode", ["odometry", "vision_position", "velocity"])
 def test_poses_are_made_again_for_the_firmware_that_they_were_sent_to(
     firmware: Firmware, mode: str
 ) -> None:

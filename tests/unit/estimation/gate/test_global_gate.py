@@ -102,6 +102,7 @@ def test_the_autopilots_own_estimate_is_no_satellite() -> None:
 def test_one_source_at_a_time() -> None:
     flown = Flown(mode="odometry")
     assert flown.fly(10) is None and flown.gate.why_not == OTHER_SOURCE
+    assert Flown(mode="velocity").fly(10) is not None  # knows nothing of where the map lies
 
 
 def test_gps_input_only_where_satellites_place_nothing() -> None:

@@ -15,7 +15,12 @@ from companion.estimation.gate.pose_gate import PoseGate, PoseToSend, Sending
 from companion.geometry.transforms import Pose, quaternion_from_euler, rotation_from_quaternion
 from companion.messages import Odometry, TrackState
 from companion.telemetry import AttitudeSample
-from drivers.mavlink.measurements.pose_messages import euler_of, odometry_message, vision_messages
+from drivers.mavlink.measurements.pose_messages import (
+    euler_of,
+    odometry_message,
+    pose_messages,
+    vision_messages,
+)
 
 MS = 1_000_000
 LATENCY_NS = 40 * MS
@@ -436,6 +441,22 @@ def test_odometry_message() -> None:
     assert np.allclose(position.covariance, message.pose_covariance)
     assert np.allclose([position.roll, position.pitch, position.yaw], [0.1, -0.2, 0.7])
     assert (speed.x, speed.y, speed.z) == (1.0, 0.5, -0.2)
+
+
+def test_the_velocity_alone_says_nothing_of_the_place() -> None:
+    pose = PoseToSend(
+        10**12, Pose(rotation_from_quaternion(ATTITUDE), np.array([1.0, 2.0, -3.0])),
+        np.array([1.0, 0.5, -0.2]), 0.1, 0.2, 0.01, 0.05, 80, 7,
+    )  # fmt: skip
+    whole, (message,) = odometry_message(pose, "px4"), pose_messages(pose, "velocity", "px4")
+    places = message.x, message.y, message.z, *message.q, *message.pose_covariance
+    assert all(math.isnan(each) for each in places)
+    for name in ("vx", "vy", "vz", "time_usec", "child_frame_id", "quality", "reset_counter"):
+        assert getattr(message, name) == getattr(whole, name)
+    assert message.velocity_covariance[0] == pytest.approx(0.04)
+    (message,) = pose_messages(pose, "velocity", "ardupilot")
+    assert message.get_type() == "VISION_SPEED_ESTIMATE"
+    assert (message.x, message.y, message.z) == (1.0, 0.5, -0.2)
 
 
 BLIND: dict[str, Any] = {"state": TrackState.DEAD_RECKONING, "quality": 1, "inertial": True}
