@@ -75,8 +75,9 @@ def _viso_delay(context: Context, values: Values) -> Wanted | None:
     return Near(latency_ms, DELAY_TOLERANCE_MS)
 
 
-def _proximity(context: Context, values: Values) -> Wanted | None:
-    return OneOf((2,)) if context.feedback.obstacle_distance else None
+def _for_obstacles(wanted: Wanted) -> Callable[[Context, Values], Wanted | None]:
+    """The condition where obstacles are sent."""
+    return lambda context, values: wanted if context.feedback.obstacle_distance else None
 
 
 def _from_pose(number: int, wanted: Wanted) -> Callable[[Context, Values], Wanted | None]:
@@ -218,8 +219,10 @@ ARDUPILOT_RULES = (
          "would take lost ones"),
     Rule("VISO_DELAY_MS", _viso_delay, "the time from exposure to sending, as measured; ArduPilot "
          "counts from arrival"),
-    Rule("PRX1_TYPE", _proximity, "2 takes OBSTACLE_DISTANCE, which feedback.obstacle_distance "
-         "sends", reboot=True),
+    Rule("PRX1_TYPE", _for_obstacles(OneOf((2,))), "2 takes OBSTACLE_DISTANCE, which "
+         "feedback.obstacle_distance sends", reboot=True),
+    Rule("PRX_FILT", _for_obstacles(OneOf((0,))), "the low pass of 0.25 Hz makes distances 0.6 s "
+         "late: 2 m at 3 m/s; ours are of the newest image, 0 takes them as they are"),
     Rule("PLND_ENABLED", _landing(OneOf((1,))), "1 lands on the marker that we send",
          reboot=True),
     Rule("PLND_TYPE", _landing(OneOf((1,))), "1 (MAVLink) takes LANDING_TARGET", reboot=True),

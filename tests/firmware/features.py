@@ -190,14 +190,14 @@ FEATURES: dict[str, tuple[Callable[[Trial, Figures], None], Conditions]] = {
         settings=("feedback.global_position=estimate", "feedback.flow=optical_flow"),
     )),
     "earth_position_px4": (earth_position, Conditions(
-        has_gps=True, pose_mode="off",
-        parameters={"EKF2_EV_CTRL": 0, "EKF2_AGP0_ID": 10, "EKF2_AGP0_CTRL": 1,
+        has_gps=True, pose_mode="velocity",
+        parameters={"EKF2_EV_CTRL": 4, "EKF2_AGP0_ID": 10, "EKF2_AGP0_CTRL": 1,
                     "EKF2_AGP0_DELAY": 60},
         settings=("feedback.global_position=sensor",),
     )),
     "wall": (wall, Conditions(
         wind_m_s=0.0, pitch_deg=-20.0, landmarks=f"wall:{WALL_NORTH_M:g}", has_depth=True,
-        parameters={"PRX1_TYPE": 2, "AVOID_ENABLE": 7},
+        parameters={"PRX1_TYPE": 2, "PRX_FILT": 0, "AVOID_ENABLE": 7},
         settings=("feedback.obstacle_distance=true", "depth.stride=4"),
     )),
 }  # fmt: skip

@@ -144,7 +144,9 @@ def test_compass_and_proximity_are_required_where_used() -> None:
     assert blocking("ardupilot", {"COMPASS_ENABLE": 0, "EK3_SRC1_YAW": 6}) == {}
     sending = FeedbackConfig(obstacle_distance=True)
     assert "PRX1_TYPE" in blocking("ardupilot", {"PRX1_TYPE": 0}, feedback=sending)
-    assert blocking("ardupilot", {"PRX1_TYPE": 0}) == {}
+    late = blocking("ardupilot", {"PRX1_TYPE": 2, "PRX_FILT": 0.25}, feedback=sending)
+    assert late["PRX_FILT"].set_to == 0
+    assert blocking("ardupilot", {"PRX1_TYPE": 0, "PRX_FILT": 0.25}) == {}
 
 
 def test_flow_needs_its_parameters_where_it_is_sent() -> None:
