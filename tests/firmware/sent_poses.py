@@ -24,6 +24,11 @@ def add_poses(figures: Figures, cable: Path, true: list[State]) -> None:
     if len(rows) < LEAST:
         return
     sent = np.array(rows)
+    figures.add("longest time without a pose", np.diff(sent[:, 0]).max(), "s")
+    figures.add("reset counter, first", sent[0, 9], "", 0.0)
+    figures.add("reset counter, last", sent[-1, 9])
+    if not np.isfinite(sent).all():  # the velocity alone
+        return
     t_s = np.array([each.t_s for each in true])
     places = np.array([each.place_m for each in true])
     delay_s = sent[:, 0] - sent[:, 1]
@@ -35,14 +40,10 @@ def add_poses(figures: Figures, cable: Path, true: list[State]) -> None:
     yaw = np.unwrap(_yaws(sent[:, 5:9]))
     true_yaw = np.interp(shown_s, t_s, np.unwrap(_yaws(np.array([e.quaternion for e in true]))))
     turned_deg = np.degrees(np.abs((yaw - true_yaw + np.pi) % (2 * np.pi) - np.pi))
-    gaps_s = np.diff(sent[:, 0])
     figures.add("pose, place off, median", percentile(away_m, 50), "m")
     figures.add("pose, place off, 95 %", percentile(away_m, 95), "m")
     figures.add("pose, place off, at most", away_m.max(), "m")
     figures.add("pose, heading off, median", percentile(turned_deg, 50), "deg")
-    figures.add("longest time without a pose", gaps_s.max(), "s")
-    figures.add("reset counter, first", sent[0, 9], "", 0.0)
-    figures.add("reset counter, last", sent[-1, 9])
 
 
 def _yaws(quaternions: Array) -> Array:
