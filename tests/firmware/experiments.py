@@ -13,6 +13,7 @@ from tests.firmware.features import DEGREE_M, FEATURES, OWN_SOURCES, up_by_gps
 from tests.firmware.figures import Figures, strayed_m
 from tests.firmware.pilots import SET_EKF_SOURCE_SET
 from tests.firmware.trial import Conditions, Trial
+from tests.firmware.way_back import WAY_BACK, way_back
 
 Flown = Callable[[Trial, Figures], None]
 HOLD_S, READY_S, PATIENT_S = 60.0, 30.0, 45.0
@@ -212,6 +213,7 @@ EXPERIMENTS: dict[str, tuple[Flown, Conditions]] = {
     "doctor": (doctor, Conditions(by_doctor=True)),
     "gps_lost": (gps_lost, Conditions(has_gps=True, parameters=OWN_SOURCES)),
     **FEATURES,
+    "way_back": (way_back, WAY_BACK),
     "mount_90": (wrong_set_up, Conditions(mount_roll_deg=90.0)),
     "upside_down": (wrong_set_up, Conditions(mount_roll_deg=180.0)),
     "lens_10": (wrong_set_up, Conditions(lens_scale=1.1)),

@@ -27,7 +27,9 @@ PX4_SPEED_M_S = 2.0
 that it is told moves there."""
 SET_TIMES = 3
 """Over UDP, without waiting for its answer."""
-COPTER_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "GUIDED": 4, "LOITER": 5, "LAND": 9, "BRAKE": 17}
+COPTER_MODES = {
+    "STABILIZE": 0, "ALT_HOLD": 2, "AUTO": 3, "GUIDED": 4, "LOITER": 5, "LAND": 9, "BRAKE": 17,
+}  # fmt: skip
 PX4_MAIN = {"MANUAL": 1, "ALTCTL": 2, "POSCTL": 3, "AUTO": 4, "ACRO": 5, "OFFBOARD": 6}
 PX4_AUTO = {"TAKEOFF": 2, "LOITER": 3, "RTL": 5, "LAND": 6}
 

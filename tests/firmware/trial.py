@@ -224,6 +224,12 @@ class Trial:
         time.sleep(RESTART_S)
         self.start_daemon()
 
+    def end_daemon(self) -> Path | None:
+        """Stop the daemon as its service does; the map that the flight has left."""
+        self._stop_daemon()
+        self.mark("companion ended")
+        return next(iter(sorted(self.folder.glob("flights/**/site.map"))), None)
+
     def run_companion(self, *words: str) -> subprocess.CompletedProcess[str]:
         """Another of its commands, with the daemon's settings; kept in commands.txt."""
         settings = [word for each in self._settings() for word in ("--set", each)]
