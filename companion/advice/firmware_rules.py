@@ -16,6 +16,8 @@ MAX_VISO_DELAY_MS = 250.0
 LEAST_LAG_S, MOST_LAG_S = 0.02, 0.25
 """Range of PLND_LAG."""
 SOURCE_SETS = 1, 2, 3
+LEAST_NOISE = 0.05
+"""Metres, and m/s: as much as a pose states over known ground."""
 VELOCITY = "velocity"
 """Mode that sends no position."""
 
@@ -145,6 +147,11 @@ def fused(context: Context, values: Values) -> Wanted:
     return Bits(0b011, "0 and 1 (horizontal and vertical position)")
 
 
+def _least_noise(but: str) -> Callable[[Context, Values], Wanted | None]:
+    """The condition on what a measurement is taken to be off by at least, but in one mode."""
+    return lambda context, values: Between(0.01, LEAST_NOISE) if context.mode != but else None
+
+
 def _height(context: Context, values: Values) -> Wanted | None:
     return OneOf((3, 0, 2)) if context.mode != VELOCITY else None
 
@@ -257,8 +264,9 @@ PX4_RULES = (
          "to be that old", reboot=True),
     Rule("EKF2_EV_NOISE_MD", _always(OneOf((0,))), "1 would not use the uncertainty that we send"),
     Rule("EKF2_EV_QMIN", _quality, "above feedback.min_quality our poses would be ignored"),
-    Rule("EKF2_EVP_NOISE", _always(Between(0.01, 1.0)), "the least uncertainty that a position "
-         "is taken to have; above 1 m it hardly counts"),
+    Rule("EKF2_EVP_NOISE", _least_noise(VELOCITY), "the least uncertainty that a position is taken "
+         "to have: over known ground ours states less than the 0.1 m that PX4 begins with"),
+    Rule("EKF2_EVV_NOISE", _least_noise("vision_position"), "the same of a velocity"),
     Rule("EKF2_EV_POS_X", _same_as("EKF2_IMU_POS_X"), OUR_BODY),
     Rule("EKF2_EV_POS_Y", _same_as("EKF2_IMU_POS_Y"), OUR_BODY),
     Rule("EKF2_EV_POS_Z", _same_as("EKF2_IMU_POS_Z"), OUR_BODY),

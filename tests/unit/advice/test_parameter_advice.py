@@ -16,10 +16,12 @@ NEW = {
     "px4": {name: value for name, (value, _) in fake_parameters.PX4.items()},
 }
 FEEDBACK = FeedbackConfig()
-ARDUPILOT_READY = {
+ARDUPILOT_READY: dict[str, float] = {
     "VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6,
 }  # fmt: skip
-PX4_READY = {"EKF2_EV_CTRL": 7, "EKF2_HGT_REF": 3}
+PX4_READY: dict[str, float] = {
+    "EKF2_EV_CTRL": 7, "EKF2_HGT_REF": 3, "EKF2_EVP_NOISE": 0.05, "EKF2_EVV_NOISE": 0.05,
+}  # fmt: skip
 READY = {"ardupilot": ARDUPILOT_READY, "px4": PX4_READY}
 
 
@@ -85,6 +87,7 @@ def test_viso_type_that_moves_our_pose_is_blocking(mode: str) -> None:
         ("EKF2_EV_DELAY", [0, 15], [50, 175]),
         ("EKF2_EV_NOISE_MD", [0], [1]),
         ("EKF2_EV_QMIN", [0, 20], [50]),
+        ("EKF2_EVP_NOISE", [0.01, 0.05], [0.1]),
         ("COM_ARM_WO_GPS", [1, 2], [0]),
         ("SYS_MC_EST_GROUP", [2], [1, 3]),
     ],
@@ -100,10 +103,10 @@ def test_bits_are_added_and_others_kept() -> None:
 
 
 def test_of_the_velocity_alone_nothing_else_is_asked_to_be_fused() -> None:
-    px4 = {"EKF2_EV_CTRL": 4, "EKF2_HGT_REF": 1, "COM_ARM_WO_GPS": 0}
+    px4: dict[str, float] = {"EKF2_EV_CTRL": 4, "EKF2_HGT_REF": 1, "COM_ARM_WO_GPS": 0}
     assert blocking("px4", px4, mode="velocity") == {}
     assert blocking("px4", {**px4, "EKF2_EV_CTRL": 0}, "velocity")["EKF2_EV_CTRL"].set_to == 4
-    ardupilot = {"EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 6, "EK3_SRC1_POSZ": 1}
+    ardupilot: dict[str, float] = {"EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 6}
     assert blocking("ardupilot", ardupilot, mode="velocity") == {}
     assert "EK3_SRC1_VELXY" in blocking("ardupilot", {"EK3_SRC1_VELXY": 0}, mode="velocity")
 

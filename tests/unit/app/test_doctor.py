@@ -51,7 +51,7 @@ def never(question: str) -> bool:
     ("firmware", "names"),
     [
         ("ardupilot", ["VISO_TYPE", "EK3_SRC1_POSXY", "EK3_SRC1_VELXY", "EK3_SRC1_VELZ"]),
-        ("px4", ["EKF2_EV_CTRL", "EKF2_HGT_REF"]),
+        ("px4", ["EKF2_EV_CTRL", "EKF2_HGT_REF", "EKF2_EVP_NOISE", "EKF2_EVV_NOISE"]),
     ],
 )
 def test_names_sets_and_finds_nothing_more(config: Config, firmware: str, names: list[str]) -> None:
@@ -84,7 +84,7 @@ def test_who_says_no_has_nothing_set(config: Config) -> None:
 
     with quick_autopilot("px4", "udpin:127.0.0.1:0") as autopilot:
         status, _ = examine(config, autopilot.url, write=True, ask=refuse)
-        assert (status, asked) == (1, ["Set 2 parameters of PX4, system 1? [y/N] "])
+        assert (status, asked) == (1, ["Set 4 parameters of PX4, system 1? [y/N] "])
         assert not autopilot.of("PARAM_SET")
 
 

@@ -86,7 +86,7 @@ def test_what_is_read_can_be_set(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("FB_MODE", 3.0), ("FB_MODE", 0.5), ("FB_MODE", -1.0), ("MAP_DENSE", 2.0),
+        ("FB_MODE", 4.0), ("FB_MODE", 0.5), ("FB_MODE", -1.0), ("MAP_DENSE", 2.0),
         ("FB_MIN_QUALITY", 20.5), ("FB_MIN_QUALITY", 0.0), ("FB_MAX_SIGMA_M", math.nan),
         ("FB_MAX_SIGMA_M", math.inf), ("STR_KBIT_S", -1.0), ("MAP_STRIDE", 1e30),
     ],
