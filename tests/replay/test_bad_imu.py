@@ -18,11 +18,12 @@ FAILS_S = 30.0
 """By then poses have been given out for some seconds."""
 
 
-def flown(folder: Path, alter: Alter) -> Run:
+def flown(folder: Path, alter: Alter, stop_s: float) -> Run:
     flight = with_imu(folder / "flight", SAMPLE, alter)
     run = replay_here(
-        flight, folder / "out", "--set", BY_IMU, "--set", "depth.enabled=false", "--stop", "40"
-    )
+        flight, folder / "out", "--set", BY_IMU, "--set", "depth.enabled=false",
+        f"--stop={stop_s}",
+    )  # fmt: skip
     assert run.status == 0, run.stderr
     return run
 
@@ -37,7 +38,7 @@ def why_not(run: Run) -> str:
     [(turned_about_z, "turned by 90 degrees about"), (late(0.3), "ms late")],
 )
 def test_nothing_is_sent_by_one_that_is_wrong(tmp_path: Path, alter: Alter, words: str) -> None:
-    run = flown(tmp_path, alter)
+    run = flown(tmp_path, alter, FAILS_S)
     assert words in why_not(run)
     assert run.report["scale"] is None
     assert run.n_sent == 0
@@ -45,7 +46,7 @@ def test_nothing_is_sent_by_one_that_is_wrong(tmp_path: Path, alter: Alter, word
 
 
 def test_what_was_sent_before_it_was_saturated_is_metric(tmp_path: Path) -> None:
-    run = flown(tmp_path, saturated(19.6133, FAILS_S))
+    run = flown(tmp_path, saturated(19.6133, FAILS_S), FAILS_S + 8.0)
     assert "saturated: its z axis ends at" in why_not(run)
     assert run.n_sent > 100
     found = score(read_tum(run.out / "poses_sent.tum"), TRUTH)

@@ -10,11 +10,11 @@ import pytest
 
 from companion.app.cli import main
 from tests.support.autopilot.received_poses import TrueFlight
-from tests.support.processes.program import Run, replay
+from tests.support.processes.program import Run, replay, replay_here
 from tests.support.reference.scoring import Score, depth_errors, read_ply, read_tum, score
 
 SAMPLE = Path(__file__).parents[2] / "sample" / "survey"
-SHORT = ["--start", "10", "--stop", "20"]
+SHORT = ["--start", "10", "--stop", "16"]
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +116,9 @@ def test_recording_is_a_recording(run: Run) -> None:
 
 
 def test_two_runs_are_identical(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        assert replay(SAMPLE, tmp_path / name, *SHORT).status == 0
+    """Also where one is in a process that has done other things before."""
+    assert replay(SAMPLE, tmp_path / "one", *SHORT).status == 0
+    assert replay_here(SAMPLE, tmp_path / "two", *SHORT).status == 0
     for result in ("trajectory.tum", "cloud.ply", "poses_sent.tum"):
         one, two = ((tmp_path / name / result).read_bytes() for name in ("one", "two"))
         assert one == two
