@@ -21,7 +21,9 @@ from companion.timing.clock import monotonic_s, wait_s
 OWN = "127.0.0.1:0"
 """Address for viewers of this machine, on a port of their own."""
 PATH_STEP_NS = 200_000_000
-BIND_AGAIN_S = 1.0
+BIND_AGAIN_S, HELD_BY_OURS = 1.0, 10
+"""Interval of attempts to have the port, and how many fail before that is told: the flight before
+may still have it while it gives its last results."""
 DRAIN_S, DRAIN_TICK_S = 2.5, 0.02
 
 
@@ -83,11 +85,14 @@ class _Viewers(Work):
 
     def _listen(self, address: str) -> None:
         """Listen when the port is free: the flight before may still have it."""
+        n_failed = 0
         while not self._over.is_set():
             try:
                 self._exporter.listen(open_listener(address))
             except (OSError, ValueError, OverflowError) as error:
-                self._closed = f"{address}: {getattr(error, 'strerror', None) or error}"
+                n_failed += 1
+                if n_failed > HELD_BY_OURS or not isinstance(error, OSError):
+                    self._closed = f"{address}: {getattr(error, 'strerror', None) or error}"
                 wait_s(self._over, BIND_AGAIN_S)
             else:
                 self._closed = ""

@@ -15,7 +15,7 @@ from drivers.recording.picture_codec import still
 from drivers.recording.recorded_content import is_sample_topic, sample_of
 from drivers.recording.recording_topics import GREY, HEALTH, PICTURES, PROFILE, VIDEO
 from drivers.recording.repair import n_cut_bytes, opened, was_cut
-from drivers.recording.video_codec import is_intra
+from drivers.video.h264_encoder import is_intra
 
 CUT, DAMAGE = "the recording was cut short", "the recording is damaged"
 

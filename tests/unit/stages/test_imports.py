@@ -19,7 +19,7 @@ NEEDED = {
     "companion.stages.recorder_work": {"mcap", "pymavlink"},
     "companion.stages.topics_work": set(),
     "companion.stages.viewers_work": set(),
-    "companion.stages.video_work": {"av", "mcap"},
+    "companion.stages.video_work": set(),
     "companion.stages.results_work": {"PIL", "pyarrow", "rerun"},
     "companion.daemon.daemon": {"pymavlink"},
 }

@@ -11,12 +11,12 @@ from companion.errors import ConfigError, FlightError
 from companion.geometry.geodesy import GeoOrigin
 from companion.messages import ClockReport, Frame, Warned
 from drivers.open_flight import open_flight
-from drivers.recording import video_codec
 from drivers.recording.mcap_file import McapFile
 from drivers.recording.mcap_scan import scan
 from drivers.recording.picture_codec import picture_encoder
 from drivers.recording.recorded_flight import RecordedFlight, is_recording, open_recording
 from drivers.telemetry.tlog_records import TlogRecords
+from drivers.video import h264_encoder
 from tests.support.flights.recorded import SIZE, START_NS, STEP_NS, camera, frames, record, samples
 
 N = 30
@@ -68,7 +68,7 @@ def test_frames_come_back_with_their_numbers_and_times(tmp_path: Path, codec: st
 def test_an_encoder_that_holds_pictures_back_loses_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(video_codec, "OPTIONS", {X264: HOLDS_BACK})
+    monkeypatch.setattr(h264_encoder, "OPTIONS", {X264: HOLDS_BACK})
     record(tmp_path / "f", N, "h264", config=RecorderConfig(least_free_mb=0, h264_encoder=X264))
     was, now = frames(N), frames_of(opened(tmp_path / "f"))
     assert [(f.seq, f.t_ns) for f in now] == [(f.seq, f.t_ns) for f in was]
