@@ -10,6 +10,7 @@ from companion.config import Config, StreamConfig
 from companion.geometry.camera import Camera
 from companion.runtime.stage_protocol import Finish, Setup
 from companion.stages import viewers_work
+from companion.streaming.exporter import open_listener
 from tests.support.waiting import until
 
 
@@ -18,7 +19,6 @@ def test_that_it_is_taken_is_told_only_where_it_stays_so(monkeypatch: pytest.Mon
     monkeypatch.setattr(viewers_work, "HELD_BY_OURS", 5)
     looked: list[str] = []
     opened: list[socket.socket] = []
-    open_listener = viewers_work.open_listener
 
     def looking(address: str) -> socket.socket:
         if address != viewers_work.OWN:
@@ -26,7 +26,7 @@ def test_that_it_is_taken_is_told_only_where_it_stays_so(monkeypatch: pytest.Mon
         opened.append(open_listener(address))
         return opened[-1]
 
-    monkeypatch.setattr(viewers_work, "open_listener", looking)
+    monkeypatch.setattr("companion.stages.viewers_work.open_listener", looking)
     with socket.socket() as before:
         before.bind(("127.0.0.1", 0))
         before.listen()
