@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -14,9 +15,9 @@ def write_atomically(
 ) -> None:  # fmt: skip
     """Put `data`, whole or in parts, at `path`, replacing the old file in one step.
 
-    Raises OSError. A failed write leaves the old file as it was, and no partial file. With
-    `durable` it waits until the data is on disk, and so survives a loss of power. Owner and mode
-    are those of `like`, if any; else it is created with `mode`, less the umask.
+    Raises OSError that names `path`. A failed write leaves the old file as it was, and no partial
+    file. With `durable` it waits until the data is on disk, and so survives a loss of power. Owner
+    and mode are those of `like`, if any; else it is created with `mode`, less the umask.
     """
     part = path.with_name(f".{path.name}.part")
     try:
@@ -34,8 +35,11 @@ def write_atomically(
         os.replace(part, path)
         if durable:
             sync(path.parent)
-    except BaseException:
-        part.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):  # the reason is what stopped the writing, not this
+            part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            error.filename = str(path)
         raise
 
 

@@ -107,3 +107,10 @@ def test_part_after_the_end(flight: Path, tmp_path: Path) -> None:
 def test_unknown_key(flight: Path, tmp_path: Path) -> None:
     line = refused(replay_here(flight, tmp_path / "out", "--set", "depth.enable=true"))
     assert "depth.enabled" in line
+
+
+def test_a_flight_in_which_nothing_is_placed(tmp_path: Path) -> None:
+    """One picture is no map; the report says what there was."""
+    flight = make_flight(tmp_path / "flight", SAMPLE, frames=range(60, 61))
+    assert "none of the pictures could be placed" in refused(replay_here(flight, tmp_path / "out"))
+    assert (tmp_path / "out" / "report.html").exists()

@@ -9,6 +9,7 @@ that says so.
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import select
 import signal
@@ -38,6 +39,8 @@ COMMANDS: dict[str, Command] = {
 }
 
 
+OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+"""Whatever file was to be written: no fault of the program, and the same for each command."""
 READER_GONE = 128 + signal.SIGPIPE
 """As of a program that SIGPIPE ends."""
 
@@ -57,11 +60,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not _readers_gone():
             raise
         return READER_GONE
-    except OSError:
+    except OSError as error:
         why = _why_not_written()
+        what = "its output" if why is not None else error.filename or "a file"
+        if why is None and error.errno in OF_THE_DISK:
+            why = error.strerror
         if why is None:
             raise
-        print(f"companion: error: its output cannot be written: {why}", file=sys.stderr)
+        print(f"companion: error: {what} cannot be written: {why}", file=sys.stderr)
         return 1
 
 

@@ -27,7 +27,7 @@ def replay_paced(
     given: RecordedInput, out: Path, config: Config, viewer: str, progress: Progress,
     notify: Callable[[str], None],
 ) -> None:  # fmt: skip
-    """Replay a flight into the folder `out`; InputError when it cannot begin.
+    """Replay a flight into the folder `out`; InputError when it cannot begin, or gives no map.
 
     `notify` takes remarks. StageError where localisation ends on the way.
     """
@@ -48,7 +48,7 @@ def replay_paced(
         flight.take(warning)
 
     def odometry(message: Odometry) -> None:
-        watched.state = message.state
+        watched.see(message.state)
 
     server = ForkServer()
     flight = LiveFlight(
@@ -83,6 +83,7 @@ def replay_paced(
         server.close()
     if faults:
         raise StageError(f"{faults[0]}; results so far are in {out}")
+    watched.check(out)
 
 
 def _wait(flight: LiveFlight, over: threading.Event) -> None:

@@ -50,13 +50,15 @@ class Watched:
     def __init__(self) -> None:
         self.state = TrackState.INITIALISING
         self.n_points = self.n_depth_maps = 0
+        self.has_tracked = False
+        """True once a frame was placed in a map."""
         self.has_origin = self.located = False
         """True once the map is georeferenced, and once it was found in that of another flight."""
 
     def take(self, message: Message) -> None:
         """Take a message of any kind."""
         if isinstance(message, Track):
-            self.state = message.state
+            self.see(message.state)
         elif isinstance(message, PointChunk):
             self.n_points += len(message.points_camera)
         elif isinstance(message, DepthMap):
@@ -66,6 +68,20 @@ class Watched:
             self.has_origin = found is not None and found.has_origin
         elif isinstance(message, Warned) and message.what == LOCATED:
             self.located = True
+
+    def see(self, state: TrackState) -> None:
+        """Take the tracker's state at a frame."""
+        self.state = state
+        self.has_tracked |= state is TrackState.TRACKING
+
+    def check(self, out: Path) -> None:
+        """FlightError where no frame of the whole flight was placed."""
+        if not self.has_tracked:
+            raise FlightError(
+                "no map: none of the pictures could be placed. A map begins where the camera moves "
+                "sideways and sees the same texture in several pictures; the calibration has to "
+                f"be that of the lens. What there is to see is in {out / 'report.html'}"
+            )
 
     def origin(self, of_log: GeoOrigin | None, of_map: GeoOrigin | None) -> GeoOrigin | None:
         """Origin of the map's world: of the log, else of the map in use, if it was found there."""
@@ -100,7 +116,7 @@ def replay(
     given: RecordedInput, out: Path, config: Config, viewer: str, progress: Progress,
     notify: Callable[[str], None],
 ) -> None:  # fmt: skip
-    """Replay a flight into the folder `out`; InputError when it cannot begin.
+    """Replay a flight into the folder `out`; InputError when it cannot begin, or gives no map.
 
     `notify` takes remarks: OpenCL devices refused, address of the viewer.
 
@@ -180,6 +196,7 @@ def replay(
             f"the dense map failed after {watched.n_depth_maps} depth maps: "
             f"{in_words(stages.depth_fault)}; path, report and the cloud so far are in {out}"
         ) from stages.depth_fault
+    watched.check(out)
 
 
 def map_origin(config: Config) -> GeoOrigin | None:

@@ -48,9 +48,11 @@ class FileViewer:
     def __exit__(self, *_: object) -> None:
         self._inbox.close()
         self._thread.join()
-        self._files.close()
-        if self._fault is not None:
-            raise self._fault
+        try:
+            self._files.close()
+        finally:
+            if self._fault is not None:
+                raise self._fault
 
     def _work(self) -> None:
         try:

@@ -5,6 +5,10 @@ They are parts of one recording: a viewer that is given several shows them as on
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
+import threading
 import uuid
 from pathlib import Path
 
@@ -17,6 +21,10 @@ APPLICATION = "companion-2"
 N_FILES = 4
 """Number of files that share the size limit."""
 LOOK_EVERY = 16
+FLUSH_S = 20.0
+"""A disk that takes longer for some megabytes takes nothing more."""
+LEFT_FREE_BYTES = 64 << 20
+"""Room for path, cloud and report of some minutes, which are worth more than the viewer's file."""
 
 
 class RrdFiles:
@@ -39,28 +47,44 @@ class RrdFiles:
     def is_full(self) -> bool:
         """True if the next file is due; the disk is checked on every LOOK_EVERY-th call only.
 
-        OSError where the recording cannot be written.
+        OSError where the recording cannot be written, or would take the room of the results.
         """
         self._n_looked += 1
-        if not self._each or self._n_looked % LOOK_EVERY:
+        if self._n_looked % LOOK_EVERY:
+            return False
+        if shutil.disk_usage(self._first.parent).free < LEFT_FREE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._paths[-1]))
+        if not self._each:
             return False
         try:
-            self.recording.flush()  # what waits for the disk counts too
+            self.recording.flush(timeout_sec=FLUSH_S)  # what waits for the disk counts too
         except RuntimeError as error:  # its thread ends with the first thing it cannot write
-            raise OSError(f"{self._paths[-1]}: cannot be written: {error}") from None
+            raise self._fault(error) from None
         return self._paths[-1].stat().st_size >= self._each
 
     def next(self) -> rr.RecordingStream:
         """Close the file, and begin another; deletes the oldest beyond the limit."""
-        self.recording.disconnect()
+        self.close()
         while len(self._paths) >= N_FILES:
             self._paths.pop(0).unlink(missing_ok=True)
         self.recording = self._begin()
         return self.recording
 
     def close(self) -> None:
-        """Write the rest."""
-        self.recording.disconnect()
+        """Write the rest; OSError where that is not done in FLUSH_S.
+
+        Rerun waits for ever for a file that cannot be written, also as the program ends: it does
+        so in a thread that is left behind then.
+        """
+        closing = threading.Thread(target=self.recording.disconnect, name="rrd end", daemon=True)
+        closing.start()
+        closing.join(FLUSH_S)
+        if closing.is_alive():
+            rr.unregister_shutdown()
+            raise self._fault("no answer from the disk")
+
+    def _fault(self, why: object) -> OSError:
+        return OSError(errno.EIO, str(why), str(self._paths[-1]))
 
     def _begin(self) -> rr.RecordingStream:
         self._n_begun += 1
@@ -68,7 +92,12 @@ class RrdFiles:
         path = self._first.with_name(f"{self._first.stem}{number}{self._first.suffix}")
         self._paths.append(path)
         recording = rr.RecordingStream(APPLICATION, recording_id=self._id)
-        recording.save(
-            path, default_blueprint=layout(live=False), write_footer=self._indexed
-        )  # fmt: skip
+        try:
+            recording.save(
+                path, default_blueprint=layout(live=False), write_footer=self._indexed
+            )  # fmt: skip
+        except RuntimeError as error:
+            raise self._fault(error) from None
+        except UnicodeEncodeError:
+            raise self._fault("its name is not UTF-8 text; PYTHONUTF8=1 reads it as such") from None
         return recording

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from companion import __version__
-from companion.app.cli import READER_GONE
+from companion.app.cli import COMMANDS, READER_GONE, main
 from companion.config import Config
 from companion.config_file import load_config
 from tests.support.processes.closed_pipe import into_closed_pipe
@@ -131,6 +132,18 @@ def test_a_full_disk_is_told_in_one_line(command: str) -> None:
     assert ended.returncode == 1
     why = "its output cannot be written: No space left on device"
     assert ended.stderr == f"companion: error: {why}\n"
+
+
+def test_a_file_that_the_disk_does_not_take_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out/cloud.ply")
+
+    monkeypatch.setitem(COMMANDS, "devices", full)
+    assert main(["devices"]) == 1
+    why = "out/cloud.ply cannot be written: No space left on device"
+    assert capsys.readouterr().err == f"companion: error: {why}\n"
 
 
 def test_errors_that_nobody_reads_end_it_too() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 from typing import Any
@@ -162,10 +163,10 @@ def test_a_write_that_fails_leaves_the_old_file(
     write_atomically(path, b"old")
 
     def full(*_: object) -> None:
-        raise OSError("no space left on device")
+        raise OSError(errno.ENOSPC, "no space left on device")
 
     monkeypatch.setattr("os.replace", full)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(OSError, match="no space left on device: "):
         write_atomically(path, b"new")
     assert [p.name for p in tmp_path.iterdir()] == ["result"]
     assert path.read_bytes() == b"old"

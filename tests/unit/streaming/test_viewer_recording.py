@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import threading
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,7 @@ from rerun.chunk import RrdReader
 from companion.config import ViewerConfig
 from companion.geometry.camera import Camera
 from companion.messages import Message, TrackState
-from companion.streaming.viewer import FileViewer
+from companion.streaming.viewer import FileViewer, rrd_files
 from tests.support.flights import flown
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -220,3 +222,37 @@ def test_a_fault_in_the_recording_neither_blocks_nor_hides(tmp_path: Path) -> No
         viewer.take(bad)
         for seq in range(20000):  # more than there is room for
             viewer.take(flown.frame(seq))
+
+
+@pytest.mark.parametrize("name", ["/dev/full", "gone/f.rrd", "\udcfc.rrd"])
+def test_a_file_that_cannot_be_written_is_named(name: str, tmp_path: Path) -> None:
+    with pytest.raises(OSError) as caught:
+        FileViewer(ViewerConfig(), CAMERA, tmp_path / name)
+    assert caught.value.filename == str(tmp_path / name)
+
+
+def test_it_leaves_room_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The results come after it, and are worth more."""
+    monkeypatch.setattr(rrd_files, "LEFT_FREE_BYTES", 1 << 62)
+    path = tmp_path / "f.rrd"
+    with pytest.raises(OSError) as caught, FileViewer(ViewerConfig(), CAMERA, path) as viewer:
+        for seq in range(100):
+            viewer.take(flown.frame(seq))
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
+    assert RrdReader(path).stream().to_chunks()  # what there was until then can be read
+
+
+def test_a_disk_that_never_answers_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Rerun's on a full disk: its thread is gone, and what it should write is waited for."""
+    monkeypatch.setattr(rrd_files, "FLUSH_S", 0.05)
+    monkeypatch.setattr(rrd_files.rr, "unregister_shutdown", lambda: None)
+    answer = threading.Event()
+    files = rrd_files.RrdFiles(tmp_path / "f.rrd", 0, indexed=False)
+    disconnect = files.recording.disconnect
+    monkeypatch.setattr(files.recording, "disconnect", answer.wait)
+    with pytest.raises(OSError, match="no answer"):
+        files.close()
+    answer.set()
+    disconnect()
