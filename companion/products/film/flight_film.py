@@ -20,7 +20,7 @@ from companion.products.film.scene_drawing import (
     draw_path,
     draw_points,
 )
-from companion.products.report.cloud_views import slant_heading_rad
+from companion.products.report.cloud_views import oblique_heading_rad
 from companion.products.report.report_page import path_segments
 from companion.products.run_folder import FinishedRun
 
@@ -81,7 +81,7 @@ class _Scene:
         low, high = np.minimum(low, places.min(0)), np.maximum(high, places.max(0))
         self._extent = float(np.linalg.norm(high - low))
         self._middle = (low + high) / 2
-        self._heading = slant_heading_rad(cloud, [places])
+        self._heading = oblique_heading_rad(cloud, [places])
         some = self._points[:: max(1, len(cloud) // N_SPACING)]
         self._distance = self._fitting_distance(some, places)
         tree = cKDTree(self._points)

@@ -72,7 +72,7 @@ def cloud_scene(
         "step": step,
         "n": len(order),
         "spacing": _spacing(points),
-        "around": np.percentile(points, [2, 98], axis=0).tolist(),
+        "around": _around(points, segments).tolist(),
         "unit": unit,
         "view": list(view),
         "paths": [_rounded(_sparse(path)) for path in segments],
@@ -94,6 +94,19 @@ def cloud_scene(
         Markup(_program()),
         len(order),
     )
+
+
+def _around(points: Array, segments: Sequence[Array]) -> Array:
+    """Corners (2, 3) of the box seen first: most of the cloud, and all of the path seen from above.
+
+    Its heights are the cloud's: a path high above it would push it out of the middle.
+    """
+    around = np.percentile(points, [2, 98], axis=0)
+    if segments:
+        path = np.concatenate(segments)[:, :2]
+        around[0, :2] = np.minimum(around[0, :2], path.min(0))
+        around[1, :2] = np.maximum(around[1, :2], path.max(0))
+    return around
 
 
 def coarse_to_fine(points: NDArray[np.floating]) -> NDArray[np.int64]:

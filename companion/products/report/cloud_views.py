@@ -18,7 +18,7 @@ WIDTH_PX = 1100
 FINER = 2
 """Supersampling factor of views, for smooth edges."""
 MAX_SPLAT_PX = 25
-SLANT_DOWN_RAD = np.radians(35)
+OBLIQUE_DOWN_RAD = np.radians(35)
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
@@ -49,12 +49,12 @@ def cloud_views(cloud: Cloud, segments: Sequence[Array]) -> list[CloudView]:
         return []
     heading = side_heading_rad(cloud, segments)
     side = f"From the side, looking {compass_point(heading)}"
-    slant_heading = slant_heading_rad(cloud, segments)
-    slant = f"At a slant, looking {compass_point(slant_heading)}"
+    oblique_heading = oblique_heading_rad(cloud, segments)
+    oblique = f"Oblique, looking {compass_point(oblique_heading)}"
     return [
         _view("From above", cloud, segments, 0.0, np.pi / 2, (1.3, 3.0)),
         _view(side, cloud, segments, heading, 0.0, (1.6, 1.6)),
-        _view(slant, cloud, segments, slant_heading, SLANT_DOWN_RAD, (1.6, 1.6)),
+        _view(oblique, cloud, segments, oblique_heading, OBLIQUE_DOWN_RAD, (1.6, 1.6)),
     ]
 
 
@@ -73,7 +73,7 @@ def side_heading_rad(cloud: Cloud, segments: Sequence[Array]) -> float:
     return float(np.arctan2(across[1], across[0]))
 
 
-def slant_heading_rad(cloud: Cloud, segments: Sequence[Array]) -> float:
+def oblique_heading_rad(cloud: Cloud, segments: Sequence[Array]) -> float:
     """Heading of the oblique view: from beside the side view's."""
     return side_heading_rad(cloud, segments) + float(np.radians(30))
 

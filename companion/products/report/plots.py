@@ -131,10 +131,17 @@ def tracking_svg(tracks: Sequence[Track], duration_s: float) -> str:
         return _svg(figure)
 
 
+def slowest_first(
+    stage_times: Mapping[str, Mapping[str, float]],
+) -> list[tuple[str, Mapping[str, float]]]:
+    """Stages with their times, in the order of their total."""
+    return sorted(stage_times.items(), key=lambda stage: -stage[1]["total_s"])
+
+
 def stages_svg(stage_times: Mapping[str, Mapping[str, float]]) -> str:
     """Milliseconds per call of each stage: bars to the median, lines to the 95th percentile."""
     with _style("stages"):
-        names = sorted(stage_times, key=lambda name: -stage_times[name]["total_s"])
+        names = [name for name, _ in slowest_first(stage_times)]
         figure = Figure(figsize=(6.4, 0.32 * len(names) + 0.9), layout="constrained")
         axes = figure.add_subplot()
         rows = np.arange(len(names))

@@ -17,10 +17,10 @@ from companion.products.flight_result import FlightResult, RunFacts, WorldPose
 from companion.products.report import plots
 from companion.products.report.cloud_scene import PlacedKeyframe, cloud_scene
 from companion.products.report.cloud_views import (
-    SLANT_DOWN_RAD,
+    OBLIQUE_DOWN_RAD,
     CloudView,
     cloud_views,
-    slant_heading_rad,
+    oblique_heading_rad,
 )
 from companion.products.report.templates import rendered
 from companion.telemetry import belief_in_words
@@ -42,7 +42,7 @@ def report_page(
     flown = [places for _, places in segments]
     scene = None
     if len(cloud):
-        view = slant_heading_rad(cloud, flown), SLANT_DOWN_RAD
+        view = oblique_heading_rad(cloud, flown), OBLIQUE_DOWN_RAD
         scene = cloud_scene(cloud, flown, _keyframes(result), view, result.unit, facts.origin)
     return rendered(
         "report.html.j2",
@@ -57,7 +57,7 @@ def report_page(
         scene=scene,
         views=[_view(view) for view in cloud_views(cloud, flown)],
         depths=_depths(result),
-        stages={**numbers["stages"], **kernel_stages(result)},
+        stages=plots.slowest_first({**numbers["stages"], **kernel_stages(result)}),
         config=json.dumps(numbers["config"], indent=2, ensure_ascii=False),
     )
 

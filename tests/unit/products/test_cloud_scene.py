@@ -67,6 +67,16 @@ def test_points_come_back_within_half_a_step(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(facts["paths"][0][:3], points[0], atol=5e-4)
 
 
+def test_all_of_the_path_is_in_sight_at_first(rng: np.random.Generator) -> None:
+    """It is flown around what is mapped; its height is not to push the cloud out of the middle."""
+    points = rng.uniform([-20, -20, -10], [20, 20, 0], (500, 3))
+    path = np.array([[-90.0, 0, -200], [0, 80, -200], [70, 0, -200]])
+    scene = cloud_scene(cloud_of(points, 7), [path[:2], path[2:]], [], (0.0, 0.5), "m", None)
+    assert scene is not None
+    low, high = json.loads(scene.facts)["around"]
+    assert low[0] == -90 and high[:2] == [70, 80] and -20 <= low[1] < -18 and low[2] > -11
+
+
 def test_each_beginning_is_spread_evenly(rng: np.random.Generator) -> None:
     """Of a plane of 64 squares each prefix has a like number in each square."""
     points = np.column_stack([rng.uniform(0, 80, (64_000, 2)), np.zeros(64_000)])

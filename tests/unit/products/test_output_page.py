@@ -110,6 +110,16 @@ def test_page_says_the_numbers(page: str) -> None:
         assert words in text, words
 
 
+def test_stages_stand_in_table_and_plot_in_one_order() -> None:
+    flight = FlightResult()
+    for message in flown.messages():
+        flight.take(message)
+    times = {"n": 1, "p50_ms": 1.0, "p95_ms": 2.0}
+    stages = {"a": {**times, "total_s": 0.1}, "b": {**times, "total_s": 7.0}}
+    made = page_of(flight, stage_times=stages)
+    assert made.index("<td>b</td>") < made.index("<td>a</td>")
+
+
 def test_text_from_outside_is_escaped(page: str) -> None:
     assert "a <device>" in read(page).text
     assert "<device>" not in page

@@ -282,7 +282,7 @@ class CloudView {
     const does = button.dataset.does;
     if (does === "above") this.camera.look(0, STEEPEST);
     else if (does === "side") this.camera.look(this.facts.view[0], 0.06);
-    else if (does === "slant") this.camera.reset();
+    else if (does === "oblique") this.camera.reset();
     else if (does === "clear") this.clear();
     else if (does === "full") {
       if (document.fullscreenElement) document.exitFullscreen();
