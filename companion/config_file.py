@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import msgspec
 
-from companion.config import EXPERT, Config
+from companion.config import ADDRESS, EXPERT, Config
 from companion.config.computer_settings import NO_PROFILE, profile_text
 from companion.errors import ConfigError
 
@@ -158,9 +158,19 @@ def with_value(config: Config, name: str, value: Any, where: str) -> Config:
             word, least, most = limits
             wanted = f"wanted {word} or a number from {least:.15g} to {most:.15g}"
         raise ConfigError(f"{where}: {name}: {wanted}, given is {value!r}") from error
+    if ADDRESS in getattr(_types()[name], "__metadata__", ()) and not _is_address(checked):
+        raise ConfigError(f'{where}: {name}: wanted HOST:PORT, or "", given is {value!r}')
     if listed_words_of(name) and len(set(checked)) < len(checked):
         raise ConfigError(f"{where}: {name}: {_wanted_list(name)}, given is {value!r}")
     return with_values(config, {name: checked})
+
+
+def _is_address(text: str) -> bool:
+    """True for HOST:PORT, [IPV6]:PORT and nothing; whether the host is there is not asked."""
+    host, _, port = text.rpartition(":")
+    bare = host.removeprefix("[").removesuffix("]")
+    named = bool(bare) and (":" in bare) == (host != bare)
+    return not text or (named and port.isascii() and port.isdigit() and int(port) < 65536)
 
 
 def _in_words(error: msgspec.ValidationError) -> str:

@@ -123,9 +123,14 @@ def _recording(flights: Path, seconds: float) -> Iterator[Part]:
         "newest.mcap", f"the last {seconds:g} s of the newest recording",
         "PICTURES of the camera, and where on Earth it flew",
     )  # fmt: skip
-    newest = [path for flight in flown_in(flights) for path in recordings_in(flight.path)]
+    try:
+        newest = [path for flight in flown_in(flights) for path in recordings_in(flight.path)]
+    except CompanionError as error:
+        newest, why = [], str(error)
+    else:
+        why = f"no recording in {flights}"
     if not newest:
-        yield Part(piece.name, piece.what, piece.shows, missing=f"no recording in {flights}")
+        yield Part(piece.name, piece.what, piece.shows, missing=why)
         return
     yield _tried(
         Part("newest.txt", "what the newest recording holds", "when it was"),

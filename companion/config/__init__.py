@@ -37,10 +37,10 @@ from companion.config.network_settings import (
     VideoConfig,
     ViewerConfig,
 )
-from companion.config.setting_kinds import EXPERT, MEASUREMENTS, Expert, Measurement
+from companion.config.setting_kinds import ADDRESS, EXPERT, MEASUREMENTS, Expert, Measurement
 
 __all__ = [
-    "EXPERT", "MEASUREMENTS", "CameraConfig", "CloudConfig", "ComputerConfig", "Config",
+    "ADDRESS", "EXPERT", "MEASUREMENTS", "CameraConfig", "CloudConfig", "ComputerConfig", "Config",
     "ControlConfig", "DaemonConfig", "DepthConfig", "DistributedConfig", "Expert", "ExportConfig",
     "FeaturesConfig", "FeedbackConfig", "GeoreferenceConfig", "GpsConfig", "LandingConfig",
     "LinkConfig", "MapConfig", "Measurement", "MountConfig", "OpenclConfig", "PageConfig",

@@ -7,14 +7,14 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from companion.config.setting_kinds import Expert
+from companion.config.setting_kinds import Address, Expert
 
 
 @dataclass(frozen=True, slots=True)
 class PageConfig:
     """The page on the drone, for a browser; see docs/page.md."""
 
-    listen: str = "127.0.0.1:9880"
+    listen: Address = "127.0.0.1:9880"
     """HOST:PORT of the page; "" for none. 0.0.0.0 is every network: whoever is not on this machine
     needs a code, which `companion page` shows."""
 
@@ -23,7 +23,7 @@ class PageConfig:
 class StreamConfig:
     """Streaming to viewers on the ground (`companion view`); see docs/viewing.md."""
 
-    listen: str = "127.0.0.1:9870"
+    listen: Address = "127.0.0.1:9870"
     """HOST:PORT at which viewers connect; "" for none. 0.0.0.0 is every network."""
     budget_kbit_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     """Rate limit of all viewers together, kbit/s; 0: as much as the link carries."""
@@ -39,7 +39,7 @@ class StreamConfig:
 class VideoConfig:
     """The camera's pictures as video for pilots, as the map sees them; see docs/viewing.md."""
 
-    listen: str = ""
+    listen: Address = ""
     """HOST:PORT of an RTSP server, whose path is /camera; "" for none. 0.0.0.0 is every network."""
     kbit_s: Annotated[int, Meta(ge=50, le=50000)] = 2000
     """Bit rate of the video, kbit/s."""

@@ -8,6 +8,9 @@ T = TypeVar("T")
 EXPERT = "expert"
 Expert = Annotated[T, EXPERT]
 """A key that few drones need: its default was found by tests, or fits nearly all."""
+ADDRESS = "HOST:PORT"
+Address = Annotated[str, ADDRESS]
+"""Where something listens; "" for nowhere."""
 Measurement = Literal[
     "attitude", "imu", "position", "satellites", "range", "height", "airspeed", "depth"
 ]

@@ -83,7 +83,9 @@ def _listener(listen: str) -> socket.socket:
 
 
 def _end_with_daemon() -> None:
-    sys.stdin.buffer.read()
+    stdin = sys.stdin.fileno()
+    while os.read(stdin, 4096):  # unbuffered: the interpreter cannot end while a buffer is read
+        pass
     os._exit(0)
 
 

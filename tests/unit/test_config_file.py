@@ -166,6 +166,11 @@ def test_key_outside_a_section(tmp_path: Path) -> None:
         ('telemetry.use=["compass"]', "depth, each at most once", "['compass']"),
         ("telemetry.use=[true]", "a list of attitude", "[True]"),
         ('telemetry.use=["imu", "range", "imu"]', "once", "['imu', 'range', 'imu']"),
+        ("page.listen=9880", "HOST:PORT", "'9880'"),
+        ("page.listen=0.0.0.0:80x", "HOST:PORT", "'0.0.0.0:80x'"),
+        ("stream.listen=0.0.0.0:65536", "HOST:PORT", "'0.0.0.0:65536'"),
+        ("video.listen=::1:8554", "HOST:PORT", "'::1:8554'"),
+        ("video.listen=:8554", "HOST:PORT", "':8554'"),
     ],
 )
 def test_wrong_value_says_what_was_wanted_and_given(override: str, wanted: str, given: str) -> None:
@@ -173,6 +178,11 @@ def test_wrong_value_says_what_was_wanted_and_given(override: str, wanted: str, 
     assert override.split("=")[0] in message
     assert wanted in message.split(": ", 2)[2]
     assert message.endswith(f", given is {given}")
+
+
+@pytest.mark.parametrize("address", ["", "0.0.0.0:0", "drone.local:9870", "[::1]:65535"])
+def test_where_something_may_listen(address: str) -> None:
+    assert load_config(None, [f"stream.listen={address}"]).stream.listen == address
 
 
 @pytest.mark.parametrize("override", ["", "=", "stride=3", "depth=3", "depth.=3", ".stride=3"])

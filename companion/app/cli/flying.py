@@ -86,7 +86,9 @@ def _support(arguments: argparse.Namespace, signals: StopSignals) -> int:
 
 def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
     if not arguments.migrate:
-        print(to_toml(load_config(arguments.config, arguments.set)), end="")
+        config = load_config(arguments.config, arguments.set)
+        _check_beyond(config)
+        print(to_toml(config), end="")
         return 0
     from companion.app.migrate_command import migrate
 
@@ -94,6 +96,23 @@ def _check_config(arguments: argparse.Namespace, signals: StopSignals) -> int:
         raise InputError("--migrate wants --config FILE, and no --set")
     migrate(arguments.config, sys.stdout)
     return 0
+
+
+def _check_beyond(config: Config) -> None:
+    """Check what the settings name; ConfigError for a link that cannot be, a warning for files.
+
+    The configuration may be for another computer, which has the files.
+    """
+    from drivers.mavlink.wire.link_url import client_endpoint, link_endpoint
+
+    if config.link.url:
+        link_endpoint(config.link.url)
+    for client in config.router.clients:
+        client_endpoint(client)
+    named = {"camera.calibration": config.camera.calibration, "map.use": config.map.use}
+    for key, name in named.items():
+        if name and not Path(name).exists():
+            print(f"companion: warning: {key}: {name}: not there", file=sys.stderr)
 
 
 COMMANDS: dict[str, Command] = {

@@ -233,12 +233,12 @@ def add_parsers(commands: Any) -> None:
     export.add_argument("run", type=Path, metavar="RUN", help="what --out of the replay was")
     export.add_argument(
         "--as", dest="formats", metavar="FORMATS",
-        help="any of ply,pcd,las,laz,copc,dsm,ortho,mosaic,glb,mesh,colmap,nerfstudio,tum,kitti,"
-        "euroc,gpx,kml,geojson; see [export]",
+        help="any of ply,pcd,las,laz,copc,dsm,ortho,mosaic,glb,mesh,textured,tiles,colmap,"
+        "nerfstudio,tum,kitti,euroc,gpx,kml,geojson; see docs/formats.md",
     )  # fmt: skip
     export.add_argument(
         "--flight", type=Path, metavar="FLIGHT",
-        help="what was replayed: its pictures, which mosaic, colmap and nerfstudio need",
+        help="what was replayed: its pictures, which mosaic, textured, colmap and nerfstudio need",
     )  # fmt: skip
     export.add_argument("--out", type=Path, metavar="DIR", help="folder for them (default: RUN)")
 

@@ -1,4 +1,4 @@
-"""A page that asks for what it is told to: the argument of `page.listen` lists it."""
+"""A page that asks for what it is told to: the value of `daemon.flights` lists it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from companion.config_file import config_of_text
 
 def main() -> None:
     told = json.loads(sys.stdin.readline())
-    for word in config_of_text(told["config"], "the daemon").page.listen.split(","):
+    for word in config_of_text(told["config"], "the daemon").daemon.flights.split(","):
         if word == "end":
             sys.exit(7)
         print(word, flush=True)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from companion import __version__
 from companion.app.cli import COMMANDS, READER_GONE, main
 from companion.config import Config
 from companion.config_file import load_config
+from companion.products.export.exports import PRODUCTS
 from tests.support.processes.closed_pipe import into_closed_pipe
 
 SAMPLE = Path(__file__).parents[3] / "sample" / "survey"
@@ -44,6 +46,19 @@ def test_check_config_prints_what_it_read(tmp_path: Path) -> None:
     printed = tmp_path / "printed.toml"
     printed.write_text(result.stdout)
     assert load_config(printed) == load_config(given, ["opencl.device=gpu"]) != Config()
+
+
+def test_check_config_looks_beyond_the_words(tmp_path: Path) -> None:
+    line = refused(companion("check-config", "--set", "link.url=rubbish"))
+    assert 'link.url: "rubbish" must begin with one of serial:' in line
+    result = companion("check-config", "--set", f"camera.calibration={tmp_path / 'none.toml'}")
+    assert result.returncode == 0  # it may be on the drone
+    assert result.stderr.startswith("companion: warning: camera.calibration: ")
+
+
+def test_help_of_export_names_every_format() -> None:
+    told = re.sub(r"\s+", "", companion("export", "--help").stdout)
+    assert ",".join(PRODUCTS) in told
 
 
 def test_unknown_key_is_one_line() -> None:

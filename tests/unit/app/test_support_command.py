@@ -97,3 +97,13 @@ def test_where_it_cannot_be_written(config: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     words = ["support", "--config", config, "--flights", flights, "--out", tmp_path / "file" / "a"]
     assert main([*map(str, words)]) == 2
+
+
+def test_a_drone_that_never_flew_is_helped_too(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flights, out = tmp_path / "none", tmp_path / "support.zip"
+    words = ["support", "--config", config, "--flights", flights, "--out", out]
+    assert main([*map(str, words)]) == 0
+    assert f"newest.mcap: not there: {flights}: not there" in capsys.readouterr().out
+    assert {"versions.txt", "settings.json"} <= set(packed(out))

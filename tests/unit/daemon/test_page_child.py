@@ -28,7 +28,7 @@ async def heard(
     journal, reloads = Journal({}), list[str]()
     stop, said = StopRequest(journal), ""
     child = PageChild(
-        load_config(None, [f"page.listen={words}"]), SettingsSource(), Path("status.sock"), True,
+        load_config(None, [f"daemon.flights={words}"]), SettingsSource(), Path("status.sock"), True,
         journal, lambda: armed, lambda: reloads.append("reload"), stop,
     )  # fmt: skip
     task = asyncio.ensure_future(child.run())
