@@ -247,7 +247,7 @@ def test_a_disk_that_never_answers_is_not_waited_for(
 ) -> None:
     """As Rerun's on a full disk: its thread is gone, and what it should write is waited for."""
     monkeypatch.setattr(rrd_files, "FLUSH_S", 0.05)
-    monkeypatch.setattr(rrd_files.rr, "unregister_shutdown", lambda: None)
+    monkeypatch.setattr("rerun.unregister_shutdown", lambda: None)
     answer = threading.Event()
     files = rrd_files.RrdFiles(tmp_path / "f.rrd", 0, indexed=False)
     disconnect = files.recording.disconnect
