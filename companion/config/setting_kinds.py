@@ -10,7 +10,7 @@ Expert = Annotated[T, EXPERT]
 """A key that few drones need: its default was found by tests, or fits nearly all."""
 ADDRESS = "HOST:PORT"
 Address = Annotated[str, ADDRESS]
-"""Where something listens; "" for nowhere."""
+"""Address at which something listens; "" for none."""
 Measurement = Literal[
     "attitude", "imu", "position", "satellites", "range", "height", "airspeed", "depth"
 ]
