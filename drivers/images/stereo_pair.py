@@ -63,7 +63,7 @@ class StereoPair:
         if np.linalg.norm(z) < LEAST_COMMON_COSINE:
             raise FlightError("one camera is behind the other: it measures no depth")
         z /= np.linalg.norm(z)
-        self._first, self._second = first, second
+        self._first = first
         self._first_from_plane = np.stack([x, np.cross(z, x), z], 1)
         self._focal_px = first.focal_px
         turned = Pose(self._first_from_plane, np.zeros(3))
