@@ -55,7 +55,7 @@ class Agreement(NamedTuple):
     `chi_square` (48, D) is by way of `BODY_FROM_IMU` and by delay of the IMU's stamps, `delays_s`
     (D,). Shares of the body's turning are left `unexplained` by the best, and
     `identity_unexplained` by the IMU as it is at its best delay. `rate_rad_s` is the change of the
-    body's rates, RMS.
+    body's rates, RMS. White noise of the attitudes counts for none of these three.
     """
 
     delays_s: Array
@@ -170,21 +170,53 @@ def agreement(
         gyro = gyro - np.einsum("dna,na->dn", gyro, down)[..., None] * down
     seen_mean, gyro_mean = seen.mean(0), gyro.mean(1)
     seen, gyro = seen - seen_mean, gyro - gyro_mean[:, None]
-    # |seen - H gyro|2 for all ways H and delays at once
-    total = float((seen**2).sum())
-    common = np.einsum("na,dnb->dab", seen, gyro)
-    squared = total + (gyro**2).sum((1, 2)) - 2.0 * np.einsum("hab,dab->hd", BODY_FROM_IMU, common)
-    squared = np.maximum(squared, 0.0)
-    variance = max(squared.min() / (3 * n), SIGMA_RATE_RAD_S**2, MODEL_ERROR * total / (3 * n))
+    total, squared = float((seen**2).sum()), _squares(seen, gyro)
+    way, delay = np.unravel_index(int(np.argmin(squared)), squared.shape)
+    left, in_row = seen - gyro[delay] @ BODY_FROM_IMU[way].T, np.diff(np.flatnonzero(use)) == 1
+    noise = _white(left, in_row)
+    turning = max(total - noise, 1e-12)
+    variance = max(
+        (float(squared.min()) - noise) / (3 * n), SIGMA_RATE_RAD_S**2,
+        MODEL_ERROR * turning / (3 * n),
+    )  # fmt: skip
+    whitened = squared / variance
+    if noise > 0.0:
+        covariance = (variance + noise / (3 * n)) * np.eye(n)
+        after = np.flatnonzero(in_row)
+        covariance[after, after + 1] = covariance[after + 1, after] = -noise / (6 * n)
+        by = np.linalg.inv(np.linalg.cholesky(covariance))
+        whitened = _squares(by @ seen, by @ gyro)
+        whitened /= max(float(whitened.min()) / (3 * n), 1.0)
     off = seen_mean - np.einsum("hab,db->hda", BODY_FROM_IMU, gyro_mean)
-    chi_square = squared / variance + (off**2).sum(2) / SIGMA_GYRO_BIAS_RAD_S**2
+    chi_square = whitened + (off**2).sum(2) / SIGMA_GYRO_BIAS_RAD_S**2
     gained = (force_by_way(window) ** 2).sum(1) / SIGMA_ACCELERATION_M_S2**2
-    share = squared / max(total, 1e-12)
+    share = np.maximum(squared - noise, 0.0) / turning
     best = np.unravel_index(int(np.argmin(chi_square + gained[:, None])), squared.shape)
     return Agreement(
         delays_s, chi_square + gained[:, None], float(share[best]), float(share[IDENTITY].min()),
-        float(np.sqrt(total / n)),
+        float(np.sqrt(turning / n)),
     )  # fmt: skip
+
+
+def _squares(seen: Array, gyro: Array) -> Array:
+    """|seen - H gyro|2 (48, D) for all ways H and delays at once, of (N, 3) and (D, N, 3)."""
+    common = np.einsum("na,dnb->dab", seen, gyro)
+    both = float((seen**2).sum()) + (gyro**2).sum((1, 2))
+    out: Array = np.maximum(both - 2.0 * np.einsum("hab,dab->hd", BODY_FROM_IMU, common), 0.0)
+    return out
+
+
+def _white(left: Array, in_row: NDArray[np.bool_]) -> float:
+    """Squares in rates (N, 3) between attitudes that come of white noise of these.
+
+    What one attitude is off by is in the turn before it and, with the other sign, in the one after.
+    Other axes, or another time, leave what goes on from one turn to the next: none of this.
+    `in_row` (N - 1,) is true of turns that follow each other.
+    """
+    if not in_row.any():
+        return 0.0
+    common = float((left[:-1][in_row] * left[1:][in_row]).sum()) / np.count_nonzero(in_row)
+    return float(np.clip(-2.0 * common * len(left), 0.0, (left**2).sum()))
 
 
 def _turned(window: ImuWindow, at_s: Array) -> Array:

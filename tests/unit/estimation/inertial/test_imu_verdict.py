@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,6 +19,7 @@ from companion.geometry.transforms import (
     Array,
     Similarity,
     quaternion_from_euler,
+    quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
     vector_from_rotation,
@@ -159,6 +161,45 @@ def test_a_right_one_is_never_refused(
     verdict, changes, _ = judged(given)
     assert changes == []
     assert verdict.believed
+
+
+def rough(given: Iterator[Sample], seed: int, sigma_rad: float = np.radians(0.1)) -> list[Sample]:
+    """Attitudes with white noise, as of a link that rounds them."""
+    rng = np.random.default_rng(seed)
+
+    def turned_a_little(each: AttitudeSample) -> AttitudeSample:
+        rotation = rotation_from_quaternion(each.ned_from_body)
+        off = rotation_from_vector(rng.normal(scale=sigma_rad, size=3))
+        return replace(each, ned_from_body=quaternion_from_rotation(rotation @ off))
+
+    return [turned_a_little(e) if isinstance(e, AttitudeSample) else e for e in given]
+
+
+@pytest.mark.parametrize("motion", [hovering, swaying, straight, circling, weaving])
+@pytest.mark.parametrize("attitude_hz", [20, 50, 100])
+def test_noise_of_the_attitude_is_not_the_imu(motion: Motion, attitude_hz: int) -> None:
+    """At 25 Hz a tenth of a degree looks like turns of 3.5 degrees/s that no gyroscope measures."""
+    given = samples(motion, attitude_hz=attitude_hz, seconds=16.0)
+    verdict, changes, _ = judged(iter(rough(given, attitude_hz)))
+    assert changes == []
+    assert verdict.believed
+
+
+MIXED = np.array([0.3, -2.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (about(2), "turned by 90 degrees about -z"),
+        (late(0.3), "ms late"),
+        (lambda each: replace(each, gyro_rad_s=each.gyro_rad_s[[1, 2, 0]] * MIXED), "its "),
+    ],
+)  # fmt: skip
+def test_noise_of_the_attitude_hides_no_wrong_imu(wrong: Wrong, words: str) -> None:
+    _, changes, believed = judged(iter(rough(altered(samples(weaving), wrong), 1)))
+    assert changes and words in changes[0].warning.detail
+    assert not believed
 
 
 @pytest.mark.parametrize("motion", [swaying, weaving])
