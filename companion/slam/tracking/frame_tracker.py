@@ -21,6 +21,8 @@ from companion.slam.optimisation.pose_refinement import refine_pose, robust_cost
 MAX_REFINED = 150
 """Points aligned by patches per frame: more cost time without improving the pose."""
 MAX_KLT_POINTS = 200
+LOST_PX = 60.0
+"""Of a camera that was lost: a metre and a half at 15 m, with 500 pixels of focal length."""
 MIN_VISIBLE_RATIO, ENOUGH_INLIERS = 0.08, 30
 """Inliers required without attitude: this ratio of the visible points, or so many."""
 
@@ -83,6 +85,14 @@ class FrameTracker:
             self._map.n_visible[visible.ids] += 1
             self._map.n_found[points[inlier]] += 1
         return True
+
+    def match_around(self, view: View, guess: Pose, min_inliers: int) -> bool:
+        """Match a view of a camera that was lost with the map about where it should be; success.
+
+        It has gone on meanwhile; where it is by inertial navigation is off by degrees.
+        """
+        around = local_points(self._map, np.zeros(0, np.int64), guess.inverse().translation)
+        return self.match(view, guess, around, LOST_PX, min_inliers=min_inliers)
 
     def track_local_map(self, view: View, guess: Pose) -> bool:
         """Track a view by the local map from a predicted pose; success."""

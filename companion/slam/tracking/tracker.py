@@ -291,6 +291,8 @@ class Tracker:
             found = found or frame_tracker.match(
                 view, guess, frame_tracker.local, 25.0, min_inliers=min_inliers
             )
+            if not found and self.state is TrackState.LOST:
+                found = frame_tracker.match_around(view, guess, min_inliers)
             if not found and has_attitude:
                 found = self._relocalise_by_reference(view)
                 if not found and self.state is TrackState.TRACKING:
